@@ -282,12 +282,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         """Drive along an edge, or attempt to park; see the class."""
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
-        try:
-            number = index(action)
-        except TypeError:
-            number = _action_number(action)
-        if not 0 <= number <= PARK:
-            raise _wrong_action(action)
+        number = action_number(action)
         (
             reward, drive, failed, walk, parking, gave_up,
             drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m,
@@ -406,13 +401,17 @@ def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
     )
 
 
-def _action_number(action: Any) -> int:
-    """Convert an action, or an array of one as models return it, to a number."""
-    number = np.asarray(action)
-    if number.size != 1 or not np.issubdtype(number.dtype, np.integer):
-        raise _wrong_action(action)
-    return int(number.item())
+def action_number(action: Any) -> int:
+    """Return the number of an action, which may be an array of one as models return it.
 
-
-def _wrong_action(action: Any) -> InputError:
-    return InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
+    Raises:
+        InputError: none of the five actions.
+    """
+    try:
+        number = index(action)
+    except TypeError:
+        array = np.asarray(action)
+        number = int(array.item()) if array.size == 1 and np.issubdtype(array.dtype, np.integer) else -1
+    if not 0 <= number <= PARK:
+        raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
+    return number

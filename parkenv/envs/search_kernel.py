@@ -27,12 +27,14 @@ from parkenv.envs.search_records import (
     PROCESS_KIND,
     SCENARIO,
     SENTINEL,
+    SHARED_KIND,
     block_at,
     edge_at,
     scenario_at,
     search_at,
     slot_at,
 )
+from parkenv.envs.shared_slots import is_shared_slot_taken
 from parkenv.world import occupancy_kernel as worlds
 from parkenv.world.keyed_random import (
     ARRIVAL_STREAM,
@@ -167,6 +169,13 @@ def finish_step_at(address: int) -> tuple[Any, ...]:
 
 
 @kernel
+def step_result_at(address: int) -> tuple[Any, ...]:
+    """Return the numbers named by `STEP_RESULT` of the last step, without changing anything."""
+    result: tuple[Any, ...] = step_result(search_at(address, 0))
+    return result
+
+
+@kernel
 def read_belief_at(
     address: int, p_occupied: FloatArray, p_observed: FloatArray, observed_at: FloatArray
 ) -> None:
@@ -215,11 +224,9 @@ def step_result(search: Any) -> tuple[Any, ...]:
 def arrive(search: Any) -> None:
     """Begin a search in the place and the world of its seed and episode, without observations."""
     key = episode_key(search.seed_state, search.episode)
-    clear_slots(search)
     search.place = int(keyed_uniform(key, PLACE_STREAM, 0, 0) * search.n_places)
     search.scenario = search.scenarios + search.place * SCENARIO_BYTES
     scenario = scenario_at(search.scenario, 0)
-    search.process = scenario.world
     day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * scenario.n_weekdays)
     midnight = int64s(scenario.weekdays)[day] * DAY_S
     second_of_window = keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (
@@ -227,12 +234,30 @@ def arrive(search: Any) -> None:
     )
     arrival = midnight + (scenario.window_start + second_of_window)
     entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * scenario.n_entries)
+    enter(search, key, day, arrival, midnight, int64s(scenario.entries)[entry])
+
+
+@kernel
+def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float, vertex: int) -> None:
+    """Begin a search of the record's scenario at a time and a vertex, without observations.
+
+    Args:
+        search: a SEARCH record with `scenario` and `place`.
+        key: key of the world.
+        day: index of the weekday or recorded day among the scenario's.
+        arrival: s since Monday 00:00.
+        midnight: beginning of that day, s since Monday 00:00.
+        vertex: vertex of the entry.
+    """
+    scenario = scenario_at(search.scenario, 0)
+    clear_slots(search)
+    search.process = scenario.world
     _, hour, second = hour_of_week(arrival)
     search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
     search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
     if scenario.world_kind == PROCESS_KIND:
         worlds.draw_day(worlds.process_at(scenario.world, 0), search)
-    search.vertex = search.previous_vertex = int64s(scenario.entries)[entry]
+    search.vertex = search.previous_vertex = vertex
     search.parked = search.over = False
     search.drive_s = search.failed_s = search.walk_s = search.parking_cost_s = search.gave_up_s = 0.0
     search.step_drive_s = search.step_failed_s = search.step_walk_s = 0.0
@@ -323,6 +348,15 @@ def finish_step(search: Any) -> None:
     search.walk_s += search.step_walk_s
     search.parking_cost_s += search.step_parking_cost_s
     search.gave_up_s += search.step_gave_up_s
+
+
+@inlined
+def give_up(search: Any) -> None:
+    """End a search after a step: the car parks elsewhere, at the give-up penalty."""
+    penalty = scenario_at(search.scenario, 0).give_up_s
+    search.step_gave_up_s += penalty
+    search.gave_up_s += penalty
+    search.over = True
 
 
 # ---- what is observed
@@ -507,6 +541,9 @@ def find_state(search: Any, record: Any, time: float) -> None:
     scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
     if scenario.world_kind == LOG_KIND:
         worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
+    elif scenario.world_kind == SHARED_KIND:
+        # Another car may change it at any time, so `valid_until` stays 0.
+        record.occupied = is_shared_slot_taken(search.process, slot, time)
     else:
         worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
 

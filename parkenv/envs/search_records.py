@@ -24,8 +24,9 @@ from parkenv.world.recorded_occupancy import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 
 N_ACTIONS = PARK + 1
-PROCESS_KIND, LOG_KIND, EXTERNAL_KIND = range(3)
-"""Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival."""
+PROCESS_KIND, LOG_KIND, EXTERNAL_KIND, SHARED_KIND = range(4)
+"""Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival; slots
+that a fleet of cars shares."""
 
 EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
 """Result of an action at a vertex: the vertex that it leads to, s, m.
@@ -62,7 +63,7 @@ SCENARIO = np.dtype(
         ("hit_rate", ADDRESS),
         ("false_alarm_rate", ADDRESS),
         # For PROCESS_KIND, a PROCESS record (that of the world may change from search to search, see SEARCH); for
-        # LOG_KIND, RECORDED_DAY records, one for each of `weekdays`.
+        # LOG_KIND, RECORDED_DAY records, one for each of `weekdays`; for SHARED_KIND, the SHARED_WORLD record.
         ("world_kind", np.int64),
         ("world", ADDRESS),
         ("prior_kind", np.int64),
@@ -140,7 +141,7 @@ SEARCH = np.dtype(
         ("n_places", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
-        # record of the world, if it is a process.
+        # record of the world, if it is a process, or SHARED_WORLD record.
         ("scenario", ADDRESS),
         ("blocks", ADDRESS),
         ("slots", ADDRESS),

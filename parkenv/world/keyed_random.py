@@ -9,6 +9,7 @@ import math
 import operator
 
 import numpy as np
+from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from sim_sensors.compilation import compiled
@@ -21,6 +22,13 @@ OBSERVATION_STREAM = 3
 VIEW_STREAM = 4
 DAY_STREAM = 5
 PLACE_STREAM = 6
+# Streams of the cars of a fleet, numbered by the car instead of the slot.
+HEADWAY_STREAM = 7
+STAY_STREAM = 8
+PATIENCE_STREAM = 9
+GOAL_STREAM = 10
+KIND_STREAM = 11
+RULE_STREAM = 12
 
 _WORD_BITS = 64
 _WORD = (1 << _WORD_BITS) - 1
@@ -80,6 +88,22 @@ def episode_key(seed_state: np.uint64, episode: int) -> np.uint64:
     # Absorb the number of words first, so that no two (seed, episode) pairs give the same sequence of words.
     key: np.uint64 = _absorbed(_absorbed(seed_state, np.uint64(1)), np.uint64(episode))
     return key
+
+
+@compiled
+def car_key(world: np.uint64, car: int) -> np.uint64:
+    """Return the key of a car's own random numbers, such as its sensor's errors; the first car's is the world's."""
+    if car == 0:
+        return world
+    key: np.uint64 = _absorbed(world, np.uint64(car))
+    return key
+
+
+@compiled
+def car_uniforms(world: np.uint64, stream: int, first: int, values: NDArray[np.float64]) -> None:
+    """Fill an array with the uniform numbers of the cars from `first` on, index 0 of the stream each."""
+    for i in range(len(values)):
+        values[i] = keyed_uniform(world, stream, first + i, 0)
 
 
 def seed_state(seed: int) -> np.uint64:

@@ -87,6 +87,29 @@ def prefetch(_: Any, address: Any) -> Any:  # noqa: ARG001 - numba passes it
     return types.void(types.int64), code
 
 
+@intrinsic
+def call_at(_: Any, address: Any, one: Any, other: Any) -> Any:  # noqa: ARG001 - numba passes them
+    """Call the compiled function at an address from `call_address` with two int64; returns an int64."""
+
+    def code(_: Any, builder: Any, __: Any, values: Any) -> Any:
+        number = ir.IntType(64)
+        function = ir.FunctionType(number, [number, number]).as_pointer()
+        return builder.call(builder.inttoptr(values[0], function), values[1:])
+
+    return types.int64(types.int64, types.int64, types.int64), code
+
+
+def call_address(function: Any) -> int:
+    """Return the address of a compiled function of two int64 that returns an int64, for `call_at`.
+
+    The function must stay referenced; an exception in it is printed, and it then returns 0.
+    """
+    signature = types.int64(types.int64, types.int64)
+    function.compile(signature)
+    compiled = function.overloads[signature.args]
+    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
+
+
 def record_at(dtype: Any) -> Any:
     """Return a function for compiled code: (address, index) -> record `index` of the array of records there."""
     dtype = np.dtype(dtype)

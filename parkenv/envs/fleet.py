@@ -1,0 +1,458 @@
+"""A world in which many cars arrive, search, compete for slots, park, stay and leave."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import ResetNeeded
+from numpy.typing import NDArray
+
+from parkenv.envs.event_queue import EVENT
+from parkenv.envs.fleet_kernel import (
+    FINISHED,
+    NEEDS_FORECAST,
+    NEEDS_SEARCH,
+    PAUSED,
+    WRONG_ACTION,
+    act_at,
+    advance_at,
+    begin_world_at,
+    init_forecast_at,
+    release_at,
+)
+from parkenv.envs.fleet_records import CAR, DUE, FLEET, KNOWLEDGE, SEARCHING, STATES
+from parkenv.envs.fleet_rules import Rule
+from parkenv.envs.search import action_number, space_of
+from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS, step_result_at
+from parkenv.envs.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
+from parkenv.envs.shared_slots import BACKGROUNDS, NO_CAR, SHARED_SLOT, shared_slots_taken_at
+from parkenv.errors import InputError
+from parkenv.scenarios.build import ScenarioSource, make_scenario
+from parkenv.world.counted_occupancy import CountedOccupancy
+from parkenv.world.demand import Demand
+from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform, world_key
+from parkenv.world.occupancy_kernel import RECORDED_DAY
+from parkenv.world.pointers import address_of
+from parkenv.world.week import DAY_S, hour_of_week
+
+_FIRST_CHUNK = 16
+MAX_STEPS = 2000
+"""Default limit of a car's decisions, as in `parkenv/Search-v2`."""
+
+
+@dataclass(frozen=True)
+class DriverKind:
+    """A kind of driver in a fleet.
+
+    Args:
+        weight: relative number of such drivers. A car's kind follows from its own random number, so with two kinds and
+            equal demand, the drivers of the first kind stay the same, and more join them, as its weight grows.
+        rule: compiled driver that decides, see `parkenv.envs.fleet_rules.RULES`; None: Python decides.
+        knows: what these drivers know of the slots: `own`, their own observations.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+    """
+
+    weight: float = 1.0
+    rule: Rule | None = None
+    knows: str = "own"
+
+    def __post_init__(self) -> None:
+        good = isinstance(self.weight, (int, float, np.number)) and math.isfinite(self.weight)
+        if not good or self.weight < 0.0:
+            raise InputError(f"DriverKind.weight is {self.weight!r}, want a finite number of at least 0")
+        if self.rule is not None and not isinstance(self.rule, Rule):
+            raise InputError(
+                f"DriverKind.rule is {self.rule!r:.60}, want a Rule such as RULES['greedy-drive'], or None"
+            )
+        if self.knows not in KNOWLEDGE:
+            raise InputError(f"DriverKind.knows is {self.knows!r}, want one of {', '.join(KNOWLEDGE)}")
+
+
+class StepOutcome(NamedTuple):
+    """What a car's last step brought."""
+
+    reward: float
+    parked: bool
+    over: bool  # whether the search is over, but for the limit of steps
+    info: dict[str, Any]  # as of `parkenv/Search-v2`
+
+
+class Fleet:
+    """Many cars in one lot, decided by compiled drivers, by agents in Python, or by both.
+
+    Every car is a search as in `parkenv/Search-v2`, with the same actions, observations and costs; its forecast is that
+    of the scenario for its arrival. The slots are shared. Events happen in continuous time: at each moment, first
+    parked cars leave, cars arrive, and cars whose step is over observe; then the cars that have to decide do so one
+    after another, in the order of these events. Of two cars before the same free slot, the first to decide gets it, and
+    the other one has a failed attempt.
+
+    A car's search ends when it parks, when it has observed that every slot is taken (*gave up*), when its patience is
+    at an end (*balked*), or at the limit of steps (*truncated*); the last three cost `give_up_s`. A parked car leaves
+    after its stay. The world ends when all searches are over.
+
+    With one car, `Demand(Headways(1))` and the background `process`, the fleet is `parkenv/Search-v2` to the last bit.
+
+    Args:
+        scenario: as of `parkenv.make_scenario`.
+        demand: when cars arrive, how long they stay; by default one car.
+        background: who else takes slots: `residents`, cars that stand there when the world begins, drawn from the
+            scenario's occupancy, and leave once; `process`, the scenario's occupancy all day; `none`, nobody: the lot
+            is empty when the world begins.
+        drivers: the kinds of drivers.
+        max_steps: limit of a car's decisions.
+        tick_s: durations of steps, and arrivals, are rounded up to multiples of this, s; 0: continuous time.
+
+    Attributes:
+        scenarios: the scenarios of the cars, one for each goal with a weight; `cars["place"]` are indices into it.
+        records: (1,) of the dtype FLEET.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+
+    Examples:
+        >>> from parkenv.envs.fleet_rules import RULES
+        >>> from parkenv.world.demand import Demand, Headways
+        >>> fleet = Fleet("campus", Demand(Headways(cars=3)), drivers=[DriverKind(rule=RULES["greedy-drive"])])
+        >>> fleet.reset(seed=1)
+        >>> fleet.run()
+        >>> fleet.state_names()
+        ['parked', 'parked', 'parked']
+    """
+
+    def __init__(
+        self,
+        scenario: ScenarioSource,
+        demand: Demand | None = None,
+        *,
+        background: str = "residents",
+        drivers: Sequence[DriverKind] = (DriverKind(),),
+        max_steps: int = MAX_STEPS,
+        tick_s: float = 0.0,
+    ) -> None:
+        self.scenario = make_scenario(scenario)
+        self.demand = Demand() if demand is None else demand
+        self.drivers = tuple(drivers)
+        self._require(background, max_steps, tick_s)
+        goals = self._weighted("goal_weights", self.demand.goal_weights, len(self.scenario.lot.goals))
+        self.scenarios = tuple(self.scenario.replace(goal=goal) for goal in goals) or (self.scenario,)
+        lot = self.scenario.lot
+        self._weighted("entry_weights", self.demand.entry_weights, len(lot.entries))
+        entry = None if self.demand.entry_weights else self.scenario.entry
+        self._entries = lot.entry_vertices if entry is None else lot.entry_vertices[[entry]]
+        self.full_belief = any(kind.rule is None for kind in self.drivers)
+        self.records = np.zeros(1, FLEET)
+        self._record = self.records[0]
+        self._address = address_of(self.records, FLEET)
+        self._tables = ScenarioRecords(self.scenarios)
+        first = self._tables.records[0]
+        self._world_kind, self._world = int(first["world_kind"]), int(first["world"])
+        self._tables.records["world_kind"], self._tables.records["world"] = SHARED_KIND, self._address
+        self._pool: list[Searches] = []
+        self._moves: list[NDArray[np.uint8]] = []
+        self._row: dict[int, tuple[Searches, int]] = {}
+        self._cars = np.zeros(0, CAR)
+        self._record["background"] = BACKGROUNDS.index(background)
+        self._record["max_steps"], self._record["tick_s"] = max_steps, tick_s
+        self._record["n_slots"] = lot.n_slots
+        self._record["scenarios"] = self._tables.records.ctypes.data
+        self.slots = np.zeros(lot.n_slots, SHARED_SLOT)
+        cost_s = np.array([one.arrival_cost_s for one in self.scenarios])
+        work = {
+            "slots": self.slots,
+            "by_cost": np.argsort(cost_s, axis=1, kind="stable").astype(np.int64),
+            "median_cost_s": np.median(cost_s, axis=1),
+            "route_seconds": np.zeros(lot.n_vertices),
+            "route_from": np.zeros(lot.n_vertices, np.int64),
+            "route_stamp": np.zeros(lot.n_vertices, np.int64),
+            "route_keys": np.zeros(4 * lot.n_vertices + 1),
+            "route_vertices": np.zeros(4 * lot.n_vertices + 1, np.int64),
+        }
+        self._kept: dict[str, NDArray[Any]] = {}
+        self._keep(work)
+
+    def _require(self, background: str, max_steps: int, tick_s: float) -> None:
+        if not isinstance(self.demand, Demand):
+            raise InputError(f"demand is a {type(self.demand).__name__}, want a Demand")
+        if background not in BACKGROUNDS:
+            raise InputError(f"background is {background!r}, want one of {', '.join(BACKGROUNDS)}")
+        if not self.drivers or not all(isinstance(kind, DriverKind) for kind in self.drivers):
+            raise InputError(f"drivers is {self.drivers!r:.60}, want at least one DriverKind")
+        if not sum(kind.weight for kind in self.drivers) > 0.0:
+            raise InputError("drivers: all weights are 0, want one above 0")
+        if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
+            raise InputError(f"max_steps is {max_steps!r}, want a whole number of at least 1")
+        if not isinstance(tick_s, (int, float, np.number)) or not 0.0 <= tick_s < math.inf:
+            raise InputError(f"tick_s is {tick_s!r}, want a finite number of at least 0")
+
+    def _weighted(self, name: str, weights: tuple[float, ...], n: int) -> range:
+        if weights and len(weights) != n:
+            raise InputError(
+                f"Demand.{name} has {len(weights)} numbers, lot {self.scenario.lot.name!r} has {n} of these"
+            )
+        return range(len(weights))
+
+    def _keep(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Keep arrays alive, and write their addresses into the fields of the FLEET record."""
+        for name, array in arrays.items():
+            self._kept[name] = array
+            self._record[name] = address_of(array, array.dtype)
+
+    # ---- a world
+
+    def reset(self, seed: int = 0, episode: int = 0) -> None:
+        """Begin the world of a seed and an episode: equal numbers give equal arrivals, stays, kinds and residents."""
+        record, key = self._record, world_key(seed, episode)
+        window = self.scenario.arrival
+        weekdays = self._tables.records["n_weekdays"][0]
+        day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * weekdays)
+        arrival = self.scenario.occupancy.draw_arrival(window, key)
+        arrival_s = window.draw_second(key)
+        midnight = round((arrival.time - arrival_s) / DAY_S) * DAY_S
+        begin_s = self.demand.arrivals.begin_s(arrival_s)
+        begin = midnight + begin_s
+        _, hour, second = hour_of_week(begin)
+        record["key"], record["day"], record["midnight"], record["arrival"] = key, day, midnight, begin
+        record["hour"], record["second_of_hour"] = hour, second
+        record["is_log"] = self._world_kind == LOG_KIND
+        record["world"] = self._world + (day * RECORDED_DAY.itemsize if record["is_log"] else 0)
+        if isinstance(self.scenario.occupancy, CountedOccupancy):
+            self._counted = self.scenario.occupancy.process_of(arrival.day).record
+            record["world"] = self._counted.ctypes.data
+        self._write_cars(key, midnight, arrival_s)
+        begin_world_at(self._address)
+
+    def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
+        plans = self.demand.draw(key, arrival_s, len(self._entries))
+        n = len(plans.arrival_s)
+        cars = np.zeros(n, CAR)
+        cars["arrival"] = midnight + plans.arrival_s
+        tick_s, begin = float(self._record["tick_s"]), float(self._record["arrival"])
+        if tick_s > 0.0:
+            cars["arrival"] = begin + np.ceil((cars["arrival"] - begin) / tick_s - 1e-9) * tick_s
+        cars["entry"] = self._entries[plans.entry]
+        cars["place"] = plans.goal
+        cars["stay_s"], cars["patience_s"] = plans.stay_s, plans.patience_s
+        shares = np.cumsum([kind.weight for kind in self.drivers])
+        cars["kind"] = np.minimum(
+            np.searchsorted(shares / shares[-1], plans.kind, side="right"), len(self.drivers) - 1
+        )
+        rules = [0 if kind.rule is None else kind.rule.address for kind in self.drivers]
+        cars["rule"] = np.array(rules, np.int64)[cars["kind"]]
+        cars["knows"] = np.array([KNOWLEDGE.index(kind.knows) for kind in self.drivers])[cars["kind"]]
+        cars["state"], cars["slot"] = DUE, NO_CAR
+        cars["ended_at"] = cars["left_at"] = np.inf
+        self._cars = cars
+        capacity = max(n, sum(len(one.records) for one in self._pool))
+        self._record["n_cars"], self._record["n_free"] = n, 0
+        self._keep(
+            {
+                "cars": cars,
+                "events": np.zeros(n, EVENT),
+                "ready": np.zeros(n, np.int64),
+                "free_searches": np.zeros(capacity, np.int64),
+                "free_moves": np.zeros(capacity, np.int64),
+            }
+        )
+        for searches, moves in zip(self._pool, self._moves, strict=True):
+            self._add_free(searches, moves)
+
+    def _add_free(self, searches: Searches, moves: NDArray[np.uint8]) -> None:
+        """Add SEARCH records to those that are free."""
+        first, n = int(self._record["n_free"]), len(searches.records)
+        rows = np.arange(n)[::-1]
+        self._kept["free_searches"][first : first + n] = searches.address + rows * SEARCH.itemsize
+        self._kept["free_moves"][first : first + n] = address_of(moves, np.uint8) + rows * moves.shape[1]
+        self._record["n_free"] = first + n
+
+    def _grow_pool(self) -> None:
+        """Make more SEARCH records, so that more cars can search at a time."""
+        size = sum(len(one.records) for one in self._pool)
+        n = min(max(_FIRST_CHUNK, size), max(len(self._cars) - size, 1))
+        searches = Searches(self._tables, n, self.full_belief)
+        moves = np.zeros((n, self.scenario.lot.n_vertices), np.uint8)
+        self._pool.append(searches)
+        self._moves.append(moves)
+        self._row |= {searches.address + row * SEARCH.itemsize: (searches, row) for row in range(n)}
+        self._add_free(searches, moves)
+
+    # ---- decisions
+
+    def run(self, agents: Sequence[Any] | None = None, until: float = math.inf) -> None:
+        """Run the world until all searches are over, or until a time.
+
+        Args:
+            agents: for each kind of driver without a rule an agent with `predict(observation, state)`, None for the
+                others; not needed if all have rules.
+            until: s since Monday 00:00; parked cars leave until then, also after the last search.
+
+        Raises:
+            InputError: a kind of driver has neither a rule nor an agent, or an agent raised an error, which is the
+                cause of this one: the message names car and time, and the world stays as it was before that decision.
+        """
+        agents = tuple(agents or ())
+        for kind, driver in enumerate(self.drivers):
+            if driver.rule is None and (kind >= len(agents) or agents[kind] is None):
+                raise InputError(f"drivers[{kind}] has no rule, want an agent for it in `agents`")
+        memory: dict[int, Any] = {}
+        while (car := self.next_decision(until)) is not None:
+            agent = agents[int(self._cars["kind"][car])]
+            try:
+                action, memory[car] = agent.predict(self.observation(car), memory.get(car))
+            except Exception as error:
+                raise InputError(
+                    f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
+                ) from error
+            self.act(action)
+            if self._cars["state"][car] != SEARCHING:
+                memory.pop(car, None)
+
+    def next_decision(self, until: float = math.inf) -> int | None:
+        """Return the car that must decide next, in Python; None if there is no such decision before the end.
+
+        Compiled drivers decide in between.
+        """
+        while (car := self.next_car(until)) is not None and self._cars["state"][car] != SEARCHING:
+            self.release()
+        return car
+
+    def next_car(self, until: float = math.inf) -> int | None:
+        """As `next_decision`, but return also cars whose search is over, once each; then call `release`."""
+        if not len(self._cars):
+            raise ResetNeeded("the fleet has no world yet: call reset() first")
+        while True:
+            status = int(advance_at(self._address, until))
+            if status >= 0:
+                return status
+            if status == NEEDS_SEARCH:
+                self._grow_pool()
+            elif status == NEEDS_FORECAST:
+                self._compute_forecast()
+            elif status == WRONG_ACTION:
+                raise InputError("a compiled driver chose an action that does not exist")
+            else:
+                assert status in (FINISHED, PAUSED)
+                return None
+
+    def act(self, action: Any) -> None:
+        """Carry out the decision of the car from `next_decision`.
+
+        Raises:
+            InputError: an action that is none of the five.
+        """
+        act_at(self._address, action_number(action))
+
+    def release(self) -> None:
+        """Drop the car from `next_car` whose search is over; its observation is gone."""
+        release_at(self._address)
+
+    def _compute_forecast(self) -> None:
+        """Compute the external forecast of the car that has just arrived."""
+        searches, row = self._row[int(self._cars["search"][self._record["pending"]])]
+        searches.complete_arrival(row)
+        searches.records["process"][row] = self._address
+        init_forecast_at(self._address)
+
+    # ---- what is known of cars and slots
+
+    @property
+    def observation_space(self) -> spaces.Dict:
+        """The space of a car's observations: that of `parkenv/Search-v2`."""
+        return space_of(self.scenarios)
+
+    def observation(self, car: int) -> dict[str, Any]:
+        """Return what a searching car observed last, as in `parkenv/Search-v2`."""
+        searches, row = self._search_of(car)
+        record = searches.records[row]
+        vertex = record["vertex"]
+        scenario = self.scenarios[self._cars["place"][car]]
+        return {
+            "vertex": np.int64(vertex),
+            "time": record["clock"].copy(),
+            "p_occupied": searches.p_occupied[row].copy(),
+            "belief": searches.belief[row].reshape(-1).copy(),
+            "day_error": searches.day_error[row].copy(),
+            "action_mask": scenario.action_masks[vertex].copy(),
+        }
+
+    def outcome(self, car: int) -> StepOutcome:
+        """Return the result of a car's last step."""
+        searches, row = self._search_of(car)
+        numbers = dict(
+            zip(STEP_RESULT, step_result_at(searches.address + row * SEARCH.itemsize), strict=True)
+        )
+        info = {"reward_terms": {term: numbers[term] for term in REWARD_TERMS}}
+        info |= {name: numbers[name] for name in (*TIME_METRICS, *COUNT_METRICS, "parked")}
+        info["place"] = self.scenarios[self._cars["place"][car]].name
+        return StepOutcome(numbers["reward"], numbers["parked"], numbers["over"], info)
+
+    def _search_of(self, car: int) -> tuple[Searches, int]:
+        """Return the searches that hold a car's record, and its row there."""
+        address = int(self._cars["search"][car])
+        if address == 0:
+            raise InputError(f"car {car} is {self.state_names()[car]}, want one that searches")
+        if not self.full_belief:
+            raise InputError("observations are kept only if a kind of driver has no rule")
+        return self._row[address]
+
+    @property
+    def cars(self) -> NDArray[np.void]:
+        """The cars, (n_cars,) of the dtype CAR, in order of arrival; a live view."""
+        return self._cars
+
+    def state_names(self) -> list[str]:
+        """Return the state of each car by name; see `parkenv.envs.fleet_records.STATES`."""
+        return [STATES[state] for state in self._cars["state"]]
+
+    def taken(self) -> NDArray[np.bool_]:
+        """Return whether each slot is taken now, (n_slots,)."""
+        taken = np.zeros(len(self.slots), np.bool_)
+        shared_slots_taken_at(self._address, self.time, taken)
+        return taken
+
+    @property
+    def begin(self) -> float:
+        """When the world began, s since Monday 00:00."""
+        return float(self._record["arrival"])
+
+    @property
+    def time(self) -> float:
+        """The time now, s since Monday 00:00."""
+        return float(self._record["time"])
+
+    @property
+    def totals(self) -> dict[str, float]:
+        """Numbers of cars now: due, searching, parked, gone; decisions so far; integrals of cars over time, s."""
+        record = self._record
+        counts = {name: float(record[f"n_{name}"]) for name in ("searching", "parked", "gone", "decisions")}
+        sums = {name: float(record[name]) for name in ("searching_s", "parked_s")}
+        return {"due": float(record["n_cars"] - record["next_car"])} | counts | sums
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory of cars, slots and searches, bytes, without the tables of the scenario."""
+        arrays = [*self._kept.values(), *self._moves]
+        return sum(array.nbytes for array in arrays) + sum(one.n_bytes for one in self._pool)
+
+    def __reduce__(self) -> tuple[Callable[..., Fleet], tuple[Any, ...]]:
+        """Copies and pickles are fleets before their first reset: records hold addresses of this process."""
+        record = self._record
+        background = BACKGROUNDS[record["background"]]
+        steps, tick_s = int(record["max_steps"]), float(record["tick_s"])
+        return _fleet, (self.scenario, self.demand, background, self.drivers, steps, tick_s)
+
+
+def total_s(cars: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the total time of cars whose search is over, (n_cars,) s: drive, failed attempts, walk, costs, penalty."""
+    terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
+    return np.asarray(np.sum([cars[name] for name in terms], axis=0))
+
+
+def _fleet(scenario: Any, demand: Demand, background: str, drivers: Any, steps: int, tick_s: float) -> Fleet:
+    return Fleet(scenario, demand, background=background, drivers=drivers, max_steps=steps, tick_s=tick_s)

@@ -1,0 +1,335 @@
+"""The compiled engine of a world with many cars: events in continuous time.
+
+A car of the fleet is a search of `parkenv.envs.search_kernel`, with the same steps and the same belief; only the slots
+are shared. At each moment the engine first carries out what is over by then: departures, arrivals, and steps, after
+which cars observe. Then the cars that have to decide do so one after another, in the order in which their steps ended.
+A decision acts at once: of two cars before the same slot the first gets it, the second has a failed attempt. The next
+moment is that of the next event.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from parkenv.envs.event_queue import ARRIVAL, DEPARTURE, REACH, event_at, pop_event, push_event
+from parkenv.envs.fleet_records import (
+    BALKED,
+    GAVE_UP,
+    LEFT,
+    PARKED,
+    SEARCHING,
+    TRUNCATED,
+    car_at,
+    fleet_at,
+)
+from parkenv.envs.search_kernel import (
+    SCENARIO_BYTES,
+    drive_or_park,
+    enter,
+    finish_step,
+    give_up,
+    init_prior,
+    observe,
+    refresh_belief,
+    write_clock,
+)
+from parkenv.envs.search_records import EXTERNAL_KIND, N_ACTIONS, scenario_at, search_at
+from parkenv.envs.shared_slots import NO_CAR, empty_shared_slots, shared_slot_at
+from parkenv.world.keyed_random import car_key
+from parkenv.world.lot import PARK
+from parkenv.world.occupancy_kernel import inlined, kernel
+from parkenv.world.pointers import call_at, int64s
+
+FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION = -1, -2, -3, -4, -5
+"""Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records are
+needed; Python must compute the forecast of the car `pending`; a compiled driver chose an unknown action."""
+
+LEAVE = -1
+"""Action of compiled drivers: give up and park elsewhere."""
+TAKE_SLOT = 16
+"""Action of compiled drivers: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
+_ON_TICK = 1e-9  # fraction of a tick
+
+
+# ---- from Python
+
+
+@kernel
+def begin_world_at(address: int) -> None:
+    """Begin the world of a FLEET record whose cars are due."""
+    fleet = fleet_at(address, 0)
+    empty_shared_slots(fleet)
+    fleet.time = fleet.arrival
+    fleet.n_events = fleet.event_number = fleet.next_car = 0
+    fleet.first_ready = fleet.n_ready = 0
+    fleet.pending = NO_CAR
+    fleet.n_searching = fleet.n_parked = fleet.n_gone = fleet.n_decisions = 0
+    fleet.searching_s = fleet.parked_s = 0.0
+
+
+@kernel
+def advance_at(address: int, until: float) -> int:
+    """Carry out events and the decisions of compiled drivers.
+
+    Args:
+        address: address of the FLEET record.
+        until: s since Monday 00:00, time to stop at; infinite: stop when all searches are over.
+
+    Returns:
+        The car whose decision, or the end of whose search, Python must handle; or a negative number, see `FINISHED`.
+    """
+    fleet = fleet_at(address, 0)
+    while True:
+        if not (fleet.next_car < fleet.n_cars or fleet.n_events > 0) and fleet.n_ready == 0:
+            break
+        if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
+            number = int64s(fleet.ready)[fleet.first_ready]
+            car = car_at(fleet.cars, number)
+            if car.rule == 0 or car.state != SEARCHING:
+                return int(number)
+            if not act(fleet, number, call_at(car.rule, address, number)):
+                return WRONG_ACTION
+            continue
+        if until == np.inf and fleet.n_searching == 0 and fleet.next_car == fleet.n_cars:
+            return FINISHED
+        if not _is_due(fleet, until):
+            break
+        status = _next_event(fleet)
+        if status < 0:
+            return int(status)
+    if until < np.inf:
+        _pass_time(fleet, max(until, fleet.time))
+    return PAUSED if fleet.n_searching > 0 or fleet.next_car < fleet.n_cars else FINISHED
+
+
+@kernel
+def act_at(address: int, action: int) -> None:
+    """Carry out the decision of the car that is first in the queue."""
+    fleet = fleet_at(address, 0)
+    act(fleet, int64s(fleet.ready)[fleet.first_ready], action)
+
+
+@kernel
+def release_at(address: int) -> None:
+    """Remove the car whose search is over from the head of the queue, and free its SEARCH record."""
+    fleet = fleet_at(address, 0)
+    number = _first_ready(fleet)
+    _free_search(fleet, car_at(fleet.cars, number))
+
+
+@kernel
+def init_forecast_at(address: int) -> None:
+    """Initialise the belief of the car `pending` with its external forecast."""
+    fleet = fleet_at(address, 0)
+    search = search_at(car_at(fleet.cars, fleet.pending).search, 0)
+    if search.belief != 0:
+        init_prior(search)
+    fleet.pending = NO_CAR
+
+
+# ---- events
+
+
+@inlined
+def _is_due(fleet: Any, time: float) -> bool:
+    """Return whether the next event is not after a time, s."""
+    if fleet.n_events > 0 and event_at(fleet.events, 0).time <= time:
+        return True
+    return bool(fleet.next_car < fleet.n_cars and car_at(fleet.cars, fleet.next_car).arrival <= time)
+
+
+@inlined
+def _next_event(fleet: Any) -> int:
+    """Carry out the next event; returns a negative number if Python must help first or after it."""
+    if fleet.next_car < fleet.n_cars:
+        arrival = car_at(fleet.cars, fleet.next_car).arrival
+        if fleet.n_events > 0:
+            event = event_at(fleet.events, 0)
+            arrives = event.time > arrival or (event.time == arrival and event.kind > ARRIVAL)
+        else:
+            arrives = True
+        if arrives:
+            if fleet.n_free == 0:
+                return NEEDS_SEARCH
+            _pass_time(fleet, arrival)
+            return int(_arrive(fleet))
+    event = event_at(fleet.events, 0)
+    _pass_time(fleet, event.time)
+    kind = event.kind
+    number = pop_event(fleet)
+    if kind == DEPARTURE:
+        _depart(fleet, number)
+    else:
+        _reach(fleet, number)
+    return 0
+
+
+@inlined
+def _pass_time(fleet: Any, time: float) -> None:
+    elapsed = time - fleet.time
+    fleet.searching_s += fleet.n_searching * elapsed
+    fleet.parked_s += fleet.n_parked * elapsed
+    fleet.time = time
+
+
+@kernel
+def _arrive(fleet: Any) -> int:
+    """Begin the search of the next car."""
+    number = fleet.next_car
+    fleet.next_car += 1
+    car = car_at(fleet.cars, number)
+    fleet.n_free -= 1
+    car.search = int64s(fleet.free_searches)[fleet.n_free]
+    car.moves = int64s(fleet.free_moves)[fleet.n_free]
+    car.target, car.n_moves = NO_CAR, 0
+    search = search_at(car.search, 0)
+    search.place = car.place
+    search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
+    enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
+    car.state = SEARCHING
+    fleet.n_searching += 1
+    _make_ready(fleet, number)
+    write_clock(search)
+    if scenario_at(search.scenario, 0).prior_kind == EXTERNAL_KIND:
+        fleet.pending = number
+        return NEEDS_FORECAST
+    if search.belief != 0:
+        init_prior(search)
+    return 0
+
+
+@kernel
+def _reach(fleet: Any, number: int) -> None:
+    """End the step of a car: it observes, and is asked again unless its search is over."""
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    observe(search)
+    _complete_step(search)
+    if search.over:
+        _end_search(fleet, number, GAVE_UP)
+    elif search.time - search.arrival >= car.patience_s:
+        give_up(search)
+        _end_search(fleet, number, BALKED)
+    elif search.n_steps >= fleet.max_steps:
+        _end_search(fleet, number, TRUNCATED)
+    else:
+        _make_ready(fleet, number)
+
+
+@inlined
+def _complete_step(search: Any) -> None:
+    finish_step(search)
+    if search.belief != 0:
+        refresh_belief(search)
+    write_clock(search)
+
+
+@inlined
+def _depart(fleet: Any, number: int) -> None:
+    car = car_at(fleet.cars, number)
+    shared_slot_at(fleet.slots, car.slot).car = NO_CAR
+    car.state, car.left_at = LEFT, fleet.time
+    fleet.n_parked -= 1
+    fleet.n_gone += 1
+
+
+# ---- decisions
+
+
+@kernel
+def act(fleet: Any, number: int, action: int) -> bool:
+    """Carry out the decision of the first car in the queue; returns whether there is such an action."""
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    if not (LEAVE <= action < N_ACTIONS or TAKE_SLOT <= action < TAKE_SLOT + fleet.n_slots):
+        return False
+    _first_ready(fleet)
+    fleet.n_decisions += 1
+    if action == LEAVE:
+        search.step_drive_s = search.step_failed_s = search.step_walk_s = search.step_parking_cost_s = 0.0
+        search.step_gave_up_s = 0.0
+        give_up(search)
+        _end_search(fleet, number, BALKED)
+        return True
+    if action >= TAKE_SLOT:
+        search.vertex = action - TAKE_SLOT
+        action = PARK
+    drive_or_park(search, action)
+    if search.parked:
+        _complete_step(search)
+        shared_slot_at(fleet.slots, search.vertex).car = number
+        car.slot = search.vertex
+        _end_search(fleet, number, PARKED)
+        push_event(fleet, fleet.time + car.stay_s, DEPARTURE, number)
+        return True
+    if fleet.tick_s > 0.0:
+        _round_up(fleet, search)
+    push_event(fleet, search.time, REACH, number)
+    return True
+
+
+@inlined
+def _round_up(fleet: Any, search: Any) -> None:
+    """Let a step end at a full tick after the beginning of the world, and at least one tick later."""
+    begin = fleet.arrival
+    ticks = max(
+        math.ceil((search.time - begin) / fleet.tick_s - _ON_TICK),
+        math.floor((fleet.time - begin) / fleet.tick_s + 0.5) + 1.0,
+    )
+    later = begin + ticks * fleet.tick_s
+    # A step that ends on a tick keeps its duration to the bit.
+    if later - search.time > _ON_TICK * fleet.tick_s:
+        search.step_drive_s += later - search.time
+        search.time = later
+
+
+@kernel
+def _end_search(fleet: Any, number: int, state: int) -> None:
+    """Record the end of a search."""
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    car.state, car.ended_at = state, fleet.time
+    car.drive_s, car.failed_s, car.walk_s = search.drive_s, search.failed_s, search.walk_s
+    car.parking_cost_s, car.gave_up_s = search.parking_cost_s, search.gave_up_s
+    car.driven_m, car.walked_m = search.driven_m, search.walked_m
+    car.failed_parks, car.slots_passed, car.n_steps = search.failed_parks, search.slots_passed, search.n_steps
+    fleet.n_searching -= 1
+    if state == PARKED:
+        fleet.n_parked += 1
+    else:
+        fleet.n_gone += 1
+    if state == TRUNCATED:
+        car.gave_up_s += scenario_at(search.scenario, 0).give_up_s
+    if car.rule == 0:
+        _make_ready(fleet, number)
+    else:
+        _free_search(fleet, car)
+
+
+@inlined
+def _make_ready(fleet: Any, number: int) -> None:
+    """Add a car to the end of the queue."""
+    int64s(fleet.ready)[(fleet.first_ready + fleet.n_ready) % fleet.n_cars] = number
+    fleet.n_ready += 1
+    car_at(fleet.cars, number).ready = True
+
+
+@inlined
+def _first_ready(fleet: Any) -> Any:
+    """Remove the first car from the queue, and return it."""
+    number = int64s(fleet.ready)[fleet.first_ready]
+    fleet.first_ready = (fleet.first_ready + 1) % fleet.n_cars
+    fleet.n_ready -= 1
+    car_at(fleet.cars, number).ready = False
+    return number
+
+
+@inlined
+def _free_search(fleet: Any, car: Any) -> None:
+    int64s(fleet.free_searches)[fleet.n_free] = car.search
+    int64s(fleet.free_moves)[fleet.n_free] = car.moves
+    fleet.n_free += 1
+    car.search = 0

@@ -1,0 +1,524 @@
+"""Demand for parking: when cars arrive, how long they stay, and how long they search before they go elsewhere.
+
+Every number of a car is drawn from its own random number, a pure function of the world's key and the car. So demand
+does not depend on what anybody does, and two demands with other rates or stays use the same random numbers: an arrival
+process of twice the rate has the same gaps, half as long.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import nnls
+from scipy.special import ndtri
+from scipy.stats import poisson
+
+from parkenv.errors import InputError
+from parkenv.world.keyed_random import (
+    ENTRY_STREAM,
+    GOAL_STREAM,
+    HEADWAY_STREAM,
+    KIND_STREAM,
+    PATIENCE_STREAM,
+    STAY_STREAM,
+    car_uniforms,
+)
+from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+MAX_CARS = 1_000_000
+"""Maximum number of cars of a world."""
+_QUANTILES = 400
+_RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.most`
+
+
+class Duration(Protocol):
+    """A law of durations, s."""
+
+    @property
+    def mean_s(self) -> float:
+        """Mean, s."""
+
+    def quantile(self, u: FloatArray) -> FloatArray:
+        """Return the durations, (k,) s, that are exceeded with probability 1 - u, for u in (0, 1)."""
+
+
+@dataclass(frozen=True)
+class ConstantTime:
+    """Always the same duration.
+
+    Args:
+        seconds: s, above 0; infinite: for ever.
+    """
+
+    seconds: float
+
+    def __post_init__(self) -> None:
+        _require("ConstantTime.seconds", self.seconds, finite=False)
+
+    @property
+    def mean_s(self) -> float:
+        """Mean, s."""
+        return self.seconds
+
+    def quantile(self, u: FloatArray) -> FloatArray:
+        """Return the durations; see `Duration`."""
+        return np.full(len(u), float(self.seconds))
+
+
+@dataclass(frozen=True)
+class ExponentialTime:
+    """Exponentially distributed durations.
+
+    Args:
+        mean_s: s, above 0 and finite.
+    """
+
+    mean_s: float
+
+    def __post_init__(self) -> None:
+        _require("ExponentialTime.mean_s", self.mean_s)
+
+    def quantile(self, u: FloatArray) -> FloatArray:
+        """Return the durations; see `Duration`."""
+        return -self.mean_s * np.log1p(-u)
+
+
+@dataclass(frozen=True)
+class LogNormalTime:
+    """Log-normally distributed durations.
+
+    Args:
+        mean_s: s, above 0 and finite.
+        cv: coefficient of variation, standard deviation over mean, above 0.
+    """
+
+    mean_s: float
+    cv: float = 1.0
+
+    def __post_init__(self) -> None:
+        _require("LogNormalTime.mean_s", self.mean_s)
+        _require("LogNormalTime.cv", self.cv)
+
+    def quantile(self, u: FloatArray) -> FloatArray:
+        """Return the durations; see `Duration`."""
+        variance = math.log1p(self.cv**2)
+        return np.asarray(self.mean_s * np.exp(math.sqrt(variance) * ndtri(u) - variance / 2))
+
+
+@dataclass(frozen=True)
+class EmpiricalTime:
+    """Durations drawn from a list, all with equal probability.
+
+    Args:
+        values_s: s, at least one, all above 0 and finite.
+    """
+
+    values_s: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "values_s", _numbers("EmpiricalTime.values_s", self.values_s))
+        for i, value in enumerate(self.values_s):
+            _require(f"EmpiricalTime.values_s[{i}]", value)
+
+    @property
+    def mean_s(self) -> float:
+        """Mean, s."""
+        return float(np.mean(self.values_s))
+
+    def quantile(self, u: FloatArray) -> FloatArray:
+        """Return the durations; see `Duration`."""
+        values = np.sort(self.values_s)
+        return np.asarray(values[(u * len(values)).astype(np.int64)])
+
+
+class Arrivals(Protocol):
+    """When the cars of a world arrive."""
+
+    @property
+    def most(self) -> int:
+        """Maximum number of cars of a world."""
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return when the world begins, s of the day; `arrival_s` is the arrival drawn from the scenario's window."""
+
+    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+        """Draw the arrivals of the world with this key, (n,) ascending s of the day, at least one."""
+
+
+@dataclass(frozen=True)
+class Headways:
+    """A fixed number of cars: the first arrives at a time in the scenario's arrival window, the others after it.
+
+    Args:
+        cars: number of cars, at least 1.
+        mean_s: mean of the exponentially distributed times between two arrivals, s.
+    """
+
+    cars: int = 1
+    mean_s: float = 10.0
+
+    def __post_init__(self) -> None:
+        _require_cars("Headways.cars", self.cars)
+        _require("Headways.mean_s", self.mean_s)
+
+    @property
+    def most(self) -> int:
+        """Number of cars."""
+        return self.cars
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return the first car's arrival."""
+        return arrival_s
+
+    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+        """Draw the arrivals; see `Arrivals`."""
+        gaps = _gaps(key, self.cars) * self.mean_s
+        gaps[0] = 0.0
+        return arrival_s + np.cumsum(gaps)
+
+
+@dataclass(frozen=True)
+class PoissonArrivals:
+    """Cars arrive as a Poisson process whose rate may change from hour to hour.
+
+    Args:
+        per_hour: cars an hour, one number or 24, one for each hour of the day; at least 0, not all 0 in the window.
+        start_s: beginning of the world, s of the day, in [0, 86400).
+        end_s: end of the arrivals, s, after `start_s`; above 86400, the rates of the day repeat.
+    """
+
+    per_hour: float | tuple[float, ...]
+    start_s: float = 8 * HOUR_S
+    end_s: float = 12 * HOUR_S
+
+    def __post_init__(self) -> None:
+        if np.ndim(self.per_hour) > 0:
+            rates = _numbers("PoissonArrivals.per_hour", self.per_hour)
+            if len(rates) != DAY_HOURS:
+                raise InputError(
+                    f"PoissonArrivals.per_hour has {len(rates)} numbers, want one or {DAY_HOURS}"
+                )
+            object.__setattr__(self, "per_hour", rates)
+        for rate in np.atleast_1d(self.per_hour):
+            _require("PoissonArrivals.per_hour", float(rate), least=0.0)
+        _require_second("PoissonArrivals.start_s", self.start_s)
+        _require("PoissonArrivals.end_s", self.end_s, above=self.start_s)
+        if not self.expected > 0.0:
+            raise InputError(
+                f"PoissonArrivals.per_hour is {self.per_hour!r}, want a rate above 0 in the window: no car would arrive"
+            )
+        if self.most > MAX_CARS:
+            raise InputError(
+                f"PoissonArrivals.per_hour: {self.expected:,.0f} cars arrive in the window, want at most {MAX_CARS:,}"
+            )
+
+    @property
+    def expected(self) -> float:
+        """Expected number of cars."""
+        return float(self._times()[1][-1])
+
+    @property
+    def most(self) -> int:
+        """Number of cars that is exceeded once in 10^12 worlds; further arrivals are left out."""
+        return int(poisson.isf(_RARE, self.expected)) + 1
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return `start_s`."""
+        del arrival_s
+        return self.start_s
+
+    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+        """Draw the arrivals; see `Arrivals`. A world in which nobody would arrive has one car, at the end."""
+        del arrival_s
+        times, expected = self._times()
+        arrivals = np.cumsum(_gaps(key, self.most))
+        arrivals = arrivals[arrivals < expected[-1]]
+        if not len(arrivals):
+            return np.array([self.end_s])
+        return np.asarray(np.interp(arrivals, expected, times))
+
+    def _times(self) -> tuple[FloatArray, FloatArray]:
+        """Return full hours in the window, with its ends, s, and the expected number of arrivals until then."""
+        hours = np.arange(self.start_s // HOUR_S + 1, math.ceil(self.end_s / HOUR_S)) * HOUR_S
+        times = np.concatenate(([self.start_s], hours, [self.end_s]))
+        rates = np.broadcast_to(np.asarray(self.per_hour, np.float64), DAY_HOURS)
+        hour = ((times[:-1] + 1e-9) // HOUR_S).astype(np.int64) % DAY_HOURS
+        return times, np.concatenate(([0.0], np.cumsum(rates[hour] * np.diff(times) / HOUR_S)))
+
+
+@dataclass(frozen=True)
+class ListedArrivals:
+    """Cars arrive at given times.
+
+    Args:
+        times_s: s of the day, in [0, 86400), ascending, at least one.
+    """
+
+    times_s: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        times = _numbers("ListedArrivals.times_s", self.times_s)
+        for i, time in enumerate(times):
+            _require_second(f"ListedArrivals.times_s[{i}]", time)
+            if i > 0 and time < times[i - 1]:
+                raise InputError(
+                    f"ListedArrivals.times_s[{i}] is {time}, want at least {times[i - 1]}, the one before"
+                )
+        object.__setattr__(self, "times_s", times)
+
+    @property
+    def most(self) -> int:
+        """Number of cars."""
+        return len(self.times_s)
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return the first arrival."""
+        del arrival_s
+        return self.times_s[0]
+
+    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+        """Return the arrivals; they are the same in every world."""
+        del key, arrival_s
+        return np.array(self.times_s)
+
+
+class CarPlans(NamedTuple):
+    """What is known of the cars of a world before anybody drives, (n,) each, in order of arrival.
+
+    Attributes:
+        arrival_s: float64, s of the day.
+        stay_s: float64, s, time in the slot.
+        patience_s: float64, s, length of the search after which the car goes elsewhere.
+        entry: int64, index of the entry.
+        goal: int64, index of the goal among those with a weight.
+        kind: float64 in (0, 1), number that decides the kind of driver.
+    """
+
+    arrival_s: FloatArray
+    stay_s: FloatArray
+    patience_s: FloatArray
+    entry: IntArray
+    goal: IntArray
+    kind: FloatArray
+
+
+@dataclass(frozen=True)
+class Demand:
+    """The demand for parking in one lot.
+
+    Args:
+        arrivals: when cars arrive.
+        stay: law of the time that a car stays in its slot.
+        patience: law of the time after which a searching car *balks*: at its next decision it goes elsewhere, at the
+            cost of the scenario's `give_up_s`.
+        entry_weights: relative number of cars of each entry of the lot; empty: as in a single search, the scenario's
+            entry, or all alike.
+        goal_weights: relative number of cars of each goal of the lot; empty: the scenario's goal.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+    """
+
+    arrivals: Arrivals = field(default_factory=Headways)
+    stay: Duration = field(default_factory=lambda: ExponentialTime(HOUR_S))
+    patience: Duration = field(default_factory=lambda: ConstantTime(math.inf))
+    entry_weights: tuple[float, ...] = ()
+    goal_weights: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name, wanted in (("arrivals", "draw"), ("stay", "quantile"), ("patience", "quantile")):
+            value = getattr(self, name)
+            if not hasattr(value, wanted):
+                kinds = "arrivals such as Headways" if name == "arrivals" else "a law such as ExponentialTime"
+                raise InputError(f"Demand.{name} is {value!r:.60}, want {kinds}")
+        for name in ("entry_weights", "goal_weights"):
+            object.__setattr__(self, name, _weights(f"Demand.{name}", getattr(self, name)))
+
+    def draw(self, key: np.uint64, arrival_s: float, n_entries: int) -> CarPlans:
+        """Draw the cars of the world with this key.
+
+        Args:
+            key: key of the world.
+            arrival_s: arrival drawn from the scenario's window, s of the day.
+            n_entries: number of entries among which cars choose if there are no `entry_weights`.
+        """
+        arrival = self.arrivals.draw(key, arrival_s)
+        n = len(arrival)
+        entries = self.entry_weights or (1.0,) * n_entries
+        return CarPlans(
+            arrival,
+            self.stay.quantile(_uniforms(key, STAY_STREAM, n)),
+            self.patience.quantile(_uniforms(key, PATIENCE_STREAM, n)),
+            _choices(_uniforms(key, ENTRY_STREAM, n), entries),
+            _choices(_uniforms(key, GOAL_STREAM, n), self.goal_weights or (1.0,)),
+            _uniforms(key, KIND_STREAM, n),
+        )
+
+    @classmethod
+    def fitted_to(cls, log: OccupancyLog, n_slots: int, kind: str = "weekday") -> Demand:
+        """Fit arrivals and stays to a log, such that occupancy comes out as recorded.
+
+        The cars of a slot are the periods in which it was observed taken. A car that was there at a day's first
+        observation is a resident, and no arrival. Stays are estimated with regard to those that are cut off by the end
+        of a day's observations; then the arrivals of each hour are those with which the expected number of arrived cars
+        comes closest to the recorded one, half-hour by half-hour (least squares, no rate below 0). A car that takes
+        the place of another one between two observations is not seen: the two count as one that stays longer.
+
+        Args:
+            log: the log.
+            n_slots: number of slots of the lot to fill; the arrivals of the log's slots are scaled to it.
+            kind: class of the days, `weekday` or `weekend`.
+
+        Raises:
+            InputError: no such days, or no car came and left on them.
+        """
+        cars = _cars_of(log, kind)
+        if not cars.ended.any():
+            raise InputError(f"{log.source}: no car comes and leaves on a {kind}, so no demand can be fitted")
+        stays = _stay_quantiles(cars.stay_s, cars.ended)
+        seen = cars.seen > 0
+        filled = _filled_by_hour(np.array(stays))[seen]
+        weight = np.sqrt(cars.seen[seen])
+        per_slot, _ = nnls(filled * weight[:, None], cars.arrived[seen] / cars.seen[seen] * weight)
+        hours = per_slot.nonzero()[0]
+        window = float(hours[0] * HOUR_S), float((hours[-1] + 1) * HOUR_S)
+        return cls(PoissonArrivals(tuple(map(float, n_slots * per_slot)), *window), EmpiricalTime(stays))
+
+
+class _RecordedCars(NamedTuple):
+    """The cars that arrived in a log.
+
+    Attributes:
+        stay_s: (k,) float64, s, until they left or were observed last.
+        ended: (k,) bool, whether they were observed to leave.
+        arrived: (48,) float64, over all slots and days: slots taken by a car that arrived, at full and half hours.
+        seen: (48,) float64, slots observed before and after that time on that day.
+    """
+
+    stay_s: FloatArray
+    ended: NDArray[np.bool_]
+    arrived: FloatArray
+    seen: FloatArray
+
+
+def _cars_of(log: OccupancyLog, kind: str) -> _RecordedCars:
+    if kind not in ("weekday", "weekend"):
+        raise InputError(f"class of day: got {kind!r}, wanted weekday or weekend")
+    grid = np.arange(DAY_PERIODS) * PERIOD_S
+    arrived, seen = np.zeros(DAY_PERIODS), np.zeros(DAY_PERIODS)
+    stays, ended = [], []
+    for day in np.flatnonzero(log.weekend == (kind == "weekend")):
+        for slot in range(len(log.slot_ids)):
+            record = day * len(log.slot_ids) + slot
+            rows = slice(log.first[record], log.first[record + 1])
+            occupied, since, last_s = log.occupied[rows], log.from_s[rows], log.second[rows][-1:]
+            if not len(occupied):
+                continue
+            changes = np.flatnonzero(np.diff(occupied.astype(np.int8))) + 1
+            inside = (grid >= log.second[rows][0]) & (grid <= last_s)
+            state = occupied[np.maximum(np.searchsorted(since, grid, side="right") - 1, 0)]
+            came = changes[occupied[changes]]
+            seen += inside
+            if len(came):
+                arrived += inside & state & (grid >= since[came[0]])
+            ends = np.concatenate((since[changes], last_s))
+            for i in np.flatnonzero(occupied[changes]):
+                if ends[i + 1] > ends[i]:
+                    stays.append(ends[i + 1] - ends[i])
+                    ended.append(i + 1 < len(changes))
+    return _RecordedCars(np.array(stays), np.array(ended, dtype=np.bool_), arrived, seen)
+
+
+def _filled_by_hour(stays: FloatArray) -> FloatArray:
+    """Return, (48, 24), expected cars at each half-hour if one car an hour arrives in each hour; stays as quantiles."""
+    grid = (np.arange(DAY_PERIODS) * PERIOD_S)[:, None, None]
+    minute = (np.arange(60) + 0.5) * 60.0
+    elapsed = grid - (np.arange(DAY_HOURS)[:, None] * HOUR_S + minute)
+    staying = 1.0 - np.searchsorted(stays, elapsed, side="right") / len(stays)
+    return np.asarray(np.where(elapsed >= 0.0, staying, 0.0).mean(axis=2))
+
+
+def _stay_quantiles(stays: FloatArray, ended: NDArray[np.bool_]) -> tuple[float, ...]:
+    """Return stays at equally likely quantiles, s, from stays of which some are known from below only.
+
+    The estimator of Kaplan and Meier; beyond the longest stay whose end was observed, an exponential law whose mean is
+    the time stayed for each observed end.
+    """
+    times, ends = np.unique(stays[ended], return_counts=True)
+    staying = len(stays) - np.searchsorted(np.sort(stays), times, side="left")
+    survival = np.cumprod(1.0 - ends / staying)
+    levels = 1.0 - (np.arange(_QUANTILES) + 0.5) / _QUANTILES
+    # The first time at which at most this fraction still stays.
+    at = np.searchsorted(-survival, -levels, side="left")
+    last, mean = times[-1], float(stays.sum() / ended.sum())
+    left = max(float(survival[-1]), levels[-1] / 2)
+    beyond = last + mean * np.log(np.maximum(left / levels, 1.0))
+    return tuple(map(float, np.where(at < len(times), times[np.minimum(at, len(times) - 1)], beyond)))
+
+
+def _uniforms(key: np.uint64, stream: int, n: int) -> FloatArray:
+    values = np.empty(n)
+    car_uniforms(key, stream, 0, values)
+    return values
+
+
+def _gaps(key: np.uint64, n: int) -> FloatArray:
+    """Exponential times with mean 1 before each car's arrival."""
+    return -np.log(_uniforms(key, HEADWAY_STREAM, n))
+
+
+def _choices(u: FloatArray, weights: Sequence[float]) -> IntArray:
+    """Return the index that each uniform number chooses by weight; equal weights as `int(u * n)`."""
+    if len(set(weights)) == 1:
+        return (u * len(weights)).astype(np.int64)
+    shares = np.cumsum(weights) / np.sum(weights)
+    return np.minimum(np.searchsorted(shares, u, side="right"), len(weights) - 1).astype(np.int64)
+
+
+def _require(
+    name: str, value: Any, *, above: float = 0.0, least: float | None = None, finite: bool = True
+) -> None:
+    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
+    good = number and not math.isnan(value) and (not finite or math.isfinite(value))
+    if not good or (value < least if least is not None else value <= above):
+        want = f"at least {least:g}" if least is not None else f"above {above:g}"
+        raise InputError(f"{name} is {value!r}, want a {'finite ' if finite else ''}number {want}")
+
+
+def _require_second(name: str, value: Any) -> None:
+    _require(name, value, least=0.0)
+    if value >= DAY_S:
+        raise InputError(f"{name} is {value!r}, want seconds of the day in [0, 86400)")
+
+
+def _require_cars(name: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_CARS:
+        raise InputError(f"{name} is {value!r}, want a whole number from 1 to {MAX_CARS:,}")
+
+
+def _numbers(name: str, values: ArrayLike) -> tuple[float, ...]:
+    try:
+        array = np.asarray(values, np.float64)
+    except (TypeError, ValueError):
+        raise InputError(f"{name} is {values!r:.60}, want numbers") from None
+    if array.ndim != 1 or not array.size:
+        raise InputError(f"{name} has shape {array.shape}, want a list of at least one number")
+    return tuple(map(float, array))
+
+
+def _weights(name: str, values: Sequence[float]) -> tuple[float, ...]:
+    if not len(values):
+        return ()
+    weights = _numbers(name, values)
+    if not all(math.isfinite(w) and w >= 0.0 for w in weights) or not sum(weights) > 0.0:
+        raise InputError(f"{name} is {values!r:.60}, want finite numbers of at least 0, not all 0")
+    return weights

@@ -1,0 +1,439 @@
+"""Many cars in one lot: parity with the single search, conservation, determinism, compiled drivers, bad input."""
+
+import math
+import pickle
+import subprocess
+import sys
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from small_lots import small_lot
+
+import parkenv
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv.envs.fleet import DriverKind, Fleet, total_s
+from parkenv.envs.fleet_records import DUE, LEFT, PARKED, SEARCHING
+from parkenv.envs.fleet_rules import RULES
+from parkenv.world.demand import (
+    ConstantTime,
+    Demand,
+    EmpiricalTime,
+    ExponentialTime,
+    Headways,
+    ListedArrivals,
+    PoissonArrivals,
+)
+
+NOISY = SensorModel(
+    15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
+)
+GREEDY = DriverKind(rule=RULES["greedy-drive"])
+
+
+def recorded_scenario():
+    from parkenv import ArrivalWindow, OccupancyLog, RecordedOccupancy
+
+    campus = parkenv.make_scenario("mini")
+    n, days = campus.lot.n_slots, ("2024-03-04", "2024-03-05", "2024-03-06")
+    rng = np.random.default_rng(3)
+    slot, day, period = (a.ravel() for a in np.meshgrid(range(n), range(3), range(48), indexing="ij"))
+    log = OccupancyLog(
+        tuple(map(str, range(n))), days, slot, day, period * 1800.0, rng.random(slot.size) < 0.6
+    )
+    occupancy = RecordedOccupancy(log, campus.lot.walk_m(0), np.arange(n))
+    window = ArrivalWindow((0, 1, 2), 8 * 3600.0, 12 * 3600.0)
+    return campus.replace(name="log", occupancy=occupancy, prior=None, arrival=window)
+
+
+@pytest.mark.parametrize(
+    ("source", "changes"),
+    [
+        ("mini", {}),
+        ("campus", {}),
+        ("street", {}),
+        ("jam", {"failure_s": 3.0}),
+        ("campus", {"sensor_model": NOISY}),
+        (recorded_scenario(), {}),
+    ],
+)
+def test_one_car_is_the_single_search_to_the_last_bit(source, changes):
+    env = gym.make("parkenv/Search-v2", scenario=source, **changes).unwrapped
+    fleet = Fleet(env.scenario, Demand(Headways(1)), background="process")
+    rng = np.random.default_rng(0)
+    for seed in range(12):
+        fleet.reset(seed)
+        observation, _ = env.reset(seed=seed)
+        over = False
+        for _ in range(300):
+            assert fleet.next_car() == 0
+            assert_same(observation, fleet.observation(0))
+            action = rng.choice(np.flatnonzero(observation["action_mask"]))
+            observation, reward, over, _, info = env.step(action)
+            fleet.act(action)
+            fleet.next_car()
+            outcome = fleet.outcome(0)
+            assert (outcome.reward, outcome.over, outcome.info) == (reward, over, info)
+            if over:
+                assert_same(observation, fleet.observation(0))
+                fleet.release()
+                assert fleet.next_car() is None
+                assert total_s(fleet.cars)[0] == info["total_s"]
+                break
+
+
+def assert_same(one, other):
+    assert one.keys() == other.keys()
+    for key in one:
+        np.testing.assert_array_equal(one[key], other[key], strict=True)
+
+
+def random_fleet(lot_seed, n_cars, background, kinds, stay_s, patience_s, tick_s, seed):
+    problem, p, _ = small_lot(lot_seed)
+    process = OccupancyProcess.from_demand(np.log(p / (1 - p)), np.zeros(168), 900.0)
+    fields = {
+        name: getattr(problem, name) for name in ("lot", "v_drive", "v_walk", "give_up_s", "sensor_model")
+    }
+    scenario = Scenario(**fields, name="small", occupancy=process)
+    demand = Demand(Headways(n_cars, 20.0), ExponentialTime(stay_s), ConstantTime(patience_s))
+    drivers = [DriverKind(rule=RULES.get(kind)) for kind in kinds]
+    fleet = Fleet(scenario, demand, background=background, drivers=drivers, max_steps=60, tick_s=tick_s)
+    fleet.reset(seed)
+    return fleet
+
+
+fleets = st.tuples(
+    st.integers(0, 323),
+    st.integers(1, 30),
+    st.sampled_from(["process", "residents", "none"]),
+    st.lists(st.sampled_from([*RULES, "python"]), min_size=1, max_size=3),
+    st.sampled_from([30.0, 600.0, 1e5]),
+    st.sampled_from([40.0, math.inf]),
+    st.sampled_from([0.0, 1.0]),
+    st.integers(0, 1000),
+)
+
+
+def check_state(fleet, time):
+    """Conservation, no slot with two cars, no time that goes back."""
+    cars, totals = fleet.cars, fleet.totals
+    assert fleet.time >= time
+    assert totals["due"] + totals["searching"] + totals["parked"] + totals["gone"] == len(cars)
+    parked = np.flatnonzero(cars["state"] == PARKED)
+    assert len(parked) == totals["parked"]
+    assert np.count_nonzero(cars["state"] == SEARCHING) == totals["searching"]
+    assert np.count_nonzero(cars["state"] == DUE) == totals["due"]
+    assert len(set(cars["slot"][parked])) == len(parked)
+    np.testing.assert_array_equal(fleet.slots["car"][cars["slot"][parked]], parked)
+    assert np.count_nonzero(fleet.slots["car"] >= 0) == len(parked)
+    assert fleet.taken()[cars["slot"][parked]].all()
+    return fleet.time
+
+
+@settings(max_examples=40, deadline=None)
+@given(fleets, st.data())
+def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(arguments, data):
+    fleet, time = random_fleet(*arguments), -math.inf
+    rng = np.random.default_rng(data.draw(st.integers(0, 99)))
+    while fleet.next_decision() is not None:
+        time = check_state(fleet, time)
+        fleet.act(rng.integers(5))
+    time = check_state(fleet, time)
+    assert fleet.totals["due"] == fleet.totals["searching"] == 0
+    cars = fleet.cars
+    fleet.run([None if kind.rule else object() for kind in fleet.drivers], until=fleet.time + 300.0)
+    check_state(fleet, time)
+    left = cars["state"] == LEFT
+    np.testing.assert_allclose(cars["left_at"][left], (cars["ended_at"] + cars["stay_s"])[left])
+    searched = np.where(cars["n_steps"] > 0, cars["ended_at"] - cars["arrival"], 0.0)
+    np.testing.assert_allclose(searched, cars["drive_s"] + cars["failed_s"], atol=1e-6)
+
+
+@settings(max_examples=15, deadline=None)
+@given(fleets)
+def test_little_s_law_holds_exactly(arguments):
+    fleet = random_fleet(*arguments)
+    rng = np.random.default_rng(0)
+    while fleet.next_decision() is not None:
+        fleet.act(rng.integers(5))
+    cars, totals = fleet.cars, fleet.totals
+    assert totals["searching_s"] == pytest.approx(np.sum(cars["ended_at"] - cars["arrival"]), abs=1e-5)
+    stayed = np.minimum(cars["left_at"], fleet.time) - cars["ended_at"]
+    assert totals["parked_s"] == pytest.approx(stayed[cars["slot"] >= 0].sum(), abs=1e-5)
+
+
+@settings(max_examples=10, deadline=None)
+@given(fleets)
+def test_equal_seeds_give_equal_runs_and_demand_does_not_depend_on_drivers(arguments):
+    runs = []
+    for background, kinds in ((None, None), (None, None), ("none", ["random"])):
+        changed = list(arguments)
+        changed[2], changed[3] = background or arguments[2], kinds or arguments[3]
+        fleet = random_fleet(*changed)
+        rng = np.random.default_rng(0)
+        while fleet.next_decision() is not None:
+            fleet.act(rng.integers(5))
+        runs.append(fleet.cars.copy())
+    same = [name for name in runs[0].dtype.names if name not in ("search", "moves")]
+    np.testing.assert_array_equal(runs[0][same], runs[1][same])
+    for name in ("arrival", "entry", "stay_s"):
+        np.testing.assert_array_equal(runs[0][name], runs[2][name])
+
+
+def test_the_first_car_at_a_slot_has_it_and_the_second_fails():
+    class Park:
+        """Drives to slot 0 by the shortest route, and parks there."""
+
+        def predict(self, observation, state=None):
+            from planners.routes import DriveRoutes
+
+            routes = DriveRoutes(scenario)
+            vertex = int(observation["vertex"])
+            return (4 if vertex == 0 else routes.move_toward(vertex, 0)), state
+
+    scenario = parkenv.make_scenario("mini")
+    demand = Demand(ListedArrivals((36000.0, 36000.0)), ConstantTime(15.0))
+    fleet = Fleet(scenario, demand, background="none")
+    fleet.reset(0)
+    fleet.run([Park()])
+    first, second = fleet.cars
+    assert (first["failed_parks"], second["failed_parks"]) == (0, 2)
+    assert first["slot"] == second["slot"] == 0
+    assert second["ended_at"] - first["ended_at"] == pytest.approx(2 * scenario.failure_s)
+    assert first["left_at"] == first["ended_at"] + 15.0
+
+
+@pytest.mark.parametrize("name", ["greedy-drive", "first-free"])
+def test_compiled_drivers_do_as_the_agents_of_their_name(name):
+    from planners.agent import make_agent
+
+    compiled, planned = [], []
+    for source in ("mini", "campus"):
+        scenario = parkenv.make_scenario(source)
+        demand = Demand(Headways(6, 30.0))
+        one = Fleet(scenario, demand, drivers=[DriverKind(rule=RULES[name])])
+        other = Fleet(scenario, demand)
+        agent = make_agent(name, scenario)
+        for seed in range(8):
+            one.reset(seed)
+            one.run()
+            other.reset(seed)
+            other.run([agent])
+            compiled += one.cars["slot"].tolist()
+            planned += other.cars["slot"].tolist()
+    assert np.mean(np.array(compiled) == planned) > 0.97  # routes of equal length may differ
+
+
+def test_residents_leave_and_do_not_come_back():
+    fleet = Fleet("campus", Demand(PoissonArrivals(1.0, 0.0, 86400.0)), drivers=[GREEDY])
+    fleet.reset(2)
+    before = fleet.taken()
+    fleet.run(until=fleet.begin + 5 * 3600.0)
+    standing = fleet.taken() & (fleet.slots["car"] < 0)
+    assert 0 < standing.sum() < before.sum()
+    assert not (standing & ~before).any()
+
+
+def test_a_car_without_patience_goes_elsewhere():
+    demand = Demand(Headways(4), patience=ConstantTime(20.0))
+    scenario = parkenv.make_scenario("jam", give_up_s=500.0)
+    fleet = Fleet(scenario, demand, drivers=[DriverKind(rule=RULES["random"])])
+    fleet.reset(0)
+    fleet.run()
+    cars = fleet.cars[np.array(fleet.state_names()) == "balked"]
+    assert len(cars)
+    assert (cars["gave_up_s"] == 500.0).all()
+    assert (cars["ended_at"] - cars["arrival"] >= 20.0).all()
+
+
+def test_goals_and_entries_are_drawn_by_weight():
+    scenario = parkenv.make_scenario("campus")
+    n_goals, n_entries = len(scenario.lot.goals), len(scenario.lot.entries)
+    demand = Demand(
+        Headways(300),
+        goal_weights=(1.0,) * (n_goals - 1) + (2.0,),
+        entry_weights=(1.0,) + (0.0,) * (n_entries - 1),
+    )
+    fleet = Fleet(scenario, demand, drivers=[GREEDY])
+    fleet.reset(0)
+    assert set(fleet.cars["entry"]) == {scenario.lot.entry_vertices[0]}
+    assert np.mean(fleet.cars["place"] == n_goals - 1) == pytest.approx(2 / (n_goals + 1), abs=0.1)
+
+
+def test_more_drivers_of_a_kind_are_those_before_and_others():
+    kinds = []
+    for share in (0.25, 0.5):
+        drivers = [DriverKind(share, RULES["random"]), DriverKind(1.0 - share, RULES["greedy-drive"])]
+        fleet = Fleet("mini", Demand(Headways(200)), drivers=drivers)
+        fleet.reset(4)
+        kinds.append(fleet.cars["kind"] == 0)
+    assert not (kinds[0] & ~kinds[1]).any()
+    assert kinds[1].mean() == pytest.approx(0.5, abs=0.1)
+
+
+def test_ordered_entry_loses_as_erlang_says():
+    # M/M/c/c: 8 slots, load 5; blocking B(8, 5) = 0.07005.
+    from parkenv.lots import grid_lot
+
+    lot = grid_lot(1, 8)
+    n = lot.n_slots
+    process = OccupancyProcess.from_demand(np.zeros(n), np.zeros(168))
+    scenario = Scenario(lot=lot, name="row", occupancy=process)
+    demand = Demand(PoissonArrivals(500.0, 0.0, 40 * 3600.0), ExponentialTime(36.0))
+    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(rule=RULES["ordered-entry"])])
+    fleet.reset(0)
+    fleet.run()
+    load, blocking = 5.0, 1.0
+    for c in range(1, n + 1):
+        blocking = load * blocking / (c + load * blocking)
+    assert np.mean(np.array(fleet.state_names()) == "balked") == pytest.approx(blocking, rel=0.15)
+
+
+def test_a_forecast_computed_in_python_reaches_every_car():
+    scenario = parkenv.make_scenario("mini")
+
+    class Prior:
+        n_slots = scenario.lot.n_slots
+
+        def forecast(self, arrival):
+            from parkenv.world.occupancy import Forecast
+
+            return Forecast(np.full(self.n_slots, 0.25), np.full(self.n_slots, 1e-3))
+
+    fleet = Fleet(scenario.replace(prior=Prior()), Demand(Headways(3, 1.0)))
+    fleet.reset(0)
+    seen = set()
+    while (car := fleet.next_decision()) is not None:
+        seen.add(car)
+        assert (fleet.observation(car)["belief"][: scenario.lot.n_slots] == 0.25).all()
+        fleet.act(4)
+        if len(seen) == 3:
+            break
+    assert seen == {0, 1, 2}
+
+
+@pytest.mark.slow
+def test_another_process_gives_the_same_run():
+    program = (
+        "from parkenv.envs.fleet import *; from parkenv.envs.fleet_rules import *; from parkenv.world.demand import *;"
+        "f = Fleet('campus', Demand(Headways(40)), drivers=[DriverKind(rule=RULES['greedy-drive'])]);"
+        "f.reset(5); f.run(); print(f.cars['slot'].tolist(), f.cars['ended_at'].tolist())"
+    )
+    runs = {
+        subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout for _ in "ab"
+    }
+    assert len(runs) == 1
+
+
+def test_demand_fitted_to_a_log_gives_its_occupancy():
+    scenario = parkenv.make_scenario("campus")
+    n = scenario.lot.n_slots
+    rates = tuple(np.interp(range(24), [0, 6, 9, 14, 20, 23], [0.5, 3.0, 75.0, 36.0, 9.0, 1.5]))
+    truth = Demand(PoissonArrivals(rates, 0.0, 86400.0), ExponentialTime(2 * 3600.0))
+    log = recorded(scenario, truth, days=20)
+    fitted = Demand.fitted_to(log, n)
+    again = recorded(scenario, fitted, days=20)
+    hours = range(7, 21)
+    before, after = (occupancy_by_hour(one)[hours] for one in (log, again))
+    assert before.max() > 0.5
+    np.testing.assert_allclose(after, before, atol=0.06)
+
+
+def recorded(scenario, demand, days):
+    """A log of days, observed every ten minutes, of a lot that starts empty and that cars enter without a drive."""
+    from parkenv import OccupancyLog
+
+    n, seconds = scenario.lot.n_slots, np.arange(0.0, 86400.0, 600.0)
+    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(rule=RULES["ordered-entry"])])
+    taken = np.zeros((days, n, len(seconds)), bool)
+    for day in range(days):
+        fleet.reset(day)
+        for i, second in enumerate(seconds):
+            fleet.run(until=float(fleet.records["midnight"][0]) + second)
+            taken[day, :, i] = fleet.taken()
+    dates = tuple(str(np.datetime64("2024-01-01") + 7 * day) for day in range(days))
+    day, slot, second = (a.ravel() for a in np.meshgrid(range(days), range(n), seconds, indexing="ij"))
+    return OccupancyLog(tuple(map(str, range(n))), dates, slot, day, second, taken.ravel())
+
+
+def occupancy_by_hour(log):
+    hour = (log.second // 3600).astype(int)
+    return np.bincount(hour, log.occupied, 24) / np.bincount(hour, minlength=24)
+
+
+def test_a_copy_is_a_fleet_before_its_first_reset():
+    fleet = Fleet("mini", Demand(Headways(3)), background="none", tick_s=0.5)
+    fleet.reset(0)
+    copy = pickle.loads(pickle.dumps(fleet))
+    assert len(copy.cars) == 0
+    copy.reset(0)
+    assert copy.begin == fleet.begin
+    np.testing.assert_array_equal(copy.cars["arrival"], fleet.cars["arrival"])
+
+
+class Raises:
+    def predict(self, observation, state=None):
+        raise RuntimeError("out of fuel")
+
+
+@pytest.mark.parametrize(
+    ("make", "words"),
+    [
+        (lambda: Headways(0), "Headways.cars is 0"),
+        (lambda: Headways(3, -1.0), "Headways.mean_s is -1.0"),
+        (lambda: PoissonArrivals(0.0), "no car would arrive"),
+        (lambda: PoissonArrivals((1.0,) * 23), "want one or 24"),
+        (lambda: PoissonArrivals(5.0, 3600.0, 3600.0), "PoissonArrivals.end_s is 3600.0"),
+        (lambda: PoissonArrivals(math.inf), "PoissonArrivals.per_hour is inf"),
+        (lambda: PoissonArrivals(1e9), "want at most 1,000,000"),
+        (lambda: ListedArrivals((5.0, 4.0)), r"ListedArrivals.times_s\[1\] is 4.0"),
+        (lambda: ListedArrivals((90000.0,)), "seconds of the day"),
+        (lambda: ListedArrivals(()), "at least one number"),
+        (lambda: ExponentialTime(0.0), "ExponentialTime.mean_s is 0.0"),
+        (lambda: ExponentialTime(math.inf), "ExponentialTime.mean_s is inf"),
+        (lambda: EmpiricalTime((5.0, 0.0)), r"EmpiricalTime.values_s\[1\] is 0.0"),
+        (lambda: ConstantTime(math.nan), "ConstantTime.seconds is nan"),
+        (lambda: Demand(stay=60.0), "Demand.stay is 60.0"),
+        (lambda: Demand(goal_weights=(0.0,)), "Demand.goal_weights"),
+        (lambda: Fleet("mini", Demand(goal_weights=(1.0,) * 9)), "Demand.goal_weights has 9 numbers"),
+        (lambda: Fleet("mini", background="crowd"), "background is 'crowd'"),
+        (lambda: Fleet("mini", tick_s=-1.0), "tick_s is -1.0"),
+        (lambda: Fleet("mini", max_steps=0), "max_steps is 0"),
+        (lambda: Fleet("mini", drivers=[]), "at least one DriverKind"),
+        (lambda: Fleet("mini", drivers=[DriverKind(0.0)]), "all weights are 0"),
+        (lambda: DriverKind(weight=-0.1), "DriverKind.weight is -0.1"),
+        (lambda: DriverKind(knows="everything"), "DriverKind.knows is 'everything'"),
+        (lambda: DriverKind(rule="random"), "want a Rule"),
+    ],
+)
+def test_bad_input_is_refused_in_a_line(make, words):
+    with pytest.raises(InputError, match=words) as caught:
+        make()
+    assert "\n" not in str(caught.value)
+
+
+def test_an_agent_that_raises_stops_the_run_and_names_the_car():
+    fleet = Fleet("mini", Demand(Headways(2)))
+    with pytest.raises(gym.error.ResetNeeded):
+        fleet.next_decision()
+    fleet.reset(0)
+    with pytest.raises(InputError, match=r"want an agent for it"):
+        fleet.run()
+    with pytest.raises(InputError, match=r"car 0: its agent raised RuntimeError at 0.0 s: out of fuel"):
+        fleet.run([Raises()])
+    assert fleet.next_decision() == 0
+    with pytest.raises(InputError, match="action is 7"):
+        fleet.act(7)
+
+
+def test_more_cars_than_slots_for_ever_end_all_the_same():
+    demand = Demand(Headways(40, 1.0), ConstantTime(math.inf))
+    fleet = Fleet("mini", demand, background="none", drivers=[GREEDY])
+    fleet.reset(0)
+    fleet.run()
+    names = fleet.state_names()
+    assert names.count("parked") == fleet.scenario.lot.n_slots
+    assert names.count("gave_up") == 40 - fleet.scenario.lot.n_slots
+    assert (fleet.cars["gave_up_s"] > 0).sum() == names.count("gave_up")
