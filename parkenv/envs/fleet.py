@@ -78,10 +78,18 @@ class DriverKind:
 class StepOutcome(NamedTuple):
     """What a car's last step brought."""
 
+    begun: bool  # whether there was a step: not before the first decision
     reward: float
     parked: bool
     over: bool  # whether the search is over, but for the limit of steps
     info: dict[str, Any]  # as of `parkenv/Search-v2`
+
+
+class CarPoses(NamedTuple):
+    """Where cars are."""
+
+    xy: NDArray[np.float64]  # (k, 2) float64, m, centres
+    yaw: NDArray[np.float64]  # (k,) float64, rad, headings
 
 
 class Fleet:
@@ -340,6 +348,12 @@ class Fleet:
                 assert status in (FINISHED, PAUSED)
                 return None
 
+    def ready_cars(self) -> list[int]:
+        """Return the cars that are to decide, or whose end Python has not handled yet, now, in their order."""
+        first, n = int(self._record["first_ready"]), int(self._record["n_ready"])
+        places = (first + np.arange(n)) % max(len(self._cars), 1)
+        return [int(car) for car in self._kept["ready"][places]]
+
     def act(self, action: Any) -> None:
         """Carry out the decision of the car from `next_decision`.
 
@@ -390,7 +404,8 @@ class Fleet:
         info = {"reward_terms": {term: numbers[term] for term in REWARD_TERMS}}
         info |= {name: numbers[name] for name in (*TIME_METRICS, *COUNT_METRICS, "parked")}
         info["place"] = self.scenarios[self._cars["place"][car]].name
-        return StepOutcome(numbers["reward"], numbers["parked"], numbers["over"], info)
+        begun = bool(searches.records["n_steps"][row])
+        return StepOutcome(begun, numbers["reward"], numbers["parked"], numbers["over"], info)
 
     def _search_of(self, car: int) -> tuple[Searches, int]:
         """Return the searches that hold a car's record, and its row there."""
@@ -409,6 +424,25 @@ class Fleet:
     def state_names(self) -> list[str]:
         """Return the state of each car by name; see `parkenv.envs.fleet_records.STATES`."""
         return [STATES[state] for state in self._cars["state"]]
+
+    def poses(self) -> CarPoses:
+        """Return where the searching cars are now; a car under way is between two vertices."""
+        cars = self._cars[self._cars["state"] == SEARCHING]
+        records = np.array(
+            [self._row[int(address)][0].records[self._row[int(address)][1]] for address in cars["search"]]
+        )
+        if not len(cars):
+            return CarPoses(np.zeros((0, 2)), np.zeros(0))
+        xy, ahead = self.scenario.lot.vertex_xy, records["vertex"]
+        behind, left = records["previous_vertex"], records["time"] - self.time
+        share = np.clip(left / np.maximum(records["step_drive_s"], 1e-9), 0.0, 1.0)
+        # A failed attempt, or a wait: the car stands.
+        share[records["step_failed_s"] > 0.0] = 0.0
+        step = xy[behind] - xy[ahead]
+        yaw = np.where(
+            behind == ahead, self.scenario.lot.vertex_yaw[ahead], np.arctan2(-step[:, 1], -step[:, 0])
+        )
+        return CarPoses(xy[ahead] + share[:, None] * step, yaw)
 
     def taken(self) -> NDArray[np.bool_]:
         """Return whether each slot is taken now, (n_slots,)."""

@@ -280,10 +280,8 @@ def _round_up(fleet: Any, search: Any) -> None:
         math.floor((fleet.time - begin) / fleet.tick_s + 0.5) + 1.0,
     )
     later = begin + ticks * fleet.tick_s
-    # A step that ends on a tick keeps its duration to the bit.
-    if later - search.time > _ON_TICK * fleet.tick_s:
-        search.step_drive_s += later - search.time
-        search.time = later
+    search.step_drive_s += later - search.time
+    search.time = later
 
 
 @kernel

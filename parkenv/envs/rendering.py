@@ -144,7 +144,7 @@ class StillLayer:
 
 
 @compiled
-def _paint_slots(
+def paint_slots(
     flat: Image,
     pixel: NDArray[np.int64],
     slot: NDArray[np.int64],
@@ -154,6 +154,18 @@ def _paint_slots(
     colors: Image,
     taken: NDArray[np.bool_],
 ) -> None:
+    """Paint the slots of a `StillLayer`, whose fields are the arguments, into its flattened image, (k, 3) uint8.
+
+    Args:
+        flat: the image, changed in place.
+        pixel: as in `StillLayer`, as are the next four.
+        slot: index into its slots.
+        cover: fraction covered by the slot.
+        car: colour of a parked car.
+        car_cover: fraction covered by the car.
+        colors: (m, 3) uint8, colour of each slot.
+        taken: (m,) bool, whether a car stands in it.
+    """
     for i in range(len(pixel)):
         s, p = slot[i], pixel[i]
         for c in range(3):
@@ -192,7 +204,7 @@ class SearchRenderer:
         self._size = (float(size[0]), float(size[1]))
         lot = scenario.lot
         room = (self._size[0] - 2 * MARGIN, self._size[1] - 2 * MARGIN)
-        fitted = MapView.fit(_corners(lot), room, LARGEST_SCALE)
+        fitted = MapView.fit(lot_corners(lot), room, LARGEST_SCALE)
         self._slot_width = float(np.median(np.minimum(lot.slot_width, lot.slot_length)))
         self._whole: MapView | None = None
         if fitted.scale * self._slot_width >= SMALLEST_SLOT:
@@ -221,7 +233,7 @@ class SearchRenderer:
         ground = self.still_layer(state)
         image = ground.image.copy()
         slots = ground.slots
-        _paint_slots(
+        paint_slots(
             image.reshape(-1, 3),
             ground.pixel,
             ground.slot,
@@ -297,7 +309,7 @@ class SearchRenderer:
     def _text_map(self, state: SearchState) -> list[str]:
         lot, belief = self.scenario.lot, state.belief
         size = (TEXT_WIDTH - 1.0, 2.0 * TEXT_ROWS - 1.0)  # a character is twice as high as wide
-        view = MapView.fit(_corners(lot), size, 1 / TEXT_CELL_LEAST)
+        view = MapView.fit(lot_corners(lot), size, 1 / TEXT_CELL_LEAST)
         if view.scale < 1 / TEXT_CELL:
             view = MapView.around(lot.vertex_xy[state.vertex], size, 1 / TEXT_CELL)
         rows = np.full((TEXT_ROWS, TEXT_WIDTH), " ")
@@ -371,10 +383,10 @@ class SearchRenderer:
         # A small car is drawn larger than to scale, to stay visible.
         length = max(4.4 * view.scale, 17.0)
         for part, color, swell in (
-            (_BODY, INK, 3.0),
-            (_BODY, CAR, 0.0),
-            (_WINDSCREEN, INK, 0.0),
-            (_REAR, INK, 0.0),
+            (CAR_BODY, INK, 3.0),
+            (CAR_BODY, CAR, 0.0),
+            (WINDSCREEN, INK, 0.0),
+            (REAR_WINDOW, INK, 0.0),
         ):
             drawing.fill_polygon(image, at + part * (np.array([length, 0.44 * length]) + swell) @ turn, color)
 
@@ -406,7 +418,8 @@ def _fitting(words: list[str], width: int) -> str:
     return f"{len(words)} slots" if words else ""
 
 
-def _corners(lot: ParkingLot) -> FloatArray:
+def lot_corners(lot: ParkingLot) -> FloatArray:
+    """Return two opposite corners, (2, 2) m, of what a frame of the whole lot shows."""
     low_x, low_y, high_x, high_y = lot.bounds()
     return np.array([[low_x - _EDGE, low_y - _EDGE], [high_x + _EDGE, high_y + _EDGE]])
 
@@ -496,8 +509,8 @@ def draw_still_layer(
     line = max(_LINE_WIDTH, 0.8 / view.scale)
     boxes = placed(_BOX, slot_length - line, slot_width - line)
     long, wide = np.minimum(0.8 * slot_length, 4.4), np.minimum(0.62 * slot_width, 1.75)
-    bodies = placed(_BODY, long, wide)
-    glass = np.stack([placed(_WINDSCREEN, long, wide), placed(_REAR, long, wide)])
+    bodies = placed(CAR_BODY, long, wide)
+    glass = np.stack([placed(WINDSCREEN, long, wide), placed(REAR_WINDOW, long, wide)])
     for i in range(len(slots)):
         cv2.fillConvexPoly(image, boxes[i], WHITE, 8, drawing.SUBPIXEL_BITS)
         cv2.fillConvexPoly(label, boxes[i], i, 8, drawing.SUBPIXEL_BITS)
@@ -570,7 +583,7 @@ def _draw_north(image: Image, view: MapView) -> None:
 _BOX = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
 _ENTRY_MARK = np.array([[9.0, 0.0], [-6.0, 8.0], [-2.0, 0.0], [-6.0, -8.0]])
 _CORNER = np.linspace(0, 2 * np.pi, 28, endpoint=False)
-_BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.4 for f in (np.cos(_CORNER), np.sin(_CORNER))], axis=1)
+CAR_BODY = 0.5 * np.stack([np.sign(f) * np.abs(f) ** 0.4 for f in (np.cos(_CORNER), np.sin(_CORNER))], axis=1)
 """Outline of a car of unit length and width, nose to +x."""
-_WINDSCREEN = np.array([[0.24, -0.40], [0.24, 0.40], [0.10, 0.32], [0.10, -0.32]])
-_REAR = np.array([[-0.36, -0.36], [-0.36, 0.36], [-0.26, 0.30], [-0.26, -0.30]])
+WINDSCREEN = np.array([[0.24, -0.40], [0.24, 0.40], [0.10, 0.32], [0.10, -0.32]])
+REAR_WINDOW = np.array([[-0.36, -0.36], [-0.36, 0.36], [-0.26, 0.30], [-0.26, -0.30]])

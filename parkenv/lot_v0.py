@@ -1,0 +1,399 @@
+"""`parkenv.lot_v0`: many cars search one lot for free slots, as a PettingZoo environment.
+
+`env` and `raw_env` make the AEC form, which is exact: the car whose decision is next decides. `parallel_env` makes the
+parallel form, which advances by ticks. Both need the extra `multi`: `pip install "parkenv[multi]"`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from numpy.typing import NDArray
+
+try:
+    from pettingzoo import AECEnv, ParallelEnv
+    from pettingzoo.utils import wrappers
+except ImportError as error:
+    raise DependencyNotInstalled(
+        'parkenv.lot_v0 needs pettingzoo, which is not installed: pip install "parkenv[multi]"'
+    ) from error
+
+from parkenv.envs.fleet import Fleet
+from parkenv.envs.fleet_agents import MAX_CYCLES, METADATA, FleetAgents, Observation, car_of
+from parkenv.envs.fleet_records import SEARCHING, TRUNCATED
+from parkenv.envs.search import action_number
+from parkenv.errors import InputError
+from parkenv.scenarios.build import ScenarioSource
+from parkenv.world.demand import Demand
+
+__all__ = ["LotEnv", "LotParallelEnv", "env", "parallel_env", "raw_env"]
+
+
+_MARGIN = 1e-6  # of a tick
+
+
+class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo has no types
+    """Many cars search one lot for free slots; the car whose decision is next decides (AEC).
+
+    ## Description
+    Cars arrive, search, compete for slots, park, stay and leave. Each car is a search as in `parkenv/Search-v2`: its
+    driver knows the lot and an occupancy forecast, observes nearby slots while driving past, and wants to reach a goal
+    on foot in as little time as possible. But the slots are shared: a slot that one car takes is taken for all others
+    until that car leaves. An agent is a car, `car_0`, `car_1`, ... in order of arrival; every agent of `parkenv` drives
+    one unchanged.
+
+    Time is continuous. At each moment, first parked cars leave, cars arrive, and cars whose step is over observe; then
+    the cars that have to decide do so one after another, in the order of these events. A decision acts at once: of two
+    cars before the same free slot, the first to decide gets it, and the other one has a failed attempt.
+
+    | | |
+    |---|---|
+    | Import | `from parkenv import lot_v0` |
+    | Actions | discrete |
+    | Parallel API | yes, `lot_v0.parallel_env()`, which advances by ticks |
+    | Manual control | no |
+    | Agents | `car_0`, ..., `car_4` by default |
+    | Action shape | `Discrete(5)` |
+    | Observation | `Dict` |
+
+    ## Action space
+    `Discrete(5)`: up, down, left, right, park; as in `parkenv/Search-v2`.
+
+    ## Observation space
+    The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `day_error`, `action_mask`. It holds
+    what the car itself has observed, and its forecast for its own arrival.
+
+    ## Rewards
+    Minus the duration of a car's step, s, as in `parkenv/Search-v2`, given when the step is over; parking also
+    subtracts the walk to the goal and the slot's parking cost. `infos[agent]["reward_terms"]` holds the terms. A car's
+    return is minus its total time. One car's gain may be the others' loss: the sum over cars is the social cost.
+
+    ## Starting state
+    `reset(seed=s)` fixes arrivals, entries, goals, stays, and the cars that stand in the lot when the world begins,
+    whatever the agents do. Later `reset()` calls go through further worlds of the same seed. All cars of the world are
+    in `agents` from the start; the first to be selected is the first to arrive. `options` are ignored.
+
+    ## Episode end
+    - Terminated, car by car: parked; gave up, because it has observed that every slot is taken; or *balked*, because
+      its search has lasted as long as its patience. Giving up and balking cost `give_up_s`.
+    - Truncated, car by car: after `max_cycles` decisions.
+
+    The world ends when all cars' searches are over. A parked car stays in its slot for its stay, then leaves.
+
+    ## Arguments
+    - `scenario`: as of `parkenv/Search-v2`: a name, a file, a lot, a `Scenario`.
+    - `cars`: number of cars. The first arrives at a time in the scenario's arrival window, the others after it, 10 s
+      apart on average; they stay for an hour on average (both exponentially distributed).
+    - `demand`: a `parkenv.world.demand.Demand` instead of `cars`: Poisson or listed arrivals, stays, patience, entries,
+      goals.
+    - `background`: who else takes slots: `residents`, cars that stand there at the beginning and leave once; `process`,
+      the scenario's occupancy all day; `none`.
+    - `max_cycles`: limit of a car's decisions.
+    - `render_mode`: `rgb_array` (480, 640, 3) or `human` (needs the extra `human`).
+    - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.
+
+    ```python
+    >>> from parkenv import lot_v0
+    >>> from planners.agent import make_agent
+    >>> env = lot_v0.env(scenario="mini", cars=3)
+    >>> env.reset(seed=1)
+    >>> driver, memory, returns = make_agent("belief", env.unwrapped.scenario), {}, {}
+    >>> for car in env.agent_iter():
+    ...     observation, reward, terminated, truncated, info = env.last()
+    ...     returns[car] = returns.get(car, 0.0) + reward
+    ...     action = None
+    ...     if not (terminated or truncated):
+    ...         action, memory[car] = driver.predict(observation, memory.get(car))
+    ...     env.step(action)
+    >>> sorted(returns)
+    ['car_0', 'car_1', 'car_2']
+
+    ```
+
+    ## Version history
+    - v0: first version.
+    """
+
+    metadata = METADATA
+
+    def __init__(
+        self,
+        scenario: ScenarioSource = "mini",
+        cars: int = 5,
+        demand: Demand | None = None,
+        background: str = "residents",
+        max_cycles: int = MAX_CYCLES,
+        render_mode: str | None = None,
+        **changes: Any,
+    ) -> None:
+        super().__init__()
+        self._cars = FleetAgents(scenario, cars, demand, background, max_cycles, 0.0, render_mode, changes)
+        self.render_mode = render_mode
+        self.possible_agents = self._cars.possible_agents
+        self.agents: list[str] = []
+
+    @property
+    def fleet(self) -> Fleet:
+        """The fleet, with the hidden occupancy; not for agents."""
+        return self._cars.fleet
+
+    @property
+    def scenario(self) -> Any:
+        """The scenario."""
+        return self.fleet.scenario
+
+    def observation_space(self, agent: str) -> spaces.Dict:
+        """Return the space of an agent's observations."""
+        return self._cars.observation_space(agent)
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        """Return the space of an agent's actions."""
+        return self._cars.action_space(agent)
+
+    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
+        """Begin a world; see the class for seeds."""
+        del options
+        self.agents = list(self._cars.begin(seed))
+        self.rewards = dict.fromkeys(self.agents, 0.0)
+        self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
+        self.terminations = dict.fromkeys(self.agents, False)
+        self.truncations = dict.fromkeys(self.agents, False)
+        self.infos: dict[str, dict[str, Any]] = {
+            agent: {"place": self.scenario.name} for agent in self.agents
+        }
+        self._skip_agent_selection = None
+        self._select()
+
+    def _select(self) -> None:
+        """Go on to the next decision, or to the next car whose search has ended."""
+        car = self.fleet.next_car()
+        if car is None:
+            assert not self.agents, "every car is selected once more when its search is over"
+            return
+        agent = self.agent_selection = f"car_{car}"
+        outcome = self.fleet.outcome(car)
+        if not outcome.begun:
+            return
+        self.rewards[agent], self.infos[agent] = outcome.reward, outcome.info
+        state = int(self.fleet.cars["state"][car])
+        self.truncations[agent] = state == TRUNCATED
+        self.terminations[agent] = state not in (SEARCHING, TRUNCATED)
+
+    def step(self, action: Any) -> None:
+        """Carry out the decision of `agent_selection`; None for a car whose search is over."""
+        if not self.agents:
+            raise ResetNeeded("no car searches: call reset()")
+        agent = self.agent_selection
+        if self.terminations[agent] or self.truncations[agent]:
+            self._was_dead_step(action)
+            self.fleet.release()
+        else:
+            self.fleet.act(action)
+            self._cumulative_rewards[agent] = 0.0
+            self._clear_rewards()
+        self._select()
+        self._accumulate_rewards()
+        if self.render_mode == "human":
+            self.render()
+
+    def observe(self, agent: str) -> Observation | None:
+        """Return what an agent's car observed last; nothing is known before it arrives."""
+        car = car_of(agent)
+        if self.fleet.cars["search"][car] == 0:
+            return self._cars.blank_observation(car)
+        return self.fleet.observation(car)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a frame, or show it, depending on `render_mode`."""
+        return self._cars.render()
+
+    def close(self) -> None:
+        """Close the window, if open."""
+        self._cars.close()
+
+
+class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
+    """Many cars search one lot for free slots; all cars that have to decide at a tick do so at once (parallel).
+
+    World, actions, observations and rewards are those of `LotEnv`, but every duration and every arrival is rounded up
+    to whole ticks after the beginning of the world; the time lost counts as drive time. Where ticks divide all times,
+    this form and `LotEnv` give the same searches.
+
+    A step of the environment is a tick. Cars under way, and cars that have not arrived, are in `agents`, too: the
+    `action_mask` in their observation is all 0, and their action is ignored. The reward of a car's step is given at the
+    tick at which it ends. Of several cars that decide at the same tick, those act first whose steps ended first.
+
+    `agents` are the cars whose search is not over: a car leaves them when it has parked, gave up or balked
+    (terminated), and all leave them after `max_cycles` ticks (truncated).
+
+    Args:
+        scenario: as of `LotEnv`, as are `cars`, `demand`, `background`, `render_mode` and further keywords.
+        cars: number of cars.
+        tick_s: length of a tick, s.
+        demand: demand instead of `cars`.
+        background: who else takes slots.
+        max_cycles: number of ticks after which all cars are truncated.
+        render_mode: `rgb_array`, `human` or None.
+        changes: fields of the scenario to replace.
+
+    Examples:
+        >>> from parkenv import lot_v0
+        >>> env = lot_v0.parallel_env(scenario="mini", cars=5, tick_s=1.0)
+        >>> observations, infos = env.reset(seed=0)
+        >>> [int(observations[car]["action_mask"].any()) for car in env.agents]
+        [1, 0, 0, 0, 0]
+    """
+
+    metadata = METADATA | {"is_parallelizable": True}
+
+    def __init__(
+        self,
+        scenario: ScenarioSource = "mini",
+        cars: int = 5,
+        tick_s: float = 1.0,
+        demand: Demand | None = None,
+        background: str = "residents",
+        max_cycles: int = MAX_CYCLES,
+        render_mode: str | None = None,
+        **changes: Any,
+    ) -> None:
+        if not tick_s > 0.0:
+            raise InputError(f"tick_s is {tick_s!r}, want a finite number above 0")
+        self._cars = FleetAgents(scenario, cars, demand, background, max_cycles, tick_s, render_mode, changes)
+        self.render_mode = render_mode
+        self.tick_s, self.max_cycles = float(tick_s), max_cycles
+        self.possible_agents = self._cars.possible_agents
+        self.agents: list[str] = []
+        self._observations: dict[str, dict[str, Any]] = {}
+        self._infos: dict[str, dict[str, Any]] = {}
+        self._deciding: set[str] = set()
+        self._tick = 0
+
+    @property
+    def fleet(self) -> Fleet:
+        """The fleet, with the hidden occupancy; not for agents."""
+        return self._cars.fleet
+
+    @property
+    def scenario(self) -> Any:
+        """The scenario."""
+        return self.fleet.scenario
+
+    def observation_space(self, agent: str) -> spaces.Dict:
+        """Return the space of an agent's observations."""
+        return self._cars.observation_space(agent)
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        """Return the space of an agent's actions."""
+        return self._cars.action_space(agent)
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
+        """Begin a world; see `LotEnv` for seeds. `options` are ignored."""
+        del options
+        self.agents = list(self._cars.begin(seed))
+        self._observations = {agent: self._cars.blank_observation(car_of(agent)) for agent in self.agents}
+        self._infos = {agent: {"place": self.scenario.name} for agent in self.agents}
+        self._tick = 0
+        self._advance({}, {})
+        return dict(self._observations), dict(self._infos)
+
+    def step(
+        self, actions: dict[str, Any]
+    ) -> tuple[
+        dict[str, Observation],
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """Carry out the actions of the cars that have to decide, and go on to the next tick.
+
+        Raises:
+            InputError: a car that has to decide has no action, or a wrong one; the world has not changed.
+        """
+        if not self.agents:
+            return {}, {}, {}, {}, {}
+        for agent in self.agents:
+            if agent not in self._deciding:
+                continue
+            if agent not in actions:
+                raise InputError(f"actions lack {agent}, want one of each car that has to decide")
+            action_number(actions[agent])
+        rewards = dict.fromkeys(self.agents, 0.0)
+        over = dict.fromkeys(self.agents, False)
+        self._act(actions, rewards, over)
+        self._tick += 1
+        self._advance(rewards, over)
+        cut = self._tick >= self.max_cycles
+        truncated = {agent: cut and not over[agent] for agent in self.agents}
+        observations: dict[str, Observation] = dict(self._observations)
+        results = observations, rewards, over, truncated, dict(self._infos)
+        self.agents = [agent for agent in self.agents if not (over[agent] or truncated[agent])]
+        self._observations = {agent: self._observations[agent] for agent in self.agents}
+        self._infos = {agent: self._infos[agent] for agent in self.agents}
+        if self.render_mode == "human":
+            self.render()
+        return results
+
+    @property
+    def _now(self) -> float:
+        """Time of the tick, s since Monday 00:00, with a margin for rounding."""
+        return self.fleet.begin + (self._tick + _MARGIN) * self.tick_s
+
+    def _act(self, actions: dict[str, Any], rewards: dict[str, float], over: dict[str, bool]) -> None:
+        """Carry out the decisions of this tick, and release the cars whose search is over."""
+        while (car := self.fleet.next_car(self._now)) is not None:
+            agent = f"car_{car}"
+            if self.fleet.cars["state"][car] == SEARCHING:
+                self.fleet.act(actions[agent])
+                mask = np.zeros_like(self._observations[agent]["action_mask"])
+                self._observations[agent] = self._observations[agent] | {"action_mask": mask}
+            else:
+                if not over.get(agent, True):
+                    self._report(car, rewards, over)
+                self.fleet.release()
+
+    def _advance(self, rewards: dict[str, float], over: dict[str, bool]) -> None:
+        """Carry out everything until this tick, and report the cars whose step is over."""
+        self.fleet.next_car(self._now)
+        self._deciding = set()
+        for car in self.fleet.ready_cars():
+            self._report(car, rewards, over)
+            if self.fleet.cars["state"][car] == SEARCHING:
+                self._deciding.add(f"car_{car}")
+
+    def _report(self, car: int, rewards: dict[str, float], over: dict[str, bool]) -> None:
+        """Take over the observation, and the outcome of the last step, of a car."""
+        agent, outcome = f"car_{car}", self.fleet.outcome(car)
+        self._observations[agent] = self.fleet.observation(car)
+        if outcome.begun:
+            rewards[agent], self._infos[agent] = outcome.reward, outcome.info
+            over[agent] = int(self.fleet.cars["state"][car]) not in (SEARCHING, TRUNCATED)
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a frame, or show it, depending on `render_mode`."""
+        return self._cars.render()
+
+    def close(self) -> None:
+        """Close the window, if open."""
+        self._cars.close()
+
+
+def raw_env(**options: Any) -> LotEnv:
+    """Make the AEC form without wrappers; options as of `LotEnv`."""
+    return LotEnv(**options)
+
+
+def env(**options: Any) -> wrappers.OrderEnforcingWrapper[str, Observation, Any]:
+    """Make the AEC form with PettingZoo's checks of actions and of the order of calls; options as of `LotEnv`."""
+    return wrappers.OrderEnforcingWrapper(wrappers.AssertOutOfBoundsWrapper(raw_env(**options)))
+
+
+def parallel_env(**options: Any) -> LotParallelEnv:
+    """Make the parallel form; options as of `LotParallelEnv`."""
+    return LotParallelEnv(**options)

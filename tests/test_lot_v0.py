@@ -1,0 +1,224 @@
+"""`parkenv.lot_v0`: PettingZoo's own tests, and its two forms beside each other."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gymnasium.error import DependencyNotInstalled, ResetNeeded
+from pettingzoo.test import (
+    api_test,
+    max_cycles_test,
+    parallel_api_test,
+    parallel_seed_test,
+    render_test,
+    seed_test,
+)
+
+import parkenv
+from parkenv import InputError, OccupancyProcess, Scenario, lot_v0
+from parkenv.lots import grid_lot
+from parkenv.world.demand import ConstantTime, Demand, ListedArrivals, PoissonArrivals
+from planners.agent import make_agent
+
+IMPORTED = str(Path(parkenv.__file__).parent / "lots" / "places" / "place-01.geojson")
+LOTS = pytest.mark.parametrize("scenario", ["mini", "campus", IMPORTED], ids=["mini", "campus", "imported"])
+# PettingZoo knows by name which environments may have dictionaries as observations.
+pytestmark = [
+    pytest.mark.filterwarnings("ignore:Observation is not a NumPy array"),
+    pytest.mark.filterwarnings("ignore:Observation space for each agent probably should be"),
+]
+
+
+@LOTS
+def test_pettingzoo_s_tests_of_the_interface(scenario):
+    api_test(lot_v0.env(scenario=scenario), num_cycles=100)
+    parallel_api_test(lot_v0.parallel_env(scenario=scenario, tick_s=5.0), num_cycles=300)
+
+
+@LOTS
+def test_pettingzoo_s_tests_of_seeds(scenario):
+    seed_test(lambda: lot_v0.env(scenario=scenario), num_cycles=50)
+    parallel_seed_test(lambda: lot_v0.parallel_env(scenario=scenario), num_cycles=50)
+
+
+def test_pettingzoo_s_test_of_pictures(monkeypatch):
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    render_test(lot_v0.env)
+    environment = lot_v0.parallel_env(render_mode="rgb_array", scenario="campus")
+    environment.reset(seed=0)
+    assert environment.render().shape == (480, 640, 3)
+
+
+def test_pettingzoo_s_test_of_max_cycles():
+    max_cycles_test(lot_v0)
+
+
+def aec_run(environment, seed, policy):
+    """Observations, rewards and ends of every car, in order."""
+    environment.reset(seed=seed)
+    seen = {agent: [] for agent in environment.agents}
+    for agent in environment.agent_iter():
+        observation, reward, terminated, truncated, _ = environment.last()
+        seen[agent].append((observation, reward, terminated, truncated))
+        environment.step(None if terminated or truncated else policy(agent, observation))
+    return seen
+
+
+def parallel_run(environment, seed, policy):
+    """As `aec_run`, of the ticks at which something happened to a car."""
+    observations, _ = environment.reset(seed=seed)
+    seen = {agent: [] for agent in environment.agents}
+    rewards = dict.fromkeys(environment.agents, 0.0)
+    ended = dict.fromkeys(environment.agents, (False, False))
+    while True:
+        for agent, observation in observations.items():
+            if observation["action_mask"].any() or any(ended[agent]):
+                seen[agent].append((observation, rewards[agent], *ended[agent]))
+        if not environment.agents:
+            return seen
+        actions = {
+            agent: policy(agent, observations[agent]) if observations[agent]["action_mask"].any() else 0
+            for agent in environment.agents
+        }
+        observations, rewards, terminated, truncated, _ = environment.step(actions)
+        ended = {agent: (terminated[agent], truncated[agent]) for agent in observations}
+
+
+def assert_alike(one, other):
+    assert one.keys() == other.keys()
+    for agent in one:
+        assert len(one[agent]) == len(other[agent])
+        for (observed, *rest), (also_observed, *also_rest) in zip(one[agent], other[agent], strict=True):
+            assert rest == also_rest
+            for key in observed:
+                np.testing.assert_array_equal(observed[key], also_observed[key], strict=True)
+
+
+def scenario_in_whole_seconds():
+    """Every drive, failed attempt and arrival takes a multiple of an eighth of a second."""
+    lot = grid_lot(2, 6)
+    process = OccupancyProcess.from_demand(np.full(lot.n_slots, 1.0), np.zeros(168), 60.0)
+    return Scenario(lot=lot, name="grid", occupancy=process, v_drive=2.0, failure_s=3.0, wait_s=1.0)
+
+
+@pytest.mark.parametrize("tick_s", [0.125, 0.0625])
+def test_both_forms_are_alike_where_ticks_divide_all_times(tick_s):
+    scenario = scenario_in_whole_seconds()
+    arrivals = ListedArrivals((36000.0, 36000.0, 36003.0, 36005.5, 36030.0))
+    demand = Demand(arrivals, stay=ConstantTime(20.0))
+    options = {"scenario": scenario, "demand": demand, "max_cycles": 100_000}
+
+    def policy():
+        rng = np.random.default_rng(3)
+        draws = {f"car_{i}": rng.random(5000) for i in range(5)}
+        counts = dict.fromkeys(draws, 0)
+
+        def choose(agent, observation):
+            actions = np.flatnonzero(observation["action_mask"])
+            counts[agent] += 1
+            return int(actions[int(draws[agent][counts[agent]] * len(actions))])
+
+        return choose
+
+    for seed in range(4):
+        aec = aec_run(lot_v0.raw_env(**options), seed, policy())
+        parallel = parallel_run(lot_v0.parallel_env(**options, tick_s=tick_s), seed, policy())
+        assert_alike(aec, parallel)
+
+
+def test_every_agent_drives_cars_of_one_world():
+    names = ["mdp", "greedy-goal", "greedy-drive", "first-free", "random", "belief", "network"]
+    environment = lot_v0.raw_env(scenario="campus", cars=len(names))
+    drivers = {f"car_{i}": make_agent(name, environment.scenario) for i, name in enumerate(names)}
+    memory = {}
+
+    def policy(agent, observation):
+        action, memory[agent] = drivers[agent].predict(observation, memory.get(agent))
+        return action
+
+    seen = aec_run(environment, 1, policy)
+    ended = {name: cars[-1][2:] for name, cars in zip(names, seen.values(), strict=True)}
+    assert ended == dict.fromkeys(names, (True, False))
+
+
+def test_a_reward_is_the_sum_of_its_terms_and_returns_are_total_times():
+    environment, returns = lot_v0.raw_env(scenario="campus", cars=6), {}
+    driver = make_agent("greedy-drive", environment.scenario)
+    memory, totals = {}, {}
+    environment.reset(seed=4)
+    for agent in environment.agent_iter():
+        observation, reward, terminated, truncated, info = environment.last()
+        returns[agent] = returns.get(agent, 0.0) + reward
+        if "reward_terms" in info:
+            assert reward == pytest.approx(sum(info["reward_terms"].values()))
+            totals[agent] = info["total_s"]
+        action = None
+        if not (terminated or truncated):
+            action, memory[agent] = driver.predict(observation, memory.get(agent))
+        environment.step(action)
+    assert len(returns) == 6
+    for agent, total in totals.items():
+        assert returns[agent] == pytest.approx(-total)
+
+
+def test_cars_under_way_are_masked_and_their_actions_ignored():
+    environment = lot_v0.parallel_env(scenario="mini", cars=3)
+    observations, _ = environment.reset(seed=0)
+    assert environment.agents == ["car_0", "car_1", "car_2"]
+    under_way = 0
+    for _ in range(20):
+        deciding = [a for a in environment.agents if observations[a]["action_mask"].any()]
+        under_way += len(environment.agents) - len(deciding)
+        if not environment.agents:
+            break
+        observations, *_ = environment.step(dict.fromkeys(deciding, 3))
+    assert under_way > 0
+
+
+def test_demand_decides_which_cars_there_are():
+    demand = Demand(PoissonArrivals(60.0, 9 * 3600.0, 9.5 * 3600.0))
+    environment = lot_v0.raw_env(scenario="campus", demand=demand, max_cycles=5)
+    environment.reset(seed=0)
+    first = list(environment.agents)
+    environment.reset(seed=1)
+    assert 10 < len(first) != len(environment.agents)
+    assert set(first) <= set(environment.possible_agents)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"cars": 0}, "cars is 0"),
+        ({"max_cycles": 0}, "max_cycles is 0"),
+        ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
+        ({"scenario": "moon"}, "moon"),
+        ({"speed": 3}, "speed"),
+    ],
+)
+def test_bad_options_are_refused_in_a_line(options, words):
+    for make in (lot_v0.raw_env, lot_v0.parallel_env):
+        with pytest.raises(InputError, match=words) as caught:
+            make(**options)
+        assert "\n" not in str(caught.value)
+
+
+def test_bad_ticks_and_actions_are_refused():
+    with pytest.raises(InputError, match="tick_s is 0"):
+        lot_v0.parallel_env(tick_s=0)
+    environment = lot_v0.parallel_env()
+    environment.reset(seed=0)
+    with pytest.raises(InputError, match="actions lack car_0"):
+        environment.step({})
+    with pytest.raises(InputError, match="action is 9"):
+        environment.step({"car_0": 9})
+    with pytest.raises(ResetNeeded):
+        lot_v0.raw_env().step(0)
+
+
+def test_without_pettingzoo_the_extra_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pettingzoo", None)
+    monkeypatch.delitem(sys.modules, "parkenv.lot_v0")
+    with pytest.raises(DependencyNotInstalled, match=r"parkenv\[multi\]"):
+        importlib.import_module("parkenv.lot_v0")
