@@ -84,11 +84,9 @@ def fleet(
         experiment.fleet(setting, its)  # raises an error before anything is run
     with writing_into(out):
         console = make_console()
-        days = []
         with machines.workers() as workers, progress_bar(console, "days") as progress:
             bar = progress.add_task("Driving", total=len(settings) * episodes)
-            for of_setting in experiment.run(workers, lambda: progress.advance(bar)):
-                days.append(of_setting)
+            days = list(experiment.run(workers, lambda: progress.advance(bar)))
         rows = summarize_days(days)
         write_csv(out / "days.csv", list(days[0][0]), (day for of_setting in days for day in of_setting))
         save_summary(

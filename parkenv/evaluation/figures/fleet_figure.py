@@ -13,13 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
+from parkenv.evaluation.fleet.measures import Roads
 from parkenv.world.scenario import SearchProblem
 
 Row = dict[str, Any]
 
 KNOWLEDGE_COLORS = {"own": INK, "shared": "#e69f00", "reserve": "#0072b2", "full": "#009e73"}
 _STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
-_CLOSED_FORM = "looks in random order"
+_CLOSED_FORM = "grey: slots looked at in random order"
 
 
 def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, path: str | Path) -> None:
@@ -48,7 +49,7 @@ def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, p
     agents = list(dict.fromkeys(row["agents"] for row in rows))
     known = list(dict.fromkeys(row["knows"] for row in rows))
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(1.0 + 3.6 * len(panels), 3.9), layout="constrained")
+        figure = Figure(figsize=(0.6 + 4.0 * len(panels), 3.9), layout="constrained")
         for ax, draw in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
             draw(ax)
             ax.grid(visible=True)
@@ -94,9 +95,8 @@ def _draw_search(ax: Axes, rows: Sequence[Row], problem: SearchProblem) -> None:
     low = min(row["occupancy"] for row in rows)
     occupancy = np.linspace(low, 1.0, 200)
     ax.plot(100.0 * occupancy, looks_s(problem, occupancy), color="#999999", linewidth=1.0)
-    ax.annotate(
-        _CLOSED_FORM, (100.0 * occupancy[40], looks_s(problem, occupancy)[40]), (0, -11), color="#777777",
-        textcoords="offset points", fontsize=7.5,
+    ax.text(
+        0.97, 0.02, _CLOSED_FORM, color="#777777", fontsize=7.5, ha="right", va="bottom", transform=ax.transAxes
     )  # fmt: skip
     most = max(row["search_s"] for row in rows)
     ax.set(xlabel="mean occupancy, %", ylabel="s", ylim=(0.0, 1.25 * most), title="Search time")
@@ -105,13 +105,14 @@ def _draw_search(ax: Axes, rows: Sequence[Row], problem: SearchProblem) -> None:
 def looks_s(problem: SearchProblem, occupancy: np.ndarray) -> np.ndarray:
     """Return the search time, s, of looking at slots in random order, (n + 1)/(m + 1) of them if m of n are free.
 
-    A look takes the mean drive from a slot to the next one; the drive to the first slot comes before.
+    A look takes the median drive from a slot to the next one; the drive from the entry to the first slot comes before.
     """
     lot, n = problem.lot, problem.lot.n_slots
     source, column = np.nonzero(lot.neighbors[:n] >= 0)
     to_slot = lot.neighbors[source, column] < n
     hop_s = float(np.median(problem.move_s[source[to_slot], column[to_slot]])) if to_slot.any() else 0.0
-    return np.asarray(hop_s * (n + 1.0) / ((1.0 - occupancy) * n + 1.0))
+    first_s = Roads(problem).first_slot_m / problem.v_drive
+    return np.asarray(first_s + hop_s * ((n + 1.0) / ((1.0 - occupancy) * n + 1.0) - 1.0))
 
 
 def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:
@@ -124,7 +125,7 @@ def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:
             linewidth=1.2,
             **style,
         )
-    ax.set(xlabel="arrivals per hour", title="Mean total time over that of reservations for all")
+    ax.set(xlabel="arrivals per hour", title="Total time over that of reservations for all")
     ax.set_xticks(sorted({row["arrivals_per_hour"] for row in rows}))
 
 
@@ -148,5 +149,5 @@ def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
     ax.set(
         xlabel="share of members, %",
         ylabel="s",
-        title=f"Total time of members (filled) and others, {most:g}/h, {agent}",
+        title=f"Total time of members (filled) and others, {most:g}/h",
     )

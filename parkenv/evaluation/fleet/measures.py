@@ -26,6 +26,9 @@ class Roads:
 
     Args:
         problem: lot, goal, speeds and costs.
+
+    Attributes:
+        first_slot_m: mean drive from an entry to the slot that is nearest to it, m.
     """
 
     def __init__(self, problem: SearchProblem) -> None:
@@ -33,6 +36,7 @@ class Roads:
         entries = np.unique(lot.entry_vertices)
         metres = dijkstra(lot.drive_matrix(), indices=entries)[:, : lot.n_slots]
         self._metres = dict(zip(map(int, entries), metres, strict=True))
+        self.first_slot_m = float(metres.min(axis=1).mean())
         self._alone_s = {
             entry: float((row / problem.v_drive + problem.arrival_cost_s).min())
             for entry, row in self._metres.items()
