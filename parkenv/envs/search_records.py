@@ -40,6 +40,8 @@ SCENARIO = np.dtype(
         ("exact_sensor", np.bool_),
         ("failure_s", np.float64),
         ("give_up_s", np.float64),
+        # Whether a search ends once every slot was last observed taken.
+        ("leave_full_lot", np.bool_),
         # Arrival window and entries: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
         ("window_start", np.float64),
         ("window_end", np.float64),
@@ -263,6 +265,7 @@ class ScenarioRecords:
             "exact_sensor": scenario.sensor_model.perfect,
             "failure_s": scenario.failure_s,
             "give_up_s": scenario.give_up_s,
+            "leave_full_lot": True,
             "window_start": scenario.arrival.start_s,
             "window_end": scenario.arrival.end_s,
             "n_entries": len(entries),
