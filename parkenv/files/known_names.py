@@ -22,5 +22,5 @@ BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.recorded_occupancy`."""
-VERIFY_CASES = ("line", "looks")
+VERIFY_CASES = ("line", "looks", "entry", "stays", "blocking", "balance", "strategies", "game")
 """Cases of `parkenv verify`: modules of `parkenv.evaluation.verify`."""

@@ -17,13 +17,14 @@ from parkenv.world.scenario import Scenario
 from planners.belief.agent import BeliefAgent, BeliefSearch, snapshot
 from planners.belief.best_path import action_values
 from planners.network.agent import NetworkAgent, NetworkSearch
-from planners.network.features import ACTION_COUNT, FAILURE_COSTS, WAITING, Features
+from planners.network.features import ACTION_COUNT, FAILURE_COSTS, LEAST_SCALE, WAITING, Features
 from planners.network.policy import NetworkPolicy
 
 FloatArray = NDArray[np.float64]
 
 LONGEST = 200
 """Number of decisions after which a search of the training data ends: longer ones drive in circles in a full lot."""
+MOST_VALUE = 6.0  # largest value of a label, in time scales
 EXPLORATION = 0.15  # probability of a random action in the searches that the teacher drives
 
 
@@ -140,7 +141,6 @@ def _label(
     known = SlotBelief.of_observation(observation).take(memory.near.slots)
     graph = memory.near.planning_graph(place.env.scenario, place.teacher.failure_s)
     belief = snapshot(here, known, memory, 0.0)
-    scale = max(float(features.lookahead_s.min()), 1e-3)
     values = np.full(ACTION_COUNT, np.nan)
     if (following >= 0).all() and len(moves):
         values[moves] = action_values(here, following, np.array(FAILURE_COSTS), graph, belief, memory.paths)
@@ -152,7 +152,12 @@ def _label(
         values[PARK] = p_free * memory.near.cost_s[here] + (1.0 - p_free) * failed_s
     # The choice is at least as good as the others, up to the second that the teacher prefers to be safe.
     values = np.where(np.isnan(values), np.nan, np.maximum(values, values[choice]))
-    return choice, np.minimum(values / scale, 6.0).astype(np.float32)
+    return choice, np.minimum(values / _time_scale(features), MOST_VALUE).astype(np.float32)
+
+
+def _time_scale(features: Features) -> float:
+    """Return the time scale of a decision, s: the least expected time of the look-ahead."""
+    return max(float(features.lookahead_s.min()), LEAST_SCALE)
 
 
 def play_pairs(places: Sequence[Place], count: int, seed: int, closest: float) -> Pairs:
@@ -191,10 +196,9 @@ def play_pairs(places: Sequence[Place], count: int, seed: int, closest: float) -
             rewards.append(float(reward))
         if branch is None:
             continue
-        times = -sum(rewards[branch.step :]) + (0.0 if terminated else place.env.scenario.give_up_s)
-        other, n_played = _play(place, branch)
-        scale = max(float(branch.features.lookahead_s.min()), 1e-3)
-        longer = np.float32((times - other) / scale)
+        first_s = -sum(rewards[branch.step :]) + (0.0 if terminated else place.env.scenario.give_up_s)
+        second_s, n_played = _play(place, branch)
+        longer = np.float32((first_s - second_s) / _time_scale(branch.features))
         rows.append((*branch.features[:3], branch.first, branch.second, longer, len(rewards) + n_played))
     return Pairs(*(np.stack(column) for column in zip(*rows, strict=True)))
 

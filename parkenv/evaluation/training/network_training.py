@@ -13,15 +13,15 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchEnv
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.statistics import mean_interval
-from parkenv.evaluation.simulate import STEP_LIMIT, charge_truncation
+from parkenv.evaluation.simulate import STEP_LIMIT, simulate
 from parkenv.evaluation.training.curve_file import CURVE, Row, read_curve
 from parkenv.evaluation.training.rl_training import MODEL, TRAINING_SEEDS, AnyTraining
 from parkenv.evaluation.training.search_training import HELD_OUT, METRICS
@@ -163,7 +163,7 @@ class Evaluation:
     def __init__(self, places: Sequence[Scenario], seeds: Sequence[int]) -> None:
         self._seeds = seeds
         self._places = [
-            (SearchEnv(place), NetworkAgent(place), its)
+            (TimeLimit(SearchEnv(place), STEP_LIMIT), NetworkAgent(place), its)
             for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True)
             if its
         ]
@@ -177,16 +177,7 @@ class Evaluation:
         for env, agent, seeds in self._places:
             agent.policy = policy
             for seed in seeds:
-                observation, _ = env.reset(seed=seed)
-                memory: Any = None
-                terminated, info = False, dict[str, Any]()
-                for _ in range(STEP_LIMIT):
-                    action, memory = agent.predict(observation, memory)
-                    observation, _, terminated, _, info = env.step(int(action))
-                    if terminated:
-                        break
-                if not terminated:
-                    charge_truncation(info, env.scenario.give_up_s)
+                info = simulate(env, agent, seed).info
                 times[seed], parked[seed] = float(info["total_s"]), bool(info["parked"])
         found = [times[seed] for seed in self._seeds], [parked[seed] for seed in self._seeds]
         return np.array(found[0]), np.array(found[1])

@@ -47,7 +47,7 @@ class Row:
     def agrees(self) -> bool:
         """Whether what theory expects is in the interval."""
         low, high = self.interval
-        return low <= self.expected <= high
+        return bool(low <= self.expected <= high)
 
     @property
     def exact(self) -> bool:
@@ -74,8 +74,9 @@ Task = Callable[[], list[Row]]
 def certain_row(case: str, expected: float, found: float, source: str, tolerance: float = 0.0) -> Row:
     """Return the row of a case without chance."""
     allowed = max(tolerance, ROUNDING * abs(expected))
+    found = float(found)
     interval = (found - allowed, found + allowed)
-    return Row(case, float(expected), float(found), (found, found), interval, tolerance, source)
+    return Row(case, float(expected), found, (found, found), interval, tolerance, source)
 
 
 def mean_row(case: str, expected: float, samples: ArrayLike, source: str, tolerance: float = 0.0) -> Row:
