@@ -404,6 +404,7 @@ class Raises:
         (lambda: Fleet("mini", drivers=[]), "at least one DriverKind"),
         (lambda: Fleet("mini", drivers=[DriverKind(0.0)]), "all weights are 0"),
         (lambda: DriverKind(weight=-0.1), "DriverKind.weight is -0.1"),
+        (lambda: Fleet("mini", delay_s=math.inf), "delay_s is inf"),
         (lambda: DriverKind(knows="everything"), "DriverKind.knows is 'everything'"),
         (lambda: DriverKind(rule="random"), "want a Rule"),
     ],

@@ -442,3 +442,11 @@ class TestTown:
         done = parkenv("lot", "import", path, "--split", "--least", "50", "--out", tmp_path / "lots")
         assert done.returncode == 2
         assert "in groups of at most 24, want a group of 50" in done.stderr
+        assert not (tmp_path / "lots").exists()
+
+    def test_a_folder_that_cannot_be_made_is_named_before_the_work(self, tmp_path):
+        path = write(tmp_path / "town.geojson", self.town())
+        (tmp_path / "lots").write_text("a file")
+        done = parkenv("lot", "import", path, "--split", "--out", tmp_path / "lots")
+        assert (done.returncode, done.stdout) == (2, "")
+        assert f"--out {tmp_path / 'lots'}: cannot be written" in done.stderr

@@ -9,6 +9,7 @@ from typer import Exit
 
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.evaluation.plurals import plural
@@ -164,7 +165,8 @@ def import_place(
             raise InputError(
                 "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture"
             )
-        _import_town(place, out, options, least)
+        with writing_into(out):
+            _import_town(place, out, options, least)
         return
     check_lot_output(out)
     if picture is not None:
@@ -194,7 +196,6 @@ def import_place(
 
 def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> None:
     """Write every car park of a town, a table of what became of each, and contact sheets."""
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.figures.contact_sheet import save_contact_sheets
     from parkenv.evaluation.lot_survey import survey_lot
     from parkenv.lots import write_lot
@@ -226,7 +227,6 @@ def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> 
                 }
                 lots.append((lot, Provenance(place.name, park.draft.guesses, survey.doubts), survey.doubt))
             rows.append(row)
-    make_folder(out)
     for lot, provenance, _ in lots:
         write_lot(lot, out / f"{lot.name}.geojson", provenance)
     drawn = [(f"{lot.name}\n{lot.n_slots} slots, doubt {doubt:.2f}", lot) for lot, _, doubt in lots]

@@ -14,7 +14,7 @@ from parkenv.files.folder_lock import folder_lock
 def writing_into(out: Path, resumed_by: str | None = None) -> Iterator[None]:
     """Make the folder, and be its only writer during the block; after an interruption, say what is in it.
 
-    A folder made in vain, for a command that turns out to be invalid, is removed.
+    The folder made for a command that turns out to be invalid is removed.
 
     Args:
         out: the folder.

@@ -197,7 +197,7 @@ class OrNumber:
 
 
 class CountsSpec(Spec):
-    """Days of a car park of which the number of free places was counted every hour, laid on the lot."""
+    """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
 
     file: FilePath = Field(
         description="Counts: car_park,capacity,hour,free (or hour_utc) as .csv or .csv.gz."

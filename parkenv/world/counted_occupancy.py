@@ -1,4 +1,4 @@
-"""Worlds that follow the hourly counts of a car park: its days, laid on the slots of a lot."""
+"""Worlds that follow the hourly counts of a car park: its days, replayed on the slots of a lot."""
 
 from __future__ import annotations
 
