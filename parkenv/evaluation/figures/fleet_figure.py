@@ -19,8 +19,9 @@ from parkenv.world.scenario import SearchProblem
 Row = dict[str, Any]
 
 KNOWLEDGE_COLORS = {"own": INK, "shared": "#e69f00", "reserve": "#0072b2", "full": "#009e73"}
-_STYLES = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
-_CLOSED_FORM = "grey: slots looked at in random order"
+_STYLES: tuple[tuple[Any, str], ...] = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
+_GREY = "#999999"
+_CLOSED_FORM = "slots looked at in random order"
 
 
 def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, path: str | Path) -> None:
@@ -58,12 +59,13 @@ def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, p
             Line2D([], [], color="#666666", linestyle=line, marker=marker, markersize=4, label=agent)
             for agent, (line, marker) in zip(agents, _cycled(agents), strict=True)
         ]
+        handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 3 + len(panels)))
         figure.suptitle(title, x=0.01, ha="left")
         save_picture(figure, path, f"{title}: search time, price of anarchy, members and others.")
 
 
-def _cycled(agents: Sequence[str]) -> list[tuple[str, str]]:
+def _cycled(agents: Sequence[str]) -> list[tuple[Any, str]]:
     return [_STYLES[i % len(_STYLES)] for i in range(len(agents))]
 
 
@@ -85,7 +87,7 @@ def _errors(rows: Sequence[Row], name: str) -> np.ndarray:
     """Return the distances of the ends of the 95 % intervals from the means, (2, n)."""
     mean = np.array([row[name] for row in rows])
     ends = np.array([row[f"{name}_ci95"] for row in rows], float).reshape(-1, 2).T
-    return np.nan_to_num(np.abs(ends - mean))
+    return np.asarray(np.nan_to_num(np.abs(ends - mean)))
 
 
 def _draw_search(ax: Axes, rows: Sequence[Row], problem: SearchProblem) -> None:
@@ -94,10 +96,7 @@ def _draw_search(ax: Axes, rows: Sequence[Row], problem: SearchProblem) -> None:
         ax.errorbar(x, [row["search_s"] for row in its], _errors(its, "search_s"), linewidth=1.2, **style)
     low = min(row["occupancy"] for row in rows)
     occupancy = np.linspace(low, 1.0, 200)
-    ax.plot(100.0 * occupancy, looks_s(problem, occupancy), color="#999999", linewidth=1.0)
-    ax.text(
-        0.97, 0.02, _CLOSED_FORM, color="#777777", fontsize=7.5, ha="right", va="bottom", transform=ax.transAxes
-    )  # fmt: skip
+    ax.plot(100.0 * occupancy, looks_s(problem, occupancy), color=_GREY, linewidth=1.0)
     most = max(row["search_s"] for row in rows)
     ax.set(xlabel="mean occupancy, %", ylabel="s", ylim=(0.0, 1.25 * most), title="Search time")
 
