@@ -116,6 +116,11 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     )
     assert rows[0]["price_of_anarchy"] == pytest.approx(expected)
     assert set(MEANS) <= rows[0].keys()
+    assert rows[0]["difference_s"] == 0.0
+    paired = [one["total_s"] - other["total_s"] for one, other in zip(reserve, own, strict=True)]
+    assert rows[1]["difference_s"] == rows[1]["members_difference_s"] == pytest.approx(np.mean(paired))
+    assert math.isnan(rows[1]["others_difference_s"])
+    assert math.isnan(summarize_days(days[1:2])[0]["difference_s"])
     alone = summarize_days(days[:1])
     assert math.isnan(alone[0]["price_of_anarchy"])
 

@@ -28,7 +28,7 @@ def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, p
     """Draw the summary of an experiment.
 
     Panels: search time against occupancy, with the closed form of slots looked at in random order; price of anarchy
-    against demand, if it is known; total time of members and others against their share, if there are several shares.
+    against demand, if it is known; what members and others gain, if there are several shares and `own`.
 
     Args:
         rows: of `summarize_days`.
@@ -45,7 +45,7 @@ def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, p
     panels: list[Callable[[Axes], None]] = [lambda ax: _draw_search(ax, whole, problem)]
     if priced:
         panels.append(lambda ax: _draw_price(ax, priced))
-    if mixed:
+    if mixed and any(row["knows"] == "own" for row in rows):
         panels.append(lambda ax: _draw_shares(ax, rows))
     agents = list(dict.fromkeys(row["agents"] for row in rows))
     known = list(dict.fromkeys(row["knows"] for row in rows))
@@ -129,24 +129,31 @@ def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:
 
 
 def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
-    """Draw the total time of members (filled) and others (hollow) at the greatest demand, of the first agent."""
-    most, agent = max(row["arrivals_per_hour"] for row in rows), rows[0]["agents"]
-    its = [row for row in rows if (row["arrivals_per_hour"], row["agents"]) == (most, agent)]
+    """Draw how much members (filled) and others (hollow) gain or lose, at the demand with the highest price of anarchy.
+
+    Of the first agent; without prices, at the greatest demand.
+    """
+    agent = rows[0]["agents"]
+    its = [row for row in rows if row["agents"] == agent and row["knows"] != "own"]
+    own = [row for row in rows if row["agents"] == agent and row["knows"] == "own"]
+    price = {row["arrivals_per_hour"]: np.nan_to_num(row["price_of_anarchy"]) for row in own}
+    chosen = max(price, key=lambda a: (price[a], a))
+    ax.axhline(0.0, color=KNOWLEDGE_COLORS["own"], linewidth=1.0, linestyle=":")
     for name, color in KNOWLEDGE_COLORS.items():
-        known = sorted((row for row in its if row["knows"] == name), key=lambda row: row["share"])
-        if name == "own" and known:
-            ax.axhline(known[0]["total_s"], color=color, linewidth=1.0, linestyle=":")
-            continue
-        for group, face in (("members_s", color), ("others_s", "white")):
+        known = sorted(
+            (row for row in its if (row["knows"], row["arrivals_per_hour"]) == (name, chosen)),
+            key=lambda row: row["share"],
+        )
+        for group, face in (("members_difference_s", color), ("others_difference_s", "white")):
             there = [row for row in known if np.isfinite(row[group])]
             if there:
                 x, y = [100.0 * row["share"] for row in there], [row[group] for row in there]
                 ax.errorbar(
                     x, y, _errors(there, group), color=color, marker="o", markersize=4, capsize=2,
-                    markerfacecolor=face, linestyle="-" if group == "members_s" else "--", linewidth=1.2,
+                    markerfacecolor=face, linestyle="-" if group[0] == "m" else "--", linewidth=1.2,
                 )  # fmt: skip
     ax.set(
         xlabel="share of members, %",
         ylabel="s",
-        title=f"Total time of members (filled) and others, {most:g}/h",
+        title=f"Change for members (filled) and others, {chosen:g}/h",
     )

@@ -29,6 +29,14 @@ Row = dict[str, Any]
 
 OWN, ASSIGNED = "own", "reserve"
 SAMPLE_S = 300.0  # time between two samples of the occupancy, s
+WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
+"""Measures whose summary has a 95 % interval over days."""
+DIFFERENCES = {
+    "difference_s": "total_s",
+    "members_difference_s": "members_s",
+    "others_difference_s": "others_s",
+}
+"""Columns of paired differences, and the measures that are compared."""
 _RESAMPLES = 9999
 
 
@@ -172,34 +180,49 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
     """Return the summary, a row for each setting, from the days of each.
 
     The *price of anarchy* of a row is the ratio of its mean total time to that of `reserve` for all cars, with the same
-    agents and demand; null where that was not run. Its interval is a bootstrap over days.
+    agents and demand; its interval is a bootstrap over days. Differences are paired: to the mean total time of all cars
+    on the same days if nobody knows more than what it observes. Both are null where the other setting was not run.
     """
     names = ("agents", "knows", "share", "arrivals_per_hour")
-    assigned = {
-        (days[0]["agents"], days[0]["arrivals_per_hour"]): days
-        for days in settings
-        if (days[0]["knows"], days[0]["share"]) == (ASSIGNED, 1.0)
-    }
+    by_setting = {tuple(days[0][name] for name in names): days for days in settings}
+
+    def alike(days: list[Row], knows: str, share: float) -> list[Row] | None:
+        return by_setting.get((days[0]["agents"], knows, share, days[0]["arrivals_per_hour"]))
+
     return [
         {
             **{name: days[0][name] for name in names},
             "days": len(days),
             "cars": sum(day["cars"] for day in days),
             **_means(days),
-            **_price(days, assigned.get((days[0]["agents"], days[0]["arrivals_per_hour"]))),
+            **_differences(days, alike(days, OWN, 0.0)),
+            **_price(days, alike(days, ASSIGNED, 1.0)),
         }
         for days in settings
     ]
+
+
+def _differences(days: list[Row], own: list[Row] | None) -> Row:
+    row: Row = {}
+    for name, column in DIFFERENCES.items():
+        paired = [
+            one[column] - other["total_s"] for one, other in zip(days, own or (), strict=own is not None)
+        ]
+        row[name], low, high = mean_interval([value for value in paired if not math.isnan(value)])
+        row[f"{name}_ci95"] = [low, high]
+    return row
 
 
 def _means(days: list[Row]) -> Row:
     row: Row = {}
     for name in MEANS:
         # On a day without members, or without others, there is no mean of theirs.
-        mean, low, high = mean_interval([day[name] for day in days if not math.isnan(day[name])])
-        row[name] = mean
-        if name in ("total_s", "search_s", "members_s", "others_s"):
+        values = [day[name] for day in days if not math.isnan(day[name])]
+        if name in WITH_INTERVAL:
+            row[name], low, high = mean_interval(values)
             row[f"{name}_ci95"] = [low, high]
+        else:
+            row[name] = float(np.mean(values))
     return row
 
 
