@@ -249,6 +249,7 @@ class Fleet:
         self._keep(work)
         if delay_s > 0.0:
             self._grow_reports()
+        self._memory: dict[int, Any] = {}  # states of the agents of `run`, by car
         self._drive_s: dict[int, NDArray[np.float64]] = {}
 
     def _require(self, background: str, max_steps: int, times: Mapping[str, float]) -> None:
@@ -301,6 +302,7 @@ class Fleet:
             self._counted = self.scenario.occupancy.process_of(arrival.day).record
             record["world"] = self._counted.ctypes.data
         self._write_cars(key, midnight, arrival_s)
+        self._memory.clear()
         begin_world_at(self._address)
 
     def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
@@ -361,7 +363,7 @@ class Fleet:
     # ---- decisions
 
     def run(self, agents: Sequence[Any] | None = None, until: float = math.inf) -> None:
-        """Run the world until all searches are over, or until a time.
+        """Run the world until all searches are over, or until a time; a later call goes on from there.
 
         Args:
             agents: for each kind of driver without a rule an agent with `predict(observation, state)`, None for the
@@ -376,7 +378,7 @@ class Fleet:
         for kind, driver in enumerate(self.drivers):
             if driver.rule is None and (kind >= len(agents) or agents[kind] is None):
                 raise InputError(f"drivers[{kind}] has no rule, want an agent for it in `agents`")
-        memory: dict[int, Any] = {}
+        memory = self._memory
         while (car := self.next_decision(until)) is not None:
             agent = agents[int(self._cars["kind"][car])]
             try:
