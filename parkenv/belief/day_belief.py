@@ -29,10 +29,17 @@ LEVELS, SLOPES = 9, 5
 REACH, FREEDOM = 4.2, 4.0
 """Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
 EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
-"""Fraction of the slots, those nearest to the goal, that an event fills -> its probability among very many slots.
+"""Fraction of the slots, those nearest to the goal, that an event fills -> its probability if very many slots are all
+forecast to be taken.
 
 With higher probabilities the car would turn round after fewer taken slots: sooner on the day of an event, and more
 often without need on other days.
+"""
+MEAN_EXCESS = 0.09
+"""Mean fraction of the slots by which occupancy is above its forecast, where it is; the excess is exponential.
+
+So an event is the less likely the more slots it fills that are forecast to be free. Fitted to the weekday mornings of
+54 German car parks in 2023, with the mean of the last four same weekdays as the forecast.
 """
 HALF_EVENTS_AT = 40.0
 """Number of slots with half the events of very many: small lots fill up on usual days."""
@@ -140,7 +147,8 @@ def _hypotheses(
     error = DayError(*(float(e) for e in day_error))
     n = len(forecast)
     within = np.argsort(np.argsort(-nearness))[:, None] < n * np.array(list(EVENTS))
-    event_weight = np.array(list(EVENTS.values())) * n / (n + HALF_EVENTS_AT)
+    filled = (1.0 - forecast) @ within / n
+    event_weight = np.array(list(EVENTS.values())) * n / (n + HALF_EVENTS_AT) * np.exp(-filled / MEAN_EXCESS)
     at_event = np.maximum(forecast, P_TAKEN_AT_EVENT)
     share = within @ event_weight
     usual = np.maximum((forecast - share * at_event) / (1.0 - share), 0.5 * forecast)
