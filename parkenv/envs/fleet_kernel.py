@@ -15,11 +15,21 @@ from typing import Any
 import numpy as np
 
 from parkenv.envs.event_queue import ARRIVAL, DEPARTURE, REACH, event_at, pop_event, push_event
+from parkenv.envs.fleet_interactions import (
+    block_lane,
+    blocked_until,
+    clear_lanes,
+    hold_slot,
+    release_slot,
+)
+from parkenv.envs.fleet_knowledge import clear_live_map, inform, report_slot, report_view
 from parkenv.envs.fleet_records import (
     BALKED,
     GAVE_UP,
     LEFT,
+    OWN_KNOWLEDGE,
     PARKED,
+    RESERVE_KNOWLEDGE,
     SEARCHING,
     TRUNCATED,
     car_at,
@@ -43,9 +53,12 @@ from parkenv.world.lot import PARK
 from parkenv.world.occupancy_kernel import inlined, kernel
 from parkenv.world.pointers import call_at, int64s
 
-FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION = -1, -2, -3, -4, -5
+FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS = range(
+    -1, -8, -1
+)
 """Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records are
-needed; Python must compute the forecast of the car `pending`; a compiled driver chose an unknown action."""
+needed; Python must compute the forecast of the car `pending`; a compiled driver chose an unknown action; more room for
+reports is needed; Python must reserve slots."""
 
 LEAVE = -1
 """Action of compiled drivers: give up and park elsewhere."""
@@ -62,6 +75,8 @@ def begin_world_at(address: int) -> None:
     """Begin the world of a FLEET record whose cars are due."""
     fleet = fleet_at(address, 0)
     empty_shared_slots(fleet)
+    clear_live_map(fleet)
+    clear_lanes(fleet)
     fleet.time = fleet.arrival
     fleet.n_events = fleet.event_number = fleet.next_car = 0
     fleet.first_ready = fleet.n_ready = 0
@@ -83,13 +98,17 @@ def advance_at(address: int, until: float) -> int:
     """
     fleet = fleet_at(address, 0)
     while True:
+        if fleet.report_capacity > 0 and fleet.n_reports + fleet.n_slots >= fleet.report_capacity:
+            return NEEDS_REPORTS
         if not (fleet.next_car < fleet.n_cars or fleet.n_events > 0) and fleet.n_ready == 0:
             break
         if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
             number = int64s(fleet.ready)[fleet.first_ready]
             car = car_at(fleet.cars, number)
             if car.rule == 0 or car.state != SEARCHING:
-                return int(number)
+                return NEEDS_RESERVATIONS if _lacks_reservation(fleet, car) else int(number)
+            if _lacks_reservation(fleet, car):
+                return NEEDS_RESERVATIONS
             if not act(fleet, number, call_at(car.rule, address, number)):
                 return WRONG_ACTION
             continue
@@ -127,7 +146,20 @@ def init_forecast_at(address: int) -> None:
     search = search_at(car_at(fleet.cars, fleet.pending).search, 0)
     if search.belief != 0:
         init_prior(search)
+    _inform(fleet, fleet.pending)
     fleet.pending = NO_CAR
+
+
+@kernel
+def inform_reserving_at(address: int) -> None:
+    """After slots have been reserved: tell the cars that are to decide."""
+    fleet = fleet_at(address, 0)
+    fleet.reservations_stale = False
+    for i in range(fleet.n_ready):
+        number = int64s(fleet.ready)[(fleet.first_ready + i) % fleet.n_cars]
+        car = car_at(fleet.cars, number)
+        if car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING:
+            _inform(fleet, number)
 
 
 # ---- events
@@ -158,6 +190,7 @@ def _next_event(fleet: Any) -> int:
             return int(_arrive(fleet))
     event = event_at(fleet.events, 0)
     _pass_time(fleet, event.time)
+    fleet.reservations_stale = True
     kind = event.kind
     number = pop_event(fleet)
     if kind == DEPARTURE:
@@ -184,9 +217,11 @@ def _arrive(fleet: Any) -> int:
     fleet.n_free -= 1
     car.search = int64s(fleet.free_searches)[fleet.n_free]
     car.moves = int64s(fleet.free_moves)[fleet.n_free]
-    car.target, car.n_moves = NO_CAR, 0
+    car.target, car.n_moves, car.reserved, car.informed_until = NO_CAR, 0, NO_CAR, -np.inf
+    fleet.reservations_stale = True
     search = search_at(car.search, 0)
-    search.place = car.place
+    search.place, search.car = car.place, number
+    car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
     search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
     enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
     car.state = SEARCHING
@@ -198,6 +233,7 @@ def _arrive(fleet: Any) -> int:
         return NEEDS_FORECAST
     if search.belief != 0:
         init_prior(search)
+    _inform(fleet, number)
     return 0
 
 
@@ -206,7 +242,15 @@ def _reach(fleet: Any, number: int) -> None:
     """End the step of a car: it observes, and is asked again unless its search is over."""
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
+    until = blocked_until(fleet, car, number)
+    if until > fleet.time:
+        _queue(fleet, car, search, number, until)
+        return
     observe(search)
+    if car.shares:
+        report_view(fleet, search)
+    if car.knows != OWN_KNOWLEDGE and car.knows != RESERVE_KNOWLEDGE:
+        inform(fleet, number)
     _complete_step(search)
     if search.over:
         _end_search(fleet, number, GAVE_UP)
@@ -220,6 +264,19 @@ def _reach(fleet: Any, number: int) -> None:
 
 
 @inlined
+def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None:
+    """Let a car wait before a blocked vertex until a time, s."""
+    before = search.step_drive_s
+    search.step_drive_s += until - fleet.time
+    search.time = until
+    if fleet.tick_s > 0.0:
+        _round_up(fleet, search)
+    car.queued_s += search.step_drive_s - before
+    block_lane(fleet, search.previous_vertex, search.time, number)
+    push_event(fleet, search.time, REACH, number)
+
+
+@inlined
 def _complete_step(search: Any) -> None:
     finish_step(search)
     if search.belief != 0:
@@ -228,9 +285,29 @@ def _complete_step(search: Any) -> None:
 
 
 @inlined
+def _inform(fleet: Any, number: int) -> None:
+    """Give a car what it knows beyond its own observations, and refresh its belief."""
+    car = car_at(fleet.cars, number)
+    if car.knows != OWN_KNOWLEDGE:
+        search = search_at(car.search, 0)
+        inform(fleet, number)
+        if search.belief != 0:
+            refresh_belief(search)
+
+
+@inlined
+def _lacks_reservation(fleet: Any, car: Any) -> bool:
+    """Return whether slots must be reserved anew before a car decides."""
+    return bool(fleet.reservations_stale and car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING)
+
+
+@inlined
 def _depart(fleet: Any, number: int) -> None:
     car = car_at(fleet.cars, number)
     shared_slot_at(fleet.slots, car.slot).car = NO_CAR
+    block_lane(fleet, car.slot, fleet.time + fleet.manoeuvre_s, number)
+    if car.shares:
+        report_slot(fleet, car.slot, False, 0.0)
     car.state, car.left_at = LEFT, fleet.time
     fleet.n_parked -= 1
     fleet.n_gone += 1
@@ -248,6 +325,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         return False
     _first_ready(fleet)
     fleet.n_decisions += 1
+    fleet.reservations_stale = True
     if action == LEAVE:
         search.step_drive_s = search.step_failed_s = search.step_walk_s = search.step_parking_cost_s = 0.0
         search.step_gave_up_s = 0.0
@@ -258,15 +336,25 @@ def act(fleet: Any, number: int, action: int) -> bool:
         search.vertex = action - TAKE_SLOT
         action = PARK
     drive_or_park(search, action)
+    car.stands, car.vertex = search.vertex == car.vertex, search.vertex
     if search.parked:
         _complete_step(search)
-        shared_slot_at(fleet.slots, search.vertex).car = number
+        shared = shared_slot_at(fleet.slots, search.vertex)
+        shared.car, shared.leaves_at = number, fleet.time + car.stay_s
+        block_lane(fleet, search.vertex, fleet.time + fleet.manoeuvre_s, number)
         car.slot = search.vertex
+        if car.shares:
+            report_slot(fleet, car.slot, True, 1.0)
         _end_search(fleet, number, PARKED)
         push_event(fleet, fleet.time + car.stay_s, DEPARTURE, number)
         return True
     if fleet.tick_s > 0.0:
         _round_up(fleet, search)
+    if car.stands:
+        hold_slot(fleet, car, number)
+        block_lane(fleet, search.vertex, search.time, number)
+    else:
+        release_slot(fleet, car)
     push_event(fleet, search.time, REACH, number)
     return True
 
@@ -294,6 +382,7 @@ def _end_search(fleet: Any, number: int, state: int) -> None:
     car.parking_cost_s, car.gave_up_s = search.parking_cost_s, search.gave_up_s
     car.driven_m, car.walked_m = search.driven_m, search.walked_m
     car.failed_parks, car.slots_passed, car.n_steps = search.failed_parks, search.slots_passed, search.n_steps
+    release_slot(fleet, car)
     fleet.n_searching -= 1
     if state == PARKED:
         fleet.n_parked += 1
@@ -312,7 +401,6 @@ def _make_ready(fleet: Any, number: int) -> None:
     """Add a car to the end of the queue."""
     int64s(fleet.ready)[(fleet.first_ready + fleet.n_ready) % fleet.n_cars] = number
     fleet.n_ready += 1
-    car_at(fleet.cars, number).ready = True
 
 
 @inlined
@@ -321,7 +409,6 @@ def _first_ready(fleet: Any) -> Any:
     number = int64s(fleet.ready)[fleet.first_ready]
     fleet.first_ready = (fleet.first_ready + 1) % fleet.n_cars
     fleet.n_ready -= 1
-    car_at(fleet.cars, number).ready = False
     return number
 
 

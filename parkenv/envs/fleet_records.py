@@ -13,9 +13,10 @@ DUE, SEARCHING, PARKED, LEFT, GAVE_UP, BALKED, TRUNCATED = range(7)
 """States of a car: not yet arrived; searching; parked; has left its slot; went elsewhere because the lot was proven
 full; went elsewhere because its patience was at an end; ended by the limit of steps."""
 
-KNOWLEDGE = ("own",)
-OWN_KNOWLEDGE = 0
-"""What a car knows of the slots: its own observations."""
+KNOWLEDGE = ("own", "shared", "reserve", "full")
+OWN_KNOWLEDGE, SHARED_KNOWLEDGE, RESERVE_KNOWLEDGE, FULL_KNOWLEDGE = range(4)
+"""What a car knows of the slots: its own observations; also those on the live map; the slot that the guidance system
+has reserved for it; the true state of every slot."""
 
 CAR_METRICS = (
     "drive_s",
@@ -44,14 +45,22 @@ CAR = np.dtype(
         # The driver: address of the compiled decide function, or 0 if Python decides; what it knows.
         ("rule", ADDRESS),
         ("knows", np.int64),
+        # Whether it reports to the live map; until when it knows that map, s; the slot reserved for it, or -1.
+        ("shares", np.bool_),
+        ("informed_until", np.float64),
+        ("reserved", np.int64),
         # One of the states above; the slot, or -1; when the search ended and when the car left its slot, s since Monday
         # 00:00, infinite before.
         ("state", np.int64),
         ("slot", np.int64),
         ("ended_at", np.float64),
         ("left_at", np.float64),
-        # Whether it waits in the queue of the cars to decide.
-        ("ready", np.bool_),
+        # Where it is, or is driving to, while it searches; whether it stands there, in a failed attempt or a wait; time
+        # spent in queues, s, part of `drive_s`; the slot that it holds, or -1.
+        ("vertex", np.int64),
+        ("stands", np.bool_),
+        ("queued_s", np.float64),
+        ("holds", np.int64),
         # Sums of the search, complete when it has ended.
         ("drive_s", np.float64),
         ("failed_s", np.float64),
@@ -73,6 +82,14 @@ CAR = np.dtype(
     align=True,
 )
 """A car of the fleet."""
+
+LIVE_SLOT = np.dtype([("time", np.float64), ("taken", np.bool_), ("p", np.float64)], align=True)
+"""A slot on the live map: time of the last report, s, before all others without one; what it says; P(taken) then."""
+
+REPORT = np.dtype(
+    [("time", np.float64), ("slot", np.int64), ("taken", np.bool_), ("p", np.float64)], align=True
+)
+"""A report for the live map."""
 
 FLEET = np.dtype(
     [
@@ -107,6 +124,23 @@ FLEET = np.dtype(
         ("n_decisions", np.int64),
         ("searching_s", np.float64),
         ("parked_s", np.float64),
+        # Blocked lanes: length of a manoeuvre, s, 0 without blocking; by vertex, (n_vertices,): until when, s, float64,
+        # and by which car, int64. For how long before they leave cars show it, s.
+        ("manoeuvre_s", np.float64),
+        ("n_vertices", np.int64),
+        ("blocked_until", ADDRESS),
+        ("blocked_by", ADDRESS),
+        ("leaving_soon_s", np.float64),
+        # The live map: (n_slots,) LIVE_SLOT; its delay, s; a ring of REPORT records that are not on it yet: its size,
+        # the first, and how many there are.
+        ("live_map", ADDRESS),
+        ("delay_s", np.float64),
+        ("reports", ADDRESS),
+        ("report_capacity", np.int64),
+        ("first_report", np.int64),
+        ("n_reports", np.int64),
+        # Whether something has happened since slots were last reserved.
+        ("reservations_stale", np.bool_),
         # For compiled drivers, by place: (n_slots,) int64 slots by cost of arrival; float64 median of that cost, s.
         ("by_cost", ADDRESS),
         ("median_cost_s", ADDRESS),
@@ -123,3 +157,4 @@ FLEET = np.dtype(
 """A world with many cars; `arrival` is when it begins, s since Monday 00:00."""
 
 car_at, fleet_at = record_at(CAR), record_at(FLEET)
+live_slot_at, report_at = record_at(LIVE_SLOT), record_at(REPORT)

@@ -34,7 +34,7 @@ from parkenv.envs.search_records import (
     search_at,
     slot_at,
 )
-from parkenv.envs.shared_slots import is_shared_slot_taken
+from parkenv.envs.shared_slots import is_slot_open
 from parkenv.world import occupancy_kernel as worlds
 from parkenv.world.keyed_random import (
     ARRIVAL_STREAM,
@@ -340,7 +340,7 @@ def drive_or_park(search: Any, action: int) -> None:
 def finish_step(search: Any) -> None:
     """Add the step to the episode; give up if every slot was last observed taken."""
     scenario = scenario_at(search.scenario, 0)
-    full = search.n_last_observed_taken == scenario.n_slots
+    full = search.n_last_observed_taken == scenario.n_slots and scenario.leave_full_lot
     search.step_gave_up_s = scenario.give_up_s if full else 0.0
     search.over = full or search.parked
     search.drive_s += search.step_drive_s
@@ -445,9 +445,15 @@ def mark_passed(search: Any) -> None:
 # ---- the belief
 
 
-@kernel
+@inlined
 def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None:
     """Set P(taken) of a slot to `p` after an observation at the current time."""
+    set_belief_of(search, column, observed_taken, p, search.time)
+
+
+@kernel
+def set_belief_of(search: Any, column: int, observed_taken: bool, p: float, time: float) -> None:
+    """Set P(taken) of a slot to `p` after an observation at a time, s, not before the arrival."""
     record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
     block = block_at(search.blocks, column >> BLOCK_BITS)
     if not record.observed:
@@ -457,11 +463,11 @@ def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None
         search.n_expected_free += 1.0 - block.prior[i]
     search.n_last_observed_taken += int(observed_taken) - int(record.observed_taken)
     record.observed_taken = observed_taken
-    block.p_observed[i], block.observed_at[i] = p, search.time
+    block.p_observed[i], block.observed_at[i] = p, time
     if search.belief != 0:
         belief, width = float32s(search.belief), search.width
         belief[P_OBSERVED * width + record.slot] = p
-        belief[OBSERVED_AT * width + record.slot] = search.time - search.arrival
+        belief[OBSERVED_AT * width + record.slot] = time - search.arrival
 
 
 @inlined
@@ -543,7 +549,7 @@ def find_state(search: Any, record: Any, time: float) -> None:
         worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
     elif scenario.world_kind == SHARED_KIND:
         # Another car may change it at any time, so `valid_until` stays 0.
-        record.occupied = is_shared_slot_taken(search.process, slot, time)
+        record.occupied = not is_slot_open(search.process, slot, search.car, time)
     else:
         worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
 

@@ -40,6 +40,8 @@ SCENARIO = np.dtype(
         ("exact_sensor", np.bool_),
         ("failure_s", np.float64),
         ("give_up_s", np.float64),
+        # Whether a search ends once every slot was last observed taken.
+        ("leave_full_lot", np.bool_),
         # Arrival window and entries: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
         ("window_start", np.float64),
         ("window_end", np.float64),
@@ -139,6 +141,8 @@ SEARCH = np.dtype(
         # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
         ("scenarios", ADDRESS),
         ("n_places", np.int64),
+        # Number of the car in its fleet, where slots are shared.
+        ("car", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
         # record of the world, if it is a process, or SHARED_WORLD record.
@@ -263,6 +267,7 @@ class ScenarioRecords:
             "exact_sensor": scenario.sensor_model.perfect,
             "failure_s": scenario.failure_s,
             "give_up_s": scenario.give_up_s,
+            "leave_full_lot": True,
             "window_start": scenario.arrival.start_s,
             "window_end": scenario.arrival.end_s,
             "n_entries": len(entries),

@@ -1,0 +1,182 @@
+"""What cars of a fleet know: the live map, reservations, everything; and mixed fleets."""
+
+import math
+from itertools import permutations
+
+import numpy as np
+import pytest
+
+import parkenv
+from parkenv.envs.fleet import DriverKind, Fleet, drive_times, total_s
+from parkenv.envs.fleet_rules import RULES
+from parkenv.world.demand import (
+    ConstantTime,
+    Demand,
+    ExponentialTime,
+    Headways,
+    ListedArrivals,
+    PoissonArrivals,
+)
+from planners.agent import make_agent
+
+TWO = Demand(ListedArrivals((36000.0, 36060.0)))
+
+
+def second_arrives(fleet, seed=0):
+    """Let the first car drive past slots until the second arrives; return what the second then knows of the slots."""
+    fleet.reset(seed)
+    viewed = set()
+    while (car := fleet.next_decision()) != 1:
+        observation = fleet.observation(car)
+        vertex = int(observation["vertex"])
+        if observation["time"][1] > 0:
+            viewed |= set(fleet.scenario.in_view(vertex))
+        moves = np.flatnonzero(observation["action_mask"][:4])
+        fleet.act(moves[0] if len(viewed) % 2 else moves[-1])
+    return viewed, fleet.observation(1)["belief"].reshape(4, -1)
+
+
+@pytest.mark.parametrize("knows", ["own", "shared"])
+@pytest.mark.parametrize("shares", [False, True])
+@pytest.mark.parametrize("delay_s", [0.0, 1e5])
+def test_the_live_map_holds_what_sharing_cars_have_observed(knows, shares, delay_s):
+    fleet = Fleet("campus", TWO, drivers=[DriverKind(knows=knows, shares=shares)], delay_s=delay_s)
+    viewed, (forecast, _, p_observed, observed_at) = second_arrives(fleet)
+    assert viewed
+    known = set(np.flatnonzero(observed_at >= 0.0))
+    assert known == (viewed if knows == "shared" and shares and delay_s == 0.0 else set())
+    taken = fleet.taken()
+    for slot in known:
+        # A minute old at most: nearly certain.
+        assert abs(p_observed[slot] - taken[slot]) < 0.1 or forecast[slot] == p_observed[slot]
+
+
+def test_reports_arrive_after_their_delay():
+    known = {}
+    for delay_s in (0.0, 30.0, 45.0, 60.0):
+        fleet = Fleet("campus", TWO, drivers=[DriverKind(knows="shared", shares=True)], delay_s=delay_s)
+        _, parts = second_arrives(fleet)
+        known[delay_s] = set(np.flatnonzero(parts[3] >= 0.0))
+    assert known[0.0] > known[30.0] > known[45.0] >= known[60.0]
+
+
+def test_many_reports_wait_for_their_delay():
+    demand = Demand(PoissonArrivals(400.0, 36000.0, 43200.0), ExponentialTime(600.0), ConstantTime(600.0))
+    kinds = [DriverKind(rule=RULES["random"], knows="shared", shares=True)]
+    fleet = Fleet("mini", demand, drivers=kinds, delay_s=1800.0)
+    fleet.reset(0)
+    fleet.run()
+    assert fleet.records["report_capacity"][0] > 4096
+    assert fleet.records["n_reports"][0] < fleet.records["report_capacity"][0]
+
+
+def test_full_knowledge_is_the_truth_at_every_decision():
+    fleet = Fleet("campus", Demand(Headways(8, 5.0), ConstantTime(60.0)), drivers=[DriverKind(knows="full")])
+    fleet.reset(1)
+    rng = np.random.default_rng(0)
+    for _ in range(200):
+        car = fleet.next_decision()
+        if car is None:
+            break
+        observation = fleet.observation(car)
+        np.testing.assert_array_equal(observation["p_occupied"] == 1.0, fleet.taken())
+        fleet.act(rng.choice(np.flatnonzero(observation["action_mask"])))
+
+
+def test_reservations_are_exclusive_and_cost_the_least_in_total():
+    fleet = Fleet("mini", Demand(Headways(3, 1.0)), background="none", drivers=[DriverKind(knows="reserve")])
+    agent, memory, together = make_agent("greedy-drive", fleet.scenario), {}, 0
+    fleet.reset(0)
+    while (car := fleet.next_decision()) is not None:
+        cars = np.flatnonzero(fleet.cars["state"] == 1)
+        reserved = fleet.cars["reserved"][cars]
+        assert len(set(reserved)) == len(cars)
+        assert (reserved >= 0).all()
+        observation = fleet.observation(car)
+        assert np.flatnonzero(observation["p_occupied"] == 0.0).tolist() == [fleet.cars["reserved"][car]]
+        if len(cars) > 1:
+            together += 1
+            cost = np.array([fleet._time_to_slots(int(one)) for one in cars])
+            cost[:, fleet.taken()] = np.inf
+            least = min(
+                sum(cost[i, slot] for i, slot in enumerate(slots))
+                for slots in permutations(range(fleet.scenario.lot.n_slots), len(cars))
+            )
+            assert cost[np.arange(len(cars)), reserved].sum() == pytest.approx(least)
+        action, memory[car] = agent.predict(observation, memory.get(car))
+        fleet.act(action)
+    assert together > 3
+    assert (fleet.cars["failed_parks"] == 0).all()
+
+
+@pytest.mark.parametrize("name", ["belief", "mdp", "greedy-goal", "first-free"])
+def test_every_agent_drives_to_its_reserved_slot(name):
+    fleet = Fleet("campus", Demand(Headways(6, 20.0)), drivers=[DriverKind(knows="reserve")])
+    fleet.reset(3)
+    fleet.run([make_agent(name, fleet.scenario)])
+    assert set(fleet.state_names()) <= {"parked", "left"}
+    assert (fleet.cars["failed_parks"] == 0).all()
+
+
+def means(knows, demand, **options):
+    kinds = [DriverKind(rule=RULES["first-free"], knows=knows, shares=True)]
+    fleet = Fleet("campus", demand, drivers=kinds, leave_full_lot=False, **options)
+    found = []
+    for seed in range(12):
+        fleet.reset(seed)
+        fleet.run()
+        found.append(total_s(fleet.cars).mean())
+    return np.mean(found)
+
+
+def test_knowing_more_helps_and_guidance_helps_most():
+    demand = Demand(PoissonArrivals(120.0, 32400.0, 36000.0), ExponentialTime(3600.0), ConstantTime(900.0))
+    own, late, shared, full, reserve = (
+        means("own", demand),
+        means("shared", demand, delay_s=120.0),
+        means("shared", demand),
+        means("full", demand),
+        means("reserve", demand),
+    )
+    assert own > late > shared > full > reserve
+
+
+def test_others_may_take_a_reserved_slot():
+    demand = Demand(PoissonArrivals(240.0, 32400.0, 36000.0), ExponentialTime(3600.0), ConstantTime(600.0))
+    kinds = [
+        DriverKind(0.5, RULES["greedy-drive"], knows="reserve"),
+        DriverKind(0.5, RULES["greedy-drive"]),
+    ]
+    fleet = Fleet("campus", demand, drivers=kinds, leave_full_lot=False)
+    fleet.reset(0)
+    fleet.run()
+    members = fleet.cars["kind"] == 0
+    parked = fleet.cars["slot"] >= 0
+    assert (parked & members).any()
+    assert (parked & ~members).any()
+
+
+@pytest.mark.parametrize("knows", ["own", "full", "reserve"])
+def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
+    demand = Demand(Headways(25, 1.0), ConstantTime(math.inf), ConstantTime(300.0))
+    kinds = [DriverKind(rule=RULES["greedy-drive"], knows=knows)]
+    searched = {}
+    for leave in (True, False):
+        fleet = Fleet("mini", demand, background="none", drivers=kinds, leave_full_lot=leave)
+        fleet.reset(0)
+        fleet.run()
+        names = np.array(fleet.state_names())
+        n = fleet.scenario.lot.n_slots
+        assert (names == "parked").sum() == n
+        assert (names == ("gave_up" if leave else "balked")).sum() == 25 - n
+        without = names != "parked"
+        searched[leave] = (fleet.cars["ended_at"] - fleet.cars["arrival"])[without].mean()
+    assert searched[True] < 300.0 <= searched[False]
+
+
+def test_drive_times_are_those_of_the_routes_of_agents():
+    from planners.routes import DriveRoutes
+
+    scenario = parkenv.make_scenario("campus")
+    expected = DriveRoutes(scenario).seconds_from(100)[: scenario.lot.n_slots]
+    np.testing.assert_allclose(drive_times(scenario, 100), expected)
