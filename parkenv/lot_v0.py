@@ -64,7 +64,7 @@ class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo 
 
     ## Observation space
     The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `day_error`, `action_mask`. It holds
-    what the car itself has observed, and its forecast for its own arrival.
+    what the car knows, by default what it has observed itself, and its forecast for its own arrival.
 
     ## Rewards
     Minus the duration of a car's step, s, as in `parkenv/Search-v2`, given when the step is over; parking also
@@ -93,6 +93,15 @@ class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo 
       the scenario's occupancy all day; `none`.
     - `max_cycles`: limit of a car's decisions.
     - `render_mode`: `rgb_array` (480, 640, 3) or `human` (needs the extra `human`).
+    - `knows`: what cars know of the slots besides the forecast: `own`, their own observations; `shared`, those of all
+      cars, `delay_s` later; `reserve`, the slot that a guidance system reserves for them; `full`, every slot.
+    - `leave_full_lot`: whether a car that knows every slot to be taken gives up at once; otherwise at the end of its
+      patience.
+    - `manoeuvre_s`: above 0, cars that park, leave or stand block their lane, and queues form.
+    - `leaving_soon_s`: above 0, cars show for that time that they leave, in a further key of the observation,
+      `leaving`, and a car that stands before such a slot holds it.
+    - `sees_cars`: whether observations have the key `cars`: the other cars in view. `parkenv.envs.fleet.Fleet`
+      describes these options and keys.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.
 
     ```python
@@ -127,10 +136,13 @@ class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo 
         background: str = "residents",
         max_cycles: int = MAX_CYCLES,
         render_mode: str | None = None,
+        knows: str = "own",
         **changes: Any,
     ) -> None:
         super().__init__()
-        self._cars = FleetAgents(scenario, cars, demand, background, max_cycles, 0.0, render_mode, changes)
+        self._cars = FleetAgents(
+            scenario, cars, demand, background, max_cycles, 0.0, render_mode, knows, changes
+        )
         self.render_mode = render_mode
         self.possible_agents = self._cars.possible_agents
         self.agents: list[str] = []
@@ -230,14 +242,15 @@ class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
     (terminated), and all leave them after `max_cycles` ticks (truncated).
 
     Args:
-        scenario: as of `LotEnv`, as are `cars`, `demand`, `background`, `render_mode` and further keywords.
+        scenario: as of `LotEnv`, as are `cars`, `demand`, `background`, `render_mode`, `knows` and further keywords.
         cars: number of cars.
         tick_s: length of a tick, s.
         demand: demand instead of `cars`.
         background: who else takes slots.
         max_cycles: number of ticks after which all cars are truncated.
         render_mode: `rgb_array`, `human` or None.
-        changes: fields of the scenario to replace.
+        knows: what cars know.
+        changes: further options, and fields of the scenario to replace.
 
     Examples:
         >>> from parkenv import lot_v0
@@ -258,11 +271,14 @@ class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
         background: str = "residents",
         max_cycles: int = MAX_CYCLES,
         render_mode: str | None = None,
+        knows: str = "own",
         **changes: Any,
     ) -> None:
         if not tick_s > 0.0:
             raise InputError(f"tick_s is {tick_s!r}, want a finite number above 0")
-        self._cars = FleetAgents(scenario, cars, demand, background, max_cycles, tick_s, render_mode, changes)
+        self._cars = FleetAgents(
+            scenario, cars, demand, background, max_cycles, tick_s, render_mode, knows, changes
+        )
         self.render_mode = render_mode
         self.tick_s, self.max_cycles = float(tick_s), max_cycles
         self.possible_agents = self._cars.possible_agents

@@ -85,6 +85,15 @@ def test_an_unknown_part_is_named():
     assert "no part 'engine' to measure; known: sensors, perception, planning, env" in str(result.exception)
 
 
+def test_days_of_fleets_are_measured():
+    from parkenv.evaluation.bench.fleet import fleet_rows
+
+    rows = fleet_rows(seed=0, seconds=0.0, worlds=2, large=400, day_cars=20, growth=(5,))
+    assert all(row["value"] > 0 for row in rows)
+    parts = [row["part"] for row in rows]
+    assert parts == ["decisions"] * 2 + ["day", "memory"] * 4 + ["growth"] * 2
+
+
 def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
     from parkenv.evaluation.bench import env as bench_env
 

@@ -90,7 +90,7 @@ def assert_same(one, other):
         np.testing.assert_array_equal(one[key], other[key], strict=True)
 
 
-def random_fleet(lot_seed, n_cars, background, kinds, stay_s, patience_s, tick_s, seed):
+def random_fleet(lot_seed, n_cars, background, kinds, stay_s, patience_s, options, seed):
     problem, p, _ = small_lot(lot_seed)
     process = OccupancyProcess.from_demand(np.log(p / (1 - p)), np.zeros(168), 900.0)
     fields = {
@@ -98,20 +98,36 @@ def random_fleet(lot_seed, n_cars, background, kinds, stay_s, patience_s, tick_s
     }
     scenario = Scenario(**fields, name="small", occupancy=process)
     demand = Demand(Headways(n_cars, 20.0), ExponentialTime(stay_s), ConstantTime(patience_s))
-    drivers = [DriverKind(rule=RULES.get(kind)) for kind in kinds]
-    fleet = Fleet(scenario, demand, background=background, drivers=drivers, max_steps=60, tick_s=tick_s)
+    drivers = [DriverKind(rule=RULES.get(kind), knows=knows, shares=shares) for kind, knows, shares in kinds]
+    fleet = Fleet(scenario, demand, background=background, drivers=drivers, max_steps=60, **options)
     fleet.reset(seed)
     return fleet
 
 
+kinds_of_drivers = st.tuples(
+    st.sampled_from([*RULES, "python"]),
+    st.sampled_from(["own", "shared", "reserve", "full"]),
+    st.booleans(),
+)
+some_options = st.fixed_dictionaries(
+    {},
+    optional={
+        "tick_s": st.sampled_from([0.3, 1.0]),
+        "delay_s": st.sampled_from([5.0, 600.0]),
+        "leave_full_lot": st.just(False),
+        "manoeuvre_s": st.sampled_from([3.0, 40.0]),
+        "leaving_soon_s": st.sampled_from([2.0, 30.0]),
+        "sees_cars": st.just(True),
+    },
+)
 fleets = st.tuples(
     st.integers(0, 323),
     st.integers(1, 30),
     st.sampled_from(["process", "residents", "none"]),
-    st.lists(st.sampled_from([*RULES, "python"]), min_size=1, max_size=3),
+    st.lists(kinds_of_drivers, min_size=1, max_size=3),
     st.sampled_from([30.0, 600.0, 1e5]),
     st.sampled_from([40.0, math.inf]),
-    st.sampled_from([0.0, 1.0]),
+    some_options,
     st.integers(0, 1000),
 )
 
@@ -132,13 +148,15 @@ def check_state(fleet, time):
     return fleet.time
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(fleets, st.data())
 def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(arguments, data):
     fleet, time = random_fleet(*arguments), -math.inf
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
-    while fleet.next_decision() is not None:
+    while (car := fleet.next_decision()) is not None:
         time = check_state(fleet, time)
+        if time == int(time) or rng.random() < 0.1:
+            assert fleet.observation_space.contains(fleet.observation(car))
         fleet.act(rng.integers(5))
     time = check_state(fleet, time)
     assert fleet.totals["due"] == fleet.totals["searching"] == 0
@@ -168,7 +186,7 @@ def test_little_s_law_holds_exactly(arguments):
 @given(fleets)
 def test_equal_seeds_give_equal_runs_and_demand_does_not_depend_on_drivers(arguments):
     runs = []
-    for background, kinds in ((None, None), (None, None), ("none", ["random"])):
+    for background, kinds in ((None, None), (None, None), ("none", [("random", "own", False)])):
         changed = list(arguments)
         changed[2], changed[3] = background or arguments[2], kinds or arguments[3]
         fleet = random_fleet(*changed)

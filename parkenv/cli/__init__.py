@@ -25,6 +25,7 @@ from parkenv.cli import (
     compare,
     demo,
     detect,
+    fleet,
     lot,
     occupancy,
     park,
@@ -61,6 +62,7 @@ add(app, "demo", demo.demo, START)
 add(app, "compare", compare.compare, SEARCH)
 add(app, "report", report.report, SEARCH)
 add(app, "commute", commute.commute, SEARCH)
+add(app, "fleet", fleet.fleet, SEARCH)
 add(app, "plan", plan.plan, SEARCH)
 add(app, "train", train.train, SEARCH)
 add(app, "publish", publish.publish, SEARCH)

@@ -18,6 +18,7 @@ PARTS = {
     "planning": "planning_rows",
     "env": "env_rows",
     "drive": "drive_rows",
+    "fleet": "fleet_rows",
 }
 """Modules of `parkenv.evaluation.bench`, and the function of each that measures."""
 
@@ -38,7 +39,7 @@ def bench(
         parkenv bench --seconds 2 --out results/bench
 
     Options:
-        parts (PART): Some of sensors, perception, planning, env, drive.  [default: all]
+        parts (PART): Some of sensors, perception, planning, env, drive, fleet.  [default: all]
         seconds (0.01 <= X <= 3600): How long each figure is measured.
         seed (N >= 0): Of the lots and the noise.
         out, -o (DIR): Folder for summary.json, and a table of each part for a page.  [default: none]

@@ -57,6 +57,7 @@ from parkenv.world.week import DAY_S, hour_of_week
 
 _FIRST_CHUNK = 16
 _UNREACHABLE_S = 1e9
+_MOST_SEEN = 127  # cars at a vertex, as observed
 MAX_STEPS = 2000
 """Default limit of a car's decisions, as in `parkenv/Search-v2`."""
 
@@ -131,6 +132,18 @@ class Fleet:
     `reserve`, all other slots are taken; others do not know of reservations and may be first. A car that knows every
     slot to be taken gives up, unless `leave_full_lot` is False.
 
+    Cars pass through each other, unless `manoeuvre_s` is above 0. Then a car that parks, or leaves its slot, blocks the
+    lane before it for that time, and a car that stands there blocks it, too; cars that reach it wait in a queue, which
+    may grow back to the entry. (Residents leave without blocking.) With `leaving_soon_s` above 0, cars of the fleet and
+    residents show for that time that they leave, and a car that stands before such a slot, in a failed attempt or a
+    wait, holds it until it drives on: the others' attempts fail. A car sees lights and other cars within the view range
+    of its sensor, in further keys of the observation:
+
+    | Key | Space | Meaning | with |
+    |-----|-------|---------|------|
+    | `leaving` | `Box(0, 1, (n_slots,), int8)` | slots in view whose cars leave soon | `leaving_soon_s` |
+    | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
+
     With one car, `Demand(Headways(1))` and the background `process`, the fleet is `parkenv/Search-v2` to the last bit.
 
     Args:
@@ -145,6 +158,9 @@ class Fleet:
         delay_s: time after which a report is on the live map, s.
         leave_full_lot: whether a car gives up once it knows every slot to be taken; otherwise it searches on until its
             patience is at an end. An informed car knows it at once, so compare kinds of knowledge with False.
+        manoeuvre_s: time for which a car that parks or leaves blocks its lane, s; 0: nobody blocks a lane.
+        leaving_soon_s: for how long before they leave cars show it, s.
+        sees_cars: whether observations hold the other cars in view.
 
     Attributes:
         scenarios: the scenarios of the cars, one for each goal with a weight; `cars["place"]` are indices into it.
@@ -174,11 +190,20 @@ class Fleet:
         tick_s: float = 0.0,
         delay_s: float = 0.0,
         leave_full_lot: bool = True,
+        manoeuvre_s: float = 0.0,
+        leaving_soon_s: float = 0.0,
+        sees_cars: bool = False,
     ) -> None:
         self.scenario = make_scenario(scenario)
         self.demand = Demand() if demand is None else demand
         self.drivers = tuple(drivers)
-        self._require(background, max_steps, tick_s, delay_s)
+        times = {
+            "tick_s": tick_s,
+            "delay_s": delay_s,
+            "manoeuvre_s": manoeuvre_s,
+            "leaving_soon_s": leaving_soon_s,
+        }
+        self._require(background, max_steps, times)
         goals = self._weighted("goal_weights", self.demand.goal_weights, len(self.scenario.lot.goals))
         self.scenarios = tuple(self.scenario.replace(goal=goal) for goal in goals) or (self.scenario,)
         lot = self.scenario.lot
@@ -199,14 +224,19 @@ class Fleet:
         self._row: dict[int, tuple[Searches, int]] = {}
         self._cars = np.zeros(0, CAR)
         self._record["background"] = BACKGROUNDS.index(background)
-        self._record["max_steps"], self._record["tick_s"] = max_steps, tick_s
-        self._record["n_slots"], self._record["delay_s"] = lot.n_slots, delay_s
+        self._record["max_steps"] = max_steps
+        for name, value in times.items():
+            self._record[name] = value
+        self.sees_cars, self.leaving_soon_s = bool(sees_cars), float(leaving_soon_s)
+        self._record["n_slots"], self._record["n_vertices"] = lot.n_slots, lot.n_vertices
         self._record["scenarios"] = self._tables.records.ctypes.data
         self.slots = np.zeros(lot.n_slots, SHARED_SLOT)
         cost_s = np.array([one.arrival_cost_s for one in self.scenarios])
         work = {
             "slots": self.slots,
             "live_map": np.zeros(lot.n_slots, LIVE_SLOT),
+            "blocked_until": np.zeros(lot.n_vertices),
+            "blocked_by": np.zeros(lot.n_vertices, np.int64),
             "by_cost": np.argsort(cost_s, axis=1, kind="stable").astype(np.int64),
             "median_cost_s": np.median(cost_s, axis=1),
             "route_seconds": np.zeros(lot.n_vertices),
@@ -219,9 +249,10 @@ class Fleet:
         self._keep(work)
         if delay_s > 0.0:
             self._grow_reports()
+        self._memory: dict[int, Any] = {}  # states of the agents of `run`, by car
         self._drive_s: dict[int, NDArray[np.float64]] = {}
 
-    def _require(self, background: str, max_steps: int, tick_s: float, delay_s: float) -> None:
+    def _require(self, background: str, max_steps: int, times: Mapping[str, float]) -> None:
         if not isinstance(self.demand, Demand):
             raise InputError(f"demand is a {type(self.demand).__name__}, want a Demand")
         if background not in BACKGROUNDS:
@@ -232,7 +263,7 @@ class Fleet:
             raise InputError("drivers: all weights are 0, want one above 0")
         if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
             raise InputError(f"max_steps is {max_steps!r}, want a whole number of at least 1")
-        for name, value in (("tick_s", tick_s), ("delay_s", delay_s)):
+        for name, value in times.items():
             if not isinstance(value, (int, float, np.number)) or not 0.0 <= value < math.inf:
                 raise InputError(f"{name} is {value!r}, want a finite number of at least 0")
 
@@ -271,6 +302,7 @@ class Fleet:
             self._counted = self.scenario.occupancy.process_of(arrival.day).record
             record["world"] = self._counted.ctypes.data
         self._write_cars(key, midnight, arrival_s)
+        self._memory.clear()
         begin_world_at(self._address)
 
     def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
@@ -331,7 +363,7 @@ class Fleet:
     # ---- decisions
 
     def run(self, agents: Sequence[Any] | None = None, until: float = math.inf) -> None:
-        """Run the world until all searches are over, or until a time.
+        """Run the world until all searches are over, or until a time; a later call goes on from there.
 
         Args:
             agents: for each kind of driver without a rule an agent with `predict(observation, state)`, None for the
@@ -346,7 +378,7 @@ class Fleet:
         for kind, driver in enumerate(self.drivers):
             if driver.rule is None and (kind >= len(agents) or agents[kind] is None):
                 raise InputError(f"drivers[{kind}] has no rule, want an agent for it in `agents`")
-        memory: dict[int, Any] = {}
+        memory = self._memory
         while (car := self.next_decision(until)) is not None:
             agent = agents[int(self._cars["kind"][car])]
             try:
@@ -451,8 +483,14 @@ class Fleet:
 
     @property
     def observation_space(self) -> spaces.Dict:
-        """The space of a car's observations: that of `parkenv/Search-v2`."""
-        return space_of(self.scenarios)
+        """The space of a car's observations: that of `parkenv/Search-v2`, and further keys; see the class."""
+        space, lot = space_of(self.scenarios), self.scenario.lot
+        further: dict[str, spaces.Space[Any]] = {}
+        if self.leaving_soon_s > 0.0:
+            further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
+        if self.sees_cars:
+            further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
+        return spaces.Dict(dict(space.items()) | further)
 
     def observation(self, car: int) -> dict[str, Any]:
         """Return what a searching car observed last, as in `parkenv/Search-v2`."""
@@ -460,7 +498,7 @@ class Fleet:
         record = searches.records[row]
         vertex = record["vertex"]
         scenario = self.scenarios[self._cars["place"][car]]
-        return {
+        observation = {
             "vertex": np.int64(vertex),
             "time": record["clock"].copy(),
             "p_occupied": searches.p_occupied[row].copy(),
@@ -468,6 +506,32 @@ class Fleet:
             "day_error": searches.day_error[row].copy(),
             "action_mask": scenario.action_masks[vertex].copy(),
         }
+        if self.leaving_soon_s > 0.0:
+            observation["leaving"] = self._leaving_in_view(int(vertex))
+        if self.sees_cars:
+            observation["cars"] = self._cars_in_view(car, int(vertex))
+        return observation
+
+    def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
+        """Return which slots in view of a vertex hold a car that shows that it leaves, (n_slots,)."""
+        leaving = np.zeros(len(self.slots), np.int8)
+        viewed = self.scenario.in_view(vertex)
+        left_s = self.slots["leaves_at"][viewed] - self.time
+        leaving[viewed] = (left_s > 0.0) & (left_s <= self.leaving_soon_s)
+        return leaving
+
+    def _cars_in_view(self, car: int, vertex: int) -> NDArray[np.int8]:
+        """Return the numbers of other searching cars by vertex, and of those that stand, (2, n_vertices)."""
+        seen = np.zeros((2, self.scenario.lot.n_vertices), np.int8)
+        others = self._cars["state"] == SEARCHING
+        others[car] = False
+        at, stands = self._cars["vertex"][others], self._cars["stands"][others]
+        xy = self.scenario.lot.vertex_xy
+        near = np.hypot(*(xy[at] - xy[vertex]).T) <= self.scenario.sensor_model.view_range
+        for row, which in enumerate((near, near & stands)):
+            count = np.bincount(at[which], minlength=seen.shape[1])
+            seen[row] = np.minimum(count, _MOST_SEEN)
+        return seen
 
     def outcome(self, car: int) -> StepOutcome:
         """Return the result of a car's last step."""
@@ -552,9 +616,11 @@ class Fleet:
         """Copies and pickles are fleets before their first reset: records hold addresses of this process."""
         record = self._record
         background = BACKGROUNDS[record["background"]]
-        steps, tick_s = int(record["max_steps"]), float(record["tick_s"])
-        delay_s, leave = float(record["delay_s"]), bool(self._tables.records["leave_full_lot"][0])
-        return _fleet, (self.scenario, self.demand, background, self.drivers, steps, tick_s, delay_s, leave)
+        times = ("tick_s", "delay_s", "manoeuvre_s", "leaving_soon_s")
+        options: dict[str, Any] = {name: float(record[name]) for name in times}
+        options |= {"background": background, "drivers": self.drivers, "max_steps": int(record["max_steps"])}
+        options["leave_full_lot"] = bool(self._tables.records["leave_full_lot"][0])
+        return _fleet, (self.scenario, self.demand, options | {"sees_cars": self.sees_cars})
 
 
 def total_s(cars: NDArray[np.void]) -> NDArray[np.float64]:
@@ -569,6 +635,5 @@ def drive_times(problem: SearchProblem, vertex: int) -> NDArray[np.float64]:
     return np.asarray(metres[0, : problem.lot.n_slots] / problem.v_drive)
 
 
-def _fleet(scenario: Any, demand: Demand, background: str, drivers: Any, *numbers: Any) -> Fleet:
-    options = dict(zip(("max_steps", "tick_s", "delay_s", "leave_full_lot"), numbers, strict=True))
-    return Fleet(scenario, demand, background=background, drivers=drivers, **options)
+def _fleet(scenario: Any, demand: Demand, options: dict[str, Any]) -> Fleet:
+    return Fleet(scenario, demand, **options)

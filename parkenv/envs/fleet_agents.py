@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.fleet import MAX_STEPS, Fleet
+from parkenv.envs.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import MAX_CARS, Demand, Headways
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
 Observation = Mapping[str, Any]
 MAX_CYCLES = MAX_STEPS
+_FLEET_OPTIONS = ("delay_s", "leave_full_lot", "manoeuvre_s", "leaving_soon_s", "sees_cars")
 METADATA: dict[str, Any] = {
     "name": "lot_v0",
     "render_modes": ["human", "rgb_array"],
@@ -40,7 +41,9 @@ class FleetAgents:
         max_cycles: limit of a car's decisions.
         tick_s: as of `Fleet`.
         render_mode: `human`, `rgb_array` or None.
-        changes: fields of the scenario to replace.
+        knows: what all cars know, as of `parkenv.envs.fleet.DriverKind`; with `shared`, all share.
+        changes: fields of the scenario to replace, and further options of `Fleet`: `delay_s`, `leave_full_lot`,
+            `manoeuvre_s`, `leaving_soon_s`, `sees_cars`.
 
     Attributes:
         possible_agents: `car_0`, `car_1`, ... in order of arrival, as many as may arrive.
@@ -58,6 +61,7 @@ class FleetAgents:
         max_cycles: int,
         tick_s: float,
         render_mode: str | None,
+        knows: str,
         changes: Mapping[str, Any],
     ) -> None:
         if render_mode is not None and render_mode not in METADATA["render_modes"]:
@@ -68,12 +72,16 @@ class FleetAgents:
             demand = Demand(Headways(int(cars)))
         if isinstance(max_cycles, bool) or not isinstance(max_cycles, (int, np.integer)) or max_cycles < 1:
             raise InputError(f"max_cycles is {max_cycles!r}, want a whole number of at least 1")
+        options = {name: value for name, value in changes.items() if name in _FLEET_OPTIONS}
+        fields = {name: value for name, value in changes.items() if name not in options}
         self.fleet = Fleet(
-            make_scenario(scenario, **changes),
+            make_scenario(scenario, **fields),
             demand,
             background=background,
+            drivers=[DriverKind(knows=knows, shares=knows == "shared")],
             max_steps=max_cycles,
             tick_s=tick_s,
+            **options,
         )
         self.render_mode = render_mode
         self.possible_agents = [f"car_{i}" for i in range(demand.arrivals.most)]

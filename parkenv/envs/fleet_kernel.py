@@ -15,6 +15,13 @@ from typing import Any
 import numpy as np
 
 from parkenv.envs.event_queue import ARRIVAL, DEPARTURE, REACH, event_at, pop_event, push_event
+from parkenv.envs.fleet_interactions import (
+    block_lane,
+    blocked_until,
+    clear_lanes,
+    hold_slot,
+    release_slot,
+)
 from parkenv.envs.fleet_knowledge import clear_live_map, inform, report_slot, report_view
 from parkenv.envs.fleet_records import (
     BALKED,
@@ -69,6 +76,7 @@ def begin_world_at(address: int) -> None:
     fleet = fleet_at(address, 0)
     empty_shared_slots(fleet)
     clear_live_map(fleet)
+    clear_lanes(fleet)
     fleet.time = fleet.arrival
     fleet.n_events = fleet.event_number = fleet.next_car = 0
     fleet.first_ready = fleet.n_ready = 0
@@ -212,7 +220,8 @@ def _arrive(fleet: Any) -> int:
     car.target, car.n_moves, car.reserved, car.informed_until = NO_CAR, 0, NO_CAR, -np.inf
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
-    search.place = car.place
+    search.place, search.car = car.place, number
+    car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
     search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
     enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
     car.state = SEARCHING
@@ -233,6 +242,10 @@ def _reach(fleet: Any, number: int) -> None:
     """End the step of a car: it observes, and is asked again unless its search is over."""
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
+    until = blocked_until(fleet, car, number)
+    if until > fleet.time:
+        _queue(fleet, car, search, number, until)
+        return
     observe(search)
     if car.shares:
         report_view(fleet, search)
@@ -248,6 +261,19 @@ def _reach(fleet: Any, number: int) -> None:
         _end_search(fleet, number, TRUNCATED)
     else:
         _make_ready(fleet, number)
+
+
+@inlined
+def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None:
+    """Let a car wait before a blocked vertex until a time, s."""
+    before = search.step_drive_s
+    search.step_drive_s += until - fleet.time
+    search.time = until
+    if fleet.tick_s > 0.0:
+        _round_up(fleet, search)
+    car.queued_s += search.step_drive_s - before
+    block_lane(fleet, search.previous_vertex, search.time, number)
+    push_event(fleet, search.time, REACH, number)
 
 
 @inlined
@@ -279,6 +305,7 @@ def _lacks_reservation(fleet: Any, car: Any) -> bool:
 def _depart(fleet: Any, number: int) -> None:
     car = car_at(fleet.cars, number)
     shared_slot_at(fleet.slots, car.slot).car = NO_CAR
+    block_lane(fleet, car.slot, fleet.time + fleet.manoeuvre_s, number)
     if car.shares:
         report_slot(fleet, car.slot, False, 0.0)
     car.state, car.left_at = LEFT, fleet.time
@@ -309,9 +336,12 @@ def act(fleet: Any, number: int, action: int) -> bool:
         search.vertex = action - TAKE_SLOT
         action = PARK
     drive_or_park(search, action)
+    car.stands, car.vertex = search.vertex == car.vertex, search.vertex
     if search.parked:
         _complete_step(search)
-        shared_slot_at(fleet.slots, search.vertex).car = number
+        shared = shared_slot_at(fleet.slots, search.vertex)
+        shared.car, shared.leaves_at = number, fleet.time + car.stay_s
+        block_lane(fleet, search.vertex, fleet.time + fleet.manoeuvre_s, number)
         car.slot = search.vertex
         if car.shares:
             report_slot(fleet, car.slot, True, 1.0)
@@ -320,6 +350,11 @@ def act(fleet: Any, number: int, action: int) -> bool:
         return True
     if fleet.tick_s > 0.0:
         _round_up(fleet, search)
+    if car.stands:
+        hold_slot(fleet, car, number)
+        block_lane(fleet, search.vertex, search.time, number)
+    else:
+        release_slot(fleet, car)
     push_event(fleet, search.time, REACH, number)
     return True
 
@@ -347,6 +382,7 @@ def _end_search(fleet: Any, number: int, state: int) -> None:
     car.parking_cost_s, car.gave_up_s = search.parking_cost_s, search.gave_up_s
     car.driven_m, car.walked_m = search.driven_m, search.walked_m
     car.failed_parks, car.slots_passed, car.n_steps = search.failed_parks, search.slots_passed, search.n_steps
+    release_slot(fleet, car)
     fleet.n_searching -= 1
     if state == PARKED:
         fleet.n_parked += 1
@@ -365,7 +401,6 @@ def _make_ready(fleet: Any, number: int) -> None:
     """Add a car to the end of the queue."""
     int64s(fleet.ready)[(fleet.first_ready + fleet.n_ready) % fleet.n_cars] = number
     fleet.n_ready += 1
-    car_at(fleet.cars, number).ready = True
 
 
 @inlined
@@ -374,7 +409,6 @@ def _first_ready(fleet: Any) -> Any:
     number = int64s(fleet.ready)[fleet.first_ready]
     fleet.first_ready = (fleet.first_ready + 1) % fleet.n_cars
     fleet.n_ready -= 1
-    car_at(fleet.cars, number).ready = False
     return number
 
 

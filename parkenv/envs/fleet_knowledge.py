@@ -29,7 +29,7 @@ from parkenv.envs.search_records import (
     search_at,
     slot_at,
 )
-from parkenv.envs.shared_slots import is_shared_slot_taken
+from parkenv.envs.shared_slots import is_slot_open
 from parkenv.world.occupancy_kernel import inlined, kernel
 from parkenv.world.pointers import float32s, int32s, int64s
 
@@ -103,7 +103,7 @@ def inform(fleet: Any, number: int) -> None:
         _inform_by_map(fleet, car, search)
     elif car.knows == FULL_KNOWLEDGE:
         for slot in range(fleet.n_slots):
-            taken = is_shared_slot_taken(search.process, slot, fleet.time)
+            taken = not is_slot_open(search.process, slot, number, fleet.time)
             set_belief_of(search, column_of(search, slot), taken, 1.0 if taken else 0.0, search.time)
     elif car.knows == RESERVE_KNOWLEDGE:
         for slot in range(fleet.n_slots):

@@ -55,8 +55,12 @@ CAR = np.dtype(
         ("slot", np.int64),
         ("ended_at", np.float64),
         ("left_at", np.float64),
-        # Whether it waits in the queue of the cars to decide.
-        ("ready", np.bool_),
+        # Where it is, or is driving to, while it searches; whether it stands there, in a failed attempt or a wait; time
+        # spent in queues, s, part of `drive_s`; the slot that it holds, or -1.
+        ("vertex", np.int64),
+        ("stands", np.bool_),
+        ("queued_s", np.float64),
+        ("holds", np.int64),
         # Sums of the search, complete when it has ended.
         ("drive_s", np.float64),
         ("failed_s", np.float64),
@@ -120,6 +124,13 @@ FLEET = np.dtype(
         ("n_decisions", np.int64),
         ("searching_s", np.float64),
         ("parked_s", np.float64),
+        # Blocked lanes: length of a manoeuvre, s, 0 without blocking; by vertex, (n_vertices,): until when, s, float64,
+        # and by which car, int64. For how long before they leave cars show it, s.
+        ("manoeuvre_s", np.float64),
+        ("n_vertices", np.int64),
+        ("blocked_until", ADDRESS),
+        ("blocked_by", ADDRESS),
+        ("leaving_soon_s", np.float64),
         # The live map: (n_slots,) LIVE_SLOT; its delay, s; a ring of REPORT records that are not on it yet: its size,
         # the first, and how many there are.
         ("live_map", ADDRESS),

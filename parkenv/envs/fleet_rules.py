@@ -18,7 +18,7 @@ from parkenv.envs.fleet_kernel import LEAVE, TAKE_SLOT
 from parkenv.envs.fleet_records import car_at, fleet_at
 from parkenv.envs.search_kernel import belief_now
 from parkenv.envs.search_records import N_ACTIONS, SENTINEL, edge_at, scenario_at, search_at, slot_at
-from parkenv.envs.shared_slots import is_shared_slot_taken
+from parkenv.envs.shared_slots import is_slot_open
 from parkenv.world.keyed_random import RULE_STREAM, keyed_uniform
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy_kernel import inlined, kernel
@@ -107,7 +107,7 @@ def decide_ordered_entry(address: int, number: int) -> int:
     fleet = fleet_at(address, 0)
     by_cost = int64s(fleet.by_cost + 8 * fleet.n_slots * car_at(fleet.cars, number).place)
     for i in range(fleet.n_slots):
-        if not is_shared_slot_taken(address, by_cost[i], fleet.time):
+        if is_slot_open(address, by_cost[i], number, fleet.time):
             return int(TAKE_SLOT + by_cost[i])
     return LEAVE
 

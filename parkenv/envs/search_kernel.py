@@ -34,7 +34,7 @@ from parkenv.envs.search_records import (
     search_at,
     slot_at,
 )
-from parkenv.envs.shared_slots import is_shared_slot_taken
+from parkenv.envs.shared_slots import is_slot_open
 from parkenv.world import occupancy_kernel as worlds
 from parkenv.world.keyed_random import (
     ARRIVAL_STREAM,
@@ -549,7 +549,7 @@ def find_state(search: Any, record: Any, time: float) -> None:
         worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
     elif scenario.world_kind == SHARED_KIND:
         # Another car may change it at any time, so `valid_until` stays 0.
-        record.occupied = is_shared_slot_taken(search.process, slot, time)
+        record.occupied = not is_slot_open(search.process, slot, search.car, time)
     else:
         worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
 

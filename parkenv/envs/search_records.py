@@ -141,6 +141,8 @@ SEARCH = np.dtype(
         # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
         ("scenarios", ADDRESS),
         ("n_places", np.int64),
+        # Number of the car in its fleet, where slots are shared.
+        ("car", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
         # record of the world, if it is a process, or SHARED_WORLD record.

@@ -37,11 +37,13 @@ SHARED_SLOT = np.dtype(
     [
         *CURSOR_FIELDS,
         ("car", np.int64),
-        ("resident_until", np.float64),
+        ("leaves_at", np.float64),
+        ("held_by", np.int64),
     ],
     align=True,
 )
-"""A shared slot: cursor of the background; the car of the fleet in it or `NO_CAR`; s, when its resident leaves."""
+"""A shared slot: cursor of the background; the car of the fleet in it or `NO_CAR`; when that car, or else the resident,
+leaves or has left, s; the car that waits for it, or `NO_CAR`."""
 
 shared_world_at, shared_slot_at = record_at(SHARED_WORLD), record_at(SHARED_SLOT)
 
@@ -61,7 +63,21 @@ def is_shared_slot_taken(address: int, slot: int, time: float) -> bool:
         return True
     if world.background == PROCESS_BACKGROUND:
         return bool(_background_state(world, slot, shared, time))
-    return bool(time < shared.resident_until)
+    return bool(time < shared.leaves_at)
+
+
+@inlined
+def is_slot_open(address: int, slot: int, car: int, time: float) -> bool:
+    """Return whether a car may park in a slot at a time, s: it is free, and no other car waits for it."""
+    held_by = shared_slot_at(shared_world_at(address, 0).slots, slot).held_by
+    return bool(held_by in (NO_CAR, car) and not is_shared_slot_taken(address, slot, time))
+
+
+@inlined
+def leaves_soon(world: Any, slot: int, time: float, soon_s: float) -> bool:
+    """Return whether the car in a slot, of the fleet or a resident, leaves within `soon_s` s after a time, s."""
+    leaves_at = shared_slot_at(world.slots, slot).leaves_at
+    return bool(time < leaves_at <= time + soon_s)
 
 
 @inlined
@@ -83,9 +99,9 @@ def empty_shared_slots(world: Any) -> None:
     for slot in range(world.n_slots):
         shared = shared_slot_at(world.slots, slot)
         shared.sojourn, shared.valid_until = 0, -np.inf
-        shared.car, shared.resident_until = NO_CAR, -np.inf
+        shared.car, shared.held_by, shared.leaves_at = NO_CAR, NO_CAR, -np.inf
         if world.background == RESIDENTS_BACKGROUND and _background_state(world, slot, shared, world.arrival):
-            shared.resident_until = _end_of_stay(world, slot, shared)
+            shared.leaves_at = _end_of_stay(world, slot, shared)
 
 
 @inlined

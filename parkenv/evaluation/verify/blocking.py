@@ -21,7 +21,7 @@ from parkenv.world.week import HOUR_S
 SOURCE = "Erlang 1917"
 SLOTS, LOAD = 10, 8.0
 FAST = 1e4  # m/s: the search takes no time
-RUNS, WARM_UP_H, HOURS = 200, 10.0, 1000.0
+RUNS, WARM_UP_H, HOURS = 200, 10.0, 600.0
 
 
 def row(rule: str, seed: int, stay: Duration, named: str) -> list[Row]:

@@ -36,7 +36,7 @@ DRIVERS_LOAD, ROWS, COLUMNS = 30.0, 4, 15  # a lot of 60 slots is full for one c
 WARM_UP_H = 30.0
 
 
-def loss_row(law: str, seed: int, runs: int = 200, hours: float = 1000.0) -> list[Row]:
+def loss_row(law: str, seed: int, runs: int = 200, hours: float = 600.0) -> list[Row]:
     """Return the row of a small lot that turns cars away."""
     expected = LOAD * (1.0 - erlang_b(SLOTS, LOAD))
     samples = _mean_taken(lane(SLOTS), "ordered-entry", LOAD, law, seed, runs, hours)
@@ -45,7 +45,7 @@ def loss_row(law: str, seed: int, runs: int = 200, hours: float = 1000.0) -> lis
     ]
 
 
-def drivers_row(law: str, seed: int, runs: int = 60, hours: float = 300.0) -> list[Row]:
+def drivers_row(law: str, seed: int, runs: int = 50, hours: float = 200.0) -> list[Row]:
     """Return the row of a lot in which cars drive and search."""
     lot = grid_lot(ROWS, COLUMNS)
     scenario = lane(1).replace(lot=lot, occupancy=lane(lot.n_slots).occupancy)

@@ -108,7 +108,7 @@ def meek_row(load: float, seed: int, runs: int = 200, hours: float = 2000.0) -> 
     return [mean_row(case, load * math.exp(-load), taken, MEEK_SOURCE)]
 
 
-def threshold_row(tau: float, seed: int, runs: int = 40, hours: float = 300.0) -> list[Row]:
+def threshold_row(tau: float, seed: int, runs: int = 30, hours: float = 200.0) -> list[Row]:
     """Return the row of the best slot of the zone."""
     zone = round(tau * ZONE_LOAD)
     fleet = loaded_fleet(lane(ZONE_SLOTS), Rule(f"threshold {tau:g}", THRESHOLDS[tau]), ZONE_LOAD, hours)

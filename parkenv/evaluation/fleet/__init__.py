@@ -1,0 +1,1 @@
+"""Experiments with many cars in one lot: settings, days, measures, summary."""

@@ -1,0 +1,177 @@
+"""Experiments with many cars: settings, measures, summary, figure and command."""
+
+import csv
+import json
+import math
+
+import numpy as np
+import pytest
+from command_line import parkenv
+
+from parkenv.envs.fleet import total_s
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.workers import Workers
+from parkenv.evaluation.figures.fleet_figure import looks_s
+from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting, summarize_days
+from parkenv.evaluation.fleet.measures import MEANS, Roads, gini
+from parkenv.lots import grid_lot
+from parkenv.scenarios.build import build, make_scenario
+from parkenv.scenarios.spec import scenario_specs
+from parkenv.world.scenario import SearchProblem
+
+
+def experiment(**changes):
+    (spec,) = scenario_specs("mini")
+    spec = spec.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
+    return FleetExperiment(
+        **({"scenario": spec, "agents": ("greedy-drive",), "arrivals_per_hour": (20.0,), "days": 2} | changes)
+    )
+
+
+def test_gini():
+    assert gini(np.zeros(3)) == 0.0
+    assert gini(np.array([1.0, 3.0])) == pytest.approx(0.25)
+    values = np.random.default_rng(0).exponential(size=20_000)
+    assert gini(values) == pytest.approx(0.5, abs=0.01), "of an exponential law"
+
+
+def test_nobody_without_members_is_run_once():
+    its = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).settings()
+    assert its == [
+        Setting("greedy-drive", *rest, 20.0)
+        for rest in (("own", 0.0), ("shared", 0.5), ("shared", 1.0), ("reserve", 0.5), ("reserve", 1.0))
+    ]
+
+
+def test_all_settings_have_the_same_days():
+    its = experiment(arrivals_per_hour=(40.0,))
+    scenario = build(its.scenario)
+    plans, members = [], []
+    for share in (0.3, 0.6):
+        fleet, agents = its.fleet(Setting("greedy-drive", "full", share, 40.0), scenario)
+        fleet.reset(3, 1)
+        plans.append(fleet.cars[["arrival", "entry", "stay_s", "patience_s"]].copy())
+        members.append(fleet.cars["kind"] == 0)
+        fleet.run(agents)
+    assert np.array_equal(*plans)
+    assert (members[1] | ~members[0]).all(), "members stay members as their share grows"
+    assert members[1].sum() > members[0].sum() > 0
+
+
+def test_measures_of_a_day_are_those_of_its_cars():
+    its = experiment(arrivals_per_hour=(60.0,), shares=(0.5,))
+    setting = Setting("greedy-drive", "shared", 0.5, 60.0)
+    day = its.run_day(setting, 0)
+    fleet, agents = its.fleet(setting, build(its.scenario))
+    fleet.reset(its.seed, 0)
+    fleet.run(agents)
+    cars = fleet.cars
+    members = (cars["kind"] == 0).mean()
+    assert day["cars"] == len(cars)
+    assert day["total_s"] == pytest.approx(total_s(cars).mean())
+    assert day["total_s"] == pytest.approx(members * day["members_s"] + (1 - members) * day["others_s"])
+    assert day["balked_fraction"] == (cars["slot"] < 0).mean() > 0.0, "60 cars for ten slots"
+    assert 0.5 < day["occupancy"] <= 1.0
+    assert 0.0 < day["cruising_share"] < 1.0
+    assert day["cruised_m"] < day["driven_m"]
+    assert day["bound_s"] < day["total_s"]
+    assert day["search_s"] == pytest.approx((cars["drive_s"] + cars["failed_s"]).mean())
+
+
+def test_nobody_is_faster_than_alone():
+    scenario = make_scenario("mini")
+    roads = Roads(scenario)
+    its = experiment(arrivals_per_hour=(5.0,), knows=("full",))
+    fleet, agents = its.fleet(its.settings()[0], build(its.scenario))
+    fleet.reset(1)
+    fleet.run(agents)
+    assert (total_s(fleet.cars) >= roads.alone_s(fleet.cars) - 1e-9).all()
+    parked = fleet.cars[fleet.cars["slot"] >= 0]
+    assert (parked["driven_m"] >= roads.metres(parked) - 1e-9).all()
+
+
+def test_an_agent_in_python_drives_as_the_compiled_one():
+    compiled, python = (
+        experiment(agents=(agent,), knows=("own",), days=1).run_day(Setting(agent, "own", 0.0, 20.0), 0)
+        for agent in ("first-free", "first-free(within_m=1000)")
+    )
+    assert compiled["cars"] == python["cars"]
+    its = experiment(agents=("belief",), knows=("own", "reserve"), days=1)
+    days = list(its.run(Workers(1)))
+    assert [one[0]["agents"] for one in days] == ["belief", "belief"]
+
+
+def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
+    its = experiment(knows=("own", "reserve"), arrivals_per_hour=(15.0, 30.0), days=3)
+    days = list(its.run(Workers(1)))
+    rows = summarize_days(days)
+    for row in rows:
+        low, high = row["price_of_anarchy_ci95"]
+        assert low <= row["price_of_anarchy"] <= high
+        if row["knows"] == "reserve":
+            assert (low, row["price_of_anarchy"], high) == (1.0, 1.0, 1.0)
+    own, reserve = days[0], days[1]
+    expected = sum(day["total_s"] * day["cars"] for day in own) / sum(
+        day["total_s"] * day["cars"] for day in reserve
+    )
+    assert rows[0]["price_of_anarchy"] == pytest.approx(expected)
+    assert set(MEANS) <= rows[0].keys()
+    assert rows[0]["difference_s"] == 0.0
+    paired = [one["total_s"] - other["total_s"] for one, other in zip(reserve, own, strict=True)]
+    assert rows[1]["difference_s"] == rows[1]["members_difference_s"] == pytest.approx(np.mean(paired))
+    assert math.isnan(rows[1]["others_difference_s"])
+    assert math.isnan(summarize_days(days[1:2])[0]["difference_s"])
+    alone = summarize_days(days[:1])
+    assert math.isnan(alone[0]["price_of_anarchy"])
+
+
+def test_the_closed_form_of_random_looks_ends_at_the_last_slot():
+    problem = SearchProblem(lot=grid_lot(1, 20))
+    one, all_but_none = looks_s(problem, np.array([0.0, 1.0]))
+    hop_s = 2.5 / problem.v_drive
+    assert all_but_none - one == pytest.approx(20 * hop_s, rel=0.05)
+
+
+def test_the_command_writes_rows_days_and_a_figure(tmp_path):
+    words = ("--scenario", "mini", "--hours", "08:00-09:00", "-n", 2, "--arrivals-per-hour", "10,30")
+    words += ("--share", "0.5,1", "--jobs", 1)
+    done = parkenv("fleet", *words, "--out", tmp_path / "a")
+    assert (done.returncode, done.stderr) == (0, "")
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    rows = summary["rows"]
+    assert len(rows) == 2 * 7
+    wanted = (
+        "agents knows share arrivals_per_hour total_s total_s_ci95 search_s failed_attempts balked_fraction"
+    )
+    assert {*wanted.split(), "price_of_anarchy", "price_of_anarchy_ci95"} <= rows[0].keys()
+    assert (tmp_path / "a" / "fleet.png").stat().st_size > 10_000
+    with (tmp_path / "a" / "days.csv").open() as file:
+        days = list(csv.DictReader(file))
+    assert len(days) == 2 * len(rows)
+    assert done.stdout.count("greedy-drive") == len(rows)
+    again = parkenv("fleet", *words, "--out", tmp_path / "b")
+    assert again.returncode == 0
+    assert (tmp_path / "b" / "days.csv").read_bytes() == (tmp_path / "a" / "days.csv").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (("--knows", "own,al"), "knows: there is no knowledge 'al'"),
+        (("--share", "0.5,1.5"), "share is 1.5, want a number from 0 to 1"),
+        (("--arrivals-per-hour", "0"), "PoissonArrivals.per_hour is 0.0, want a rate above 0"),
+        (("--arrivals-per-hour", "1e9"), "cars arrive in the window, want at most 1,000,000"),
+        (("--agents", "oracle"), "agent 'oracle' knows the future of single searches"),
+        (("--agents", "greedy"), "unknown agent 'greedy'"),
+    ],
+)
+def test_bad_input_is_refused_before_anything_is_run(words, message, tmp_path):
+    done = parkenv("fleet", "--scenario", "mini", *words, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_experiment_without_days_is_refused():
+    with pytest.raises(InputError, match="days is 0, want at least 1"):
+        experiment(days=0)

@@ -1,0 +1,217 @@
+"""How cars of a fleet get in each other's way: queues, lights of cars that leave, held slots, what cars see."""
+
+import numpy as np
+import pytest
+
+import parkenv
+from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, lot_v0
+from parkenv.envs.fleet import DriverKind, Fleet
+from parkenv.envs.fleet_rules import RULES
+from parkenv.lots import grid_lot
+from parkenv.world.demand import (
+    ConstantTime,
+    Demand,
+    ExponentialTime,
+    Headways,
+    ListedArrivals,
+    PoissonArrivals,
+)
+from parkenv.world.lot import PARK
+from planners.routes import DriveRoutes
+
+LOT = grid_lot(1, 8)
+SCENARIO = Scenario(
+    lot=LOT,
+    name="row",
+    occupancy=OccupancyProcess.from_demand(np.zeros(8), np.zeros(168)),
+    v_drive=2.5,
+    failure_s=10.0,
+    sensor_model=SensorModel(view_range=6.0),
+)
+ROUTES = DriveRoutes(SCENARIO)
+
+
+class ParkIn:
+    """Drives to one slot and attempts to park there until it succeeds."""
+
+    def __init__(self, slots):
+        self.slots = slots
+
+    def action(self, car, vertex):
+        slot = self.slots[car]
+        return PARK if vertex == slot else ROUTES.move_toward(vertex, slot)
+
+
+def drive(fleet, slots):
+    """Run a fleet in which each car parks in its slot; return the observations of each car."""
+    policy, seen = ParkIn(slots), {}
+    while (car := fleet.next_decision()) is not None:
+        observation = fleet.observation(car)
+        seen.setdefault(car, []).append(observation)
+        fleet.act(policy.action(car, int(observation["vertex"])))
+    return seen
+
+
+def by_distance():
+    """Slots by the drive from the entry."""
+    return np.argsort(ROUTES.seconds_from(int(LOT.entry_vertices[0]))[:8])
+
+
+def arriving(*times, stay_s=1e5):
+    return Demand(ListedArrivals(tuple(36000.0 + t for t in times)), ConstantTime(stay_s))
+
+
+def test_a_car_that_parks_blocks_those_behind_it():
+    near, far = by_distance()[[0, -1]]
+    ends = {}
+    for manoeuvre_s in (0.0, 30.0):
+        fleet = Fleet(SCENARIO, arriving(0.0, 0.5), background="none", manoeuvre_s=manoeuvre_s)
+        fleet.reset(0)
+        drive(fleet, [near, far])
+        ends[manoeuvre_s] = fleet.cars["ended_at"] - fleet.cars["arrival"]
+        assert fleet.cars["queued_s"][0] == 0.0
+        waited = fleet.cars["queued_s"][1]
+    assert ends[0.0][0] == ends[30.0][0]
+    assert ends[30.0][1] - ends[0.0][1] == pytest.approx(waited)
+    # It reaches the blocked vertex half a second after the manoeuvre has begun.
+    assert waited == pytest.approx(29.5)
+
+
+def test_queues_grow_backwards_and_dissolve():
+    near, far = by_distance()[[3, -1]]
+    fleet = Fleet(SCENARIO, arriving(0.0, 1.5, 3.0, 4.5), background="none", manoeuvre_s=60.0)
+    fleet.reset(0)
+    others = by_distance()[[-1, -2, -3]]
+    drive(fleet, [near, *others])
+    queued = fleet.cars["queued_s"]
+    assert queued[0] == 0.0
+    assert (np.diff(queued[1:]) < 0).all()
+    assert queued[3] > 45.0
+    assert fleet.state_names() == ["parked"] * 4
+    assert far == others[0]
+
+
+def test_a_leaving_car_blocks_the_lane():
+    near, far = by_distance()[[0, -1]]
+    fleet = Fleet(SCENARIO, arriving(0.0, 60.0, stay_s=58.0), background="none", manoeuvre_s=20.0)
+    fleet.reset(0)
+    drive(fleet, [near, far])
+    assert fleet.cars["left_at"][0] < fleet.cars["ended_at"][1]
+    assert fleet.cars["queued_s"][1] > 0.0
+
+
+def test_the_car_that_waits_for_one_that_leaves_has_the_slot():
+    slot = int(by_distance()[2])
+    states = {}
+    for soon_s in (0.0, 15.0):
+        # The first leaves while the second stands in a failed attempt; the third comes by in between.
+        demand = Demand(ListedArrivals((36000.0, 36040.0, 36049.0)), ConstantTime(46.0))
+        fleet = Fleet(SCENARIO, demand, background="none", leaving_soon_s=soon_s)
+        fleet.reset(0)
+        drive(fleet, [slot] * 3)
+        states[soon_s] = np.argsort(fleet.cars["ended_at"]).tolist()
+        assert (fleet.slots["held_by"] == -1).all()
+    assert states[0.0] == [0, 2, 1]
+    assert states[15.0] == [0, 1, 2]
+
+
+def test_lights_are_seen_in_view_only_and_before_the_departure_only():
+    slot, beside = by_distance()[[2, 3]]
+    demand = arriving(0.0, 20.0, stay_s=100.0)
+    fleet = Fleet(SCENARIO, demand, background="none", leaving_soon_s=12.0)
+    fleet.reset(0)
+    leaves_at = None
+    seen = []
+    while (car := fleet.next_decision()) is not None and fleet.time < fleet.begin + 140.0:
+        observation = fleet.observation(car)
+        vertex = int(observation["vertex"])
+        assert fleet.observation_space.contains(observation)
+        if car == 0:
+            fleet.act(ParkIn([slot]).action(0, vertex))
+            leaves_at = fleet.time + 100.0
+            continue
+        lit = np.flatnonzero(observation["leaving"]).tolist()
+        in_view = slot in SCENARIO.in_view(vertex)
+        expected = in_view and 0 < leaves_at - fleet.time <= 12.0
+        assert lit == ([slot] if expected else [])
+        seen.append(expected)
+        # Drive to the slot beside it, and wait there by actions that the graph does not have.
+        missing = np.flatnonzero(observation["action_mask"][:4] == 0)
+        fleet.act(missing[0] if vertex == beside else ROUTES.move_toward(vertex, int(beside)))
+    assert any(seen)
+    assert not all(seen)
+
+
+def test_cars_see_others_in_view_and_where_one_stands():
+    slot = int(by_distance()[4])
+    fleet = Fleet(SCENARIO, arriving(0.0, 2.0, 4.0), background="none", sees_cars=True)
+    fleet.reset(0)
+    seen = drive(fleet, [slot] * 3)
+    counts = np.array([observation["cars"].sum(axis=1) for observation in seen[2]])
+    assert counts.max() <= 2
+    assert (counts[:, 0] > 0).any()
+    assert (counts[:, 1] <= counts[:, 0]).all()
+    # The second fails at the slot, and stands there.
+    assert any(observation["cars"][1, slot] == 1 for observation in seen[2])
+
+
+@pytest.mark.parametrize("rule", ["greedy-drive", "random"])
+def test_crowded_lots_stay_sound(rule):
+    demand = Demand(PoissonArrivals(500.0, 36000.0, 37800.0), ExponentialTime(300.0), ConstantTime(400.0))
+    fleet = Fleet(
+        "mini",
+        demand,
+        drivers=[DriverKind(rule=RULES[rule])],
+        manoeuvre_s=8.0,
+        leaving_soon_s=10.0,
+        leave_full_lot=False,
+    )
+    time = -np.inf
+    fleet.reset(2)
+    for minute in range(60):
+        fleet.run(until=fleet.begin + 60.0 * minute)
+        parked = fleet.cars["slot"][fleet.cars["state"] == 2]
+        assert len(set(parked)) == len(parked)
+        assert fleet.time >= time
+        time = fleet.time
+    fleet.run()
+    cars = fleet.cars
+    assert (cars["queued_s"] > 0).any()
+    assert (cars["queued_s"] <= cars["drive_s"] + 1e-9).all()
+    searched = cars["ended_at"] - cars["arrival"]
+    np.testing.assert_allclose(searched, cars["drive_s"] + cars["failed_s"], atol=1e-6)
+    assert (fleet.slots["held_by"] == -1).all()
+
+
+@pytest.mark.parametrize("tick_s", [1.0, 0.3])
+def test_queues_keep_to_ticks(tick_s):
+    demand = Demand(Headways(30, 3.0))
+    kinds = [DriverKind(rule=RULES["greedy-drive"])]
+    fleet = Fleet("mini", demand, drivers=kinds, tick_s=tick_s, manoeuvre_s=7.7, background="none")
+    fleet.reset(0)
+    fleet.run()
+    ticks = (fleet.cars["ended_at"] - fleet.begin) / tick_s
+    np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
+    assert (fleet.cars["queued_s"] > 0).any()
+
+
+def test_the_pettingzoo_forms_take_these_options():
+    options = {"knows": "full", "sees_cars": True, "leaving_soon_s": 10.0, "manoeuvre_s": 5.0, "cars": 4}
+    environment = lot_v0.raw_env(scenario="campus", **options)
+    environment.reset(seed=0)
+    for agent in environment.agent_iter(60):
+        observation, _, terminated, truncated, _ = environment.last()
+        assert environment.observation_space(agent).contains(observation)
+        action = None
+        if not (terminated or truncated):
+            action = environment.action_space(agent).sample(observation["action_mask"])
+        environment.step(action)
+    parallel = lot_v0.parallel_env(scenario="campus", **options)
+    observations, _ = parallel.reset(seed=0)
+    for agent, observation in observations.items():
+        assert parallel.observation_space(agent).contains(observation)
+    with pytest.raises(InputError, match=r"DriverKind\.knows is 'all'"):
+        lot_v0.raw_env(knows="all")
+    with pytest.raises(InputError, match="manoeuvre_s is -1"):
+        lot_v0.parallel_env(manoeuvre_s=-1)
+    assert parkenv.make_scenario("campus").name == parallel.scenario.name
