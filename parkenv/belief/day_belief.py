@@ -28,7 +28,7 @@ LEVELS, SLOPES = 9, 5
 """Numbers of levels and slopes. Searches take as long with 21 levels, within noise, and 1 % longer with five."""
 REACH, FREEDOM = 4.2, 4.0
 """Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
-EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
+EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.16 / 7)
 """Fraction of the slots, those nearest to the goal, that an event fills -> its probability if very many slots are all
 forecast to be taken.
 
