@@ -28,18 +28,17 @@ LEVELS, SLOPES = 9, 5
 """Numbers of levels and slopes. Searches take as long with 21 levels, within noise, and 1 % longer with five."""
 REACH, FREEDOM = 4.2, 4.0
 """Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
-EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.16 / 7)
-"""Fraction of the slots, those nearest to the goal, that an event fills -> its probability if very many slots are all
-forecast to be taken.
+EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
+"""Fraction of the slots, those nearest to the goal, that an event fills -> its probability among very many slots.
 
 With higher probabilities the car would turn round after fewer taken slots: sooner on the day of an event, and more
 often without need on other days.
 """
-MEAN_EXCESS = 0.09
-"""Mean fraction of the slots by which occupancy is above its forecast, where it is; the excess is exponential.
+MEAN_EXCESS, USUAL_EXCESS = 0.09, 0.15
+"""Fractions of the slots: by how much occupancy is above its forecast in the mean, where it is; on one day in five.
 
-So an event is the less likely the more slots it fills that are forecast to be free. Fitted to the weekday mornings of
-54 German car parks in 2023, with the mean of the last four same weekdays as the forecast.
+The excess is exponential: fitted to the weekday mornings of 54 German car parks in 2023, with the mean of the last four
+same weekdays as the forecast. An event that fills more slots that are forecast to be free is the less likely.
 """
 HALF_EVENTS_AT = 40.0
 """Number of slots with half the events of very many: small lots fill up on usual days."""
@@ -148,7 +147,8 @@ def _hypotheses(
     n = len(forecast)
     within = np.argsort(np.argsort(-nearness))[:, None] < n * np.array(list(EVENTS))
     filled = (1.0 - forecast) @ within / n
-    event_weight = np.array(list(EVENTS.values())) * n / (n + HALF_EVENTS_AT) * np.exp(-filled / MEAN_EXCESS)
+    rarer = np.exp(-np.maximum(filled - USUAL_EXCESS, 0.0) / MEAN_EXCESS)
+    event_weight = np.array(list(EVENTS.values())) * n / (n + HALF_EVENTS_AT) * rarer
     at_event = np.maximum(forecast, P_TAKEN_AT_EVENT)
     share = within @ event_weight
     usual = np.maximum((forecast - share * at_event) / (1.0 - share), 0.5 * forecast)
