@@ -11,11 +11,11 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.day_error import DayError, centred_logits, nearness
 
 
-def forecast_of(n, seed=0, level=0.8, slope=0.0, decay_rate=0.0):
-    """Forecast, nearness, and belief before any observation."""
+def forecast_of(n, seed=0, level=0.8, slope=0.0, decay_rate=0.0, least=0.3):
+    """Forecast of at least `least`, nearness, and belief before any observation."""
     rng = np.random.default_rng(seed)
     near = nearness(rng.uniform(10.0, 90.0, n))
-    p = rng.uniform(0.3, 0.95, n)
+    p = rng.uniform(least, 0.95, n)
     return p, near, SlotBelief.of_forecast(p, np.full(n, decay_rate), (level, slope))
 
 
@@ -51,15 +51,29 @@ def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
 
 def test_an_event_is_told_from_a_fuller_day():
     """Slots near the goal are all taken, those further on as forecast: the belief changes near the goal alone."""
-    p, near, before = forecast_of(120, level=0.3)
+    p, near, before = forecast_of(120, level=0.3, least=0.6)
     seen = np.flatnonzero((near > 0.3) | (near < -0.8))
     belief = before.update(seen, np.where(near[seen] > 0.0, True, np.arange(len(seen)) % 3 > 0))
     day = DayBelief(before, near)
     day.update(belief)
     found = day.p_occupied(belief)
-    assert found[(near < 0.3) & (near > 0.0)].min() > 0.99
+    assert found[(near < 0.3) & (near > 0.0)].min() > 0.98
     far = (near < -0.6) & (near > -0.8)
-    assert abs((logit(found[far]) - logit(p[far])).mean()) < 0.5
+    assert abs((logit(found[far]) - logit(p[far])).mean()) < 0.25
+
+
+@pytest.mark.parametrize(("taken_in_a_row", "believed"), [(2, False), (16, True)])
+def test_filling_a_nearly_empty_lot_takes_more_than_two_taken_slots(taken_in_a_row, believed):
+    """Where an event would begin, some slots in a row are taken; otherwise the lot is as empty as forecast."""
+    near = nearness(np.arange(200.0))
+    before = SlotBelief.of_forecast(np.full(200, 0.2), np.zeros(200), (0.8, 0.0))
+    far, beyond, rest = np.split(np.argsort(near), [80, 80 + taken_in_a_row])
+    seen = np.concatenate([far, beyond])
+    belief = before.update(seen, np.concatenate([np.arange(80) % 5 == 0, np.ones(taken_in_a_row, bool)]))
+    day = DayBelief(before, near)
+    day.update(belief)
+    found = day.p_occupied(belief)[rest]
+    assert found.min() > 0.99 if believed else found.max() < 0.25
 
 
 def test_a_certain_forecast_is_believed_whatever_is_observed():

@@ -48,6 +48,21 @@ def recorded_scenario():
     return campus.replace(name="log", occupancy=occupancy, prior=None, arrival=window)
 
 
+def counted_scenario():
+    """Days of counted car parks, with a forecast that Python computes at every arrival."""
+    from parkenv import ArrivalWindow
+    from parkenv.world.counted_occupancy import CountedOccupancy
+
+    mini = parkenv.make_scenario("mini")
+    curve = np.stack([np.interp(range(24), [0, 10, 23], [0.2, top, 0.3]) for top in (0.9, 0.6)])
+    days = ("2024-01-01", "2024-01-02")
+    level = np.log(curve / (1.0 - curve))
+    attraction = np.linspace(1.0, -1.0, mini.lot.n_slots)
+    occupancy = CountedOccupancy(days, curve, level, np.full((2, 24), 0.8), attraction)
+    window = ArrivalWindow((0, 1), 9 * 3600.0, 12 * 3600.0)
+    return mini.replace(name="counted", occupancy=occupancy, prior=None, arrival=window)
+
+
 @pytest.mark.parametrize(
     ("source", "changes"),
     [
@@ -57,6 +72,7 @@ def recorded_scenario():
         ("jam", {"failure_s": 3.0}),
         ("campus", {"sensor_model": NOISY}),
         (recorded_scenario(), {}),
+        (counted_scenario(), {}),
     ],
 )
 def test_one_car_is_the_single_search_to_the_last_bit(source, changes):
