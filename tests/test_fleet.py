@@ -1,11 +1,14 @@
 """Many cars in one lot: parity with the single search, conservation, determinism, compiled drivers, bad input."""
 
+import itertools
 import math
 import pickle
 import subprocess
 import sys
+import warnings
 
 import gymnasium as gym
+import numba
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -31,6 +34,27 @@ NOISY = SensorModel(
     15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
 )
 GREEDY = DriverKind(rule=RULES["greedy-drive"])
+
+
+def test_no_function_for_a_record_is_compiled_for_one_that_merely_begins_like_it():
+    from parkenv.envs import fleet_records, search_records, shared_slots
+    from parkenv.world import occupancy_kernel
+
+    modules = (occupancy_kernel, shared_slots, search_records, fleet_records)
+    records = {
+        name: numba.from_dtype(value)
+        for module in modules
+        for name, value in vars(module).items()
+        if isinstance(value, np.dtype) and value.names
+    }
+    taken_for = set()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", numba.errors.NumbaExperimentalFeatureWarning)
+        for (name, one), (other_name, other) in itertools.permutations(records.items(), 2):
+            if one != other and one.can_convert_to(None, other) is not None:
+                taken_for.add((name, other_name))
+    # Functions of shared slots take the address of the record of the fleet.
+    assert taken_for == {("FLEET", "SHARED_WORLD")}
 
 
 def recorded_scenario():

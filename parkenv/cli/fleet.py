@@ -36,7 +36,7 @@ def fleet(
     guidance system that reserves slots for all cars; it needs reserve among --knows, and 1 among --share.
 
     Examples:
-        parkenv fleet --scenario campus --arrivals-per-hour 60,120,240 --out results/fleet
+        parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
 

@@ -74,7 +74,7 @@ _ON_TICK = 1e-9  # fraction of a tick
 def begin_world_at(address: int) -> None:
     """Begin the world of a FLEET record whose cars are due."""
     fleet = fleet_at(address, 0)
-    empty_shared_slots(fleet)
+    empty_shared_slots(address)
     clear_live_map(fleet)
     clear_lanes(fleet)
     fleet.time = fleet.arrival

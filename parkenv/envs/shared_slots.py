@@ -20,30 +20,32 @@ BACKGROUNDS = ("process", "residents", "none")
 PROCESS_BACKGROUND, RESIDENTS_BACKGROUND, NO_BACKGROUND = range(3)
 NO_CAR = -1
 
+# Records do not begin with another's fields: numba would take them for that type, with a warning.
 SHARED_WORLD_FIELDS = [
+    # (n_slots,) SHARED_SLOT records.
+    ("n_slots", np.int64),
+    ("slots", ADDRESS),
     *WORLD_FIELDS,
     ("background", np.int64),
     # The scenario's own world, as in SCENARIO: whether it is a log; a PROCESS record, or the RECORDED_DAY of the day.
     ("is_log", np.bool_),
     ("world", ADDRESS),
-    # (n_slots,) SHARED_SLOT records.
-    ("n_slots", np.int64),
-    ("slots", ADDRESS),
 ]
 SHARED_WORLD = np.dtype(SHARED_WORLD_FIELDS, align=True)
-"""The hidden occupancy of a world that many cars share; longer records that begin with these fields also serve."""
+"""The hidden occupancy of a world that many cars share. A longer record that begins with these fields also serves, by
+its address."""
 
 SHARED_SLOT = np.dtype(
     [
-        *CURSOR_FIELDS,
         ("car", np.int64),
         ("leaves_at", np.float64),
         ("held_by", np.int64),
+        *CURSOR_FIELDS,
     ],
     align=True,
 )
-"""A shared slot: cursor of the background; the car of the fleet in it or `NO_CAR`; when that car, or else the resident,
-leaves or has left, s; the car that waits for it, or `NO_CAR`."""
+"""A shared slot: the car of the fleet in it or `NO_CAR`; when that car, or else the resident, leaves or has left, s;
+the car that waits for it, or `NO_CAR`; cursor of the background."""
 
 shared_world_at, shared_slot_at = record_at(SHARED_WORLD), record_at(SHARED_SLOT)
 
@@ -92,8 +94,13 @@ def _background_state(world: Any, slot: int, shared: Any, time: float) -> bool:
 
 
 @kernel
-def empty_shared_slots(world: Any) -> None:
-    """Begin a world: no car of the fleet is parked, and residents are where the background has cars at the arrival."""
+def empty_shared_slots(address: int) -> None:
+    """Begin a world: no car of the fleet is parked, and residents are where the background has cars at the arrival.
+
+    Args:
+        address: address of the SHARED_WORLD record.
+    """
+    world = shared_world_at(address, 0)
     if not world.is_log:
         worlds.draw_day(worlds.process_at(world.world, 0), world)
     for slot in range(world.n_slots):
