@@ -30,6 +30,7 @@ from parkenv.envs.fleet_kernel import (
     init_forecast_at,
     release_at,
 )
+from parkenv.envs.fleet_network import NetworkRule
 from parkenv.envs.fleet_records import (
     CAR,
     DUE,
@@ -245,6 +246,7 @@ class Fleet:
             "route_keys": np.zeros(4 * lot.n_vertices + 1),
             "route_vertices": np.zeros(4 * lot.n_vertices + 1, np.int64),
         }
+        work["networks"] = self._networks()
         self._kept: dict[str, NDArray[Any]] = {}
         self._keep(work)
         if delay_s > 0.0:
@@ -273,6 +275,13 @@ class Fleet:
                 f"Demand.{name} has {len(weights)} numbers, lot {self.scenario.lot.name!r} has {n} of these"
             )
         return range(len(weights))
+
+    def _networks(self) -> NDArray[np.int64]:
+        """Return the address of the NETWORK record of each kind of driver, 0 for those without."""
+        rules = [kind.rule for kind in self.drivers]
+        return np.array(
+            [rule.address_for(self.scenarios) if isinstance(rule, NetworkRule) else 0 for rule in rules], np.int64
+        )
 
     def _keep(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Keep arrays alive, and write their addresses into the fields of the FLEET record."""
@@ -408,19 +417,23 @@ class Fleet:
             status = int(advance_at(self._address, until))
             if status >= 0:
                 return status
-            if status == NEEDS_SEARCH:
-                self._grow_pool()
-            elif status == NEEDS_FORECAST:
-                self._compute_forecast()
-            elif status == NEEDS_REPORTS:
-                self._grow_reports()
-            elif status == NEEDS_RESERVATIONS:
-                self._reserve_slots()
-            elif status == WRONG_ACTION:
-                raise InputError("a compiled driver chose an action that does not exist")
-            else:
-                assert status in (FINISHED, PAUSED)
+            if status in (FINISHED, PAUSED):
                 return None
+            self.help(status)
+
+    def help(self, status: int) -> None:
+        """Do what only Python can do, after `advance_at` returned a negative status; then call that again."""
+        if status == NEEDS_SEARCH:
+            self._grow_pool()
+        elif status == NEEDS_FORECAST:
+            self._compute_forecast()
+        elif status == NEEDS_REPORTS:
+            self._grow_reports()
+        elif status == NEEDS_RESERVATIONS:
+            self._reserve_slots()
+        else:
+            assert status == WRONG_ACTION
+            raise InputError("a compiled driver chose an action that does not exist")
 
     def ready_cars(self) -> list[int]:
         """Return the cars that are to decide, or whose end Python has not handled yet, now, in their order."""
@@ -587,6 +600,11 @@ class Fleet:
         taken = np.zeros(len(self.slots), np.bool_)
         shared_slots_taken_at(self._address, self.time, taken)
         return taken
+
+    @property
+    def address(self) -> int:
+        """Address of the FLEET record, for compiled code; valid while this object lives."""
+        return self._address
 
     @property
     def begin(self) -> float:

@@ -144,6 +144,8 @@ FLEET = np.dtype(
         # For compiled drivers, by place: (n_slots,) int64 slots by cost of arrival; float64 median of that cost, s.
         ("by_cost", ADDRESS),
         ("median_cost_s", ADDRESS),
+        # For trained networks that drive: (n_kinds,) int64 addresses of NETWORK records by kind of driver.
+        ("networks", ADDRESS),
         # Work space of searches for routes: (n_vertices,) float64, int64, int64; (4 n_vertices + 1,) float64, int64.
         ("route_seconds", ADDRESS),
         ("route_from", ADDRESS),

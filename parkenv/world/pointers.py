@@ -13,7 +13,9 @@ import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np import arrayobj
 from numpy.typing import NDArray
 
 _LINE = 64  # bytes of a cache line
@@ -70,6 +72,32 @@ def _elements(item: Any) -> Any:
 # In compiled code, `float64s(address)[i]` reads and writes element i of the array of float64 at an address.
 float64s, float32s = _elements(types.float64), _elements(types.float32)
 int64s, int32s, uint8s = _elements(types.int64), _elements(types.int32), _elements(types.uint8)
+
+
+def _arrays(item: Any) -> Any:
+    @intrinsic
+    def array(_: Any, address: Any, shape: Any) -> Any:  # noqa: ARG001 - numba passes it
+        kind = types.Array(item, len(shape), "C")
+
+        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+            view = context.make_array(kind)(context, builder)
+            itemsize = context.get_abi_sizeof(context.get_data_type(item))
+            lengths, strides, size = cgutils.unpack_tuple(builder, values[1]), [], ir.Constant(ir.IntType(64), itemsize)
+            for length in reversed(lengths):
+                strides.insert(0, size)
+                size = builder.mul(size, length)
+            data = builder.inttoptr(values[0], context.get_data_type(item).as_pointer())
+            arrayobj.populate_array(view, data, lengths, strides, itemsize, meminfo=None)
+            return view._getvalue()
+
+        return kind(types.int64, shape), code
+
+    return array
+
+
+# In compiled code, `float32_array(address, (m, n))` is the array at an address.
+float64_array, float32_array = _arrays(types.float64), _arrays(types.float32)
+int64_array, int32_array, int16_array = _arrays(types.int64), _arrays(types.int32), _arrays(types.int16)
 
 
 @intrinsic

@@ -1,0 +1,279 @@
+"""A trained policy network as a compiled driver of a fleet."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.envs.fleet_records import car_at, fleet_at
+from parkenv.envs.fleet_rules import Rule
+from parkenv.envs.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings
+from parkenv.envs.search_records import N_ACTIONS, N_REGIONS, scenario_at, search_at
+from parkenv.errors import InputError
+from parkenv.world.keyed_random import RULE_STREAM, keyed_uniform
+from parkenv.world.occupancy_kernel import inlined, kernel
+from parkenv.world.pointers import (
+    ADDRESS,
+    address_of,
+    float32_array,
+    float32s,
+    float64_array,
+    int16_array,
+    int32_array,
+    int64_array,
+    int64s,
+    record_at,
+    uint8s,
+)
+from parkenv.world.scenario import SearchProblem
+
+Layer = tuple[NDArray[np.float32], NDArray[np.float32]]
+"""Weights, (n_outputs, n_inputs), and biases, (n_outputs,), of a layer, as in PyTorch."""
+ACTIVATIONS = ("tanh", "relu")
+TANH, RELU = range(2)
+
+SURROUNDINGS = np.dtype(
+    [
+        *((name, ADDRESS) for name in Surroundings._fields),
+        ("n_lots", np.int64), ("n_vertices", np.int64), ("width", np.int64), ("k", np.int64),
+    ],
+    align=True,
+)  # fmt: skip
+"""Addresses of the arrays of `Surroundings`, and their lengths."""
+
+NETWORK = np.dtype(
+    [
+        # The SURROUNDINGS record, and room for an observation, (width,) float32.
+        ("surroundings", ADDRESS),
+        ("local", ADDRESS),
+        # (n_layers + 1,) int64, widths from the inputs to the outputs; float32: for each layer the weights,
+        # (n_inputs, n_outputs), then the biases; room for two layers.
+        ("n_layers", np.int64),
+        ("widths", ADDRESS),
+        ("weights", ADDRESS),
+        ("values", ADDRESS),
+        ("widest", np.int64),
+        # Activation of the hidden layers; whether actions that the graph does not have are left out; whether actions
+        # are drawn from the policy, instead of taking the most probable one.
+        ("activation", np.int64),
+        ("masked", np.bool_),
+        ("sampled", np.bool_),
+    ],
+    align=True,
+)
+"""A policy network that observes `local` and `action_mask`."""
+
+surroundings_at, network_at = record_at(SURROUNDINGS), record_at(NETWORK)
+
+
+@kernel
+def decide_by_network(address: int, number: int) -> int:
+    """Choose the action of the network of the car's kind."""
+    fleet = fleet_at(address, 0)
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    network = network_at(int64s(fleet.networks)[car.kind], 0)
+    around = _surroundings_of(network)
+    observe_surroundings(search, around, float32_array(network.local, (around.fixed.shape[1],)))
+    return int(_choose(network, search, _logits(network, search)))
+
+
+@kernel
+def observe_locally(address: int, number: int, local: NDArray[np.float32]) -> None:
+    """Write the `local` observation of a car whose kind is driven by a network; call once at each of its decisions."""
+    fleet = fleet_at(address, 0)
+    car = car_at(fleet.cars, number)
+    network = network_at(int64s(fleet.networks)[car.kind], 0)
+    observe_surroundings(search_at(car.search, 0), _surroundings_of(network), local)
+
+
+@inlined
+def _surroundings_of(network: Any) -> Surroundings:
+    its = surroundings_at(network.surroundings, 0)
+    n_lots, n, width, k = its.n_lots, its.n_vertices, its.width, its.k
+    # The lengths of flat arrays do not matter to compiled code.
+    return Surroundings(
+        int64_array(its.first, (n_lots,)),
+        float32_array(its.fixed, (n, width)),
+        int32_array(its.starts, (n + 1,)),
+        int32_array(its.slots, (n,)),
+        int16_array(its.near, (n, k)),
+        int16_array(its.ahead, (n, 4, k)),
+        float64_array(its.total_s, (n, 4, k)),
+        float64_array(its.crow_s, (n, 2)),
+        int32_array(its.samples, (n_lots, N_REGIONS, 4)),
+        int64_array(its.first_view, (n_lots,)),
+        float64_array(its.view_s, (n,)),
+        int32_array(its.columns, (n,)),
+    )
+
+
+@inlined
+def _logits(network: Any, search: Any) -> int:
+    """Compute the network's output for the observation in `local`; returns the address of (5,) float32."""
+    widths = int64s(network.widths)
+    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
+    local, values = float32s(network.local), float32s(network.values)
+    # The inputs are in alphabetical order: `action_mask`, then `local`.
+    for action in range(N_ACTIONS):
+        values[action] = masks[search.vertex * N_ACTIONS + action]
+    for i in range(widths[0] - N_ACTIONS):
+        values[N_ACTIONS + i] = local[i]
+    at, before = network.weights, network.values
+    for layer in range(network.n_layers):
+        after = network.values + 4 * network.widest * ((layer + 1) & 1)
+        n_inputs, n_outputs = widths[layer], widths[layer + 1]
+        _apply_layer(at, before, after, n_inputs, n_outputs)
+        if layer < network.n_layers - 1:
+            _activate(after, n_outputs, network.activation)
+        at += 4 * (n_inputs + 1) * n_outputs
+        before = after
+    return int(before)
+
+
+@kernel
+def _apply_layer(weights_at: int, inputs_at: int, outputs_at: int, n_inputs: int, n_outputs: int) -> None:
+    weights = float32_array(weights_at, (n_inputs + 1, n_outputs))
+    inputs = float32_array(inputs_at, (n_inputs,))
+    outputs = float32_array(outputs_at, (n_outputs,))
+    for j in range(n_outputs):
+        outputs[j] = weights[n_inputs, j]
+    for i in range(n_inputs):
+        value = inputs[i]
+        if value != np.float32(0.0):
+            for j in range(n_outputs):
+                outputs[j] += value * weights[i, j]
+
+
+@kernel
+def _activate(values_at: int, n: int, activation: int) -> None:
+    values = float32s(values_at)
+    for j in range(n):
+        values[j] = math.tanh(values[j]) if activation == TANH else max(values[j], np.float32(0.0))
+
+
+@inlined
+def _choose(network: Any, search: Any, logits_at: int) -> int:
+    """Choose the most probable action, or draw one."""
+    logits = float32s(logits_at)
+    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
+    best, highest = -1, -np.inf
+    for action in range(N_ACTIONS):
+        open_to_it = not network.masked or masks[search.vertex * N_ACTIONS + action]
+        if open_to_it and logits[action] > highest:
+            best, highest = action, logits[action]
+    if not network.sampled:
+        return best
+    total = 0.0
+    for action in range(N_ACTIONS):
+        if not network.masked or masks[search.vertex * N_ACTIONS + action]:
+            total += math.exp(logits[action] - highest)
+    left = keyed_uniform(search.key, RULE_STREAM, 0, search.n_steps) * total
+    for action in range(N_ACTIONS):
+        if not network.masked or masks[search.vertex * N_ACTIONS + action]:
+            left -= math.exp(logits[action] - highest)
+            if left < 0.0:
+                return action
+    return best
+
+
+class _Bound(NamedTuple):
+    """The NETWORK record of a rule in some scenarios, and what its addresses point to."""
+
+    record: NDArray[np.void]
+    kept: tuple[Any, ...]
+
+
+class NetworkRule(Rule):
+    """A policy network, a multilayer perceptron on the `local` observation, as a compiled driver of a fleet.
+
+    Several fleets may share one; its weights may change at any time.
+
+    Args:
+        layers: weights and biases from the inputs, `action_mask` and `local`, to logits, or values, of the five actions.
+        k: number of slots in the observation.
+        activation: of the hidden layers, `tanh` or `relu`.
+        masked: whether actions that the graph does not have are left out.
+        sampled: whether to draw actions from the policy, instead of taking the most probable one.
+        name: for tables.
+
+    Raises:
+        InputError: layers that do not fit.
+    """
+
+    def __init__(
+        self,
+        layers: Sequence[Layer],
+        k: int = 5,
+        *,
+        activation: str = "tanh",
+        masked: bool = True,
+        sampled: bool = False,
+        name: str = "network",
+    ) -> None:
+        super().__init__(name, decide_by_network)
+        self._known: dict[tuple[int, ...], _Bound] = {}
+        self.k, self.sampled = k, sampled
+        self.set_layers(layers, activation=activation, masked=masked)
+
+    def set_layers(self, layers: Sequence[Layer], *, activation: str = "tanh", masked: bool = True) -> None:
+        """Replace the network, in all fleets that use this rule.
+
+        Raises:
+            InputError: layers that do not fit.
+        """
+        if activation not in ACTIVATIONS:
+            raise InputError(f"activation is {activation!r}, want one of {', '.join(ACTIVATIONS)}")
+        shapes = [weights.shape for weights, _ in layers]
+        widths = [shapes[0][1], *(shape[0] for shape in shapes)] if shapes else [0]
+        wanted = N_ACTIONS + FIRST_NEAR + PER_NEAR * self.k
+        chain = [(b, a) for a, b in pairwise(widths)]
+        if (widths[0], widths[-1]) != (wanted, N_ACTIONS) or shapes != chain:
+            raise InputError(f"layers have shapes {shapes}, want a chain from {wanted} numbers to {N_ACTIONS}")
+        self.layers, self.activation, self.masked = list(layers), activation, masked
+        flat = [part for weights, biases in layers for part in (weights.T.ravel(), biases)]
+        self._arrays = {
+            "widths": np.array(widths, np.int64),
+            "weights": np.concatenate(flat).astype(np.float32),
+            "values": np.zeros(2 * max(widths), np.float32),
+        }
+        for bound in self._known.values():
+            self._write(bound.record)
+
+    def address_for(self, problems: Sequence[SearchProblem]) -> int:
+        """Return the address of a NETWORK record for fleets in these scenarios; it lives as long as this rule."""
+        key = tuple(map(id, problems))
+        if key not in self._known:
+            around = Surroundings.of(problems, self.k)
+            arrays = [np.ascontiguousarray(array) for array in around]
+            its = np.zeros(1, SURROUNDINGS)
+            for name, array in zip(Surroundings._fields, arrays, strict=True):
+                its[name] = address_of(array, array.dtype)
+            n, width = around.fixed.shape
+            its["n_lots"], its["n_vertices"], its["width"], its["k"] = len(around.first), n, width, self.k
+            record, local = np.zeros(1, NETWORK), np.zeros(width, np.float32)
+            record["surroundings"], record["local"] = address_of(its, SURROUNDINGS), address_of(local, np.float32)
+            self._write(record)
+            self._known[key] = _Bound(record, (its, local, arrays, tuple(problems)))
+        return address_of(self._known[key].record, NETWORK)
+
+    def _write(self, record: NDArray[np.void]) -> None:
+        for name, array in self._arrays.items():
+            record[name] = address_of(array, array.dtype)
+        record["n_layers"], record["widest"] = len(self.layers), len(self._arrays["values"]) // 2
+        record["activation"] = ACTIVATIONS.index(self.activation)
+        record["masked"], record["sampled"] = self.masked, self.sampled
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the network; records hold addresses of this process."""
+        options = {name: getattr(self, name) for name in ("activation", "masked", "sampled", "name")}
+        return _network_rule, (self.layers, self.k, options)
+
+
+def _network_rule(layers: Sequence[Layer], k: int, options: dict[str, Any]) -> NetworkRule:
+    return NetworkRule(layers, k, **options)
