@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def train(
     algorithm: str | None = None,
     /,
-    env: Literal["search", "drive"] = "search",
+    env: Literal["search", "fleet", "drive"] = "search",
     scenario: str | None = None,
     steps: int | None = None,
     trainings: int = 5,
@@ -44,6 +44,13 @@ def train(
     evaluate_on: str | None = None,
     curriculum: Literal["size"] | None = None,
     without: str | None = None,
+    arrivals_per_hour: float | None = None,
+    stay_min: float | None = None,
+    patience_min: float | None = None,
+    knows: Literal["own", "shared", "reserve", "full"] | None = None,
+    among: str | None = None,
+    learners: float | None = None,
+    test_among: str | None = None,
     test_on: str | None = None,
     agents: str | None = None,
     beside: str | None = None,
@@ -55,9 +62,10 @@ def train(
     """Train agents by reinforcement learning with several seeds, and draw their learning curves beside the planners.
 
     The reward of search agents is minus the time in seconds. They observe the surroundings of the car, so they run on
-    any lot. Driving agents park the car in a slot, with hindsight experience replay (sac, tqc) or the dense reward
-    (ppo); their curriculum starts just outside the slot. Both are evaluated in held-out worlds; each seed's best model
-    is kept, and tested at the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
+    any lot. In a fleet, one network drives all cars, or a share of them. Driving agents park the car in a slot, with
+    hindsight experience replay (sac, tqc) or the dense reward (ppo); their curriculum starts just outside the slot. All
+    are evaluated in held-out worlds; each seed's best model is kept, and tested at the end. Hyperparameters are in
+    parkenv/evaluation/training/configs.py.
 
     Examples:
         parkenv train maskable-ppo --scenario campus
@@ -66,20 +74,24 @@ def train(
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train network --scenario my-lots --evaluate-on other-lots
         parkenv train ppo --beside results/maskable-ppo,results/dqn
+        parkenv train --env fleet --scenario campus --arrivals-per-hour 120 --trainings 3
         parkenv train sac --env drive --scenario campus,street --trainings 3
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
 
     Options:
-        algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo, network. To drive: sac, tqc,
+        algorithm (ALGORITHM): To search: dqn, ppo, maskable-ppo (default), recurrent-ppo, network. In a fleet: ppo,
+            maskable-ppo (default). To drive: sac, tqc,
             ppo (default).
-        env (search|drive): Learn to search (parkenv/Search-v2), or to drive into slots (parkenv/Drive-v1).
+        env (search|fleet|drive): Learn to search (parkenv/Search-v2), to search as all cars of a fleet, or to drive
+            into slots (parkenv/Drive-v1).
         scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
             campus; to drive, campus,street; for network, made lots alone]
-        steps (N >= 1): Decisions of a training; for network, those that belief labels.  [default: 2000000; for network,
-            10000; to drive, the training config's]
+        steps (N >= 1): Decisions of a training; for network, those that belief labels.  [default: 2000000; in a
+            fleet, 500000; for network, 10000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.
         seed (N >= 0): First seed of the trainings.
-        out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM]
+        out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM,
+            results/fleet-ALGORITHM]
 
     Learning:
         clone (AGENT): Start with behaviour cloning of this planner (search; ppo, maskable-ppo).
@@ -89,24 +101,35 @@ def train(
             (search).  [default: all places from the start]
         without (PART[,...]): Parts of network to leave out: lookahead, tokens, day, memory.  [default: none]
 
+    Many cars:
+        arrivals_per_hour (X > 0): Cars that arrive in the hours of the scenario (fleet).  [default: 120]
+        stay_min (0.1 <= X <= 100000): Mean of the exponentially distributed stays, minutes (fleet).  [default: 60]
+        patience_min (0.1 <= X <= 100000): Minutes after which a searching car goes elsewhere (fleet).  [default: 10]
+        knows (own|shared|reserve|full): What the learning cars know, as in parkenv fleet.  [default: own]
+        among (AGENT): Driver of the other cars: greedy-drive, first-free, random or a model.  [default: none, every car
+            learns]
+        learners (0 < X < 1): Share of the cars that learn, with --among.  [default: 0.1]
+        test_among (NAME[,...]|none): Test also with the model as each tenth car among these.  [default: greedy-drive]
+
     Evaluation:
-        evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; to drive, a twentieth of --steps]
+        evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; in a fleet and to drive, a
+            twentieth of --steps]
         evaluation_episodes (N >= 2): Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind
-            of slot.  [default: 256; to drive, 64]
+            of slot; in a fleet, days.  [default: 256; to drive, 64; in a fleet, 8]
         held_out (0 < X < 1): Train on other places than evaluations are in: hold out this share of --scenario, by a
             hash of each lot (search).  [default: none]
         evaluate_on (NAME|FILE|DIR[,...]): Hold out these places instead (search).  [default: none]
         test_on (NAME|FILE|DIR[,...]): Scenarios to test in at the end.  [default: those of the training; with held-out
             places, all of either side together]
         agents (NAME[,...]|none): Agents that are drawn for comparison.  [default: belief, mdp-tuned, mdp, first-free,
-            greedy-drive, greedy-goal; with held-out places, belief, mdp, first-free, greedy-drive; to drive, planner]
+            greedy-drive, greedy-goal; with held-out places, belief, mdp, first-free, greedy-drive; in a fleet,
+            greedy-drive, first-free; to drive, planner]
         beside (DIR[,...]): Folders of other trainings with the same evaluations, to draw in the same figure.
 
     Results:
         resume: Continue from the checkpoints in --out; the models equal those of an unbroken training.
         tensorboard: Keep logs for TensorBoard in --out.
     """
-    from parkenv.evaluation.experiments.agent_spec import split_agents
     from parkenv.evaluation.experiments.spec import TrainingSpec
 
     given = {
@@ -114,17 +137,25 @@ def train(
         "evaluate_on": tuple(args.scenario_specs(evaluate_on)) if evaluate_on else None,
         "test_on": tuple(args.scenario_specs(test_on)) if test_on else None,
         "without": args.words("--without", without) if without else None,
-        "agents": None if agents is None else [] if agents == "none" else split_agents(agents),
+        "agents": _agents(agents),
+        "test_among": _agents(test_among),
+        "among": among,
     }
     spec = TrainingSpec().changed(
         env=env, algorithm=algorithm, steps=steps, trainings=trainings, seed=seed, clone=clone,
         demonstrations=demonstrations, k=k, held_out=held_out, curriculum=curriculum, evaluate_every=evaluate_every,
-        evaluation_episodes=evaluation_episodes,
-        tensorboard=tensorboard, **given, **machines.given,
+        evaluation_episodes=evaluation_episodes, arrivals_per_hour=arrivals_per_hour, stay_min=stay_min,
+        patience_min=patience_min, knows=knows, learners=learners, tensorboard=tensorboard, **given, **machines.given,
     )  # fmt: skip
     out = out or Path("results") / _task_of(spec).folder
     with writing_into(out, "the same command with --resume"):
         run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
+
+
+def _agents(text: str | None) -> list[str] | None:
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+
+    return None if text is None else [] if text == "none" else split_agents(text)
 
 
 def _task_of(spec: TrainingSpec) -> TrainingTask:
@@ -135,6 +166,10 @@ def _task_of(spec: TrainingSpec) -> TrainingTask:
         from parkenv.evaluation.training.network_task import NetworkTask
 
         return NetworkTask(spec)
+    if spec.env == "fleet":
+        from parkenv.evaluation.training.fleet_task import FleetTask
+
+        return FleetTask(spec)
     return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
 
 

@@ -42,6 +42,7 @@ from parkenv.envs.fleet_records import (
     STATES,
 )
 from parkenv.envs.fleet_rules import Rule
+from parkenv.envs.local_observation import Surroundings, observe_surroundings_at
 from parkenv.envs.search import action_number, space_of
 from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS, step_result_at
 from parkenv.envs.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
@@ -253,6 +254,7 @@ class Fleet:
             self._grow_reports()
         self._memory: dict[int, Any] = {}  # states of the agents of `run`, by car
         self._drive_s: dict[int, NDArray[np.float64]] = {}
+        self._surroundings: dict[int, Surroundings] = {}
 
     def _require(self, background: str, max_steps: int, times: Mapping[str, float]) -> None:
         if not isinstance(self.demand, Demand):
@@ -280,7 +282,8 @@ class Fleet:
         """Return the address of the NETWORK record of each kind of driver, 0 for those without."""
         rules = [kind.rule for kind in self.drivers]
         return np.array(
-            [rule.address_for(self.scenarios) if isinstance(rule, NetworkRule) else 0 for rule in rules], np.int64
+            [rule.address_for(self.scenarios) if isinstance(rule, NetworkRule) else 0 for rule in rules],
+            np.int64,
         )
 
     def _keep(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -391,7 +394,9 @@ class Fleet:
         while (car := self.next_decision(until)) is not None:
             agent = agents[int(self._cars["kind"][car])]
             try:
-                action, memory[car] = agent.predict(self.observation(car), memory.get(car))
+                k = getattr(agent, "local_k", None)  # models observe `local`
+                observation = self.observation(car) if k is None else self.local_observation(car, k)
+                action, memory[car] = agent.predict(observation, memory.get(car))
             except Exception as error:
                 raise InputError(
                     f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
@@ -524,6 +529,20 @@ class Fleet:
         if self.sees_cars:
             observation["cars"] = self._cars_in_view(car, int(vertex))
         return observation
+
+    def local_observation(self, car: int, k: int = 5) -> dict[str, Any]:
+        """Return the `local` observation of a searching car, with k slots; to be called once at each of its decisions.
+
+        `parkenv.envs.local_observation` describes it.
+        """
+        searches, row = self._search_of(car)
+        if k not in self._surroundings:
+            self._surroundings[k] = Surroundings.of(self.scenarios, k)
+        around = self._surroundings[k]
+        local = np.empty(around.fixed.shape[1], np.float32)
+        observe_surroundings_at(searches.address + row * SEARCH.itemsize, around, local)
+        scenario = self.scenarios[self._cars["place"][car]]
+        return {"local": local, "action_mask": scenario.action_masks[searches.records["vertex"][row]].copy()}
 
     def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
         """Return which slots in view of a vertex hold a car that shows that it leaves, (n_slots,)."""

@@ -195,7 +195,7 @@ class NetworkRule(Rule):
     Several fleets may share one; its weights may change at any time.
 
     Args:
-        layers: weights and biases from the inputs, `action_mask` and `local`, to logits, or values, of the five actions.
+        layers: weights and biases from the inputs, `action_mask` and `local`, to logits, or values, of the actions.
         k: number of slots in the observation.
         activation: of the hidden layers, `tanh` or `relu`.
         masked: whether actions that the graph does not have are left out.
@@ -234,7 +234,9 @@ class NetworkRule(Rule):
         wanted = N_ACTIONS + FIRST_NEAR + PER_NEAR * self.k
         chain = [(b, a) for a, b in pairwise(widths)]
         if (widths[0], widths[-1]) != (wanted, N_ACTIONS) or shapes != chain:
-            raise InputError(f"layers have shapes {shapes}, want a chain from {wanted} numbers to {N_ACTIONS}")
+            raise InputError(
+                f"layers have shapes {shapes}, want a chain from {wanted} numbers to {N_ACTIONS}"
+            )
         self.layers, self.activation, self.masked = list(layers), activation, masked
         flat = [part for weights, biases in layers for part in (weights.T.ravel(), biases)]
         self._arrays = {
@@ -257,7 +259,10 @@ class NetworkRule(Rule):
             n, width = around.fixed.shape
             its["n_lots"], its["n_vertices"], its["width"], its["k"] = len(around.first), n, width, self.k
             record, local = np.zeros(1, NETWORK), np.zeros(width, np.float32)
-            record["surroundings"], record["local"] = address_of(its, SURROUNDINGS), address_of(local, np.float32)
+            record["surroundings"], record["local"] = (
+                address_of(its, SURROUNDINGS),
+                address_of(local, np.float32),
+            )
             self._write(record)
             self._known[key] = _Bound(record, (its, local, arrays, tuple(problems)))
         return address_of(self._known[key].record, NETWORK)

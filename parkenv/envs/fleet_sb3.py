@@ -122,7 +122,10 @@ class FleetVecEnv(SharedVecEnv):
         self._cars, self._first = np.full(n, NO_CAR, np.int64), np.zeros(n, np.int64)
         self._ended = np.zeros(n, CAR)
         self._rewards, self._done = np.zeros(n), np.zeros(n, np.bool_)
-        self._local, self._masks = np.zeros((2, n, shape[0]), np.float32), np.zeros((2, n, N_ACTIONS), np.int8)
+        self._local, self._masks = (
+            np.zeros((2, n, shape[0]), np.float32),
+            np.zeros((2, n, N_ACTIONS), np.int8),
+        )
 
     def share(self, policy: Any) -> None:
         """Let the other learning cars drive by the current weights of a policy of stable-baselines3 or sb3-contrib.

@@ -79,10 +79,10 @@ def _arrays(item: Any) -> Any:
     def array(_: Any, address: Any, shape: Any) -> Any:  # noqa: ARG001 - numba passes it
         kind = types.Array(item, len(shape), "C")
 
-        def code(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def code(context: Any, builder: Any, _: Any, values: Any) -> Any:
             view = context.make_array(kind)(context, builder)
-            itemsize = context.get_abi_sizeof(context.get_data_type(item))
-            lengths, strides, size = cgutils.unpack_tuple(builder, values[1]), [], ir.Constant(ir.IntType(64), itemsize)
+            itemsize = ir.Constant(ir.IntType(64), context.get_abi_sizeof(context.get_data_type(item)))
+            lengths, strides, size = cgutils.unpack_tuple(builder, values[1]), [], itemsize
             for length in reversed(lengths):
                 strides.insert(0, size)
                 size = builder.mul(size, length)

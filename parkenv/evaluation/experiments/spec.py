@@ -218,6 +218,7 @@ class BenchmarkSpec(Workplace):
 
 BUSY = TrafficSpec(cars=3, pedestrians=5)
 """Default traffic of runs with simulated sensors."""
+Minutes = Annotated[float, Field(ge=0.1, le=100_000.0)]
 CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
 """Distance between captures, m."""
 
@@ -252,12 +253,18 @@ class DemoSpec(Workplace):
     seed: int = Field(0, ge=0, lt=2**31)
 
 
+FLEET_FIELDS = ("arrivals_per_hour", "stay_min", "patience_min", "knows", "among", "learners", "test_among")
+"""Fields of trainings with `env = "fleet"`."""
+
+
 class TrainingSpec(Workplace):
     """Training by reinforcement learning, one model per seed; missing values depend on the environment."""
 
     kind: Literal["train"] = "train"
-    env: Literal["search", "drive"] = Field("search", description="Search for a slot, or drive into one.")
-    algorithm: str | None = Field(None, description="maskable-ppo for search, ppo for drive if absent.")
+    env: Literal["search", "fleet", "drive"] = Field(
+        "search", description="Search for a slot, alone or as all cars of a fleet; or drive into one."
+    )
+    algorithm: str | None = Field(None, description="maskable-ppo to search, ppo to drive if absent.")
     scenarios: Scenarios | None = Field(None, description="Trained on, drawn for each search.")
     held_out: Level | None = Field(
         None,
@@ -273,6 +280,27 @@ class TrainingSpec(Workplace):
         "steps (search).",
     )
     test_on: Scenarios | None = Field(None, description="Tested on in the end; the same if absent.")
+    arrivals_per_hour: float | None = Field(
+        None, gt=0.0, le=100_000.0, description="Cars that arrive; 120 if absent (fleet)."
+    )
+    stay_min: Minutes | None = Field(None, description="Mean stay; 60 if absent (fleet).")
+    patience_min: Minutes | None = Field(
+        None, description="After which a searching car goes elsewhere; 10 if absent (fleet)."
+    )
+    knows: Literal["own", "shared", "reserve", "full"] | None = Field(
+        None, description="What the learning cars know; own if absent (fleet)."
+    )
+    among: AgentItem | None = Field(
+        None, description="Compiled driver of the other cars; every car learns if absent (fleet)."
+    )
+    learners: Level | None = Field(
+        None, description="With among: share of the cars that learn; 0.1 if absent (fleet)."
+    )
+    test_among: Several[AgentItem] | None = Field(
+        None,
+        max_length=100,
+        description="Tested also as each tenth car among these; greedy-drive if absent (fleet).",
+    )
     steps: int | None = Field(None, ge=1, le=10**12, description="Decisions of a training.")
     trainings: int = Field(5, ge=1, le=10_000, description="How many, one for each seed.")
     seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
@@ -298,10 +326,17 @@ class TrainingSpec(Workplace):
 
     @model_validator(mode="after")
     def _of_env(self) -> Self:
+        if self.env != "search":
+            alone = ("clone", "demonstrations", "held_out", "evaluate_on", "curriculum")
+            self._require_unset("search", *alone)
         if self.env == "drive":
-            for name in ("clone", "demonstrations", "k", "held_out", "evaluate_on", "curriculum"):
-                if getattr(self, name) is not None:
-                    raise PydanticCustomError("whole", "{name} goes with env search", {"name": name})
+            self._require_unset("search", "k")
+        if self.env == "fleet":
+            self._require_unset("search or drive", "test_on")
+        else:
+            self._require_unset("fleet", *FLEET_FIELDS)
+        if self.learners is not None and self.among is None:
+            raise PydanticCustomError("whole", "learners goes with among")
         if self.without is not None and self.algorithm != "network":
             raise PydanticCustomError("whole", "without goes with algorithm network")
         if self.held_out is not None and self.evaluate_on is not None:
@@ -309,6 +344,11 @@ class TrainingSpec(Workplace):
         if self.demonstrations is not None and self.clone is None:
             raise PydanticCustomError("whole", "demonstrations goes with clone")
         return self
+
+    def _require_unset(self, env: str, *names: str) -> None:
+        for name in names:
+            if getattr(self, name) is not None:
+                raise PydanticCustomError("whole", "{name} goes with env {env}", {"name": name, "env": env})
 
 
 SPECS: dict[str, type[Workplace]] = {

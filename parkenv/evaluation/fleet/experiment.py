@@ -13,17 +13,16 @@ import numpy as np
 
 from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.envs.fleet_records import KNOWLEDGE
-from parkenv.envs.fleet_rules import RULES
 from parkenv.errors import InputError, nearest
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import Workers
+from parkenv.evaluation.fleet.drivers import driver_of
 from parkenv.evaluation.fleet.measures import MEANS, Roads, day_measures
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
-from planners.agent import ClairvoyantAgent, make_agent
 
 Row = dict[str, Any]
 
@@ -127,13 +126,7 @@ class FleetExperiment:
 
     def fleet(self, setting: Setting, scenario: Scenario) -> tuple[Fleet, list[Any]]:
         """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled."""
-        spec = AgentSpec.of(setting.agents)
-        rule = None if spec.options else RULES.get(spec.name)
-        agent = None if rule is not None else make_agent(spec.name, scenario, **spec.options)
-        if isinstance(agent, ClairvoyantAgent):
-            raise InputError(
-                f"agent {setting.agents!r} knows the future of single searches, and drives no fleet"
-            )
+        rule, agent = driver_of(AgentSpec.of(setting.agents), scenario)
         kinds = [
             DriverKind(setting.share, rule, setting.knows, shares=setting.knows == "shared"),
             DriverKind(1.0 - setting.share, rule, OWN),

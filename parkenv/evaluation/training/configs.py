@@ -65,6 +65,9 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
 }
 """Config of each algorithm for search."""
 
+FLEET_CONFIGS = {name: SEARCH_CONFIGS[name] for name in ("ppo", "maskable-ppo")}
+"""Config of each algorithm for a fleet: those of search whose network is compiled for the other cars."""
+
 
 WAY_IN = "way-in"  # start on the planned path into the slot
 

@@ -127,6 +127,10 @@ class Training(AnyTraining):
         """Called before each rollout; subclasses may make the environment harder. It must depend on the steps alone."""
         del model
 
+    def before_checkpoint(self, model: Any) -> None:
+        """Called between rollouts, before a checkpoint; subclasses may bring the environment to a simpler state."""
+        del model
+
     def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
         """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
@@ -241,6 +245,7 @@ class _Evaluator(BaseCallback):  # type: ignore[misc]
                 model, self.folder / MODEL, results=scores, command=subject.command, **subject.description()
             )
         write_csv(self.folder / CURVE, list(self.curve[0]), self.curve)
+        subject.before_checkpoint(model)
         # Last: a training that is killed before this line repeats what it has just done.
         save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
         return scores
