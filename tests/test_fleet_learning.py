@@ -31,9 +31,10 @@ from planners.model_file import save_model
 
 MINI = make_scenario("mini")
 DEMAND = Demand(PoissonArrivals(60.0, 8 * 3600, 8.5 * 3600), ExponentialTime(480.0), ConstantTime(300.0))
+LEARNERS = (DriverKind(),)
 
 
-def batch(n=3, drivers=(DriverKind(),), **options):
+def batch(n=3, drivers=LEARNERS, **options):
     return FleetVecEnv(n, MINI, DEMAND, drivers, leave_full_lot=False, **options)
 
 
@@ -108,6 +109,8 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
     agent = make_agent(f"{name}:{path}", MINI)
     rule, none = driver_of(AgentSpec(name=f"{name}:{path}"), MINI)
     assert none is None
+    assert rule.sampled == (algorithm is not DQN), "policies draw their actions in fleets"
+    rule = network_rule(model.policy, 5)
     found = []
     for kind, agents in ((DriverKind(rule=rule), None), (DriverKind(), [agent])):
         fleet = Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False)
@@ -152,7 +155,7 @@ def test_a_search_that_is_cut_off_says_so_and_one_that_balks_does_not():
         for _ in range(2000):
             masks = venv.action_masks()
             masks[:, 4] = False  # drive on
-            _, rewards, done, infos = venv.step(masks.argmax(axis=1))
+            _, _, done, infos = venv.step(masks.argmax(axis=1))
             ends += [info for info, over in zip(infos, done, strict=True) if over]
             if len(ends) > 5:
                 break

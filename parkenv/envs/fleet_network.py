@@ -239,7 +239,7 @@ class NetworkRule(Rule):
             )
         self.layers, self.activation, self.masked = list(layers), activation, masked
         flat = [part for weights, biases in layers for part in (weights.T.ravel(), biases)]
-        self._arrays = {
+        self._arrays: dict[str, NDArray[Any]] = {
             "widths": np.array(widths, np.int64),
             "weights": np.concatenate(flat).astype(np.float32),
             "values": np.zeros(2 * max(widths), np.float32),

@@ -220,7 +220,8 @@ class FleetVecEnv(SharedVecEnv):
 
     def action_masks(self) -> BoolArray:
         """Return the action masks, (n_envs, 5) bool."""
-        return self._masks[0].astype(np.bool_)
+        masks: BoolArray = self._masks[0].astype(np.bool_)
+        return masks
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any

@@ -82,7 +82,8 @@ def _arrays(item: Any) -> Any:
         def code(context: Any, builder: Any, _: Any, values: Any) -> Any:
             view = context.make_array(kind)(context, builder)
             itemsize = ir.Constant(ir.IntType(64), context.get_abi_sizeof(context.get_data_type(item)))
-            lengths, strides, size = cgutils.unpack_tuple(builder, values[1]), [], itemsize
+            lengths, size = cgutils.unpack_tuple(builder, values[1]), itemsize
+            strides: list[Any] = []
             for length in reversed(lengths):
                 strides.insert(0, size)
                 size = builder.mul(size, length)

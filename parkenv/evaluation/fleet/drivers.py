@@ -18,6 +18,7 @@ from parkenv.evaluation.experiments.workers import Workers
 from parkenv.world.demand import Demand
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
+from planners.learned import LearnedAgent
 
 Row = dict[str, Any]
 _WITHOUT_NETWORK_RULE = ("recurrent-ppo",)
@@ -26,7 +27,8 @@ _WITHOUT_NETWORK_RULE = ("recurrent-ppo",)
 def driver_of(spec: AgentSpec, scenario: Scenario) -> tuple[Rule | None, Any]:
     """Return the compiled driver of an agent, or else the agent itself, which decides in Python.
 
-    Heuristics and trained networks without memory are compiled.
+    Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
+    actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
 
     Raises:
         InputError: there is no such agent, or it is none for fleets.
@@ -36,10 +38,11 @@ def driver_of(spec: AgentSpec, scenario: Scenario) -> tuple[Rule | None, Any]:
     agent = make_agent(spec.name, scenario, **spec.options)
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
-    if getattr(agent, "local_k", None) is not None and agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
+    if isinstance(agent, LearnedAgent) and agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
         from parkenv.envs.fleet_sb3 import network_rule
 
-        return network_rule(agent.model, agent.local_k, name=spec.label), None
+        sampled = agent.card.algorithm != "dqn"
+        return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     return None, agent
 
 

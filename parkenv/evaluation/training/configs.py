@@ -65,8 +65,13 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
 }
 """Config of each algorithm for search."""
 
-FLEET_CONFIGS = {name: SEARCH_CONFIGS[name] for name in ("ppo", "maskable-ppo")}
-"""Config of each algorithm for a fleet: those of search whose network is compiled for the other cars."""
+# Fewer and shorter rollouts than for single searches: the other cars follow the network only from rollout to rollout.
+_IN_FLEET = {**_ON_POLICY, "batch_size": 1024}
+FLEET_CONFIGS = {
+    "ppo": TrainingConfig(64, "MultiInputPolicy", _IN_FLEET, 0.05),
+    "maskable-ppo": TrainingConfig(64, "MultiInputPolicy", _IN_FLEET, 0.05),
+}
+"""Config of each algorithm for a fleet; their networks are compiled for the other cars."""
 
 
 WAY_IN = "way-in"  # start on the planned path into the slot

@@ -77,7 +77,7 @@ class FleetTraining(Training):
     def evaluate(self, policy: Any, env: VecEnv) -> Row:
         """Run the held-out days."""
         del env
-        row = self.fleet.row(network_rule(policy, self.k), self.evaluation_seed, self.days)
+        row = self.fleet.row(network_rule(policy, self.k, sampled=True), self.evaluation_seed, self.days)
         low, high = row["total_s_ci95"]
         found = (row["total_s"], low, high, row["parked_fraction"], row["search_s"])
         return dict(zip(self.metrics, found, strict=True))
