@@ -77,7 +77,7 @@ def test_the_other_cars_choose_as_the_learning_one_does():
     """A world driven through the batch equals one in which all cars follow the same policy."""
     venv = batch(1)
     model = small(MaskablePPO, venv, n_steps=8, batch_size=8)
-    venv.share(model.policy)
+    venv.follow(model.policy)
     venv.network.sampled = False
     venv.network.set_layers(*layers_of(model.policy)[:1])
     venv.seed(1)

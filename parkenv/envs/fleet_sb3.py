@@ -16,7 +16,6 @@ from parkenv.envs.fleet import MAX_STEPS, DriverKind, Fleet, total_s
 from parkenv.envs.fleet_kernel import act_at, advance_at, release_at
 from parkenv.envs.fleet_network import Layer, NetworkRule, observe_locally
 from parkenv.envs.fleet_records import CAR, SEARCHING, TRUNCATED, car_at, fleet_at
-from parkenv.envs.fleet_rules import RULES
 from parkenv.envs.local_observation import local_space
 from parkenv.envs.search_records import N_ACTIONS, scenario_at, search_at
 from parkenv.envs.shared_slots import NO_CAR
@@ -37,7 +36,6 @@ _METRICS = (
 _DECIDED, _UNDER_WAY, _OVER, _OBSERVED = range(4)
 """Stages of a world during a step: its car has decided, is under way, has ended its search, or has observed."""
 _CAR_BYTES = CAR.itemsize
-_WARM_UP = RULES["greedy-drive"]
 
 
 class FleetVecEnv(SharedVecEnv):
@@ -47,14 +45,14 @@ class FleetVecEnv(SharedVecEnv):
     car, from its arrival to the end of its search, then those of the next car to arrive. The other learning cars of the
     world are driven by the same network in compiled code, and draw their actions as the learning car does. So decisions
     are in their true order in continuous time, an episode is the search of one car, and algorithms need no change.
-    `ShareNetwork` is a callback that hands the current weights to the other cars before each rollout; without it they
+    `ShareNetwork` is a callback that hands the current weights to the other cars before each rollout; until then, they
     choose among the possible actions alike.
 
     Rewards are minus seconds times `reward_scale`. An episode is terminated when the car parks, gives up or balks, and
     truncated after `max_steps` decisions. Its last `info` is as that of `SearchVecEnv`.
 
     At `reset`, worlds begin at a car in the middle of a day, drawn from the seed, so that the batch holds all times of
-    the day at once; cars before it drive as `greedy-drive` does. Later days begin with their first car.
+    the day at once; the network drives the cars before it, too. Later days begin with their first car.
 
     Args:
         num_envs: number of worlds.
@@ -115,6 +113,7 @@ class FleetVecEnv(SharedVecEnv):
             Fleet(its, demand, drivers=kinds, max_steps=max_steps, **options) for _ in range(num_envs)
         ]
         self.reward_scale = reward_scale
+        self._policy: Any = None
         n = num_envs
         self._world_seeds, self._days = np.zeros(n, np.int64), np.full(n, -1, np.int64)
         self._addresses = np.array([fleet.address for fleet in self.fleets], np.int64)
@@ -127,12 +126,15 @@ class FleetVecEnv(SharedVecEnv):
             np.zeros((2, n, N_ACTIONS), np.int8),
         )
 
-    def share(self, policy: Any) -> None:
-        """Let the other learning cars drive by the current weights of a policy of stable-baselines3 or sb3-contrib.
+    def follow(self, policy: Any) -> None:
+        """Let the other learning cars drive by a policy of stable-baselines3 or sb3-contrib.
+
+        Its current weights are copied now, and whenever worlds begin by `reset` or `set_state`.
 
         Raises:
             InputError: a policy that is no multilayer perceptron on the `local` observation.
         """
+        self._policy = policy
         layers, activation, masked = layers_of(policy)
         self.network.set_layers(layers, activation=activation, masked=masked)
 
@@ -152,13 +154,13 @@ class FleetVecEnv(SharedVecEnv):
         return self._begin_days()
 
     def _begin_days(self) -> dict[str, NDArray[Any]]:
+        if self._policy is not None:
+            self.follow(self._policy)
         for i in range(self.num_envs):
             self._begin_day(i)
-            cars, draws = self.fleets[i].cars, np.random.default_rng([self._world_seeds[i], self._days[i]])
-            learning = np.flatnonzero(cars["kind"] == LEARNERS)
-            if len(learning):
-                self._first[i] = learning[draws.integers(len(learning))]
-                cars["rule"][: self._first[i]][cars["kind"][: self._first[i]] == LEARNERS] = _WARM_UP.address
+            draws = np.random.default_rng([self._world_seeds[i], self._days[i]])
+            learning = np.flatnonzero(self.fleets[i].cars["kind"] == LEARNERS)
+            self._first[i] = learning[draws.integers(len(learning))] if len(learning) else 0
         self._start_all()
         self._advance(np.zeros(self.num_envs, np.int64))
         return self._observations()
@@ -214,7 +216,7 @@ class FleetVecEnv(SharedVecEnv):
         return {"seeds": self._world_seeds.copy(), "days": self._days.copy()}
 
     def set_state(self, state: Mapping[str, Any]) -> None:
-        """Begin the days that a state from `get_state` names."""
+        """Begin the days that a state from `get_state` names; the others follow the policy as it is now."""
         self._world_seeds[:], self._days[:] = state["seeds"], state["days"]
         self._begin_days()
 
@@ -241,7 +243,7 @@ class ShareNetwork(BaseCallback):  # type: ignore[misc]
     """Callback for `learn`: before each rollout, hand the weights of the policy to the other cars of `FleetVecEnv`."""
 
     def _on_rollout_start(self) -> None:
-        self.training_env.share(self.model.policy)
+        self.training_env.follow(self.model.policy)
 
     def _on_step(self) -> bool:
         return True

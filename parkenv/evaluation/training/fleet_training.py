@@ -13,7 +13,6 @@ from parkenv.envs.fleet_sb3 import FleetVecEnv, network_rule
 from parkenv.evaluation.fleet.drivers import MixedFleet, driver_of
 from parkenv.evaluation.training.configs import (
     FLEET_CONFIGS,
-    MAX_STEPS,
     REWARD_SCALE,
     TrainingConfig,
     config_of,
@@ -61,13 +60,17 @@ class FleetTraining(Training):
         if fleet.among is not None:
             kinds.append(DriverKind(1.0 - fleet.share, driver_of(fleet.among, fleet.scenario)[0]))
         return FleetVecEnv(
-            self.config.n_envs, fleet.scenario, fleet.demand, kinds, REWARD_SCALE, self.k, MAX_STEPS,
+            self.config.n_envs, fleet.scenario, fleet.demand, kinds, REWARD_SCALE, self.k, fleet.max_steps,
             leave_full_lot=False,
         )  # fmt: skip
 
+    def connect(self, model: Any) -> None:
+        """Let the other cars of the worlds follow the model's policy."""
+        model.env.follow(model.policy)
+
     def before_rollout(self, model: Any) -> None:
-        """Let the other cars drive by the current weights."""
-        model.env.share(model.policy)
+        """Hand the current weights to the other cars."""
+        model.env.follow(model.policy)
 
     def before_checkpoint(self, model: Any) -> None:
         """Begin all worlds anew: a checkpoint then needs no more than the numbers of their days."""

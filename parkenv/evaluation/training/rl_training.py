@@ -119,6 +119,10 @@ class Training(AnyTraining):
         """Return the arguments of the algorithm's constructor, without the learning rate."""
         return {name: value for name, value in self.config.settings.items() if name != "learning_rate"}
 
+    def connect(self, model: Any) -> None:
+        """Called once the model exists, new or to be restored; subclasses may tell the environment of it."""
+        del model
+
     def prepare(self, model: Any, seed: int) -> None:
         """Prepare a new model before training; subclasses may pretrain it."""
         del model, seed
@@ -164,6 +168,7 @@ class Training(AnyTraining):
             model.set_logger(Logger(None, []))
         # stable-baselines3 has seeded the environment with the network's seed.
         env.seed(TRAINING_SEEDS * (seed + 1))
+        self.connect(model)
         if checkpoint.exists():
             state, curve = read_checkpoint(checkpoint)
             require_columns(curve, self.columns, checkpoint)
