@@ -85,10 +85,13 @@ def test_an_unknown_part_is_named():
     assert "no part 'engine' to measure; known: sensors, perception, planning, env" in str(result.exception)
 
 
-def test_days_of_fleets_are_measured():
+def test_days_of_fleets_are_measured(monkeypatch):
+    from parkenv.evaluation.bench import sumo
     from parkenv.evaluation.bench.fleet import fleet_rows
 
-    rows = fleet_rows(seed=0, seconds=0.0, worlds=2, large=400, day_cars=20, growth=(5,))
+    monkeypatch.setattr(sumo, "sumo_folder", lambda: None)
+    *rows, missing = fleet_rows(seed=0, seconds=0.0, worlds=2, large=400, day_cars=20, growth=(5,))
+    assert missing["case"] == "SUMO: not installed"
     assert all(row["value"] > 0 for row in rows)
     parts = [row["part"] for row in rows]
     assert parts == ["decisions"] * 2 + ["day", "memory"] * 4 + ["growth"] * 2

@@ -112,8 +112,8 @@ def train(
         test_among (NAME[,...]|none): Test also with the model as each tenth car among these.  [default: greedy-drive]
 
     Evaluation:
-        evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; in a fleet and to drive, a
-            twentieth of --steps]
+        evaluate_every (N >= 1): Decisions between evaluations.  [default: 100000; in a fleet, a tenth of
+            --steps; to drive, a twentieth]
         evaluation_episodes (N >= 2): Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind
             of slot; in a fleet, days.  [default: 256; to drive, 64; in a fleet, 8]
         held_out (0 < X < 1): Train on other places than evaluations are in: hold out this share of --scenario, by a

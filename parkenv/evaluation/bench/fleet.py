@@ -10,6 +10,7 @@ import numpy as np
 from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.envs.fleet_rules import RULES
 from parkenv.evaluation.bench.rows import BenchRow, duration, rate
+from parkenv.evaluation.bench.sumo import sumo_rows
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.demand import Demand, ExponentialTime, Headways, PoissonArrivals
@@ -38,7 +39,8 @@ def fleet_rows(
 
     A batch is many worlds with random actions, from their beginning to their end, one world after the other. Days are
     24 hours in which cars arrive as a Poisson process and stay for two hours on average; the residents of the lot,
-    which is 80 % full at midnight, leave and do not return.
+    which is 80 % full at midnight, leave and do not return. If SUMO is installed, it simulates the same days on a lot
+    of one-way lanes.
 
     Args:
         seed: seed of the worlds.
@@ -78,7 +80,7 @@ def fleet_rows(
         )
         rows += duration("growth", case, 1e3 * took, "ms a day")
         rows += duration("growth", case, 1e9 * took / day.totals["decisions"], "ns a decision")
-    return rows
+    return rows + sumo_rows(seed)
 
 
 def _day(cars: int) -> Demand:

@@ -10,7 +10,8 @@ import resource
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -20,9 +21,13 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.fleet import Fleet, drive_times
+from parkenv.envs.fleet import DriverKind, Fleet, drive_times
+from parkenv.envs.fleet_rules import RULES
 from parkenv.errors import InputError
+from parkenv.evaluation.bench.rows import BenchRow, absent, duration
+from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.lot import ParkingLot
+from parkenv.world.week import HOUR_S
 
 PARKING_WEIGHTS = {
     "parking.distanceto.weight": 1,  # the nearest of the areas not known to be full
@@ -30,7 +35,10 @@ PARKING_WEIGHTS = {
     "parking.memory": 1_000_000,  # an area found full is not tried again for this time, s
     "parking.frustration": 1_000_000,
 }
-"""Parameters of SUMO's drivers that make its rule that of `greedy-drive`: always on to the nearest slot not known taken."""
+"""Parameters with which SUMO's drivers do as `greedy-drive`: drive on to the nearest slot not known to be taken."""
+STEPS_S = (1.0, 0.1)
+"""Time steps of SUMO, s."""
+_WINDOW = 8 * HOUR_S, 13 * HOUR_S
 _SHORT_M = 2.0  # length of a parking area on its lane, m
 # A step is 0.1 to 1 s, so these reach any speed, or stop, within one.
 _AT_ONCE = 100.0  # m/s²
@@ -84,6 +92,47 @@ def sumo_version(folder: Path) -> str:
     return f"SUMO {said[said.index('sumo') + 1] if 'sumo' in said else said[3]}"
 
 
+def sumo_rows(seed: int = 0, days: int = 3, per_hour: float = 60.0) -> list[BenchRow]:
+    """Return rows with CPU times and mean search times of the same days in a fleet and in SUMO, if it is installed.
+
+    Args:
+        seed: seed of the days.
+        days: number of days.
+        per_hour: cars an hour, from 8 to 13 o'clock.
+    """
+    folder = sumo_folder()
+    if folder is None:
+        return absent("day", "SUMO: not installed", "s")
+    demand = Demand(PoissonArrivals(per_hour, *_WINDOW), ExponentialTime(HOUR_S))
+    kind = DriverKind(rule=RULES["greedy-drive"])
+    fleet = Fleet("street", demand, background="none", drivers=[kind], leave_full_lot=False)
+    end_s = _WINDOW[1] - _WINDOW[0] + HOUR_S
+    peers = {f"{sumo_version(folder)}, steps of {step:g} s": step for step in STEPS_S}
+    cpu_s: dict[str, list[float]] = {name: [] for name in ("ours", *peers)}
+    search_s: dict[str, list[float]] = {name: [] for name in ("ours", *peers)}
+    fleet.reset(seed)
+    fleet.run()  # compiles
+    for day in range(days):
+        start = time.process_time()
+        fleet.reset(seed, day)
+        fleet.run()
+        cpu_s["ours"].append(time.process_time() - start)
+        search_s["ours"].append(float((fleet.cars["ended_at"] - fleet.cars["arrival"]).mean()))
+        for name, step in peers.items():
+            theirs = run_sumo(fleet, folder, step, end_s)
+            cpu_s[name].append(theirs.cpu_s)
+            search_s[name].append(float(np.nanmean(theirs.search_s)))
+    case = f"street, {per_hour:g} cars an hour for 5 hours, greedy-drive"
+    ours, *others = (float(np.mean(cpu_s[name])) for name in cpu_s)
+    rows = duration("day", case, 1e3 * ours, "ms", **{n: 1e3 * t for n, t in zip(peers, others, strict=True)})
+    ours, *others = (float(np.mean(search_s[name])) for name in search_s)
+    for name, other in zip(peers, others, strict=True):
+        (row,) = duration("day", f"{case}: mean search time", ours, "s of search", **{name: other})
+        row["ratio"] = None  # to be equal, not to be small
+        rows.append(row)
+    return rows
+
+
 def streets_of(lot: ParkingLot) -> list[Street]:
     """Return the streets of a lot whose slots all lie on one-way lanes.
 
@@ -96,7 +145,9 @@ def streets_of(lot: ParkingLot) -> list[Street]:
     reached = np.bincount(lot.neighbors[lot.neighbors >= 0], minlength=lot.n_vertices)
     for slot in range(lot.n_slots):
         if len(neighbors[slot]) != 1 or reached[slot] != 1:
-            raise InputError(f"lot {lot.name!r}: slot {slot} is on no one-way lane, which SUMO's parking areas need")
+            raise InputError(
+                f"lot {lot.name!r}: slot {slot} is on no one-way lane, which SUMO's parking areas need"
+            )
     length = {
         (u, int(v)): float(lot.edge_length[u, a])
         for u, row in enumerate(lot.neighbors)
@@ -140,12 +191,12 @@ def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> SumoDay
             [
                 folder / "sumo", "-n", at / "lot.net.xml", "-a", at / "parking.add.xml", "-r", at / "trips.rou.xml",
                 "--step-length", str(step_s), "--end", str(end_s), "--stop-output", at / "stops.xml",
-                "--time-to-teleport", "-1", "--no-step-log", "true", "--no-warnings", "true",
+                "--stop-output.write-unfinished", "true", "--time-to-teleport", "-1", "--no-step-log", "true",
+                "--no-warnings", "true",
             ]
         )  # fmt: skip
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         stops = ElementTree.parse(at / "stops.xml").getroot()
-        # Areas still taken at the end have no entry yet, so every car stops for good only for the statistics.
         started = {stop.get("id"): float(stop.get("started", "nan")) for stop in stops}
     arrival_s = fleet.cars["arrival"] - fleet.begin
     search_s = np.array([started.get(str(car), np.nan) for car in range(len(arrival_s))]) - arrival_s
@@ -157,13 +208,18 @@ def _write_network(fleet: Fleet, streets: Iterable[Street], at: Path, folder: Pa
     xy, speed = fleet.scenario.lot.vertex_xy, fleet.scenario.v_drive
     streets = list(streets)
     junctions = sorted({v for street in streets for v in (street.start, street.end)})
-    _write(at / "lot.nod.xml", "nodes", [("node", {"id": v, "x": xy[v, 0], "y": xy[v, 1]}) for v in junctions])
+    _write(
+        at / "lot.nod.xml", "nodes", [("node", {"id": v, "x": xy[v, 0], "y": xy[v, 1]}) for v in junctions]
+    )
     edges = [
-        ("edge", {"id": s.name, "from": s.start, "to": s.end, "numLanes": 1, "speed": speed, "length": s.length})
+        (
+            "edge",
+            {"id": s.name, "from": s.start, "to": s.end, "numLanes": 1, "speed": speed, "length": s.length},
+        )
         for s in streets
     ]
     _write(at / "lot.edg.xml", "edges", edges)
-    files = ["-n", at / "lot.nod.xml", "-e", at / "lot.edg.xml", "-o", at / "lot.net.xml"]
+    files: list[str | Path] = ["-n", at / "lot.nod.xml", "-e", at / "lot.edg.xml", "-o", at / "lot.net.xml"]
     # Without lanes within junctions, routes have the lengths of the lot's drive graph.
     _run([folder / "netconvert", *files, "--no-internal-links", "true"])
 
@@ -218,7 +274,7 @@ def _add(parent: ElementTree.Element, tag: str, attributes: Mapping[str, object]
     return ElementTree.SubElement(parent, tag, text)
 
 
-def _run(command: list[str | Path]) -> str:
+def _run(command: Sequence[str | Path]) -> str:
     """Run one of SUMO's programs and return its output.
 
     Raises:

@@ -65,11 +65,11 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
 }
 """Config of each algorithm for search."""
 
-# Fewer and shorter rollouts than for single searches: the other cars follow the network only from rollout to rollout.
-_IN_FLEET = {**_ON_POLICY, "batch_size": 1024}
+# Shorter rollouts than for single searches: the other cars follow the network only from rollout to rollout.
+_IN_FLEET = {**_ON_POLICY, "n_steps": 128, "batch_size": 1024}
 FLEET_CONFIGS = {
-    "ppo": TrainingConfig(64, "MultiInputPolicy", _IN_FLEET, 0.05),
-    "maskable-ppo": TrainingConfig(64, "MultiInputPolicy", _IN_FLEET, 0.05),
+    "ppo": TrainingConfig(32, "MultiInputPolicy", _IN_FLEET, 0.05),
+    "maskable-ppo": TrainingConfig(32, "MultiInputPolicy", _IN_FLEET, 0.05),
 }
 """Config of each algorithm for a fleet; their networks are compiled for the other cars."""
 

@@ -48,7 +48,7 @@ class FleetTask(TrainingTask):
     def __init__(self, spec: TrainingSpec) -> None:
         super().__init__(spec)
         self.steps = spec.steps or 500_000
-        self.evaluate_every = spec.evaluate_every or max(1, self.steps // 20)
+        self.evaluate_every = spec.evaluate_every or max(1, self.steps // 10)
         self.k = spec.k or 5
         self.compared = PLANNERS if spec.agents is None else spec.agents
         self.test_among = (AgentSpec(name="greedy-drive"),) if spec.test_among is None else spec.test_among
