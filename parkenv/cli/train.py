@@ -74,7 +74,7 @@ def train(
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train network --scenario my-lots --evaluate-on other-lots
         parkenv train ppo --beside results/maskable-ppo,results/dqn
-        parkenv train --env fleet --scenario campus --arrivals-per-hour 120 --trainings 3
+        parkenv train --env fleet --arrivals-per-hour 120 --trainings 3
         parkenv train sac --env drive --scenario campus,street --trainings 3
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
 
@@ -96,7 +96,7 @@ def train(
     Learning:
         clone (AGENT): Start with behaviour cloning of this planner (search; ppo, maskable-ppo).
         demonstrations (N >= 1): Episodes of the planner to clone.  [default: 2000]
-        k (N >= 1): Slots in an observation (search).  [default: 5]
+        k (N >= 1): Slots in an observation (search, fleet).  [default: 5]
         curriculum (size): Begin with the smallest tenth of the places, and add larger ones evenly until half of --steps
             (search).  [default: all places from the start]
         without (PART[,...]): Parts of network to leave out: lookahead, tokens, day, memory.  [default: none]

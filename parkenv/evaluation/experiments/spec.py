@@ -310,7 +310,7 @@ class TrainingSpec(Workplace):
     demonstrations: int | None = Field(
         None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone."
     )
-    k: int | None = Field(None, ge=1, le=1_000, description="Slots in an observation (search).")
+    k: int | None = Field(None, ge=1, le=1_000, description="Slots in an observation (search, fleet).")
     evaluate_every: int | None = Field(None, ge=1, le=10**12, description="Decisions between evaluations.")
     evaluation_episodes: int | None = Field(
         None,
