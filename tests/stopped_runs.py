@@ -21,8 +21,8 @@ from parkenv.evaluation.training.rl_training import MODEL
 
 COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
-    "fleet": "fleet --scenario mini --hours 08:00-09:00 --agents first-free(within_m=100) --knows own,reserve "
-    "--arrivals-per-hour 40,80 -n 40 --no-figures",
+    "fleet": "fleet --scenario mini --hours 08:00-09:00 --agents first-free(within_m=100) --knows own "
+    "--arrivals-per-hour 20 -n 40 --no-figures",
     "survey": "survey --scenario mini --sessions 3 --every 6",
     "calibrate": "calibrate --scenario mini -n 3",
     "benchmark": "benchmark run v1 --agents first-free",

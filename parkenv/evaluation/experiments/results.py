@@ -259,14 +259,14 @@ class ResultFolder:
         # Rewrite the readable lines: this drops a line truncated by a crash, and its episode runs again.
         self._write(self.episodes.values(), self._timings.values())
 
-    def add(self, rows: Sequence[Row], timings: Sequence[Row] = ()) -> None:
-        """Append finished episodes, and flush them to disk."""
+    def add(self, rows: Sequence[Row], timings: Sequence[Row] = (), *, sync: bool = True) -> None:
+        """Append finished episodes, and flush them to disk; see `append_text`."""
         # Memory first: after an interruption, `finish` rewrites the files from it.
         self._timings |= self._by_key(timings)
         self.episodes |= self._by_key(rows)
         # Timings before episodes: a finished episode would not run again for its timing.
         for file, columns, new in self._files(rows, timings):
-            append_text(file, csv_text(columns, new))
+            append_text(file, csv_text(columns, new), sync=sync)
 
     def decision_s(self, key: Key) -> list[float]:
         """Return the wall times of an episode's decisions, s; empty if a crash lost them."""

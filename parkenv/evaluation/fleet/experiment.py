@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -50,6 +51,7 @@ DIFFERENCES = {
     "others_difference_s": "others_s",
 }
 """Columns of paired differences, and the measures that are compared."""
+SYNC_S = 1.0  # least time between two flushes of finished days to disk, s
 _RESAMPLES = 9999
 
 Pairs = list[tuple[Row, Row]]
@@ -279,8 +281,12 @@ def _run_days(
     on_progress: Callable[[int], None],
 ) -> None:
     told = set()
+    synced = -math.inf
     for _, (row, messages) in workers.results(tasks):
-        folder.add([row])
+        # A day may take a millisecond, and a flush to disk a second.
+        sync = time.monotonic() >= synced + SYNC_S
+        folder.add([row], sync=sync)
+        synced = time.monotonic() if sync else synced
         on_progress(1)
         for message in messages:
             if message not in told:
