@@ -96,9 +96,8 @@ class Surroundings(NamedTuple):
     # (n, at least 6k) int16: indices of the k nearest slots into the row's slots, -1 past the last; the first move to
     # each, -1 if none; those of the k slots ahead of each move, least drive plus walk first, -1 past the last
     indices: NDArray[np.int16]
-    targets: NDArray[
-        np.int32
-    ]  # (n, 4) int32, vertices that the moves lead to; -1 if the graph has no such move
+    # (n, 4) int32, vertices that the moves lead to; -1 if the graph has no such move
+    targets: NDArray[np.int32]
     starts: NDArray[np.int32]  # (n + 1,) int32, start of each row's slots in `slots`
     slots: NDArray[np.int32]  # int32, the near or ahead slots of each row, without repeats
     crow_s: FloatArray  # (n, 2) s, coordinates divided by the driving speed
@@ -178,10 +177,11 @@ class LocalObservation(
             raise TypeError(f"LocalObservation wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
         self._surroundings = Surroundings.of(env.unwrapped.scenarios, k)
         self.observation_space = local_space(k)
+        self._n_numbers = FIRST_NEAR + PER_NEAR * k
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the local observation."""
-        local = np.empty(self.observation_space["local"].shape, dtype=np.float32)
+        local = np.empty(self._n_numbers, dtype=np.float32)
         assert isinstance(self.env.unwrapped, SearchEnv)
         observe_surroundings_at(self.env.unwrapped.searches.address, self._surroundings, local)
         return {"local": local, "action_mask": observation["action_mask"]}
