@@ -157,15 +157,14 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 
 def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     """Measure the steps per second of random drives on `campus` with laser scans alone."""
-    env = gym.make("parkenv/SearchSensors-v2", scenario="campus", observation="scan")
+    env: gym.Env[Any, Any] = gym.make("parkenv/SearchSensors-v2", scenario="campus", observation="scan")
     observation, _ = env.reset(seed=seed)
     rng = np.random.default_rng(seed)
 
     def step(_: int) -> None:
         nonlocal observation
-        observation, _, terminated, truncated, _ = env.step(
-            rng.choice(np.flatnonzero(observation["action_mask"][:PARK]))
-        )
+        action = rng.choice(np.flatnonzero(observation["action_mask"][:PARK]))
+        observation, _, terminated, truncated, _ = env.step(action)
         if terminated or truncated:
             observation, _ = env.reset()
 
