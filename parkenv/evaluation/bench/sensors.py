@@ -161,7 +161,7 @@ def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     observation, _ = env.reset(seed=seed)
     rng = np.random.default_rng(seed)
 
-    def step(_: int) -> None:
+    def step(number: int) -> None:  # noqa: ARG001 - the call has it
         nonlocal observation
         action = rng.choice(np.flatnonzero(observation["action_mask"][:PARK]))
         observation, _, terminated, truncated, _ = env.step(action)
