@@ -144,12 +144,17 @@ def train(
     spec = TrainingSpec().changed(
         env=env, algorithm=algorithm, steps=steps, trainings=trainings, seed=seed, clone=clone,
         demonstrations=demonstrations, k=k, held_out=held_out, curriculum=curriculum, evaluate_every=evaluate_every,
-        evaluation_episodes=evaluation_episodes, arrivals_per_hour=arrivals_per_hour, stay_min=stay_min,
-        patience_min=patience_min, knows=knows, learners=learners, tensorboard=tensorboard, **given, **machines.given,
+        evaluation_episodes=evaluation_episodes, arrivals_per_hour=arrivals_per_hour, stay_s=_seconds(stay_min),
+        patience_s=_seconds(patience_min), knows=knows, learners=learners, tensorboard=tensorboard, **given,
+        **machines.given,
     )  # fmt: skip
     out = out or Path("results") / _task_of(spec).folder
     with writing_into(out, "the same command with --resume"):
         run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
+
+
+def _seconds(minutes: float | None) -> float | None:
+    return None if minutes is None else 60.0 * minutes
 
 
 def _agents(text: str | None) -> list[str] | None:

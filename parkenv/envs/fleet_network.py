@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 
 from parkenv.envs.fleet_records import car_at, fleet_at
 from parkenv.envs.fleet_rules import Rule
-from parkenv.envs.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings
+from parkenv.envs.local_observation import (
+    FIRST_NEAR,
+    N_MOVES,
+    PER_NEAR,
+    SAMPLES,
+    Surroundings,
+    observe_surroundings,
+)
 from parkenv.envs.search_records import N_ACTIONS, N_REGIONS, scenario_at, search_at
 from parkenv.errors import InputError
 from parkenv.world.keyed_random import RULE_STREAM, keyed_uniform
@@ -40,7 +47,7 @@ TANH, RELU = range(2)
 SURROUNDINGS = np.dtype(
     [
         *((name, ADDRESS) for name in Surroundings._fields),
-        ("n_lots", np.int64), ("n_vertices", np.int64), ("width", np.int64), ("k", np.int64),
+        *((name, np.int64) for name in ("n_lots", "n_vertices", "n_numbers", "n_indices", "k")),
     ],
     align=True,
 )  # fmt: skip
@@ -79,7 +86,8 @@ def decide_by_network(address: int, number: int) -> int:
     search = search_at(car.search, 0)
     network = network_at(int64s(fleet.networks)[car.kind], 0)
     around = _surroundings_of(network)
-    observe_surroundings(search, around, float32_array(network.local, (around.fixed.shape[1],)))
+    width = FIRST_NEAR + PER_NEAR * surroundings_at(network.surroundings, 0).k
+    observe_surroundings(search, around, float32_array(network.local, (width,)))
     return int(_choose(network, search, _logits(network, search)))
 
 
@@ -95,21 +103,20 @@ def observe_locally(address: int, number: int, local: NDArray[np.float32]) -> No
 @inlined
 def _surroundings_of(network: Any) -> Surroundings:
     its = surroundings_at(network.surroundings, 0)
-    n_lots, n, width, k = its.n_lots, its.n_vertices, its.width, its.k
-    # The lengths of flat arrays do not matter to compiled code.
+    n_lots, n = its.n_lots, its.n_vertices
+    # The lengths of flat arrays do not matter to compiled code, but for that of the last.
     return Surroundings(
         int64_array(its.first, (n_lots,)),
-        float32_array(its.fixed, (n, width)),
+        float32_array(its.numbers, (n, its.n_numbers)),
+        int16_array(its.indices, (n, its.n_indices)),
+        int32_array(its.targets, (n, N_MOVES)),
         int32_array(its.starts, (n + 1,)),
         int32_array(its.slots, (n,)),
-        int16_array(its.near, (n, k)),
-        int16_array(its.ahead, (n, 4, k)),
-        float64_array(its.total_s, (n, 4, k)),
         float64_array(its.crow_s, (n, 2)),
-        int32_array(its.samples, (n_lots, N_REGIONS, 4)),
+        int32_array(its.samples, (n_lots, N_REGIONS, SAMPLES)),
         int64_array(its.first_view, (n_lots,)),
-        float64_array(its.view_s, (n,)),
-        int32_array(its.columns, (n,)),
+        float32_array(its.view_s, (n,)),
+        int32_array(its.columns, ((N_MOVES + 1) * its.k,)),
     )
 
 
@@ -256,8 +263,10 @@ class NetworkRule(Rule):
             its = np.zeros(1, SURROUNDINGS)
             for name, array in zip(Surroundings._fields, arrays, strict=True):
                 its[name] = address_of(array, array.dtype)
-            n, width = around.fixed.shape
-            its["n_lots"], its["n_vertices"], its["width"], its["k"] = len(around.first), n, width, self.k
+            width = FIRST_NEAR + PER_NEAR * self.k
+            its["n_lots"], its["n_vertices"] = len(around.first), len(around.numbers)
+            its["n_numbers"], its["n_indices"] = around.numbers.shape[1], around.indices.shape[1]
+            its["k"] = self.k
             record, local = np.zeros(1, NETWORK), np.zeros(width, np.float32)
             record["surroundings"], record["local"] = (
                 address_of(its, SURROUNDINGS),

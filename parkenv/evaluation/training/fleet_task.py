@@ -31,6 +31,7 @@ from parkenv.evaluation.training.training_task import (
 from parkenv.scenarios.build import build
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import HOUR_S
 
 PLANNERS = tuple(AgentSpec(name=name) for name in ("greedy-drive", "first-free"))
 FEW = 0.1
@@ -66,8 +67,8 @@ class FleetTask(TrainingTask):
         window, spec = self.scenario.arrival, self.spec
         demand = Demand(
             PoissonArrivals(spec.arrivals_per_hour or 120.0, window.start_s, window.end_s),
-            ExponentialTime(60.0 * (spec.stay_min or 60.0)),
-            ConstantTime(60.0 * (spec.patience_min or 10.0)),
+            ExponentialTime(spec.stay_s or HOUR_S),
+            ConstantTime(spec.patience_s or 600.0),
         )
         share = 1.0 if spec.among is None else spec.learners or FEW
         return MixedFleet(self.scenario, demand, spec.knows or "own", share, spec.among)
