@@ -60,7 +60,9 @@ def main():
     torch.manual_seed(0)
     torch.set_num_threads(1)
     env = PettingZooWrapper(
-        Deciding(lot_v0.parallel_env(scenario="mini", cars=CARS, tick_s=2.0, max_cycles=TICKS)),
+        Deciding(
+            lot_v0.parallel_env(scenario="mini", cars=CARS, background="none", tick_s=2.0, max_cycles=TICKS)
+        ),
         group_map=MarlGroupMapType.ALL_IN_ONE_GROUP,
         use_mask=True,
         done_on_any=False,
