@@ -15,6 +15,7 @@ from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Workplace
+    from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
     from parkenv.evaluation.report.fleet_recording import FleetDay
     from parkenv.evaluation.report.repetition import Cases
 
@@ -94,7 +95,7 @@ def make_report(
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.evaluation.report.fleet_recording import choose_days, differing_days
     from parkenv.evaluation.report.page import page_data, write_page
-    from parkenv.evaluation.report.repetition import Repetition, differences, drawable, drawable_days
+    from parkenv.evaluation.report.repetition import Repetition, differences, drawable, drawable_settings
     from parkenv.evaluation.report.run_folder import RunFolder
     from parkenv.evaluation.report.search_recording import choose, record
 
@@ -118,13 +119,17 @@ def make_report(
         notes.append(f"There is no replay: {error}")
     sensed = any(case.rig is not None for case, _ in repeated.cases)
     wanted = replays.episodes if replays.episodes is not None else SENSED if sensed else EPISODES
-    given = () if repeated.days else _chosen(repeated.cases, replays.replay, replays.agents)
-    cases, too_large = drawable(list(given))
+    days: list[FleetDay] = []
+    cases: Cases = []
+    if (fleets := repeated.fleets) is not None:
+        settings, too_large = drawable_settings(fleets, _chosen_settings(fleets, replays.agents))
+        wanted = replays.episodes if replays.episodes is not None else DAYS
+        numbers = replays.replay and _numbers_of(range(fleets.spec.days), replays.replay)
+        days = choose_days(fleets, settings, wanted, numbers or None)
+    else:
+        cases, too_large = drawable(_chosen(repeated.cases, replays.replay, replays.agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
-    days, too_many = drawable_days(_chosen_days(repeated.days, replays.replay, replays.agents))
-    notes += too_many
-    days = choose_days(days, replays.episodes if replays.episodes is not None else DAYS)
     again = range(min(replays.sessions, repeated.sessions) if drives is None else 0)
     counted = run.totals() if encounters else {}
     tasks: list[Callable[[], dict[str, Any]]] = []
@@ -141,27 +146,22 @@ def make_report(
             done.append(one)
             progress.advance(bar)
     watched, rest = done[: len(encounters)], done[len(encounters) :]
-    driven, fleets = rest[: len(again)], rest[len(again) :]
-    notes += differences(watched) + differing_days(fleets)
+    driven, shown = rest[: len(again)], rest[len(again) :]
+    notes += differences(watched) + differing_days(shown)
     path = out or folder / PAGE
-    write_page(
-        page_data(run, watched, driven if drives is None else drives, fleets, notes), path, run.figures
-    )
+    write_page(page_data(run, watched, driven if drives is None else drives, shown, notes), path, run.figures)
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
     return path
 
 
-def _chosen_days(days: Sequence[FleetDay], replay: str | None, agents: str | None) -> list[FleetDay]:
-    """Return the days selected by `--replay` and `--agents`."""
-    if agents is not None:
-        names = _agents_of(list(dict.fromkeys(day.label for day in days)), agents) if days else []
-        days = [day for day in days if day.label in names]
-    if replay is not None and days:
-        wanted = _numbers_of(sorted({day.day for day in days}), replay)
-        days = [day for day in days if day.day in wanted]
-    return list(days)
+def _chosen_settings(fleets: FleetExperiment, agents: str | None) -> list[Setting]:
+    """Return the settings with the agents selected by `--agents`."""
+    if agents is None:
+        return fleets.settings
+    names = _agents_of(list(dict.fromkeys(one.agent.label for one in fleets.settings)), agents)
+    return [one for one in fleets.settings if one.agent.label in names]
 
 
 def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:

@@ -42,17 +42,6 @@ class FleetDay:
     setting: Setting
     day: int
 
-    @property
-    def label(self) -> str:
-        """The agent, as in tables."""
-        return self.setting.agent.label
-
-    @property
-    def expected_cars(self) -> float:
-        """Expected number of cars."""
-        window = self.experiment.scenario.arrival
-        return self.setting.arrivals_per_hour * (window.end_s - window.start_s) / 3600.0
-
     def record(self, counted: Mapping[tuple[Any, ...], float]) -> Recording:
         """Repeat the day, and record it: times in centiseconds since the day's arrivals begin.
 
@@ -88,17 +77,27 @@ class FleetDay:
         }
 
 
-def choose_days(days: Sequence[FleetDay], count: int) -> list[FleetDay]:
-    """Choose days for a replay: the first day of each setting, settings in which all are members first, then the next.
+def choose_days(
+    experiment: FleetExperiment, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
+) -> list[FleetDay]:
+    """Choose days for a replay.
 
     Args:
-        days: all days, by setting.
-        count: number of days to choose.
+        experiment: the experiment.
+        settings: settings to choose from.
+        count: number of days to choose: the first day of each setting, those in which all or none are members first,
+            then the next day.
+        days: all of these days instead.
     """
-    most = max((one.setting.share for one in days), default=0.0)
-    order = sorted(days, key=lambda one: (one.day, one.setting.share not in (0.0, most)))
-    chosen = set(map(id, order[:count]))
-    return [one for one in days if id(one) in chosen]
+    if not settings:
+        return []
+    if days is not None:
+        return [FleetDay(experiment, setting, day) for setting in settings for day in days]
+    most = max(setting.share for setting in settings)
+    order = sorted(range(len(settings)), key=lambda i: settings[i].share not in (0.0, most))
+    needed = min(experiment.spec.days, -(-count // len(settings)))
+    chosen = [(i, day) for day in range(needed) for i in order][:count]
+    return [FleetDay(experiment, settings[i], day) for i, day in sorted(chosen)]
 
 
 def differing_days(recorded: Sequence[Recording]) -> list[str]:
