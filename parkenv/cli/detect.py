@@ -15,12 +15,14 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from parkenv.perception.cross_validation import CropScore
+    from parkenv.perception.detector import Detector
 
 
 def detect(
     images: list[Path],
     /,
     model: list[str] | None = None,
+    detector: str | None = None,
     threshold: float = 0.5,
     least_height: float | None = None,
     out: Path | None = None,
@@ -30,10 +32,13 @@ def detect(
     Examples:
         parkenv detect photo.png --out results/cars
         parkenv detect photos --model side --threshold 0.8
+        parkenv detect photos --detector yolo.onnx --out results/cars
 
     Options:
         images (FILE|DIR): Image files, or folders of them.
         model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; repeatable.  [default: side and front]
+        detector (NAME|FILE|MODULE:CLASS): Instead of models: a network (.onnx), or a class of your own.  [default:
+            none]
         threshold (P): Least probability of a reported car.
         least_height (PX >= 8): Height of the smallest regions searched, px.  [default: the model's]
         out, -o (DIR): Folder for pictures, NAME_cars.png, and summary.json.  [default: none]
@@ -45,9 +50,20 @@ def detect(
     from parkenv.evaluation.figures.survey_pictures import draw_detections
     from parkenv.files.atomic_write import atomic_write
     from parkenv.files.images import images_in, read_image
+    from parkenv.perception.detector_registry import make_detector
     from parkenv.perception.hog_detector import HogDetector
 
-    detector = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
+    finder: Detector
+    if detector is None:
+        finder = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
+    elif model or least_height is not None:
+        raise InputError(
+            f"--detector {detector} excludes --model and --least-height, which choose HOG models"
+        )
+    elif not 0.0 < threshold < 1.0:
+        raise InputError(f"--threshold is {threshold}, want between 0 and 1")
+    else:
+        finder = make_detector(detector, threshold)
     chosen = [f for path in images for f in (images_in(path) if path.is_dir() else [path])]
     for file in chosen:
         read_image(file)  # a damaged one is refused before any work
@@ -69,7 +85,8 @@ def detect(
     )
     for file, drawing in progress:
         image = read_image(file)
-        found = detector.detect(image)
+        found = finder.detect(image)
+        found = found.select(found.probability >= threshold)
         for box, p, end in zip(
             found.boxes.tolist(), found.probability.tolist(), found.end_on.tolist(), strict=True
         ):
@@ -183,24 +200,35 @@ def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
     return make_table("Held-out crops", ["part", "cars", "others", "AUC", *rates], rows)
 
 
-def evaluate_detector(uiuc: Path, model: str = "side", out: Path = Path("results/detector")) -> None:
-    """Measure recall and precision of a side model on UIUC's test sets, by their matching rule.
+def evaluate_detector(
+    uiuc: Path, model: str = "side", out: Path = Path("results/detector"), *, detector: str | None = None
+) -> None:
+    """Measure recall and precision of a detector on UIUC's test sets, by their matching rule.
+
+    A HOG model (--model) is searched at the sizes of the set's cars, a --detector looks as it does in a survey.
 
     Examples:
         parkenv evaluate-detector --uiuc CarData --model side
+        parkenv evaluate-detector --uiuc CarData --detector yolo.onnx
 
     Options:
         uiuc (DIR): UIUC's folder as published (CarData).
-        model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`.
+        model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; any other detector is taken as with
+            --detector.
+        detector (NAME|FILE|MODULE:CLASS): Instead of a model: hog, a network (.onnx), or a class of your own.
+            [default: none]
         out, -o (DIR): Folder for summary.json and the curves.
     """
     from rich.progress import Progress
 
-    from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
+    from parkenv.evaluation.experiments.detector_scores import LEAST_SCORED, save_curves, score_on_uiuc
     from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.perception.car_model import CarModel
+    from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
+    from parkenv.perception.detector_registry import make_detector
 
-    loaded = CarModel.load(model)
+    name = detector or model
+    is_model = detector is None and (name in PACKAGED_MODELS or name.lower().endswith(".npz"))
+    loaded = CarModel.load(name) if is_model else make_detector(name, LEAST_SCORED)
     make_folder(out)
     console = make_console()
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -209,6 +237,6 @@ def evaluate_detector(uiuc: Path, model: str = "side", out: Path = Path("results
     rows = [score.row for score in scores]
     cells = ([f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)
     console.print(make_table(None, list(rows[0]), cells))
-    save_curves(scores, f"model {model}", out / "recall_precision.png")
+    save_curves(scores, f"{'model' if is_model else 'detector'} {name}", out / "recall_precision.png")
     save_summary(out, None, rows)
     console.print(f"Written: {out / 'recall_precision.png'}, summary.json")

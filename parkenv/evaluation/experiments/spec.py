@@ -19,7 +19,7 @@ from parkenv.files.known_names import (
     WeatherName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
+from parkenv.files.spec_file import Axis, DetectorName, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,
     Hours,
@@ -143,11 +143,16 @@ class ExperimentSpec(Workplace):
     episodes: int = Field(200, ge=1, le=MAX_EPISODES, description="Searches of each agent in each setting.")
     seed: int = Field(0, ge=0, lt=2**31, description="Episode i has the seed `seed` + i.")
     rig: RigName | None = Field(None, description="Observe slots through this rig's simulated sensors.")
+    detector: DetectorName | None = Field(
+        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    )
     figures: bool = True
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
         _require_distinct(self.agents, self.scenarios)
+        if self.detector is not None and self.rig is None:
+            raise PydanticCustomError("whole", "detector goes with a rig, such as laser")
         if (count := self.episode_count) > MAX_EPISODES:
             raise PydanticCustomError(
                 "whole",
@@ -283,7 +288,9 @@ class SurveySpec(Workplace):
     scenario: ScenarioItem = scenario_spec("campus")
     sessions: int = Field(6, ge=1, le=100_000)
     rig: RigName | None = Field(None, description="The scenario's if absent.")
-    detector: str = Field("hog", description="hog, side, front, a model file (.npz) or MODULE:CLASS.")
+    detector: DetectorName | None = Field(
+        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    )
     hours: Several[Hours] = Field(
         ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
         description="When drives begin, one window after the other, on the scenario's days.",
@@ -302,7 +309,9 @@ class DemoSpec(Workplace):
     sessions: int = Field(4, ge=1, le=100_000)
     episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
     every: CaptureDistance = Field(2.5, description="Between captures, m, in the survey and in the searches.")
-    detector: str = "hog"
+    detector: DetectorName | None = Field(
+        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    )
     seed: int = Field(0, ge=0, lt=2**31)
 
 
