@@ -157,8 +157,8 @@ def train_detector(
 
     Examples:
         parkenv train-detector --uiuc CarData --out side.npz
-        parkenv train-detector --labels coco/annotations.json --images coco/pictures --out side.npz
-        parkenv train-detector --labels yolo --classes car,van --front --out front.npz
+        parkenv train-detector --labels coco.json --images pictures -o side.npz
+        parkenv train-detector --labels yolo --front -o front.npz
         parkenv train-detector --crops kitti --front --out front.npz \
             --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
 

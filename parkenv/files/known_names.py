@@ -21,6 +21,9 @@ WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
 MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 MAP_NAMES: tuple[MapName, ...] = get_args(MapName)
+KnowledgeName = Literal["own", "shared", "reserve", "full"]
+"""What the cars of a fleet know; see `parkenv.envs.fleet.DriverKind`."""
+KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
