@@ -316,6 +316,7 @@ def test_a_curriculum_opens_places_by_size():
 
 
 def small(monkeypatch):
+    """Fewer environments, and searches of at most 60 decisions: an untrained agent drives in circles."""
     import dataclasses
 
     from parkenv.evaluation.training.configs import SEARCH_CONFIGS
@@ -325,6 +326,7 @@ def small(monkeypatch):
         config, n_envs=16, settings={**config.settings, "batch_size": 256, "n_steps": 32}
     )
     monkeypatch.setitem(SEARCH_CONFIGS, "ppo", few)
+    monkeypatch.setattr("parkenv.evaluation.training.search_training.MAX_STEPS", 60)
 
 
 def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
@@ -333,7 +335,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     training = SearchTraining(
         "ppo",
         2_048,
-        512,
+        1_024,
         tuple(PLACES[:4]),
         range(2_000_000, 2_000_024),
         held_out=tuple(PLACES[4:]),
