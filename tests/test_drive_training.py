@@ -527,7 +527,8 @@ def test_success_is_drawn_by_kind(tmp_path):
 # One on-policy algorithm, and one with a replay buffer.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algorithm):
+def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, monkeypatch, algorithm):
+    monkeypatch.setitem(DRIVE_CONFIGS, algorithm, FULL_SIZE[algorithm])  # that of the command's own process
     out = tmp_path / "out"
     steps = 20_000 if algorithm == "ppo" else 4_000  # two rollouts; a thousand steps with updates
     every = steps // 4
