@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_import_osm import car_park
 from test_typed_csv import SESSION
+from tiny_networks import Tiny
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.benchmark import Suite, check_result
@@ -28,6 +29,7 @@ from parkenv.evaluation.report.page import page_data, write_page
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.trips.calibration import Calibration, TripFolder
 from parkenv.files.images import read_image
+from parkenv.files.onnx_file import read_onnx
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.mapping.store import MapStore, Session
@@ -171,6 +173,7 @@ EXPERIMENT = {
     "seed": 1,
     "grid": {"failure_s": [10.0, 20.0], "occupancy_levels": [0.5]},
 }
+NETWORK = Tiny("yolo", names=("car",)).model().SerializeToString()
 MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text())
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
@@ -302,6 +305,7 @@ FORMATS = [
     Format("log.csv.gz", LOG.encode(), mutated_bytes, OccupancyLog.read),
     Format("process.json", PROCESS, mutated_json, OccupancyProcess.from_file),
     Format("model.json", MODEL, mutated_json, sensor_model),
+    Format("network.onnx", NETWORK, mutated_bytes, read_onnx),
     Format("scenario.toml", SCENARIO, mutated_text, scenario),
     Format("scenario.json", tomllib.loads(SCENARIO), mutated_json, scenario),
     Format("experiment.json", EXPERIMENT, mutated_json, ExperimentSpec.read),

@@ -32,7 +32,7 @@ def survey(
     hours: str | None = None,
     traffic: args.Traffic,
     rig: RigName | None = None,
-    detector: str = "hog",
+    detector: str | None = None,
     weather: WeatherName | None = None,
     pose_noise: float = 0.0,
     rerun: Path | None = None,

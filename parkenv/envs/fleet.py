@@ -34,7 +34,6 @@ from parkenv.envs.fleet_records import (
     CAR,
     DUE,
     FLEET,
-    KNOWLEDGE,
     LIVE_SLOT,
     REPORT,
     SEARCHING,
@@ -46,6 +45,7 @@ from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT,
 from parkenv.envs.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
 from parkenv.envs.shared_slots import BACKGROUNDS, NO_CAR, SHARED_SLOT, shared_slots_taken_at
 from parkenv.errors import InputError
+from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.demand import Demand
@@ -371,8 +371,9 @@ class Fleet:
             until: s since Monday 00:00; parked cars leave until then, also after the last search.
 
         Raises:
-            InputError: a kind of driver has neither a rule nor an agent, or an agent raised an error, which is the
-                cause of this one: the message names car and time, and the world stays as it was before that decision.
+            InputError: a kind of driver has neither a rule nor an agent, or an agent raised an error (the cause of this
+                one) or chose an action that does not exist: the message names car and time, and the world stays as it
+                was before that decision.
         """
         agents = tuple(agents or ())
         for kind, driver in enumerate(self.drivers):
@@ -387,7 +388,12 @@ class Fleet:
                 raise InputError(
                     f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
                 ) from error
-            self.act(action)
+            try:
+                self.act(action)
+            except InputError as error:
+                raise InputError(
+                    f"car {car}: its agent at {self.time - self.begin:.1f} s: {error}"
+                ) from error
             if self._cars["state"][car] != SEARCHING:
                 memory.pop(car, None)
 

@@ -13,7 +13,6 @@ DUE, SEARCHING, PARKED, LEFT, GAVE_UP, BALKED, TRUNCATED = range(7)
 """States of a car: not yet arrived; searching; parked; has left its slot; went elsewhere because the lot was proven
 full; went elsewhere because its patience was at an end; ended by the limit of steps."""
 
-KNOWLEDGE = ("own", "shared", "reserve", "full")
 OWN_KNOWLEDGE, SHARED_KNOWLEDGE, RESERVE_KNOWLEDGE, FULL_KNOWLEDGE = range(4)
 """What a car knows of the slots: its own observations; also those on the live map; the slot that the guidance system
 has reserved for it; the true state of every slot."""
