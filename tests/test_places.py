@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.bench.env import grids
 from parkenv.evaluation.experiments.spec import ExperimentSpec, TrainingSpec
+from parkenv.evaluation.training.cloning import clone
 from parkenv.evaluation.training.search_task import SearchTask
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times
 from parkenv.lots import write_lot
@@ -431,7 +433,8 @@ def test_bad_options_of_held_out_places_are_one_line(tmp_path, options, message)
 
 
 @pytest.mark.slow
-def test_the_command_learns_on_some_places_and_tests_on_others(folder):
+def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
+    monkeypatch.setattr("parkenv.evaluation.training.search_training.clone", partial(clone, updates=50))
     out = folder / "trained"
     done = parkenv(
         "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 20_000, "--trainings", 1,
