@@ -25,6 +25,7 @@ from parkenv.evaluation.experiments.benchmark import Suite, check_result
 from parkenv.evaluation.experiments.results import ResultFolder
 from parkenv.evaluation.experiments.spec import ExperimentSpec
 from parkenv.evaluation.experiments.surveys import detection_by_distance, read_sessions
+from parkenv.evaluation.fleet.experiment import TABLE
 from parkenv.evaluation.report.page import page_data, write_page
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.trips.calibration import Calibration, TripFolder
@@ -253,6 +254,21 @@ COMMUTE_SUMMARY = {
     "command": ["parkenv", "commute"], "version": "0.1.0", "seed": 0, "complete": True,
     "rows": [COMMUTE_ROW | {"day": 1}], "weeks": [COMMUTE_ROW | {"days": "1-2", "difference_s": 0.0}],
 }  # fmt: skip
+FLEET_SUMMARY = {
+    "command": ["parkenv", "fleet"], "version": "0.1.0", "seed": 0, "complete": True, "stay_s": 3600.0,
+    "rows": [
+        {
+            "scenario": "mini", "agents": "random", "knows": knows, "share": 0.5, "arrivals_per_hour": 20.0, "days": 2,
+            "total_s": 70.0, "total_s_ci95": [60.0, 80.0], "occupancy": 0.5, "balked_fraction": 0.1,
+            "price_of_anarchy": price, "price_of_anarchy_ci95": [price, price], "others_s": None,
+        }
+        for knows, price in (("own", 1.1), ("shared", None))
+    ],
+}  # fmt: skip
+DAY = dict.fromkeys((*TABLE.keys, *TABLE.columns), "1.5") | {
+    "scenario": "mini", "agents": "random", "knows": "own", "day": "0", "cars": "20", "members_s": "nan",
+}  # fmt: skip
+DAY_ROWS = f"{','.join(DAY)}\n{','.join(DAY.values())}\n"
 SESSION_ROWS = f"{','.join(SESSION)}\n{','.join(SESSION.values())}\n"
 TRIP = {
     "slots": "observed",
@@ -339,6 +355,8 @@ FORMATS = [
     Format("summary.json", SUMMARY, mutated_json, reported),
     Format("survey.json", SURVEY_SUMMARY, mutated_json, reported_kind),
     Format("commute.json", COMMUTE_SUMMARY, mutated_json, reported_kind),
+    Format("fleet.json", FLEET_SUMMARY, mutated_json, reported_kind),
+    Format("days.csv", DAY_ROWS, mutated_text, TABLE.read),
     Format("sessions.csv", SESSION_ROWS, mutated_text, sessions),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
     Format("timings.csv", TIMING_ROWS, mutated_text, resumed),

@@ -21,6 +21,7 @@ from parkenv.envs.fleet_kernel import (
     NEEDS_REPORTS,
     NEEDS_RESERVATIONS,
     NEEDS_SEARCH,
+    NEEDS_STEPS,
     PAUSED,
     WRONG_ACTION,
     act_at,
@@ -38,6 +39,7 @@ from parkenv.envs.fleet_records import (
     REPORT,
     SEARCHING,
     STATES,
+    STEP,
 )
 from parkenv.envs.fleet_rules import Rule
 from parkenv.envs.search import action_number, space_of
@@ -360,6 +362,16 @@ class Fleet:
         self._row |= {searches.address + row * SEARCH.itemsize: (searches, row) for row in range(n)}
         self._add_free(searches, moves)
 
+    def keep_steps(self) -> None:
+        """From now on, keep the steps of all cars; `steps` returns those of the present world."""
+        if not self._record["step_capacity"]:
+            self._grow_steps()
+
+    @property
+    def steps(self) -> NDArray[np.void]:
+        """Steps of all cars since `keep_steps`, (n,) of the dtype STEP, in order of their beginning."""
+        return self._kept.get("steps", np.zeros(0, STEP))[: int(self._record["n_kept_steps"])].copy()
+
     # ---- decisions
 
     def run(self, agents: Sequence[Any] | None = None, until: float = math.inf) -> None:
@@ -422,6 +434,8 @@ class Fleet:
                 self._grow_reports()
             elif status == NEEDS_RESERVATIONS:
                 self._reserve_slots()
+            elif status == NEEDS_STEPS:
+                self._grow_steps()
             elif status == WRONG_ACTION:
                 raise InputError("a compiled driver chose an action that does not exist")
             else:
@@ -461,6 +475,14 @@ class Fleet:
         reports[:n] = np.roll(old, -first)[:n]
         self._keep({"reports": reports})
         self._record["first_report"], self._record["report_capacity"] = 0, len(reports)
+
+    def _grow_steps(self) -> None:
+        """Make room for more steps that are kept."""
+        old = self._kept.get("steps", np.zeros(0, STEP))
+        steps = np.zeros(max(2 * len(old), 4096), STEP)
+        steps[: len(old)] = old
+        self._keep({"steps": steps})
+        self._record["step_capacity"] = len(steps)
 
     def _reserve_slots(self) -> None:
         """Assign free slots to the searching cars of the guidance system, at the least total time."""

@@ -36,8 +36,8 @@ class PathChoice(NamedTuple):
     """Result of a search for a path."""
 
     onward_s: float  # s, expected time of the path
-    # s, expected time left after its first step if the car goes on and that step leads to a vertex where nothing new
-    # is observed; else inf
+    # s, expected time left after its first step if the car goes on and that step leads to a vertex where no slot is
+    # observed for the first time; else inf
     remaining_s: float
     at_hand_s: float  # s, expected time of driving to the best slot that is known now
     slot: int  # that slot, or -1
@@ -369,8 +369,11 @@ def _evaluate(
     if stops[1].time == 0.0 and stops[2].first > 0:
         return Candidate(value, np.inf, ATTEMPT)  # only an attempt takes no time
     following = stops[1].vertex
-    if stops[2].first > 0 or following == vertex:
+    if following == vertex:
         onward_s = np.inf
+    for j in range(stops[2].first):
+        if path.observations[j].is_first:
+            onward_s = np.inf
     return Candidate(value, onward_s, following)
 
 

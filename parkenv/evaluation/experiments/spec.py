@@ -35,6 +35,8 @@ MAX_EPISODES = 10_000_000
 """Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
 MAX_DAYS = 3_650
 """Maximum number of days of a commute."""
+MAX_SETTINGS = 10_000
+"""Maximum number of settings of an experiment with many cars."""
 SPEC_FILE = "experiment.json"  # file in a run folder with the specification of its experiment
 DEFAULT_AGENTS = (
     "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
@@ -242,6 +244,12 @@ class FleetSpec(Workplace):
     def _bounded(self) -> Self:
         _require_distinct(self.agents, ())
         settings = len(self.agents) * len(self.knows) * len(self.shares) * len(self.arrivals_per_hour)
+        if settings > MAX_SETTINGS:
+            raise PydanticCustomError(
+                "whole",
+                "agents x knows x shares x arrivals_per_hour is {count} settings, want at most {most}",
+                {"count": settings, "most": MAX_SETTINGS},
+            )
         if (count := settings * self.days) > MAX_EPISODES:
             raise PydanticCustomError(
                 "whole",
