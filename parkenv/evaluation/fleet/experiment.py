@@ -24,6 +24,7 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
+from planners.names import EXPECTS_RIVALS
 
 Row = dict[str, Any]
 
@@ -129,7 +130,9 @@ class FleetExperiment:
         """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled."""
         spec = AgentSpec.of(setting.agents)
         rule = None if spec.options else RULES.get(spec.name)
-        agent = None if rule is not None else make_agent(spec.name, scenario, **spec.options)
+        # Who expects rivals is told how many arrive, as a forecast of traffic would.
+        told = {"arrivals_per_hour": setting.arrivals_per_hour} if spec.name == EXPECTS_RIVALS else {}
+        agent = None if rule is not None else make_agent(spec.name, scenario, **{**told, **spec.options})
         if isinstance(agent, ClairvoyantAgent):
             raise InputError(
                 f"agent {setting.agents!r} knows the future of single searches, and drives no fleet"
