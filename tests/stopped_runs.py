@@ -21,6 +21,8 @@ from parkenv.evaluation.training.rl_training import MODEL
 
 COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
+    "fleet": "fleet --scenario mini --hours 08:00-09:00 --agents first-free(within_m=100) --knows own "
+    "--arrivals-per-hour 20 -n 40 --no-figures",
     "survey": "survey --scenario mini --sessions 3 --every 6",
     "calibrate": "calibrate --scenario mini -n 3",
     "benchmark": "benchmark run v1 --agents first-free",
@@ -105,6 +107,8 @@ def result_of(name, out):
             summary["complete"],
             [r["total_s"] for r in summary["rows"]],
         )
+    if name == "fleet":
+        return (out / "days.csv").read_bytes(), summary["complete"], summary["rows"]
     if name == "survey":
         with (out / "sessions.csv").open(newline="") as file:
             rows = [{**row, "seconds_per_frame": None} for row in csv.DictReader(file)]

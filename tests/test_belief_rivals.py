@@ -3,12 +3,14 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from parkenv.evaluation.fleet.spec import FleetSpec
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.day_belief import DayBelief, RivalRates
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.envs.fleet_rules import RULES
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
@@ -35,7 +37,7 @@ def test_without_rivals_it_is_belief_action_for_action():
         make_agent("belief", scenario),
         make_agent("belief-rivals", scenario, arrivals_per_hour=0),
     )
-    for seed in range(8):
+    for seed in range(3):
         assert actions(belief, scenario, seed) == actions(nobody, scenario, seed)
 
 
@@ -112,13 +114,11 @@ def test_wrong_rates_are_refused():
 
 
 def test_an_experiment_tells_it_the_demand():
-    (spec,) = scenario_specs("mini")
-    its = FleetExperiment(spec, ("belief-rivals",))
-    scenario = make_scenario("mini")
-    _, (agent, _) = its.fleet(Setting("belief-rivals", "own", 0.0, 120.0), scenario)
-    assert agent.arrivals_per_hour == 120.0
-    _, (agent, _) = its.fleet(Setting("belief-rivals(arrivals_per_hour=30)", "own", 0.0, 120.0), scenario)
-    assert agent.arrivals_per_hour == 30.0
+    (scenario,) = scenario_specs("mini")
+    its = FleetExperiment(FleetSpec().changed(scenario=scenario))
+    for name, rate in (("belief-rivals", 120.0), ("belief-rivals(arrivals_per_hour=30)", 30.0)):
+        _, (agent, _) = its.fleet(Setting(AgentSpec.of(name), "own", 0.0, 120.0))
+        assert agent.arrivals_per_hour == rate
 
 
 @pytest.mark.slow

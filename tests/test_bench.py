@@ -72,7 +72,7 @@ def test_bench_writes_its_rows(tmp_path):
     keys = {"part", "case", "value", "unit", "peer", "peer_value", "ratio"}
     assert summary["rows"]
     assert all(set(row) == keys and row["value"] > 0 for row in summary["rows"])
-    assert {row["part"] for row in summary["rows"]} == {"laser", "camera"}
+    assert {row["part"] for row in summary["rows"]} == {"laser", "camera", "environment"}
     assert "pymunk" in result.output
     assert result.output.splitlines()[0].startswith("After an installation each part first compiles")
     stages = {"transform and raster", "of that, transform", "shading", "exposure and noise"}

@@ -58,7 +58,7 @@ def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
 
 OPTIONAL = (
     "address", "agents", "beside", "bounds", "calibrated", "car_park", "clone", "crops", "lot", "map_says", "model",
-    "picture", "replay", "rerun", "rig", "uiuc",
+    "labels", "picture", "replay", "rerun", "rig", "uiuc",
 )  # fmt: skip
 """Options that do nothing unless they are given."""
 

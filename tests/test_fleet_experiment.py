@@ -10,22 +10,31 @@ from command_line import parkenv
 
 from parkenv.envs.fleet import total_s
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.workers import Workers
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.spec import FleetSpec
 from parkenv.evaluation.figures.fleet_figure import looks_s
 from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting, summarize_days
 from parkenv.evaluation.fleet.measures import MEANS, Roads, gini
 from parkenv.lots import grid_lot
-from parkenv.scenarios.build import build, make_scenario
+from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.world.scenario import SearchProblem
 
 
 def experiment(**changes):
-    (spec,) = scenario_specs("mini")
-    spec = spec.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
-    return FleetExperiment(
-        **({"scenario": spec, "agents": ("greedy-drive",), "arrivals_per_hour": (20.0,), "days": 2} | changes)
-    )
+    (scenario,) = scenario_specs("mini")
+    scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
+    fields = {"scenario": scenario, "arrivals_per_hour": (20.0,), "days": 2, **changes}
+    return FleetExperiment(FleetSpec().changed(**fields))
+
+
+def setting(agent, *rest):
+    return Setting(AgentSpec.of(agent), *rest)
+
+
+def days_of(its):
+    """Return the days of each setting."""
+    return [[its.run_day(one, day)[0] for day in range(its.spec.days)] for one in its.settings]
 
 
 def test_gini():
@@ -36,19 +45,18 @@ def test_gini():
 
 
 def test_nobody_without_members_is_run_once():
-    its = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).settings()
+    its = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).settings
     assert its == [
-        Setting("greedy-drive", *rest, 20.0)
+        setting("greedy-drive", *rest, 20.0)
         for rest in (("own", 0.0), ("shared", 0.5), ("shared", 1.0), ("reserve", 0.5), ("reserve", 1.0))
     ]
 
 
 def test_all_settings_have_the_same_days():
     its = experiment(arrivals_per_hour=(40.0,))
-    scenario = build(its.scenario)
     plans, members = [], []
     for share in (0.3, 0.6):
-        fleet, agents = its.fleet(Setting("greedy-drive", "full", share, 40.0), scenario)
+        fleet, agents = its.fleet(setting("greedy-drive", "full", share, 40.0))
         fleet.reset(3, 1)
         plans.append(fleet.cars[["arrival", "entry", "stay_s", "patience_s"]].copy())
         members.append(fleet.cars["kind"] == 0)
@@ -60,10 +68,10 @@ def test_all_settings_have_the_same_days():
 
 def test_measures_of_a_day_are_those_of_its_cars():
     its = experiment(arrivals_per_hour=(60.0,), shares=(0.5,))
-    setting = Setting("greedy-drive", "shared", 0.5, 60.0)
-    day = its.run_day(setting, 0)
-    fleet, agents = its.fleet(setting, build(its.scenario))
-    fleet.reset(its.seed, 0)
+    its_setting = setting("greedy-drive", "shared", 0.5, 60.0)
+    day, _ = its.run_day(its_setting, 0)
+    fleet, agents = its.fleet(its_setting)
+    fleet.reset(its.spec.seed, 0)
     fleet.run(agents)
     cars = fleet.cars
     members = (cars["kind"] == 0).mean()
@@ -82,7 +90,7 @@ def test_nobody_is_faster_than_alone():
     scenario = make_scenario("mini")
     roads = Roads(scenario)
     its = experiment(arrivals_per_hour=(5.0,), knows=("full",))
-    fleet, agents = its.fleet(its.settings()[0], build(its.scenario))
+    fleet, agents = its.fleet(its.settings[0])
     fleet.reset(1)
     fleet.run(agents)
     assert (total_s(fleet.cars) >= roads.alone_s(fleet.cars) - 1e-9).all()
@@ -92,18 +100,18 @@ def test_nobody_is_faster_than_alone():
 
 def test_an_agent_in_python_drives_as_the_compiled_one():
     compiled, python = (
-        experiment(agents=(agent,), knows=("own",), days=1).run_day(Setting(agent, "own", 0.0, 20.0), 0)
+        experiment(agents=(agent,), knows=("own",), days=1).run_day(setting(agent, "own", 0.0, 20.0), 0)[0]
         for agent in ("first-free", "first-free(within_m=1000)")
     )
     assert compiled["cars"] == python["cars"]
     its = experiment(agents=("belief",), knows=("own", "reserve"), days=1)
-    days = list(its.run(Workers(1)))
+    days = days_of(its)
     assert [one[0]["agents"] for one in days] == ["belief", "belief"]
 
 
 def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     its = experiment(knows=("own", "reserve"), arrivals_per_hour=(15.0, 30.0), days=3)
-    days = list(its.run(Workers(1)))
+    days = days_of(its)
     rows = summarize_days(days)
     for row in rows:
         low, high = row["price_of_anarchy_ci95"]
@@ -157,10 +165,16 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--knows", "own,al"), "knows: there is no knowledge 'al'"),
-        (("--share", "0.5,1.5"), "share is 1.5, want a number from 0 to 1"),
-        (("--arrivals-per-hour", "0"), "PoissonArrivals.per_hour is 0.0, want a rate above 0"),
-        (("--arrivals-per-hour", "1e9"), "cars arrive in the window, want at most 1,000,000"),
+        (("--knows", "own,al"), "--knows is 'al', want 'own', 'shared', 'reserve' or 'full'"),
+        (("--knows", "own,own"), "--knows is 'own,own': a name stands twice"),
+        (("--share", "0.5,1.5"), "--share is 1.5, want a number of at most 1"),
+        (("--share", "nan"), "--share is nan, want a finite number"),
+        (("--share", ""), "--share is '', want numbers separated by commas"),
+        (("--arrivals-per-hour", "0"), "--arrivals-per-hour is 0.0, want a number above 0"),
+        (("--stay-min", "0"), "--stay-min: want 0.1 <= X <= 100000"),
+        (("--stay-min", "inf"), "--stay-min: want 0.1 <= X <= 100000"),
+        (("-n", "0"), "--episodes: want N >= 1"),
+        (("--arrivals-per-hour", "1e6"), "cars arrive in the window, want at most 1,000,000"),
         (("--agents", "oracle"), "agent 'oracle' knows the future of single searches"),
         (("--agents", "greedy"), "unknown agent 'greedy'"),
     ],
@@ -173,5 +187,79 @@ def test_bad_input_is_refused_before_anything_is_run(words, message, tmp_path):
 
 
 def test_an_experiment_without_days_is_refused():
-    with pytest.raises(InputError, match="days is 0, want at least 1"):
+    with pytest.raises(InputError, match="days is 0, want a number of at least 1"):
         experiment(days=0)
+    with pytest.raises(InputError, match="is 40000000 days, want at most 10000000"):
+        experiment(days=10_000, arrivals_per_hour=tuple(map(float, range(1, 1001))))
+
+
+WORDS = (
+    "--scenario",
+    "mini",
+    "--hours",
+    "08:00-09:00",
+    "--arrivals-per-hour",
+    "30",
+    "--knows",
+    "own,reserve",
+)
+
+
+def test_a_finished_run_is_extended_and_not_mixed_with_another(tmp_path):
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    assert parkenv("fleet", *WORDS, "-n", 1, "--no-figures", "--out", out).returncode == 0
+    first = (out / "days.csv").read_text()
+    refused = parkenv("fleet", *WORDS, "--out", out)
+    assert f"--out {out}: holds a finished fleet; add --resume to go on with it" in refused.stderr
+    for words, message in (
+        (("--stay-min", "30"), "--resume: stay_s was 3600.0"),
+        (("--seed", "1"), "--resume: seed was 0"),
+        (("--hours", "08:00-10:00"), "--resume: mini.arrivals.hours was '08:00-09:00'"),
+    ):
+        assert message in parkenv("fleet", "--resume", *words, "--out", out).stderr
+    (out / "days.csv").write_text(first[:-20])
+    done = parkenv("fleet", "--resume", "-n", 2, "--share", "0.5,1", "--out", out)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert parkenv("fleet", *WORDS, "-n", 2, "--share", "0.5,1", "--out", whole).returncode == 0
+    assert (out / "days.csv").read_bytes() == (whole / "days.csv").read_bytes()
+    rows = [json.loads((folder / "summary.json").read_text())["rows"] for folder in (out, whole)]
+    assert rows[0] == rows[1]
+    assert parkenv("run", out, "--overwrite", "--jobs", 1).returncode == 0
+    assert (out / "days.csv").read_bytes() == (whole / "days.csv").read_bytes()
+
+
+def test_a_part_of_the_days_is_compared_with_the_same_days():
+    its = experiment(knows=("own", "reserve"), days=2)
+    own, reserve = days_of(its)
+    _, row = summarize_days([own, reserve[1:]])
+    assert row["difference_s"] == pytest.approx(reserve[1]["total_s"] - own[1]["total_s"])
+
+
+@pytest.mark.parametrize(
+    ("module", "body", "message"),
+    [
+        ("raising", "raise RuntimeError('no idea')", ": its agent raised RuntimeError at"),
+        ("mistaken", "return 17, state", "action is 17, want a whole number from 0 to 4"),
+    ],
+)
+def test_an_agent_that_fails_is_named_with_setting_day_and_car_and_earlier_days_are_kept(
+    tmp_path, module, body, message
+):
+    (tmp_path / f"{module}.py").write_text(
+        "class Failing:\n"
+        "    calls = 0\n"
+        "    def __init__(self, scenario): pass\n"
+        "    def predict(self, observation, state=None, **_):\n"
+        "        Failing.calls += 1\n"
+        "        if Failing.calls > 200:\n"
+        f"            {body}\n"
+        "        return int(observation['action_mask'].nonzero()[0][-1]), state\n"
+    )
+    out = tmp_path / "out"
+    words = (*WORDS[:4], "--arrivals-per-hour", "3", "--knows", "own", "-n", 30)
+    done = parkenv("fleet", "--agents", f"{module}:Failing", *words, "--jobs", 1, "--out", out, cwd=tmp_path)
+    assert done.returncode == 2
+    assert len(done.stderr.splitlines()) == 1
+    assert message in done.stderr
+    assert f"{module}:Failing, own, share 0, 3 cars an hour, day" in done.stderr
+    assert len((out / "days.csv").read_text().splitlines()) > 1

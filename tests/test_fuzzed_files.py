@@ -18,16 +18,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_import_osm import car_park
 from test_typed_csv import SESSION
+from tiny_networks import Tiny
 
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.benchmark import Suite, check_result
 from parkenv.evaluation.experiments.results import ResultFolder
 from parkenv.evaluation.experiments.spec import ExperimentSpec
 from parkenv.evaluation.experiments.surveys import detection_by_distance, read_sessions
+from parkenv.evaluation.fleet.experiment import TABLE
 from parkenv.evaluation.report.page import page_data, write_page
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.trips.calibration import Calibration, TripFolder
 from parkenv.files.images import read_image
+from parkenv.files.onnx_file import read_onnx
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.mapping.store import MapStore, Session
@@ -171,6 +174,7 @@ EXPERIMENT = {
     "seed": 1,
     "grid": {"failure_s": [10.0, 20.0], "occupancy_levels": [0.5]},
 }
+NETWORK = Tiny("yolo", names=("car",)).model().SerializeToString()
 MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text())
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
@@ -250,6 +254,21 @@ COMMUTE_SUMMARY = {
     "command": ["parkenv", "commute"], "version": "0.1.0", "seed": 0, "complete": True,
     "rows": [COMMUTE_ROW | {"day": 1}], "weeks": [COMMUTE_ROW | {"days": "1-2", "difference_s": 0.0}],
 }  # fmt: skip
+FLEET_SUMMARY = {
+    "command": ["parkenv", "fleet"], "version": "0.1.0", "seed": 0, "complete": True, "stay_s": 3600.0,
+    "rows": [
+        {
+            "scenario": "mini", "agents": "random", "knows": knows, "share": 0.5, "arrivals_per_hour": 20.0, "days": 2,
+            "total_s": 70.0, "total_s_ci95": [60.0, 80.0], "occupancy": 0.5, "balked_fraction": 0.1,
+            "price_of_anarchy": price, "price_of_anarchy_ci95": [price, price], "others_s": None,
+        }
+        for knows, price in (("own", 1.1), ("shared", None))
+    ],
+}  # fmt: skip
+DAY = dict.fromkeys((*TABLE.keys, *TABLE.columns), "1.5") | {
+    "scenario": "mini", "agents": "random", "knows": "own", "day": "0", "cars": "20", "members_s": "nan",
+}  # fmt: skip
+DAY_ROWS = f"{','.join(DAY)}\n{','.join(DAY.values())}\n"
 SESSION_ROWS = f"{','.join(SESSION)}\n{','.join(SESSION.values())}\n"
 TRIP = {
     "slots": "observed",
@@ -302,6 +321,7 @@ FORMATS = [
     Format("log.csv.gz", LOG.encode(), mutated_bytes, OccupancyLog.read),
     Format("process.json", PROCESS, mutated_json, OccupancyProcess.from_file),
     Format("model.json", MODEL, mutated_json, sensor_model),
+    Format("network.onnx", NETWORK, mutated_bytes, read_onnx),
     Format("scenario.toml", SCENARIO, mutated_text, scenario),
     Format("scenario.json", tomllib.loads(SCENARIO), mutated_json, scenario),
     Format("experiment.json", EXPERIMENT, mutated_json, ExperimentSpec.read),
@@ -335,6 +355,8 @@ FORMATS = [
     Format("summary.json", SUMMARY, mutated_json, reported),
     Format("survey.json", SURVEY_SUMMARY, mutated_json, reported_kind),
     Format("commute.json", COMMUTE_SUMMARY, mutated_json, reported_kind),
+    Format("fleet.json", FLEET_SUMMARY, mutated_json, reported_kind),
+    Format("days.csv", DAY_ROWS, mutated_text, TABLE.read),
     Format("sessions.csv", SESSION_ROWS, mutated_text, sessions),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
     Format("timings.csv", TIMING_ROWS, mutated_text, resumed),

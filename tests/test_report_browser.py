@@ -239,6 +239,44 @@ def test_another_world_can_be_chosen(page):
 
 
 @pytest.mark.slow
+def test_a_day_with_many_cars_is_played(browser, tmp_path):
+    command = ["fleet", "--scenario", "mini", "--hours", "08:00-08:30", "--arrivals-per-hour", "40", "--knows",
+               "own,reserve", "-n", "1", "--jobs", "1", "--report", "--out", str(tmp_path)]  # fmt: skip
+    assert parkenv(*command).returncode == 0
+    screen(browser, 1400)
+    browser.get((tmp_path / "report.html").as_uri())
+    days = json.loads(one(browser, "#report-data").get_attribute("textContent"))["fleets"]
+    assert [p.get_attribute("data-setting") for p in every(browser, "#crowd .panel")] == ["own", "reserve"]
+    assert painted(browser, "#crowd .panel canvas") > 20
+    slider = one(browser, "#crowd input[type=range]")
+    for seconds in (0.0, 700.0, 1500.0, 300.0):
+        browser.execute_script(
+            "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'));",
+            slider,
+            seconds,
+        )
+        for day, counts in zip(days, every(browser, "#crowd .counts"), strict=True):
+            now = 100 * float(slider.get_attribute("value"))
+            cars = list(zip(day["arrival"], day["ended"], day["slot"], day["leaves"], strict=True))
+            searching = sum(arrival <= now < ended for arrival, ended, _, _ in cars)
+            taken = sum(leaves > now for leaves in day["residents"][1::2])
+            taken += sum(slot >= 0 and ended <= now < leaves for _, ended, slot, leaves in cars)
+            assert counts.text.startswith(f"{searching} searching")
+            assert f"{taken * 10} % of the slots taken" in counts.text
+            assert "as in days.csv" in counts.text
+    one(browser, "#crowd .play").click()
+    WebDriverWait(browser, 30).until(lambda _: float(slider.get_attribute("value")) > 310.0)
+    one(browser, "#crowd .play").click()
+    one(browser, "#crowd .chip[data-setting=reserve]").click()
+    assert [p.get_attribute("data-setting") for p in every(browser, "#crowd .panel")] == ["own"]
+    screen(browser, 390, 844, dark=True)
+    browser.get((tmp_path / "report.html").as_uri())
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    assert len(every(browser, "#crowd .panel")) == 1
+    assert browser.get_log("browser") == []
+
+
+@pytest.mark.slow
 def test_a_survey_drive_is_shown_in_step(browser, tmp_path):
     command = [
         "survey",

@@ -8,6 +8,7 @@ from shapely.geometry import LineString, Polygon
 
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import ScanPlane
+from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.mesh import Material
 from sim_sensors.scene import OverlapWarning, Scene, overlapping
 from sim_sensors.scenery import (
@@ -142,6 +143,31 @@ def test_changing_one_slot_leaves_every_other_array_as_it_was():
     np.testing.assert_array_equal(back.instances.pose, before.pose)
     assert not np.array_equal(other.vehicle_pose[7], scene.vehicle_pose[7])
     assert scene.vehicle_model[7] >= 0
+
+
+def test_the_scan_plane_of_a_changed_scene_is_that_of_one_made_anew():
+    """It is changed with the scene, one footprint at a time; scans are equal to the last bit."""
+    lot = SlotLot([[3.0 * i, 0.0] for i in range(40)], 1.57, 5.0, 2.5)
+    rng = np.random.default_rng(0)
+    taken, number = rng.random(40) < 0.5, np.zeros(40, np.int64)
+    changed = lot.scene(taken, number)
+    poses = np.column_stack([rng.uniform(0, 120, 30), np.full(30, -6.0), rng.uniform(-3, 3, 30)])
+    changed.scan_plane  # noqa: B018 - from here on it is changed with the scene
+    for _ in range(120):
+        slot = int(rng.integers(40))
+        if taken[slot]:
+            changed = changed.without_vehicle(slot)
+        else:
+            number[slot] += 1
+            changed = lot.filled(changed, slot, int(number[slot]))
+        taken[slot] = not taken[slot]
+        assert "scan_plane" in vars(changed)
+    anew = lot.scene(taken, number)
+    for one, other in zip(
+        *(LaserScanner().scan_batch_with_ids(scene.scan_plane, poses) for scene in (changed, anew)),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(one, other)
 
 
 def test_the_car_in_a_slot_depends_on_seed_slot_and_arrival_alone():

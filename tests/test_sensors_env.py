@@ -99,6 +99,14 @@ def test_waiting_makes_one_capture_and_time_goes_on():
     assert observation["captured_at"][0] == 1.0
 
 
+def test_scans_alone_are_those_beside_the_pictures():
+    both, alone = make(), make(observation="scan")
+    without = {name for name in both.observation_space if not name.startswith("image.")}
+    assert set(alone.observation_space) == without
+    for full, scan in zip(drive(both, 3, (3, 3, 3)), drive(alone, 3, (3, 3, 3)), strict=True):
+        assert data_equivalence({name: full[name] for name in without}, scan, exact=True)
+
+
 def test_a_scan_shows_max_range_where_nothing_is_met():
     observation, _ = make(rig=LASER_ONLY).reset(seed=0)
     scan = observation["scan.laser"][0]
@@ -140,6 +148,8 @@ def test_frames_show_the_camera_beside_the_lot():
         ({"weather": "snow"}, "weather is 'snow'"),
         ({"captures": 0}, "captures is 0, want a whole number of at least 1"),
         ({"every": float("nan")}, "every is nan m"),
+        ({"observation": "scans"}, "observation is 'scans', want one of full, scan"),
+        ({"observation": "scan", "rig": "stereo"}, 'observation is "scan", want a rig with a laser'),
         ({"traffic": 5}, "traffic is a int, want a Traffic"),
         ({"arrival": "08:00"}, "arrival is '08:00', want an ArrivalWindow"),
     ],

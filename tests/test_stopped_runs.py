@@ -36,7 +36,11 @@ def has_lines(path, count):
 
 @pytest.mark.parametrize(
     ("name", "number", "file", "lines"),
-    [("compare", signal.SIGTERM, "episodes.csv", 5), ("calibrate", signal.SIGKILL, "trips.jsonl", 2)],
+    [
+        ("compare", signal.SIGTERM, "episodes.csv", 5),
+        ("fleet", signal.SIGTERM, "days.csv", 5),
+        ("calibrate", signal.SIGKILL, "trips.jsonl", 2),
+    ],
 )
 def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(
     tmp_path, name, number, file, lines
@@ -50,7 +54,8 @@ def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(
         assert code == 143
         assert f"--resume --out {out} goes on" in " ".join(output.split())
         summary = json.loads((out / "summary.partial.json").read_text())
-        episodes = sum(row["episodes"] for row in summary["rows"])
+        counted = "days" if name == "fleet" else "episodes"
+        episodes = sum(row[counted] for row in summary["rows"])
         assert (summary["complete"], episodes) == (False, len((out / file).read_text().splitlines()) - 1)
     else:
         assert code == -signal.SIGKILL
@@ -68,7 +73,7 @@ def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(
     list(
         zip(
             COMMANDS,
-            [signal.SIGINT, signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGTERM],
+            [signal.SIGINT, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGTERM],
             strict=True,
         )
     ),
@@ -239,7 +244,7 @@ def test_a_folder_has_one_writer(tmp_path):
     try:
         holder.stdout.readline()
         assert not torn.exists()
-        for command in ("compare", "survey", "train", "calibrate", "demo", "park"):
+        for command in ("compare", "fleet", "survey", "train", "calibrate", "demo", "park"):
             refused = parkenv(command, "--scenario", "mini", "--out", out)
             assert refused.returncode == 2
             assert f"out: process {holder.pid} on " in refused.stderr

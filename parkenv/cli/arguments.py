@@ -16,7 +16,8 @@ Sensors:
     rig (laser|stereo|both_sides): Observe slots through simulated sensors, detector and all, instead of the sensor
         model: about a second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and
         a camera to each side.
-    detector (NAME|FILE): hog: the packaged models; side or front: one of them; a model file; MODULE:CLASS: your own.
+    detector (NAME|FILE|MODULE:CLASS): hog: the packaged models; side or front: one of them; a file of
+        `parkenv train-detector` (.npz) or a network (.onnx); MODULE:CLASS: your own.  [default: the scenario's, hog]
     weather (NAME): {weathers}.  [default: drawn each time]
 
 World:
@@ -338,6 +339,16 @@ def workers_of(place: Machines | Workplace) -> Workers:
     from parkenv.evaluation.experiments.workers import Workers
 
     return Workers(place.jobs or None, place.backend or "loky", place.address)
+
+
+def require_rig(rig: str | None, detector: str | None) -> None:
+    """Refuse a detector without sensors.
+
+    Raises:
+        InputError: there is a detector, but no rig.
+    """
+    if detector is not None and rig is None:
+        raise InputError(f"--detector {detector}: has no images to look at; add --rig laser")
 
 
 def not_none(**values: Any) -> dict[str, Any]:

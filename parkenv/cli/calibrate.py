@@ -31,6 +31,7 @@ def calibrate(
     world: args.ObservedSearches,
     traffic: args.Traffic,
     rig: RigName | None = None,
+    detector: str | None = None,
     resume: bool = False,
     machines: args.Machines,
 ) -> None:
@@ -61,6 +62,7 @@ def calibrate(
     from parkenv.evaluation.trips import calibration
     from parkenv.evaluation.trips.driven_search import DrivenSearch
     from parkenv.evaluation.trips.lot_driver import DrivingStyle
+    from parkenv.perception.detector_registry import detector_version
     from parkenv.scenarios.build import build
     from parkenv.world.scenario import KMH
 
@@ -69,19 +71,23 @@ def calibrate(
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice)
     agents = args.one_agent(agents)
-    DrivenSearch(its, agents, style=style, rig=rig)  # raises an error before anything is driven
+    args.require_rig(rig, detector)
+    DrivenSearch(
+        its, agents, style=style, rig=rig, detector=detector
+    )  # raises an error before anything is driven
     with writing_into(out, "the same command with --resume"):
         settings = {
             "version": __version__, "scenario": its.name,
             "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
             "files": fingerprints(spec.files()), "agent": agents, "style": dataclasses.asdict(style), "rig": rig,
+            **({} if detector is None else {"detector": detector_version(detector)}),
             "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agents).name]),
         }  # fmt: skip
         folder = calibration.TripFolder(out, settings, resume=resume)
         console = make_console()
         with progress_bar(console, "trips") as progress, machines.workers() as workers:
             bar = progress.add_task("Driving", total=2 * episodes)
-            trips = calibration.TripPlan(its, agents, style, rig)
+            trips = calibration.TripPlan(its, agents, style, rig, detector)
             seeds = range(seed, seed + episodes)
             rows = calibration.drive_trips(trips, seeds, folder, workers, lambda n: progress.advance(bar, n))
         made, table = calibration.calibrate(rows, its, speed)
@@ -121,6 +127,7 @@ def trip(
     world: args.ObservedSearches,
     traffic: args.Traffic,
     rig: RigName | None = None,
+    detector: str | None = None,
     rerun: Path | None = None,
 ) -> None:
     """Drive one trip from the entry into a slot, and film it from above at five times real speed.
@@ -152,6 +159,7 @@ def trip(
 
     if out.suffix.lower() != ".gif":
         raise InputError(f"--out is {out}, want a file that ends in .gif")
+    args.require_rig(rig, detector)
     if blind and rig is not None:
         raise InputError("--blind and --rig: without observations no sensors are needed; name one of the two")
     if rerun is not None:
@@ -161,7 +169,8 @@ def trip(
     its = build(traffic.on(world.spec(scenario)))
     speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
     style = DrivingStyle(speed=speed, notice_m=notice)
-    search = DrivenSearch(blind_scenario(its) if blind else its, args.one_agent(agents), style=style, rig=rig)
+    world_seen = blind_scenario(its) if blind else its
+    search = DrivenSearch(world_seen, args.one_agent(agents), style=style, rig=rig, detector=detector)
     make_folder(out.parent)
     console = make_console()
     with console.status("Driving and drawing"):

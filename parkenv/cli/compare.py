@@ -49,6 +49,7 @@ def compare(
     occupancy_levels: str | None = None,
     map_says: str | None = None,
     rig: RigName | None = None,
+    detector: str | None = None,
     figures: bool | None = None,
     rerun: Path | None = None,
     trust: bool = False,
@@ -99,7 +100,8 @@ def compare(
     sweep = costs.failure_cost == "sweep"
     if folder.resume:
         base = args.saved(out, ExperimentSpec)
-        require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
+        named = args.not_none(agents=agents, detector=detector)
+        require_trust(base, out, trust, given=named | machines.given)
     else:
         base = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
     grid = costs.grid(base.grid)
@@ -113,7 +115,7 @@ def compare(
         grid = grid.changed("--calibrated", calibrated=calibrated)
     grid = args.changed_axis(grid, "occupancy_levels", "--occupancy-levels", occupancy_levels)
     grid = args.changed_axis(grid, "map_says", "--map-says", map_says)
-    given = args.not_none(episodes=episodes, seed=seed, rig=rig, figures=figures)
+    given = args.not_none(episodes=episodes, seed=seed, rig=rig, detector=detector, figures=figures)
     if agents is not None:
         given["agents"] = readable_models(split_agents(agents), trust_model)
     scenarios = tuple(world.specs(scenario, base.scenarios))
@@ -181,7 +183,7 @@ def _record(case: Case, seeds: range, path: Path) -> None:
     from parkenv.evaluation.trips.sensor_log import record_search, sensor_log
     from planners.agent import make_agent
 
-    env = SearchPerceptionEnv(case.scenario, rig=str(case.rig))
+    env = SearchPerceptionEnv(case.scenario, rig=str(case.rig), detector=case.detector)
     with sensor_log(path, case.scenario.lot, env.rig) as log:
         record_search(env, make_agent(case.agent, env.scenario, **case.options), seeds[0], log)
 

@@ -6,6 +6,8 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from parkenv.files.known_names import (
+    DETECTOR_SUFFIXES,
+    DETECTORS,
     LOT_SUFFIXES,
     PACKAGED_LOTS,
     SCENARIO_NAMES,
@@ -59,14 +61,14 @@ COMPLETERS: dict[str, Completer] = {
     "calibrated": completer((), (".json",)),
     "cases": completer(VERIFY_CASES, several=True),
     "clone": completer(tuple(AGENTS)),
-    "detector": completer(("hog", "side", "front"), (".npz",)),
+    "detector": completer(DETECTORS, DETECTOR_SUFFIXES),
     "evaluate_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),
     "experiment": completer((), _TABLES),
     "lot": completer(PACKAGED_LOTS, LOT_SUFFIXES, several=True),
     "log": completer((), (".csv", ".csv.gz")),
     "mapping": completer((), (".csv",)),
     "map_file": completer((), (".sqlite",)),
-    "model": completer(("side", "front"), (".npz",)),
+    "model": completer(DETECTORS, DETECTOR_SUFFIXES),
     "occupancy": completer((), (".csv", ".csv.gz", ".json")),
     "place": completer((), (*LOT_SUFFIXES, ".osm", ".csv")),
     "places": completer((), LOT_SUFFIXES),

@@ -49,7 +49,7 @@ def demo(
     out: Path = Path("results/demo"),
     *,
     every: float | None = None,
-    detector: str = "hog",
+    detector: str | None = None,
     rerun: Path | None = None,
     folder: args.RunFolder,
     machines: args.Machines,
@@ -223,7 +223,7 @@ def _settings(spec: DemoSpec) -> dict[str, Any]:
         "version": __version__,
         **flat_tables(spec.model_dump(mode="json", exclude={"jobs", "backend", "address", "episodes"})),
         "files": fingerprints(spec.files()),
-        "detector": detector_version(spec.detector),
+        "detector": detector_version(spec.detector or spec.scenario.detector),
     }
 
 

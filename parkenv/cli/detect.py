@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from parkenv.cli.tables import make_console, make_table, save_summary
+from parkenv.cli.arguments import words
+from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import distinct_names, file_name
@@ -14,85 +15,132 @@ from parkenv.files.file_names import distinct_names, file_name
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from parkenv.perception.car_datasets import LabelledImage
     from parkenv.perception.cross_validation import CropScore
+    from parkenv.perception.detector import Detector
 
 
 def detect(
     images: list[Path],
     /,
     model: list[str] | None = None,
+    detector: str | None = None,
     threshold: float = 0.5,
     least_height: float | None = None,
+    step: int = 1,
     out: Path | None = None,
 ) -> None:
-    """Find cars in image files.
+    """Find cars in photographs and videos.
+
+    With --out, pictures and films with the boxes drawn in are written, and all boxes with frame and time as a table.
 
     Examples:
         parkenv detect photo.png --out results/cars
         parkenv detect photos --model side --threshold 0.8
+        parkenv detect drive.mp4 --detector yolo.onnx --step 5 --out results/cars
 
     Options:
-        images (FILE|DIR): Image files, or folders of them.
+        images (FILE|DIR): Images, videos, or folders of them.
         model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; repeatable.  [default: side and front]
+        detector (NAME|FILE|MODULE:CLASS): Instead of models: a network (.onnx), or a class of your own.  [default:
+            none]
         threshold (P): Least probability of a reported car.
         least_height (PX >= 8): Height of the smallest regions searched, px.  [default: the model's]
-        out, -o (DIR): Folder for pictures, NAME_cars.png, and summary.json.  [default: none]
+        step (N >= 1): Of a video, look at every N-th frame.
+        out, -o (DIR): Folder for NAME_cars.png, NAME_cars.mp4, boxes.csv and summary.json.  [default: none]
     """
-    import cv2
-    from rich.progress import track
-
+    from parkenv.evaluation.experiments.detection_run import (
+        BOX_COLUMNS,
+        detect_in_image,
+        detect_in_video,
+        require_readable,
+    )
     from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.survey_pictures import draw_detections
-    from parkenv.files.atomic_write import atomic_write
-    from parkenv.files.images import images_in, read_image
-    from parkenv.perception.hog_detector import HogDetector
+    from parkenv.files.csv_writing import write_csv
+    from parkenv.files.videos import Video
 
-    detector = HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
-    chosen = [f for path in images for f in (images_in(path) if path.is_dir() else [path])]
-    for file in chosen:
-        read_image(file)  # a damaged one is refused before any work
-    drawings = [file_name(f"{name}_cars", ".png") for name in distinct_names(chosen)]
+    finder = _finder(model, detector, threshold, least_height)
+    chosen = require_readable(images)  # a damaged one is refused before any work
+    drawings = [
+        file_name(f"{name}_cars", ".mp4" if isinstance(one, Video) else ".png")
+        for one, name in zip(chosen.values(), distinct_names(list(chosen)), strict=True)
+    ]
     if out is not None:
         originals = {file.resolve() for file in chosen}
         for drawing in drawings:
             if (out / drawing).resolve() in originals:
-                raise InputError(f"--out {out}: {drawing} would replace an image that is searched")
+                kind = "a video" if drawing.endswith(".mp4") else "an image"
+                raise InputError(f"--out {out}: {drawing} would replace {kind} that is searched")
         make_folder(out)
     console = make_console()
-    rows, cells = [], []
-    progress = track(
-        zip(chosen, drawings, strict=True),
-        "Detecting",
-        total=len(chosen),
-        console=console,
-        disable=not console.is_terminal,
-    )
-    for file, drawing in progress:
-        image = read_image(file)
-        found = detector.detect(image)
-        for box, p, end in zip(
-            found.boxes.tolist(), found.probability.tolist(), found.end_on.tolist(), strict=True
-        ):
-            view = "end" if end else "side"
-            rows.append({"file": str(file), "box": box, "probability": p, "view": view})
-            cells.append((str(file), *(f"{v:.0f}" for v in box), f"{p:.2f}", view))
-        if out is not None:
-            colored = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
-            drawn = draw_detections(colored, found)
-            with atomic_write(out / drawing) as beside:
-                beside.write_bytes(cv2.imencode(".png", drawn[..., ::-1])[1].tobytes())
+    boxes: list[dict[str, Any]] = []
+    videos: list[dict[str, Any]] = []
+    total: int | None = 0
+    for one in chosen.values():
+        frames = -(-one.frames // step) if isinstance(one, Video) and one.frames else 1
+        total = None if total is None or (isinstance(one, Video) and not one.frames) else total + frames
+    with progress_bar(console, "frames") as progress:
+        task = progress.add_task("Detecting", total=total)
+        for (file, one), drawing in zip(chosen.items(), drawings, strict=True):
+            drawn = None if out is None else out / drawing
+            if isinstance(one, Video):
+                found = detect_in_video(one, finder, threshold, step, drawn, lambda: progress.advance(task))
+                videos.append(found.row)
+                boxes += found.boxes
+            else:
+                boxes += detect_in_image(file, finder, threshold, drawn)
+                progress.advance(task)
     headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
-    console.print(make_table(None, headings, cells))
-    console.print(f"{plural(len(rows), 'car')} in {plural(len(chosen), 'image')}")
+    cells = [
+        (b["file"], *(f"{b[side]:.0f}" for side in headings[1:5]), f"{b['probability']:.2f}", b["view"])
+        for b in boxes
+        if b["frame"] is None
+    ]
+    n_images = len(chosen) - len(videos)
+    if n_images:
+        console.print(make_table(None, headings, cells))
+        console.print(f"{plural(len(cells), 'car')} in {plural(n_images, 'image')}")
+    for video in videos:
+        console.print(
+            f"{video['file']}: {plural(video['frames'], 'frame')} of {video['seconds']:.1f} s, "
+            f"{plural(video['boxes'], 'box', 'boxes')}, at most {plural(video['most_cars'], 'car')} in a frame"
+        )
     if out is not None:
-        save_summary(out, None, rows)
-        console.print(f"Images are in {out}")
+        write_csv(out / "boxes.csv", BOX_COLUMNS, boxes)
+        rows = [
+            {"file": b["file"], "box": [b[side] for side in headings[1:5]]} | {k: b[k] for k in headings[5:]}
+            for b in boxes
+            if b["frame"] is None
+        ]
+        save_summary(out, None, rows, videos=videos)
+        console.print(f"Pictures, films, boxes.csv and summary.json are in {out}")
+
+
+def _finder(
+    model: list[str] | None, detector: str | None, threshold: float, least_height: float | None
+) -> Detector:
+    """Return the detector that the options describe."""
+    from parkenv.perception.detector_registry import make_detector
+    from parkenv.perception.hog_detector import HogDetector
+
+    if detector is None:
+        return HogDetector.load(*(model or ()), threshold=threshold, least_height=least_height)
+    if model or least_height is not None:
+        raise InputError(
+            f"--detector {detector} excludes --model and --least-height, which choose HOG models"
+        )
+    if not 0.0 < threshold < 1.0:
+        raise InputError(f"--threshold is {threshold}, want between 0 and 1")
+    return make_detector(detector, threshold)
 
 
 def train_detector(
     out: Path,
     uiuc: Path | None = None,
     crops: Path | None = None,
+    labels: Path | None = None,
+    images: Path | None = None,
+    classes: str | None = None,
     front: bool = False,
     folds: int = 0,
     seed: int = 0,
@@ -103,12 +151,14 @@ def train_detector(
     jitter: int = 2,
     misaligned: int = 2,
 ) -> None:
-    r"""Train a car model on photographs: aligned crops of cars, and images without cars.
+    r"""Train a car model on photographs: with labelled boxes, or aligned crops of cars and images without cars.
 
     With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car.
 
     Examples:
         parkenv train-detector --uiuc CarData --out side.npz
+        parkenv train-detector --labels coco.json --images pictures -o side.npz
+        parkenv train-detector --labels yolo --front -o front.npz
         parkenv train-detector --crops kitti --front --out front.npz \
             --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
 
@@ -116,6 +166,10 @@ def train_detector(
         out, -o (FILE.npz): The model file to write.
         uiuc (DIR): UIUC's folder: trains on TrainImages (or TrainImages.tar.gz).
         crops (DIR): Instead: a folder with positives/, negatives/ (or vehicles/, non-vehicles/).
+        labels (FILE.json|DIR): Instead: labelled photographs, a file of COCO, or a folder of YOLO (images/ and labels/,
+            or .txt beside the pictures; names in data.yaml or classes.txt).
+        images (DIR): Folder of the pictures of COCO.  [default: the file's]
+        classes (NAME[,...]): Classes of the labels that are cars.  [default: car, van, truck, bus and the like]
         front: Train a model of fronts and rears, with a square window.
         folds (N >= 0): Folds of a cross-validation on the crops; 0: none.
         seed (N >= 0): Seed of jitter, solver and folds.
@@ -131,14 +185,26 @@ def train_detector(
     from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
     from parkenv.perception.cross_validation import cross_validated
     from parkenv.perception.hog import Descriptor
+    from parkenv.perception.labelled_folders import crops_of, read_labels
+    from parkenv.perception.simulated_photos import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
     from parkenv.perception.training import TrainingSettings, train
 
-    if (uiuc is None) == (crops is None):
-        raise InputError("give either --uiuc FOLDER or --crops FOLDER")
+    if sum(source is not None for source in (uiuc, crops, labels)) != 1:
+        raise InputError("give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER")
+    if labels is None and (images is not None or classes is not None):
+        raise InputError("--images and --classes go with --labels")
     if out.suffix != ".npz":
         raise InputError(f"--out {out}: want a name that ends in .npz")
     check_writable(out)
-    data = read_uiuc_training(uiuc) if uiuc is not None else read_crop_folder(Path(str(crops)))
+    photos: list[LabelledImage] = []
+    alignment: dict[str, Any] = {}
+    if labels is not None:
+        named = words("--classes", classes) if classes is not None else ()
+        data, photos = crops_of(read_labels(labels, images, named), end_on=front, seed=seed)
+        alignment = {"region_aspect": END_ASPECT, "car": END_CAR} if front else {}
+        alignment = alignment or {"region_aspect": SIDE_ASPECT, "car": SIDE_CAR}
+    else:
+        data = read_uiuc_training(uiuc) if uiuc is not None else read_crop_folder(Path(str(crops)))
     descriptor = Descriptor(128, 128 if front else 64, normalization)
     settings = TrainingSettings(
         penalty=penalty, rounds=rounds, jitter=jitter, misaligned=misaligned, seed=seed
@@ -162,7 +228,9 @@ def train_detector(
             descriptor=descriptor,
             end_on=front,
             settings=settings,
-            trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in {uiuc or crops}",
+            trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in {uiuc or crops or labels}",
+            photos=photos,
+            **alignment,
             progress=status.update,
         )
     model.save(out)
@@ -183,24 +251,35 @@ def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
     return make_table("Held-out crops", ["part", "cars", "others", "AUC", *rates], rows)
 
 
-def evaluate_detector(uiuc: Path, model: str = "side", out: Path = Path("results/detector")) -> None:
-    """Measure recall and precision of a side model on UIUC's test sets, by their matching rule.
+def evaluate_detector(
+    uiuc: Path, model: str = "side", out: Path = Path("results/detector"), *, detector: str | None = None
+) -> None:
+    """Measure recall and precision of a detector on UIUC's test sets, by their matching rule.
+
+    A HOG model (--model) is searched at the sizes of the set's cars, a --detector looks as it does in a survey.
 
     Examples:
         parkenv evaluate-detector --uiuc CarData --model side
+        parkenv evaluate-detector --uiuc CarData --detector yolo.onnx
 
     Options:
         uiuc (DIR): UIUC's folder as published (CarData).
-        model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`.
+        model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; any other detector is taken as with
+            --detector.
+        detector (NAME|FILE|MODULE:CLASS): Instead of a model: hog, a network (.onnx), or a class of your own.
+            [default: none]
         out, -o (DIR): Folder for summary.json and the curves.
     """
     from rich.progress import Progress
 
-    from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
+    from parkenv.evaluation.experiments.detector_scores import LEAST_SCORED, save_curves, score_on_uiuc
     from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.perception.car_model import CarModel
+    from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
+    from parkenv.perception.detector_registry import make_detector
 
-    loaded = CarModel.load(model)
+    name = detector or model
+    is_model = detector is None and (name in PACKAGED_MODELS or name.lower().endswith(".npz"))
+    loaded = CarModel.load(name) if is_model else make_detector(name, LEAST_SCORED)
     make_folder(out)
     console = make_console()
     with Progress(console=console, disable=not console.is_terminal, transient=True) as progress:
@@ -209,6 +288,6 @@ def evaluate_detector(uiuc: Path, model: str = "side", out: Path = Path("results
     rows = [score.row for score in scores]
     cells = ([f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)
     console.print(make_table(None, list(rows[0]), cells))
-    save_curves(scores, f"model {model}", out / "recall_precision.png")
+    save_curves(scores, f"{'model' if is_model else 'detector'} {name}", out / "recall_precision.png")
     save_summary(out, None, rows)
     console.print(f"Written: {out / 'recall_precision.png'}, summary.json")

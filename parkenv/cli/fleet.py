@@ -3,29 +3,42 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.folder_run import run_into
+from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.trust import readable_models, require_trust
+from parkenv.evaluation.plurals import plural
+
+if TYPE_CHECKING:
+    from parkenv.evaluation.experiments.spec import FleetSpec
 
 Row = dict[str, Any]
 
+PICTURE = "fleet.png"
+
 
 def fleet(
+    agents: str | None = None,
     scenario: str | None = None,
-    agents: str = "greedy-drive",
-    episodes: int = 10,
-    seed: int = 0,
+    episodes: int | None = None,
+    seed: int | None = None,
     out: Path = Path("results/fleet"),
     *,
-    arrivals_per_hour: str = "60,120,240",
-    knows: str = "own,shared,reserve,full",
-    share: str = "1",
-    stay_min: float = 60.0,
-    patience_min: float = 10.0,
-    delay: float = 0.0,
+    arrivals_per_hour: str | None = None,
+    stay_min: float | None = None,
+    patience_min: float | None = None,
+    knows: str | None = None,
+    share: str | None = None,
+    delay: float | None = None,
     world: args.ObservedSearches,
+    figures: bool | None = None,
+    trust: bool = False,
+    trust_model: bool = False,
+    folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
     """Let many cars arrive in one lot, search, park, stay and leave, and compare what they know.
@@ -39,68 +52,89 @@ def fleet(
         parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
+        parkenv fleet --resume --episodes 20
 
     Options:
         agents (NAME[,...]): Agents, each of which drives all cars in turn, with any options in brackets. greedy-drive,
-            first-free and random are compiled; any other agent decides in Python.
-        episodes, -n (1 <= N <= 100000): Days of each setting.
-        seed (N >= 0): Seed of the days.
-        out, -o (DIR): Folder for summary.json, days.csv and fleet.png.
+            first-free and random are compiled; any other agent decides in Python.  [default: greedy-drive]
+        episodes, -n (N >= 1): Days of each setting.  [default: 10]
+        seed (N >= 0): Seed of the days.  [default: 0]
+        out, -o (DIR): Folder for experiment.json, days.csv, summary.json and fleet.png.
 
     Demand:
-        arrivals_per_hour (X[,...]): Cars an hour that arrive.
-        stay_min (0.1 <= X <= 100000): Mean of the exponentially distributed stays, minutes.
+        arrivals_per_hour (X[,...]): Cars an hour that arrive.  [default: 60,120,240]
+        stay_min (0.1 <= X <= 100000): Mean of the exponentially distributed stays, minutes.  [default: 60]
         patience_min (0.1 <= X <= 100000): Minutes after which a searching car goes elsewhere, at the give-up penalty.
+            [default: 10]
 
     Knowledge:
         knows (NAME[,...]): What members know. own: what they observe; shared: also a live map of what members observe;
-            reserve: the slot that a guidance system has reserved; full: the state of every slot.
+            reserve: the slot that a guidance system has reserved; full: the state of every slot.  [default:
+            own,shared,reserve,full]
         share (X[,...]): Shares of the cars that are members, from 0 to 1; the others know what they observe.
-        delay (0.0 <= X <= 100000): Age of the live map, s.
+            [default: 1]
+        delay (0.0 <= X <= 100000): Age of the live map, s.  [default: 0]
+
+    Results:
+        figures: Draw the picture.  [default: figures]
     """
     from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.figures.fleet_figure import save_fleet_figure
-    from parkenv.evaluation.fleet.experiment import FleetExperiment, summarize_days
-    from parkenv.evaluation.plurals import plural
-    from parkenv.files.csv_writing import write_csv
-    from parkenv.scenarios.build import build
+    from parkenv.evaluation.experiments.spec import FleetSpec
 
-    spec = world.spec(scenario)
-    experiment = FleetExperiment(
-        spec,
-        tuple(split_agents(agents)),
-        tuple(args.words("--knows", knows)),
-        tuple(args.numbers("--share", share)),
-        tuple(args.numbers("--arrivals-per-hour", arrivals_per_hour)),
-        episodes,
-        seed,
-        60.0 * stay_min,
-        60.0 * patience_min,
-        delay,
-    )
-    its = build(spec)
-    settings = experiment.settings()
-    for setting in settings:
-        experiment.fleet(setting, its)  # raises an error before anything is run
-    with writing_into(out):
-        console = make_console()
-        with machines.workers() as workers, progress_bar(console, "days") as progress:
-            bar = progress.add_task("Driving", total=len(settings) * episodes)
-            days = list(experiment.run(workers, lambda: progress.advance(bar)))
-        rows = summarize_days(days)
-        write_csv(out / "days.csv", list(days[0][0]), (day for of_setting in days for day in of_setting))
-        save_summary(
-            out, seed, [{"scenario": its.name, **row} for row in rows], stay_s=experiment.stay_s,
-            patience_s=experiment.patience_s, delay_s=delay,
-        )  # fmt: skip
-        title = f"{its.name}: {its.lot.n_slots} slots, {plural(episodes, 'day')}"
-        save_fleet_figure(rows, its, title, out / "fleet.png")
+    base = FleetSpec()
+    if folder.resume:
+        base = args.saved(out, FleetSpec)
+        require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
+    spec = base.changed(**args.not_none(days=episodes, seed=seed, figures=figures), **machines.given)
+    if agents is not None:
+        spec = spec.changed(agents=readable_models(split_agents(agents), trust_model))
+    spec = spec.changed(scenario=args.one_scenario(world.specs(scenario, [base.scenario])))
+    if knows is not None:
+        spec = spec.changed("--knows", knows=args.words("--knows", knows))
+    if share is not None:
+        spec = spec.changed("--share", shares=args.numbers("--share", share))
+    if arrivals_per_hour is not None:
+        its = args.numbers("--arrivals-per-hour", arrivals_per_hour)
+        spec = spec.changed("--arrivals-per-hour", arrivals_per_hour=its)
+    if stay_min is not None:
+        spec = spec.changed("--stay-min", stay_s=60.0 * stay_min)
+    if patience_min is not None:
+        spec = spec.changed("--patience-min", patience_s=60.0 * patience_min)
+    if delay is not None:
+        spec = spec.changed("--delay", delay_s=delay)
+    with writing_into(out, f"--resume --out {out}"):
+        run_fleet_of(spec, out, folder)
+
+
+def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
+    """Run an experiment with a progress bar, print its table and draw its picture.
+
+    Raises:
+        InputError: the experiment cannot be run, or the folder cannot be used.
+        KeyboardInterrupt: the run was interrupted; the results of finished days are printed and in the folder.
+    """
+    from parkenv.evaluation.fleet.experiment import run_fleets
+
+    console = make_console()
+    result = run_into(out, run_fleets, spec, folder, console, doing="Driving", unit="days")
+    its = result.experiment.scenario
+    title = f"{its.name}: {its.lot.n_slots} slots, {plural(spec.days, 'day')}"
+    if result.rows:
         headings = (
             "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
             "cruising", "occupancy", "price of anarchy",
         )  # fmt: skip
-        console.print(make_table(title, headings, map(_cells, rows)))
-        console.print(f"Summary, days and figure are in {out}")
+        console.print(make_table(title, headings, map(_cells, result.rows)))
+    if not result.complete:
+        raise KeyboardInterrupt
+    if spec.figures:
+        from parkenv.evaluation.figures.fleet_figure import save_fleet_figure
+
+        with console.status("Drawing the picture"):
+            save_fleet_figure(result.rows, its, title, out / PICTURE)
+    console.print(f"Days{', summary and the picture' if spec.figures else ' and summary'} are in {out}")
+    if folder.report:
+        make_report(out, spec)
 
 
 def _cells(row: Row) -> tuple[str, ...]:

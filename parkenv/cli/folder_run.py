@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import TaskID
 
-    from parkenv.evaluation.experiments.spec import CommuteSpec, ExperimentSpec
+    from parkenv.evaluation.experiments.spec import CommuteSpec, ExperimentSpec, FleetSpec
 
 Result = TypeVar("Result")
 
@@ -21,7 +21,7 @@ Result = TypeVar("Result")
 def run_into(
     out: Path,
     run: Callable[..., Result],
-    spec: ExperimentSpec | CommuteSpec,
+    spec: ExperimentSpec | CommuteSpec | FleetSpec,
     folder: args.RunFolder,
     console: Console,
     *,
@@ -32,7 +32,7 @@ def run_into(
 
     Args:
         out: the folder.
-        run: `run_experiment` or `run_commute`.
+        run: `run_experiment`, `run_commute` or `run_fleets`.
         spec: its specification.
         folder: whether an earlier run is continued or replaced.
         console: where the progress bar is shown.

@@ -15,11 +15,13 @@ from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import Workplace
+    from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
+    from parkenv.evaluation.report.fleet_recording import FleetDay
     from parkenv.evaluation.report.repetition import Cases
 
 PAGE = "report.html"
-EPISODES, SENSED = 20, 4
-"""Default number of replayed searches: in general, and with rendered sensors at every step."""
+EPISODES, SENSED, DAYS = 20, 4, 8
+"""Default number of replayed searches: in general, and with rendered sensors at every step; of days with many cars."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +30,8 @@ class Replays:
 
     Options:
         episodes, -n (N >= 0): About how many episodes to replay, all agents together.  [default: 20; through simulated
-            sensors 4]
-        replay (SEED[,...]): Replay the episodes with these seeds.
+            sensors 4; 8 days of a fleet]
+        replay (SEED[,...]): Replay the episodes with these seeds, or these days of a fleet.
         agents (NAME[,...]): Replay only these agents.
         sessions (N >= 0): Survey drives to replay.
         frames (2 <= N <= 250): Captures of them to keep, all drives together.
@@ -65,7 +67,7 @@ def report(
         parkenv report results/survey --sessions 2
 
     Options:
-        run (DIR): Folder of compare, survey, demo, train or another command.
+        run (DIR): Folder of compare, survey, demo, train, fleet or another command.
         out, -o (FILE.html): The page.  [default: DIR/report.html]
     """
     make_report(run, machines, replays, out=out, trust=trust)
@@ -91,8 +93,9 @@ def make_report(
             are not trusted.
     """
     from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.report.fleet_recording import choose_days, differing_days
     from parkenv.evaluation.report.page import page_data, write_page
-    from parkenv.evaluation.report.repetition import Repetition, differences, drawable
+    from parkenv.evaluation.report.repetition import Repetition, differences, drawable, drawable_settings
     from parkenv.evaluation.report.run_folder import RunFolder
     from parkenv.evaluation.report.search_recording import choose, record
 
@@ -116,7 +119,15 @@ def make_report(
         notes.append(f"There is no replay: {error}")
     sensed = any(case.rig is not None for case, _ in repeated.cases)
     wanted = replays.episodes if replays.episodes is not None else SENSED if sensed else EPISODES
-    cases, too_large = drawable(_chosen(repeated.cases, replays.replay, replays.agents))
+    days: list[FleetDay] = []
+    cases: Cases = []
+    if (fleets := repeated.fleets) is not None:
+        settings, too_large = drawable_settings(fleets, _chosen_settings(fleets, replays.agents))
+        wanted = replays.episodes if replays.episodes is not None else DAYS
+        numbers = replays.replay and _numbers_of(range(fleets.spec.days), replays.replay)
+        days = choose_days(fleets, settings, wanted, numbers or None)
+    else:
+        cases, too_large = drawable(_chosen(repeated.cases, replays.replay, replays.agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
     again = range(min(replays.sessions, repeated.sessions) if drives is None else 0)
@@ -126,40 +137,60 @@ def make_report(
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
     tasks += [partial(repeated.drive, number, replays.frames // max(len(again), 1)) for number in again]
+    day_totals = run.day_totals() if days else {}
+    tasks += [partial(one.record, day_totals) for one in days]
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
         bar = progress.add_task(stage, total=len(tasks))
         done: list[dict[str, Any]] = []
         for one in workers.in_order(tasks):
             done.append(one)
             progress.advance(bar)
-    watched = done[: len(encounters)]
-    notes += differences(watched)
+    watched, rest = done[: len(encounters)], done[len(encounters) :]
+    driven, shown = rest[: len(again)], rest[len(again) :]
+    notes += differences(watched) + differing_days(shown)
     path = out or folder / PAGE
-    recorded = done[len(encounters) :] if drives is None else drives
-    write_page(page_data(run, watched, recorded, notes), path, run.figures)
+    write_page(page_data(run, watched, driven if drives is None else drives, shown, notes), path, run.figures)
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
     return path
 
 
+def _chosen_settings(fleets: FleetExperiment, agents: str | None) -> list[Setting]:
+    """Return the settings with the agents selected by `--agents`."""
+    if agents is None:
+        return fleets.settings
+    names = _agents_of(list(dict.fromkeys(one.agent.label for one in fleets.settings)), agents)
+    return [one for one in fleets.settings if one.agent.label in names]
+
+
 def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:
     """Return the searches selected by `--replay` and `--agents`."""
     if agents is not None:
-        from parkenv.evaluation.experiments.agent_spec import split_agents
-
-        known = list(dict.fromkeys(case.label for case, _ in cases))
-        for name in (names := split_agents(agents)):
-            if name not in known:
-                raise InputError(f"--agents has {name!r}; {nearest(name, known)}")
+        names = _agents_of(list(dict.fromkeys(case.label for case, _ in cases)), agents)
         cases = [(case, numbers) for case, numbers in cases if case.label in names]
     if replay is not None:
-        its_seeds: Sequence[int] = cases[0][1] if cases else range(0)
-        theirs = f"{its_seeds[0]} to {its_seeds[-1]}" if its_seeds else "none"
-        wanted: list[int] = []
-        for number in args.numbers("--replay", replay):
-            if number not in its_seeds:
-                raise InputError(f"--replay has {number:g}; this run's are {theirs}")
-            wanted.append(int(number))
+        wanted = _numbers_of(cases[0][1] if cases else (), replay)
         cases = [(case, wanted) for case, _ in cases]
     return cases
+
+
+def _agents_of(known: Sequence[str], agents: str) -> list[str]:
+    """Return the agents that `--agents` names."""
+    from parkenv.evaluation.experiments.agent_spec import split_agents
+
+    for name in (names := split_agents(agents)):
+        if name not in known:
+            raise InputError(f"--agents has {name!r}; {nearest(name, known)}")
+    return names
+
+
+def _numbers_of(known: Sequence[int], replay: str) -> list[int]:
+    """Return the seeds or days that `--replay` names."""
+    theirs = f"{known[0]} to {known[-1]}" if known else "none"
+    wanted: list[int] = []
+    for number in args.numbers("--replay", replay):
+        if number not in known:
+            raise InputError(f"--replay has {number:g}; this run's are {theirs}")
+        wanted.append(int(number))
+    return wanted

@@ -10,6 +10,7 @@ from parkenv.cli.benchmark import run_suite
 from parkenv.cli.commute import run_commute_of
 from parkenv.cli.compare import run_comparison
 from parkenv.cli.demo import run_demo
+from parkenv.cli.fleet import run_fleet_of
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.survey import run_survey_of
 from parkenv.cli.train import run_training
@@ -19,6 +20,7 @@ from parkenv.errors import InputError, nearest
 KINDS: Mapping[str, Callable[..., None]] = {
     "compare": run_comparison,
     "commute": run_commute_of,
+    "fleet": run_fleet_of,
     "benchmark": run_suite,
     "survey": run_survey_of,
     "demo": run_demo,
@@ -39,7 +41,7 @@ def run(
     """Run an experiment file: agents, scenarios, and a grid of settings.
 
     Settings that the file leaves out have the defaults of its command. The result folder keeps a copy, experiment.json,
-    for `parkenv report` and `--resume`. The key `kind` selects the command: compare (the default), commute,
+    for `parkenv report` and `--resume`. The key `kind` selects the command: compare (the default), commute, fleet,
     benchmark, survey, demo or train.
 
     Examples:

@@ -13,7 +13,7 @@ from parkenv.errors import InputError, nearest
 if TYPE_CHECKING:
     from pydantic import BaseModel
 
-KINDS = ("scenario", "compare", "commute", "benchmark", "survey", "demo", "train")
+KINDS = ("scenario", "compare", "commute", "fleet", "benchmark", "survey", "demo", "train")
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -25,6 +25,7 @@ def schemas() -> dict[str, dict[str, Any]]:
         ScenarioSpec,
         specs.ExperimentSpec,
         specs.CommuteSpec,
+        specs.FleetSpec,
         specs.BenchmarkSpec,
         specs.SurveySpec,
         specs.DemoSpec,
@@ -42,7 +43,8 @@ def schema(kind: str | None = None, /, out: Path | None = None) -> None:
         parkenv schema --out docs/schemas
 
     Options:
-        kind (KIND): scenario, compare, commute, benchmark, survey, demo, train.  [default: scenario; all with --out]
+        kind (KIND): scenario, compare, commute, fleet, benchmark, survey, demo, train.  [default: scenario; all with
+            --out]
         out, -o (DIR): Folder for all schemas, KIND.schema.json.  [default: none]
     """
     if kind is not None and kind not in KINDS:

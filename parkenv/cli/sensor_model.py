@@ -19,6 +19,7 @@ def fit_sensor_model(
     out: Path = Path("sensor_model.json"),
     *,
     world: args.Searches,
+    detector: str | None = None,
     weather: WeatherName | None = None,
     machines: args.Machines,
 ) -> None:
@@ -56,6 +57,7 @@ def fit_sensor_model(
             episodes,
             seed=seed,
             weather=weather,
+            detector=detector,
             workers=workers,
             on_progress=lambda: progress.advance(bar),
         )

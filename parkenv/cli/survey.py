@@ -32,10 +32,11 @@ def survey(
     hours: str | None = None,
     traffic: args.Traffic,
     rig: RigName | None = None,
-    detector: str = "hog",
+    detector: str | None = None,
     weather: WeatherName | None = None,
     pose_noise: float = 0.0,
     rerun: Path | None = None,
+    record: Path | None = None,
     folder: args.ReportedRun,
     machines: args.Machines,
 ) -> None:
@@ -64,6 +65,10 @@ def survey(
         rig (laser|stereo|both_sides): laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a
             laser and a camera to each side.  [default: the scenario's, laser]
         pose_noise (M >= 0): Localisation error of the car, m.
+
+    Results:
+        record (FILE.mcap): Also record images, scans and poses of the first session (extra bags), for `parkenv
+            map-drive`.  [default: none]
     """
     from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
 
@@ -73,10 +78,16 @@ def survey(
         weather=weather, every=every, pose_noise=pose_noise, seed=seed, **windows, **machines.given,
     )  # fmt: skip
     with writing_into(out, "the same command"):
-        run_survey_of(spec, out, folder, rerun)
+        run_survey_of(spec, out, folder, rerun, record)
 
 
-def run_survey_of(spec: SurveySpec, out: Path, folder: args.ReportedRun, rerun: Path | None = None) -> None:
+def run_survey_of(
+    spec: SurveySpec,
+    out: Path,
+    folder: args.ReportedRun,
+    rerun: Path | None = None,
+    record: Path | None = None,
+) -> None:
     """Drive the sessions that the map in the folder does not hold yet, print errors and draw figures.
 
     Raises:
@@ -95,11 +106,14 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.ReportedRun, rerun: 
     from parkenv.evaluation.trips.sensor_log import record_session, require_viewer, sensor_log
     from parkenv.mapping.discovery import score_discovery
     from parkenv.mapping.inference import predict
+    from parkenv.mapping.recorded_drive import record_drive, require_recordable
     from parkenv.mapping.store import MapStore
     from parkenv.mapping.survey import Survey
 
     if rerun is not None:
         require_viewer()
+    if record is not None:
+        require_recordable(record)
     its, settings = survey_of(spec)
     map_file = out / MAP_FILE
     if folder.overwrite:
@@ -172,6 +186,75 @@ def run_survey_of(spec: SurveySpec, out: Path, folder: args.ReportedRun, rerun: 
             with sensor_log(rerun, its.lot, first.pipeline.rig) as recording:
                 record_session(first, 0, recording)
         print_recorded(console, rerun)
+    if record is not None:
+        with console.status(f"Driving the first session once more for {record}"):
+            record_drive(Survey(its, settings), 0, record)
+        console.print(f"Recorded: {record}; map it with: parkenv map-drive {record}")
+
+
+def map_drive(
+    recording: Path,
+    /,
+    scenario: str | None = None,
+    calibration: Path | None = None,
+    every: float = 0.0,
+    out: Path = Path("results/drive"),
+    *,
+    lot: str | None = None,
+    detector: str | None = None,
+) -> None:
+    """Map a recorded drive: images, scans and poses of a car of your own become a session of a map file.
+
+    A recording of `parkenv survey --record` says which sensors it has; for any other a calibration file says so.
+
+    Examples:
+        parkenv survey --scenario mini --sessions 1 --record drive.mcap
+        parkenv map-drive drive.mcap --scenario mini --out results/drive
+        parkenv map-drive bag.mcap --lot lot.geojson --calibration car.toml
+
+    Options:
+        recording (FILE|DIR): An MCAP file, or a rosbag of ROS 2 (folder, .db3) or of ROS 1 (.bag); extra bags.
+        calibration (FILE): Sensors, mounts and topics (.toml).  [default: those of the recording]
+        every (M >= 0): Least distance between captures, m.
+        out, -o (DIR): Folder for map.sqlite, to which the session is added, map.png and summary.json.
+    """
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.evaluation.figures.survey_pictures import save_map
+    from parkenv.mapping.drive_calibration import DriveCalibration
+    from parkenv.mapping.inference import predict
+    from parkenv.mapping.recorded_drive import RecordedDrive
+    from parkenv.mapping.recorded_drive import map_drive as mapped
+    from parkenv.mapping.store import MapStore
+    from parkenv.perception.detector_registry import make_detector
+    from parkenv.scenarios.build import build
+
+    its = build(args.World(lot=lot).spec(scenario))
+    finder = make_detector(detector or its.detector)
+    console = make_console()
+    with console.status(f"Reading {recording}"):
+        drive = RecordedDrive(recording, None if calibration is None else DriveCalibration.read(calibration))
+    make_folder(out)
+    with MapStore(out / "map.sqlite", its.lot) as store, progress_bar(console, "captures") as progress:
+        if store.has(drive.key):
+            raise InputError(f"{out / 'map.sqlite'}: holds the drive {drive.key!r} already")
+        task = progress.add_task("Mapping", total=None)
+        found = mapped(drive, its.lot, finder, every, lambda: progress.advance(task))
+        store.add(found.session)
+        log = store.log()
+    states = found.states
+    row = {
+        "recording": str(recording),
+        "key": drive.key,
+        "captures": found.frames,
+        "slots": its.lot.n_slots,
+        "seen": int(states.in_view.sum()),
+        "taken": int((states.occupied & states.in_view).sum()),
+        "cars_located": len(found.session.cars),
+    }
+    save_map(its.lot, predict(log, found.session.time), None, f"{its.name}: {drive.key}", out / "map.png")
+    save_summary(out, None, [row])
+    console.print(make_table(None, ["figure", "value"], ((name, str(value)) for name, value in row.items())))
+    console.print(f"Written: {out / 'map.sqlite'}, map.png, summary.json")
 
 
 DayName = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]

@@ -31,7 +31,7 @@ def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] 
     from parkenv.evaluation.experiments.agent_spec import classes_in
     from parkenv.files.user_class import find_module
 
-    classes = () if "agents" in given else classes_in(spec)
+    classes = classes_in(spec, given)
     named = [f"{name} ({find_module(name) or 'not found'})" for name in classes]
     if "address" not in given and (address := getattr(spec, "address", None)):
         # A cluster's answers are pickled objects.

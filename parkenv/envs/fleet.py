@@ -21,6 +21,7 @@ from parkenv.envs.fleet_kernel import (
     NEEDS_REPORTS,
     NEEDS_RESERVATIONS,
     NEEDS_SEARCH,
+    NEEDS_STEPS,
     PAUSED,
     WRONG_ACTION,
     act_at,
@@ -34,11 +35,11 @@ from parkenv.envs.fleet_records import (
     CAR,
     DUE,
     FLEET,
-    KNOWLEDGE,
     LIVE_SLOT,
     REPORT,
     SEARCHING,
     STATES,
+    STEP,
 )
 from parkenv.envs.fleet_rules import Rule
 from parkenv.envs.search import action_number, space_of
@@ -46,6 +47,7 @@ from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT,
 from parkenv.envs.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
 from parkenv.envs.shared_slots import BACKGROUNDS, NO_CAR, SHARED_SLOT, shared_slots_taken_at
 from parkenv.errors import InputError
+from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.demand import Demand
@@ -360,6 +362,16 @@ class Fleet:
         self._row |= {searches.address + row * SEARCH.itemsize: (searches, row) for row in range(n)}
         self._add_free(searches, moves)
 
+    def keep_steps(self) -> None:
+        """From now on, keep the steps of all cars; `steps` returns those of the present world."""
+        if not self._record["step_capacity"]:
+            self._grow_steps()
+
+    @property
+    def steps(self) -> NDArray[np.void]:
+        """Steps of all cars since `keep_steps`, (n,) of the dtype STEP, in order of their beginning."""
+        return self._kept.get("steps", np.zeros(0, STEP))[: int(self._record["n_kept_steps"])].copy()
+
     # ---- decisions
 
     def run(self, agents: Sequence[Any] | None = None, until: float = math.inf) -> None:
@@ -371,8 +383,9 @@ class Fleet:
             until: s since Monday 00:00; parked cars leave until then, also after the last search.
 
         Raises:
-            InputError: a kind of driver has neither a rule nor an agent, or an agent raised an error, which is the
-                cause of this one: the message names car and time, and the world stays as it was before that decision.
+            InputError: a kind of driver has neither a rule nor an agent, or an agent raised an error (the cause of this
+                one) or chose an action that does not exist: the message names car and time, and the world stays as it
+                was before that decision.
         """
         agents = tuple(agents or ())
         for kind, driver in enumerate(self.drivers):
@@ -387,7 +400,12 @@ class Fleet:
                 raise InputError(
                     f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
                 ) from error
-            self.act(action)
+            try:
+                self.act(action)
+            except InputError as error:
+                raise InputError(
+                    f"car {car}: its agent at {self.time - self.begin:.1f} s: {error}"
+                ) from error
             if self._cars["state"][car] != SEARCHING:
                 memory.pop(car, None)
 
@@ -416,6 +434,8 @@ class Fleet:
                 self._grow_reports()
             elif status == NEEDS_RESERVATIONS:
                 self._reserve_slots()
+            elif status == NEEDS_STEPS:
+                self._grow_steps()
             elif status == WRONG_ACTION:
                 raise InputError("a compiled driver chose an action that does not exist")
             else:
@@ -455,6 +475,14 @@ class Fleet:
         reports[:n] = np.roll(old, -first)[:n]
         self._keep({"reports": reports})
         self._record["first_report"], self._record["report_capacity"] = 0, len(reports)
+
+    def _grow_steps(self) -> None:
+        """Make room for more steps that are kept."""
+        old = self._kept.get("steps", np.zeros(0, STEP))
+        steps = np.zeros(max(2 * len(old), 4096), STEP)
+        steps[: len(old)] = old
+        self._keep({"steps": steps})
+        self._record["step_capacity"] = len(steps)
 
     def _reserve_slots(self) -> None:
         """Assign free slots to the searching cars of the guidance system, at the least total time."""

@@ -34,6 +34,7 @@ from parkenv.envs.fleet_records import (
     TRUNCATED,
     car_at,
     fleet_at,
+    step_at,
 )
 from parkenv.envs.search_kernel import (
     SCENARIO_BYTES,
@@ -53,12 +54,12 @@ from parkenv.world.lot import PARK
 from parkenv.world.occupancy_kernel import inlined, kernel
 from parkenv.world.pointers import call_at, int64s
 
-FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS = range(
-    -1, -8, -1
-)
+(
+    FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,
+) = range(-1, -9, -1)  # fmt: skip
 """Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records are
 needed; Python must compute the forecast of the car `pending`; a compiled driver chose an unknown action; more room for
-reports is needed; Python must reserve slots."""
+reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
 LEAVE = -1
 """Action of compiled drivers: give up and park elsewhere."""
@@ -83,6 +84,7 @@ def begin_world_at(address: int) -> None:
     fleet.pending = NO_CAR
     fleet.n_searching = fleet.n_parked = fleet.n_gone = fleet.n_decisions = 0
     fleet.searching_s = fleet.parked_s = 0.0
+    fleet.n_kept_steps = 0
 
 
 @kernel
@@ -100,6 +102,8 @@ def advance_at(address: int, until: float) -> int:
     while True:
         if fleet.report_capacity > 0 and fleet.n_reports + fleet.n_slots >= fleet.report_capacity:
             return NEEDS_REPORTS
+        if fleet.step_capacity > 0 and fleet.n_kept_steps == fleet.step_capacity:
+            return NEEDS_STEPS
         if not (fleet.next_car < fleet.n_cars or fleet.n_events > 0) and fleet.n_ready == 0:
             break
         if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
@@ -335,6 +339,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
     if action >= TAKE_SLOT:
         search.vertex = action - TAKE_SLOT
         action = PARK
+    origin = search.vertex
     drive_or_park(search, action)
     car.stands, car.vertex = search.vertex == car.vertex, search.vertex
     if search.parked:
@@ -356,7 +361,17 @@ def act(fleet: Any, number: int, action: int) -> bool:
     else:
         release_slot(fleet, car)
     push_event(fleet, search.time, REACH, number)
+    if fleet.step_capacity > 0:
+        _keep_step(fleet, search, number, origin)
     return True
+
+
+@inlined
+def _keep_step(fleet: Any, search: Any, number: int, origin: int) -> None:
+    step = step_at(fleet.steps, fleet.n_kept_steps)
+    step.car, step.begin, step.end = number, fleet.time, search.time
+    step.origin, step.vertex, step.failed = origin, search.vertex, search.step_failed_s > 0.0
+    fleet.n_kept_steps += 1
 
 
 @inlined

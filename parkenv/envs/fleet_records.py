@@ -13,7 +13,6 @@ DUE, SEARCHING, PARKED, LEFT, GAVE_UP, BALKED, TRUNCATED = range(7)
 """States of a car: not yet arrived; searching; parked; has left its slot; went elsewhere because the lot was proven
 full; went elsewhere because its patience was at an end; ended by the limit of steps."""
 
-KNOWLEDGE = ("own", "shared", "reserve", "full")
 OWN_KNOWLEDGE, SHARED_KNOWLEDGE, RESERVE_KNOWLEDGE, FULL_KNOWLEDGE = range(4)
 """What a car knows of the slots: its own observations; also those on the live map; the slot that the guidance system
 has reserved for it; the true state of every slot."""
@@ -91,6 +90,20 @@ REPORT = np.dtype(
 )
 """A report for the live map."""
 
+STEP = np.dtype(
+    [
+        ("car", np.int64),
+        ("begin", np.float64),
+        ("end", np.float64),
+        ("origin", np.int64),
+        ("vertex", np.int64),
+        ("failed", np.bool_),
+    ],
+    align=True,
+)
+"""A step of a car, but for the last one, which parks it: index of the car; s since Monday 00:00; the vertices that it
+drives from and to; whether it is a failed attempt. A car that does not act at the end of its step waits in a queue."""
+
 FLEET = np.dtype(
     [
         *SHARED_WORLD_FIELDS,
@@ -141,6 +154,10 @@ FLEET = np.dtype(
         ("n_reports", np.int64),
         # Whether something has happened since slots were last reserved.
         ("reservations_stale", np.bool_),
+        # (step_capacity,) STEP records of all steps so far, if they are kept, and how many there are.
+        ("steps", ADDRESS),
+        ("step_capacity", np.int64),
+        ("n_kept_steps", np.int64),
         # For compiled drivers, by place: (n_slots,) int64 slots by cost of arrival; float64 median of that cost, s.
         ("by_cost", ADDRESS),
         ("median_cost_s", ADDRESS),
@@ -157,4 +174,4 @@ FLEET = np.dtype(
 """A world with many cars; `arrival` is when it begins, s since Monday 00:00."""
 
 car_at, fleet_at = record_at(CAR), record_at(FLEET)
-live_slot_at, report_at = record_at(LIVE_SLOT), record_at(REPORT)
+live_slot_at, report_at, step_at = record_at(LIVE_SLOT), record_at(REPORT), record_at(STEP)

@@ -54,7 +54,6 @@ from parkenv.envs.search_records import (
     PROCESS_KIND,
     SENTINEL,
     block_at,
-    edge_at,
     scenario_at,
     search_at,
     slot_at,
@@ -77,25 +76,35 @@ HERE, PER_MOVE, PER_NEAR = 14, 8, 8
 FIRST_NEAR = HERE + N_MOVES * PER_MOVE
 SAMPLES = 4
 _NOWHERE = -1
+# A row of `Surroundings.numbers`: whether there is a slot here, the walk from it; for each move, whether the graph has
+# it, drive time, the move with the shortest drive and walk after it, and where it leads, in s from here; drive to the k
+# nearest slots; walk from them; drive plus walk via the k slots ahead of each move. Times but the last are encoded.
+_FIRST_MOVE, _MOVE_NUMBERS = 2, 5
+_FIRST_SLOT = _FIRST_MOVE + N_MOVES * _MOVE_NUMBERS
+_LINE = 64  # bytes of a cache line
 
 
 class Surroundings(NamedTuple):
-    """The surroundings of every vertex of one or several lots; rows are vertices, lot after lot."""
+    """The surroundings of every vertex of one or several lots; rows are vertices, lot after lot.
+
+    What a step reads of a row lies in few cache lines: with many places, they come from the slow outer cache.
+    """
 
     first: NDArray[np.int64]  # (n_lots,) int64, first row of each lot
-    fixed: NDArray[np.float32]  # (n, 46 + 8k) float32, the constant part of the observation
+    # (n, at least 22 + 6k) float32, the constant numbers of the observation, see `_FIRST_SLOT`
+    numbers: NDArray[np.float32]
+    # (n, at least 6k) int16: indices of the k nearest slots into the row's slots, -1 past the last; the first move to
+    # each, -1 if none; those of the k slots ahead of each move, least drive plus walk first, -1 past the last
+    indices: NDArray[np.int16]
+    # (n, 4) int32, vertices that the moves lead to; -1 if the graph has no such move
+    targets: NDArray[np.int32]
     starts: NDArray[np.int32]  # (n + 1,) int32, start of each row's slots in `slots`
     slots: NDArray[np.int32]  # int32, the near or ahead slots of each row, without repeats
-    # (n, k) int16, indices of the nearest ones into the row's slots; -1 past the last
-    near: NDArray[np.int16]
-    # (n, 4, k) int16, indices of those ahead of each move, least drive plus walk first; -1 past the last
-    ahead: NDArray[np.int16]
-    total_s: FloatArray  # (n, 4, k) s, drive plus walk via each slot of `ahead`
     crow_s: FloatArray  # (n, 2) s, coordinates divided by the driving speed
     samples: NDArray[np.int32]  # (n_lots, 4, 4) int32, sample slots from each quarter of the lot by walk
     first_view: NDArray[np.int64]  # (n_lots,) int64, start of each lot in `view_s`
-    view_s: FloatArray  # s, straight-line drive plus walk for each slot in view of each vertex
-    columns: NDArray[np.int32]  # int32, scratch space for the columns of a row's slots
+    view_s: NDArray[np.float32]  # s, straight-line drive plus walk for each slot in view of each vertex
+    columns: NDArray[np.int32]  # (5k,) int32, scratch space for the columns of a row's slots
 
     @property
     def n_bytes(self) -> int:
@@ -118,14 +127,13 @@ class Surroundings(NamedTuple):
         parts = [_around(problem, int(k)) for problem in problems]
         joined = [np.concatenate(arrays) for arrays in zip(*parts, strict=True)]
         first = np.concatenate([[0], np.cumsum([p.lot.n_vertices for p in problems])[:-1]])
-        count, *rest = joined
+        count, numbers, indices, targets, slots, crow_s, samples = joined
         starts = np.concatenate([[0], np.cumsum(count)]).astype(np.int32)
-        fixed, slots, near, ahead, total_s, crow_s, samples = rest
         views = [_view_s(problem) for problem in problems]
         first_view = np.concatenate([[0], np.cumsum([len(seconds) for seconds in views])[:-1]])
         arrays: list[NDArray[Any]] = [
-            first.astype(np.int64), fixed, starts, slots, near, ahead, total_s, crow_s, samples,
-            first_view.astype(np.int64), np.concatenate(views), np.zeros(int(count.max()), dtype=np.int32),
+            first.astype(np.int64), numbers, indices, targets, starts, slots, crow_s, samples,
+            first_view.astype(np.int64), np.concatenate(views), np.zeros((N_MOVES + 1) * k, dtype=np.int32),
         ]  # fmt: skip
         return cls(*in_one_block(arrays))
 
@@ -169,10 +177,11 @@ class LocalObservation(
             raise TypeError(f"LocalObservation wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
         self._surroundings = Surroundings.of(env.unwrapped.scenarios, k)
         self.observation_space = local_space(k)
+        self._n_numbers = FIRST_NEAR + PER_NEAR * k
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Return the local observation."""
-        local = np.empty(self._surroundings.fixed.shape[1], dtype=np.float32)
+        local = np.empty(self._n_numbers, dtype=np.float32)
         assert isinstance(self.env.unwrapped, SearchEnv)
         observe_surroundings_at(self.env.unwrapped.searches.address, self._surroundings, local)
         return {"local": local, "action_mask": observation["action_mask"]}
@@ -193,40 +202,47 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
     _remember(search, around, lot)
     scenario, first = scenario_at(search.scenario, 0), around.first[lot]
     row = first + search.vertex
-    for i in range(local.size):
-        local[i] = around.fixed[row, i]
-    columns = around.columns
+    numbers, indices, columns = around.numbers[row], around.indices[row], around.columns
+    k = columns.size // (N_MOVES + 1)
     decay_belief(search)
     _find_columns(search, around, row)
-    if local[0] == 1.0:
-        local[1] = 1.0 - _p_occupied(search, columns[around.near[row, 0]])
+    local[0], local[2] = numbers[0], numbers[1]
+    local[1] = 1.0 - _p_occupied(search, columns[indices[0]]) if local[0] == 1.0 else 0.0
     local[3] = _squashed(search.time - search.arrival)
+    local[4] = local[5] = local[6] = 0.0
     if search.n_observed > 0:
         local[4] = search.n_observed / (search.n_observed + MANY_SLOTS)
         local[5] = search.n_observed_free / search.n_observed
         local[6] = search.n_expected_free / search.n_observed
     for region in range(N_REGIONS):
         local[7 + region] = search.free_by_region[region]
-    remembered = search.remembered_slot
+    remembered, dx, dy = search.remembered_slot, 0.0, 0.0
+    local[11], local[12], local[13] = 0.0, 1.0, 1.0
     if remembered != _NOWHERE:
+        dx = around.crow_s[first + remembered, 0] - around.crow_s[row, 0]
+        dy = around.crow_s[first + remembered, 1] - around.crow_s[row, 1]
         local[11] = 1.0 - _p_occupied(search, int32s(search.columns)[remembered])
         local[12] = _squashed(_arrival_cost_s(scenario, remembered))
-        local[13] = _squashed(_crow_s(around, row, first + remembered))
+        local[13] = _squashed(math.sqrt(dx * dx + dy * dy))
     for move in range(N_MOVES):
-        at = HERE + PER_MOVE * move
+        at, here = HERE + PER_MOVE * move, _FIRST_MOVE + _MOVE_NUMBERS * move
+        for i in range(3):
+            local[at + i] = numbers[here + i]
+        for i in range(3, PER_MOVE):
+            local[at + i] = 0.0
+        local[at + 5] = local[at + 7] = 1.0
         if local[at] == 0.0:
             continue
-        target = edge_at(scenario.edges, search.vertex * N_ACTIONS + move).target
-        local[at + 3] = 1.0 if target == search.previous_vertex else 0.0
+        local[at + 3] = 1.0 if around.targets[row, move] == search.previous_vertex else 0.0
         if remembered != _NOWHERE:
-            local[at + 7] = _squashed(_crow_s(around, first + target, first + remembered))
-        ahead, total_s = around.ahead[row, move], around.total_s[row, move]
+            x, y = dx - numbers[here + 3], dy - numbers[here + 4]
+            local[at + 7] = _squashed(math.sqrt(x * x + y * y))
         none_free, expected, n_ahead, n_observed_ahead, worst = 1.0, 0.0, 0, 0, 0.0
-        for i in range(ahead.size):
-            which = ahead[i]
+        for i in range(k):
+            which = indices[(2 + move) * k + i]
             if which == _NOWHERE:
                 break
-            worst = total_s[i]
+            worst = numbers[_FIRST_SLOT + (2 + move) * k + i]
             column = columns[which]
             p_taken = _p_occupied(search, column)
             expected += none_free * (1.0 - p_taken) * worst
@@ -237,13 +253,16 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
             local[at + 4] = 1.0 - none_free
             local[at + 5] = _squashed(expected + none_free * (worst + MINUTE))
             local[at + 6] = n_observed_ahead / n_ahead
-    for i in range(around.near.shape[1]):
-        which = around.near[row, i]
-        if which == _NOWHERE:
-            break
-        column = columns[which]
-        local[FIRST_NEAR + PER_NEAR * i] = 1.0 - _p_occupied(search, column)
-        local[FIRST_NEAR + PER_NEAR * i + 1] = 1.0 if slot_at(search.slots, column).observed else 0.0
+    for i in range(k):
+        at, which, first_move = FIRST_NEAR + PER_NEAR * i, indices[i], indices[k + i]
+        local[at] = local[at + 1] = 0.0
+        if which != _NOWHERE:
+            column = columns[which]
+            local[at] = 1.0 - _p_occupied(search, column)
+            local[at + 1] = 1.0 if slot_at(search.slots, column).observed else 0.0
+        local[at + 2], local[at + 3] = numbers[_FIRST_SLOT + i], numbers[_FIRST_SLOT + k + i]
+        for move in range(N_MOVES):
+            local[at + 4 + move] = 1.0 if first_move == move else 0.0
 
 
 @inlined
@@ -324,17 +343,17 @@ def _remember(search: Any, around: Surroundings, lot: int) -> None:
     search.remembered_slot = best
 
 
-def _view_s(problem: SearchProblem) -> FloatArray:
+def _view_s(problem: SearchProblem) -> NDArray[np.float32]:
     """Straight-line drive plus walk for each slot in view of each vertex, row by row, s."""
     starts, slots = problem.slots_in_view
     viewer = np.repeat(np.arange(problem.lot.n_vertices), np.diff(starts))
     away = problem.lot.vertex_xy[slots] - problem.lot.vertex_xy[viewer]
-    seconds: FloatArray = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.arrival_cost_s[slots]
-    return seconds
+    seconds = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.arrival_cost_s[slots]
+    return seconds.astype(np.float32)
 
 
 def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
-    """For one lot: the number of slots of each row, and the arrays of `Surroundings` except `first` and `starts`."""
+    """For one lot: the number of slots of each row, and the arrays from `numbers` to `samples` but `starts`."""
     lot = problem.lot
     n = lot.n_vertices
     neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.arrival_cost_s
@@ -348,29 +367,32 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
         with np.errstate(invalid="ignore"):
             return np.where(np.isfinite(seconds), seconds / (seconds + MINUTE), 1.0)
 
-    fixed = np.zeros((n, FIRST_NEAR + PER_NEAR * k), dtype=np.float32)
-    fixed[: lot.n_slots, 0] = 1.0
-    fixed[:, 2] = 1.0
-    fixed[: lot.n_slots, 2] = squashed(walk_s)
-    fixed[:, 12:14] = 1.0
+    crow_s = lot.vertex_xy / problem.v_drive
     best_s = _best_totals(neighbors, move_s, walk_s)
-    moves = fixed[:, HERE:FIRST_NEAR].reshape(n, N_MOVES, PER_MOVE)
     there = neighbors >= 0
+    here = np.zeros((n, 2))
+    here[:, 1] = 1.0
+    here[: lot.n_slots] = np.stack([np.ones(lot.n_slots), squashed(walk_s)], axis=1)
+    moves = np.empty((n, N_MOVES, _MOVE_NUMBERS))
     moves[..., 0] = there
     moves[..., 1] = squashed(np.where(there, move_s, np.inf))
     moves[..., 2] = squashed(np.where(there, move_s + best_s[neighbors], np.inf))
-    moves[..., 5] = moves[..., 7] = 1.0
-    nearest = fixed[:, FIRST_NEAR:].reshape(n, k, PER_NEAR)
-    nearest[..., 2] = squashed(near_s)
-    nearest[..., 3] = squashed(np.where(near >= 0, walk_s[near], np.inf))
-    nearest[..., 4:] = near_move[..., None] == np.arange(N_MOVES)
-    crow_s = lot.vertex_xy / problem.v_drive
+    moves[..., 3:] = np.where(there[..., None], crow_s[neighbors] - crow_s[:, None], 0.0)
+    near_walk_s = np.where(near >= 0, walk_s[near], np.inf)
+    ahead_total_s = np.where(ahead_index >= 0, total_s, 0.0)
+    numbers = (here, moves, squashed(near_s), squashed(near_walk_s), ahead_total_s)
     by_walk = np.argsort(walk_s, kind="stable")
     shares = (np.arange(N_REGIONS)[:, None] + (np.arange(SAMPLES) + 0.5) / SAMPLES) / N_REGIONS
     samples = by_walk[(shares * lot.n_slots).astype(np.int64)].astype(np.int32)
-    finite = np.where(ahead_index >= 0, total_s, 0.0)
-    indices = near_index.astype(np.int16), ahead_index.astype(np.int16)
-    return count, fixed, slots, *indices, finite, crow_s, samples[None]
+    indices = _in_lines((near_index, near_move, ahead_index), np.int16)
+    targets = neighbors.astype(np.int32)
+    return count, _in_lines(numbers, np.float32), indices, targets, slots, crow_s, samples[None]
+
+
+def _in_lines(parts: Sequence[NDArray[Any]], dtype: type[np.generic]) -> NDArray[Any]:
+    """Put the rows of several arrays beside each other; each row fills whole cache lines."""
+    rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1).astype(dtype)
+    return np.pad(rows, ((0, 0), (0, -rows.shape[1] % (_LINE // rows.itemsize))))
 
 
 @compiled

@@ -27,7 +27,7 @@ class OnboardPerception:
         scenario: the world. If its sensor model is perfect, the fitted model of the rig replaces it, because the belief
             update needs the error rates of the real observations.
         rig, weather, captures, every: as in `SensorSampler`.
-        detector: a detector, or its name as in `make_detector`; None: the packaged HOG detector.
+        detector: a detector, or its name as in `make_detector`; None: the scenario's.
 
     Attributes:
         scenario: the scenario with the sensor model of the belief update.
@@ -51,7 +51,7 @@ class OnboardPerception:
         detector: str | Detector | None = None,
     ) -> None:
         self.sampler = SensorSampler(scenario, rig, weather, captures, every)
-        self.pipeline = PerceptionPipeline(self.sampler.rig, scenario.lot, detector)
+        self.pipeline = PerceptionPipeline(self.sampler.rig, scenario.lot, detector or scenario.detector)
         if scenario.sensor_model.perfect:
             fitted = SensorModel.named("laser" if self.sampler.rig.lasers else "stereo")
             scenario = scenario.replace(sensor_model=fitted)
@@ -115,7 +115,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 2 | largest number of captures on an edge |
     | `every` | 1.25 | m, least distance between captures on an edge |
-    | `detector` | `None` | a `Detector`, or its name: `hog`, `side`, `front`, a model file, `MODULE:CLASS` |
+    | `detector` | the scenario's | a `Detector`, or `hog`, `side`, `front`, a file (.npz, .onnx), `MODULE:CLASS` |
 
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
     are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).

@@ -20,7 +20,6 @@ from parkenv.envs.search_records import (
     scenario_at,
     search_at,
 )
-from parkenv.world.lot import MOVES
 from parkenv.world.occupancy import IntArray
 from parkenv.world.occupancy_kernel import inlined, prefetch_forecast
 from parkenv.world.pointers import int32s, int64s, prefetch
@@ -28,7 +27,6 @@ from parkenv.world.pointers import int32s, int64s, prefetch
 _APART = 2  # searches between two stages
 _LINE = 64  # bytes of a cache line
 _SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
-_N_MOVES = len(MOVES)
 
 
 @inlined
@@ -63,13 +61,12 @@ def _prefetch_vertex(search: Any, around: Surroundings, action: int) -> None:
     target = _target(search, action)
     prefetch(scenario.action_masks + target * N_ACTIONS)
     prefetch(scenario.view_starts + 8 * target)
-    _prefetch(scenario.edges + target * N_ACTIONS * _EDGE_BYTES, _N_MOVES * _EDGE_BYTES)
-    row, k = around.first[search.place] + target, around.near.shape[1]
-    width = 4 * around.fixed.shape[1]
-    _prefetch(around.fixed.ctypes.data + row * width, width)
-    _prefetch(around.near.ctypes.data + row * 2 * k, 2 * k)
-    _prefetch(around.ahead.ctypes.data + row * 8 * k, 8 * k)
-    _prefetch(around.total_s.ctypes.data + row * 32 * k, 32 * k)
+    row = around.first[search.place] + target
+    width = 4 * around.numbers.shape[1]
+    _prefetch(around.numbers.ctypes.data + row * width, width)
+    width = 2 * around.indices.shape[1]
+    _prefetch(around.indices.ctypes.data + row * width, width)
+    prefetch(around.targets.ctypes.data + 16 * row)
     prefetch(around.starts.ctypes.data + 4 * row)
     prefetch(around.crow_s.ctypes.data + 16 * row)
 
@@ -81,26 +78,22 @@ def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
     target = _target(search, action)
     first = int64s(scenario.view_starts)[target]
     _prefetch(scenario.viewed + 8 * first, _LINE)
-    _prefetch(around.view_s.ctypes.data + 8 * (around.first_view[search.place] + first), _LINE)
+    _prefetch(around.view_s.ctypes.data + 4 * (around.first_view[search.place] + first), _LINE)
     start = around.starts[around.first[search.place] + target]
     _prefetch(around.slots.ctypes.data + 4 * start, _LINE)
 
 
 @inlined
 def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
-    """Prefetch what is known of these slots, of the remembered one, and of the neighbours of that vertex."""
+    """Prefetch what is known of these slots and of the remembered one."""
     scenario = scenario_at(search.scenario, 0)
-    target, first = _target(search, action), around.first[search.place]
-    crow_s, remembered = around.crow_s.ctypes.data, search.remembered_slot
-    for move in range(_N_MOVES):
-        to = edge_at(scenario.edges, target * N_ACTIONS + move).target
-        prefetch(crow_s + 16 * (first + to))
-    prefetch(crow_s + 16 * (first + remembered))
+    first, remembered = around.first[search.place], search.remembered_slot
+    prefetch(around.crow_s.ctypes.data + 16 * (first + remembered))
     prefetch(scenario.walk_s + 8 * remembered)
     prefetch(scenario.parking_cost_s + 8 * remembered)
     if scenario.prior_kind != PROCESS_KIND:
         return
-    row, columns = first + target, int32s(search.columns)
+    row, columns = first + _target(search, action), int32s(search.columns)
     for i in range(around.starts[row], around.starts[row + 1]):
         slot = np.int64(around.slots[i])
         if columns[slot] == SENTINEL:

@@ -34,6 +34,22 @@ class Station(NamedTuple):
     movers: Movers | None = None
 
 
+def make_rig(rig: str | SensorRig | None, scenario: Scenario) -> SensorRig:
+    """Return a rig by name, as it is, or by default the scenario's.
+
+    Raises:
+        InputError: an unknown name, or something else than a rig.
+    """
+    rig = scenario.rig if rig is None else rig
+    if isinstance(rig, SensorRig):
+        return rig
+    if not isinstance(rig, str):
+        raise InputError(f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
+    if rig not in RIG_NAMES:
+        raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
+    return SensorRig.named(rig)
+
+
 class SensorSampler:
     """Samples the simulated sensors of the searching car along each edge it drives.
 
@@ -59,22 +75,13 @@ class SensorSampler:
         captures: int,
         every: float,
     ) -> None:
-        rig = scenario.rig if rig is None else rig
-        if isinstance(rig, str):
-            if rig not in RIG_NAMES:
-                raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-            rig = SensorRig.named(rig)
-        elif not isinstance(rig, SensorRig):
-            raise InputError(
-                f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}"
-            )
         if weather is not None and weather not in PRESETS:
             raise InputError(f"weather is {weather!r}, want None or one of {', '.join(PRESETS)}")
         if isinstance(captures, bool) or not isinstance(captures, (int, np.integer)) or captures < 1:
             raise InputError(f"captures is {captures!r}, want a whole number of at least 1")
         if not (isinstance(every, (int, float)) and math.isfinite(every) and every > 0.0):
             raise InputError(f"every is {every!r} m, want a finite distance above 0")
-        self.rig = rig
+        self.rig = make_rig(rig, scenario)
         self.captures = int(captures)
         self._lot, self._scenario = scenario.lot, scenario
         self._weather, self._every = weather, every

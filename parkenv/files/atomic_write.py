@@ -56,8 +56,13 @@ def _temporary(path: Path) -> Path:
     return path.with_name(f".{path.name}.{os.getpid()}.part")
 
 
-def append_text(path: Path, text: str) -> None:
-    """Append to a file, and flush it to disk; on failure, restore the file.
+def append_text(path: Path, text: str, *, sync: bool = True) -> None:
+    """Append to a file; on failure, restore the file.
+
+    Args:
+        path: the file.
+        text: the text.
+        sync: flush it to disk, so that it survives a power failure; otherwise it survives the end of this process.
 
     Raises:
         InputError: the file cannot be written, e.g. because the disk is full; the message names it.
@@ -68,7 +73,8 @@ def append_text(path: Path, text: str) -> None:
             with path.open("a", encoding="utf-8") as file:
                 file.write(text)
                 file.flush()
-                os.fsync(file.fileno())
+                if sync:
+                    os.fsync(file.fileno())
         except OSError:
             os.truncate(path, size)
             raise

@@ -74,10 +74,15 @@ def images_in(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
-    files = sorted((f for f in folder.rglob("*") if f.suffix.lower() in SUFFIXES), key=natural_order)
+    files = files_in(folder, SUFFIXES)
     if not files:
         raise InputError(f"{folder}: holds no images, want some of {', '.join(SUFFIXES)}")
     return files
+
+
+def files_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
+    """Return the files in a folder and its subfolders with one of the suffixes, in natural order of their names."""
+    return sorted((f for f in folder.rglob("*") if f.suffix.lower() in suffixes), key=natural_order)
 
 
 def natural_order(path: Path) -> list[tuple[str, int]]:

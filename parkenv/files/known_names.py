@@ -13,11 +13,17 @@ LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
 RigName = Literal["laser", "stereo", "both_sides"]
+DETECTORS = ("hog", "side", "front")
+"""Packaged detectors: hog has both HOG models, side and front; any other is a network in parkenv/perception/models."""
+DETECTOR_SUFFIXES = (".npz", ".onnx")
 WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
 MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 MAP_NAMES: tuple[MapName, ...] = get_args(MapName)
+KnowledgeName = Literal["own", "shared", "reserve", "full"]
+"""What the cars of a fleet know; see `parkenv.envs.fleet.DriverKind`."""
+KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)

@@ -24,6 +24,7 @@ from pydantic_core import CoreSchema, ErrorDetails
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.atomic_write import atomic_write
+from parkenv.files.known_names import DETECTOR_SUFFIXES, DETECTORS
 from parkenv.files.limited_reading import MAX_SPEC_BYTES, is_there, read_json, read_toml
 
 _SHOWN = 60
@@ -61,6 +62,29 @@ def _resolved(value: object, info: ValidationInfo) -> object:
 
 FilePath = Annotated[Path, BeforeValidator(_resolved)]
 """An existing file; paths are relative to the folder of the file that names them."""
+
+
+def _detector(value: object, info: ValidationInfo) -> object:
+    """Resolve the file of a detector relative to the folder of the file that names it; leave names as they are."""
+    if not isinstance(value, str | Path):
+        return value
+    is_file = str(value).lower().endswith(DETECTOR_SUFFIXES)
+    return str(_resolved(value, info)) if is_file else str(value)
+
+
+def _packaged(value: str) -> str:
+    if value not in DETECTORS and not value.lower().endswith(DETECTOR_SUFFIXES):
+        wanted = f"{', '.join(DETECTORS)} or a file ({', '.join(DETECTOR_SUFFIXES)})"
+        # Scenario files hold no code.
+        note = "; a class of your own is named by --detector or in an experiment" if ":" in value else ""
+        raise ValueError(f"{wanted}{note}")
+    return value
+
+
+DetectorName = Annotated[str, BeforeValidator(_detector)]
+"""A packaged detector, a file (.npz, .onnx) or `MODULE:CLASS`; paths are relative to the folder of the file."""
+PackagedDetector = Annotated[str, BeforeValidator(_detector), AfterValidator(_packaged)]
+"""A packaged detector or a file."""
 
 
 class OrText:

@@ -167,7 +167,7 @@ class Survey:
             begun = clock.perf_counter()
             result = self.pipeline.process(TimedCapture(time, capture), slots, vehicle)
             for view in result.views:
-                _update_grid(grid, view, vehicle)
+                update_grid(grid, view, vehicle)
                 cars.append(view.cars.poses)
             frame_s.append(clock.perf_counter() - begun)
             observed_at[slots.updated] = time
@@ -192,7 +192,8 @@ class Survey:
         )  # fmt: skip
 
 
-def _update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> None:
+def update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> None:
+    """Update a grid by the cars that one camera sees from a vehicle at (3,) x, y, yaw."""
     x, y, yaw = view.mount.in_world(vehicle)
     away = view.cars.xy - np.array([x, y])
     bearing = np.arctan2(away[:, 1], away[:, 0]) - yaw

@@ -220,6 +220,12 @@ def _cut(
     return np.asarray(cv2.warpAffine(image, moved, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
 
 
+def cut_out(image: Image, region: NDArray[np.float64], size: tuple[int, int]) -> Image:
+    """Cut a region, (4,) px, left, top, right, bottom, out of an image, and resize it to (width, height)."""
+    left, top, right, bottom = region.tolist()
+    return _cut(image, (left, top), (right, bottom), size)
+
+
 def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator, settings: TrainingSettings) -> Image:
     """Return a slightly shifted and scaled copy."""
     height, width = crop.shape

@@ -152,6 +152,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             if spec.traffic is None
             else Traffic(spec.traffic.cars, spec.traffic.pedestrians),
             rig=spec.rig,
+            detector=spec.detector,
         )
         error = spec.occupancy.day_error
         return made if error is None else _with_day_error(made, DayError(error.level, error.slope))

@@ -16,6 +16,7 @@ from pydantic_core import CoreSchema
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import (
+    DETECTORS,
     LOT_SUFFIXES,
     PACKAGED_LOTS,
     SCENARIO_NAMES,
@@ -26,7 +27,7 @@ from parkenv.files.known_names import (
     SensorModelName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.spec_file import FilePath, OrText, Several, Spec, read_tables
+from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
 from parkenv.world import real_week
 from parkenv.world.day_error import MAX_LOGITS
 from parkenv.world.occupancy import ArrivalWindow
@@ -413,6 +414,9 @@ class ScenarioSpec(Spec):
         name="perfect"
     )
     rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
+    detector: PackagedDetector = Field(
+        "hog", description="What looks at their images: hog, side, front, or a file (.npz, .onnx)."
+    )
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."
     )
@@ -428,6 +432,15 @@ class ScenarioSpec(Spec):
         """Read a scenario file; the default name of the scenario is that of the file."""
         path = Path(path)
         return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)._of_file(path)
+
+    def files(self) -> list[Path]:
+        """Return every file named in the specification, and the settings beside the detector's."""
+        files = super().files()
+        if self.detector not in DETECTORS:
+            its = Path(self.detector)
+            beside = (its.with_suffix(s) for s in (".toml", ".json") if its.suffix.lower() == ".onnx")
+            files += [its, *(file for file in beside if is_there(file))]
+        return list(dict.fromkeys(files))
 
     @property
     def source(self) -> str:

@@ -47,7 +47,8 @@ def in_one_block(arrays: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
     ]
     different = dict(zip(keys, arrays, strict=True))
     begins = np.cumsum([0, *(-(-array.nbytes // _LINE) * _LINE for array in different.values())])
-    block = np.zeros(int(begins[-1]), np.uint8)
+    block = np.zeros(int(begins[-1]) + _LINE, np.uint8)
+    block = block[-block.ctypes.data % _LINE :]
     copies = {}
     for (key, array), begin in zip(different.items(), begins, strict=False):
         copies[key] = copy = block[begin : begin + array.nbytes].view(array.dtype).reshape(array.shape)

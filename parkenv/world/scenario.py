@@ -158,6 +158,7 @@ class Scenario(SearchProblem):
         entry: index into `lot.entries`; None draws one for each search.
         traffic: other road users in the lot, visible to simulated sensors and on driven trips.
         rig: name of the car's sensor rig, where sensors are simulated.
+        detector: name of the car's detector there, as `parkenv.perception.detector_registry.make_detector` takes it.
     """
 
     name: str
@@ -167,6 +168,7 @@ class Scenario(SearchProblem):
     entry: int | None = None
     traffic: Traffic = field(default_factory=Traffic)
     rig: str = "laser"
+    detector: str = "hog"
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -96,7 +96,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     has filled a lot against the forecast, drivers who take the first free slot still do better. Each path is evaluated
     on its own, without the option to change to another path after an observation. Estimates depend on the position of
     the car, so it could alternate between two paths for ever; until it observes something new, it therefore keeps its
-    path unless another one is better than the time that this path was expected to take. If a sensor misses slots, a
+    path unless another one is better than the time that this path was expected to take, or that time is over. Another
+    look at a slot that is still taken is not new: the path counted on it. If a sensor misses slots, a
     slot that was in view and not detected is observed again only from vertices where a detection is more likely than
     not. A slot that is not detected from its own vertex either is attempted.
 
@@ -227,7 +228,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
         memory.replans += not (kept or math.isnan(memory.failure_s))
         memory.targets, memory.failure_s = choice.targets, choice.failure_s
-        memory.remaining_s = choice.remaining_s
+        # A path that has had its time is given up for a new plan.
+        memory.remaining_s = choice.remaining_s if choice.remaining_s > 0.0 else math.inf
         memory.expected_s = min(choice.onward_s, choice.at_hand_s)
         if choice.slot >= 0 and choice.at_hand_s <= choice.onward_s + self._worth_passing_s:
             memory.remaining_s = math.inf

@@ -36,8 +36,8 @@ class PathChoice(NamedTuple):
     """Result of a search for a path."""
 
     onward_s: float  # s, expected time of the path
-    # s, expected time left after its first step if the car goes on and that step leads to a vertex where nothing is
-    # observed, or, if paths are persistent, no slot for the first time; else inf
+    # s, expected time left after its first step if the car goes on and that step leads to a vertex where no slot is
+    # observed for the first time; else inf
     remaining_s: float
     at_hand_s: float  # s, expected time of driving to the best slot that is known now
     slot: int  # that slot, or -1
@@ -54,8 +54,6 @@ class Budget(NamedTuple):
     failure_costs: FloatArray
     work: int  # maximum number of evaluation steps; it bounds the time of a decision
     depth: int  # maximum number of targets of a path
-    # whether a path is kept also past slots that are observed again, see `remaining_s` of `best_path`
-    persistent: bool = False
 
 
 class Candidate(NamedTuple):
@@ -64,7 +62,6 @@ class Candidate(NamedTuple):
     onward_s: float
     remaining_s: float
     next_vertex: int
-    observes_again: bool  # whether the first step leads to a vertex where slots are observed
 
 
 def best_path(
@@ -169,9 +166,7 @@ def _best_path(
             break
         chosen = path
         n_stops, _ = rollout_path(vertex, targets, failure_s, graph, belief, path)
-    keeps = budget.persistent or not best.observes_again
-    remaining_s = best.remaining_s if keeps else np.inf
-    return best.onward_s, remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
+    return best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
 
 
 def action_values(
@@ -366,26 +361,20 @@ def _evaluate(
 ) -> Candidate:
     """Evaluate a path. If it was expected to take less, `remaining_s`, that is its value."""
     if n_stops < 2:
-        return Candidate(np.inf, np.inf, NOWHERE, False)
+        return Candidate(np.inf, np.inf, NOWHERE)
     value, onward_s = evaluate_path(n_stops, left_s, options, fallback_s, graph, belief, path)
     stops = path.stops
     if remaining_s < value:
         value, onward_s = remaining_s, remaining_s - stops[1].time
     if stops[1].time == 0.0 and stops[2].first > 0:
-        return Candidate(value, np.inf, ATTEMPT, False)  # only an attempt takes no time
+        return Candidate(value, np.inf, ATTEMPT)  # only an attempt takes no time
     following = stops[1].vertex
-    if following == vertex or _shows_unobserved(stops[2].first, path):
+    if following == vertex:
         onward_s = np.inf
-    return Candidate(value, onward_s, following, stops[2].first > 0)
-
-
-@compiled(error_model="numpy")
-def _shows_unobserved(n_observations: int, path: PathBuffer) -> bool:
-    """Return whether one of the first observations of a path is of a slot that was not observed before."""
-    n_first = 0
-    for j in range(n_observations):
-        n_first += path.observations[j].is_first
-    return n_first > 0
+    for j in range(stops[2].first):
+        if path.observations[j].is_first:
+            onward_s = np.inf
+    return Candidate(value, onward_s, following)
 
 
 @compiled(error_model="numpy")

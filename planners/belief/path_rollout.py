@@ -199,7 +199,7 @@ def _repeat_path(
         if is_hidden(s, graph.views[i].rate, belief):
             continue
         if path.marks[s].observed_at >= 0.0 or belief.slots[s].state == OBSERVED_TAKEN:
-            leaves = belief.slots[s].p_free_usual * belief.slots[s].decay_rate
+            leaves = belief.slots[s].leaving
             leaving += leaves
             cost_s += leaves * graph.cost_s[s]
     if leaving > 0.0:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
@@ -23,6 +23,7 @@ Records = NDArray[Any]
 
 MOST_HYPOTHESES = 160  # maximum number of hypotheses about the day, and about rivals
 MOST_STOPS = 400  # maximum number of vertices of a path
+AGAIN_S = 30.0  # s after which a path typically observes a taken slot again
 
 VIEW = np.dtype(
     [
@@ -39,6 +40,7 @@ SLOT = np.dtype(
         ("p_free", np.float64),  # now
         ("p_free_usual", np.float64),  # the value to which it decays
         ("decay_rate", np.float64),  # 1/s, rate of that decay
+        ("leaving", np.float64),  # 1/s, rate at which a taken slot is left
         ("odds", np.float64),  # P(taken)/P(free) at about the earliest arrival of the car; inf where hopeless
         ("least_odds", np.float64),  # the value to which those decay
         ("bonus_s", np.float64),  # s, value of its first observation for later searches
@@ -134,12 +136,28 @@ def set_slots(
         forecast, decay_rate, at = parts[s], parts[n + s], belief.slots[s]
         p_free, usual = 1.0 - p_occupied[s], max(mean_over_days(belief.weights, belief.p_free_if[s]), 1e-6)
         # Cars leave as often as forecast; on a fuller day free slots are taken faster.
-        rate = decay_rate * (1.0 - forecast) / usual
+        leaving = decay_rate * (1.0 - forecast)
+        rate = leaving / usual
+        if at.state == OBSERVED_TAKEN and len(belief.weights) > 1:
+            rate = _rate_of_return(leaving, usual, belief.weights, belief.p_free_if[s])
         on_arrival = usual + (p_free - usual) * math.exp(-rate * drive_s[s] if drive_s[s] < np.inf else 0.0)
-        at.p_free, at.p_free_usual, at.decay_rate = p_free, usual, rate
+        at.p_free, at.p_free_usual, at.decay_rate, at.leaving = p_free, usual, rate, leaving
         at.odds = (1.0 - on_arrival) / on_arrival if on_arrival > 0.0 else np.inf
         at.least_odds = 1.0 / usual - 1.0
         at.bonus_s = 4.0 * explore * forecast * (1.0 - forecast)
+
+
+@compiled(error_model="numpy")
+def _rate_of_return(leaving: float, usual: float, weights: FloatArray, p_free_if: FloatArray) -> float:
+    """Return the rate, 1/s, at which a slot observed taken returns to its usual P(free), averaged over hypotheses.
+
+    The average is right after `AGAIN_S`. Where an event may have filled the lot, a slot that is left is taken again
+    before the car is back: with the rate at which it is left, another round would seem worth its time for ever.
+    """
+    p_free = 0.0
+    for h in range(len(weights)):
+        p_free += weights[h] * p_free_if[h] * decayed_part(leaving / p_free_if[h], AGAIN_S)
+    return -math.log(max(1.0 - p_free / usual, 1e-9)) / AGAIN_S
 
 
 class PathBuffer(NamedTuple):

@@ -71,8 +71,6 @@ class BeliefRivalsAgent(BeliefAgent):
             raise InputError(f"arrivals_per_hour is {arrivals_per_hour}, want a finite number of at least 0")
         self.arrivals_per_hour = arrivals_per_hour
         self._per_s = np.array(list(rates)) / 3600.0
-        # Among full slots that become free now and then, all paths are alike: do not choose anew at every step.
-        self._budget = self._budget._replace(persistent=bool(self._per_s.any()))
         self._rate_weight = np.array(list(rates.values()))
         lot = self.problem.lot
         drive_m = dijkstra(lot.drive_matrix(), indices=np.unique(lot.entry_vertices), min_only=True)

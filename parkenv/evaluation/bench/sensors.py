@@ -8,6 +8,7 @@ from importlib.util import find_spec
 from typing import Any
 
 import cv2
+import gymnasium as gym
 import numpy as np
 import pymunk
 from numba import get_num_threads
@@ -15,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from parkenv.evaluation.bench.rows import BenchRow, duration, rate, seconds_each
+from parkenv.world.lot import PARK
 from sim_sensors.camera.ground_texture import ground_texture
 from sim_sensors.camera.light_maps import light_maps
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
@@ -44,7 +46,7 @@ def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
         seed: seed of the lots and the noise.
         seconds: duration of each measurement.
     """
-    return laser_rows(seed, seconds) + camera_rows(seed, seconds)
+    return laser_rows(seed, seconds) + camera_rows(seed, seconds) + search_rows(seed, seconds)
 
 
 def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
@@ -151,6 +153,23 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     rows += rate("camera", f"stereo; {case}", 1.0 / both, "pairs/s")
     boxes = each(lambda _: vehicle_boxes(camera, scene, poses[0], frame))
     return rows + duration("camera", "true boxes of a frame", 1e3 * boxes, "ms")
+
+
+def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
+    """Measure the steps per second of random drives on `campus` with laser scans alone."""
+    env: gym.Env[Any, Any] = gym.make("parkenv/SearchSensors-v2", scenario="campus", observation="scan")
+    observation, _ = env.reset(seed=seed)
+    rng = np.random.default_rng(seed)
+
+    def step(number: int) -> None:  # noqa: ARG001 - the call has it
+        nonlocal observation
+        action = rng.choice(np.flatnonzero(observation["action_mask"][:PARK]))
+        observation, _, terminated, truncated, _ = env.step(action)
+        if terminated or truncated:
+            observation, _ = env.reset()
+
+    case = "SearchSensors-v2 on campus, scans alone, up to 4 a step"
+    return rate("environment", case, 1.0 / seconds_each(step, seconds), "steps/s")
 
 
 def parked_cars(seed: int = 0) -> Scene:

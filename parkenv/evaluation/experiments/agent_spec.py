@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, model_validator
 
 from parkenv.errors import InputError
+from parkenv.files.known_names import DETECTOR_SUFFIXES
 from parkenv.files.spec_file import OrText, Spec
 from planners.names import FILE_AGENTS
 
@@ -117,16 +119,21 @@ def split_agents(text: str) -> list[str]:
     return [word.strip() for word in words if word.strip()]
 
 
-def classes_in(spec: Spec) -> list[str]:
-    """Return the classes `MODULE:CLASS` that a specification names: agents and detectors of a user's own."""
+def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
+    """Return the classes `MODULE:CLASS` that a specification names: agents and detectors of a user's own.
+
+    Args:
+        spec: the specification.
+        without: fields to leave out.
+    """
     found: list[str] = []
-    for field in type(spec).model_fields:
+    for field in (name for name in type(spec).model_fields if name not in without):
         value = getattr(spec, field)
         for part in value if isinstance(value, tuple) else (value,):
             name = (
                 part.name if isinstance(part, AgentSpec) else part if field in ("clone", "detector") else None
             )
-            if isinstance(name, str):
+            if isinstance(name, str) and not name.lower().endswith(DETECTOR_SUFFIXES):
                 before, colon, _ = name.partition(":")
                 found += [name] if colon and (field == "detector" or before not in FILE_AGENTS) else []
             elif isinstance(part, Spec):

@@ -22,7 +22,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec, label_of
 from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.evaluation.experiments.experiment import spec_fingerprint
-from parkenv.evaluation.experiments.results import OUTCOME_COLUMNS, ResultFolder, Row
+from parkenv.evaluation.experiments.results import OUTCOME_COLUMNS, EpisodeTable, ResultFolder, Row
 from parkenv.evaluation.experiments.spec import SPEC_FILE, CommuteSpec
 from parkenv.evaluation.experiments.statistics import mean_interval, trimmed_mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
@@ -45,7 +45,7 @@ from planners.names import WITHOUT_FORECAST
 FIXED, NONE = "fixed", "none"
 """Names in the column `map` of the references: a right map that does not learn; an agent that uses no map."""
 KEYS = ("scenario", "map", "agent", "course", "day_number", "driver")
-COLUMNS = ("seed", *OUTCOME_COLUMNS, "forecast_error")
+TABLE = EpisodeTable(keys=KEYS, columns=("seed", *OUTCOME_COLUMNS, "forecast_error"))
 MAPS_FOLDER = "maps"
 BLOCK_DAYS = 10
 """Days per task: an interruption loses few of them, and the map of a course is seldom rebuilt from its trips."""
@@ -299,8 +299,8 @@ def run_commute(
     commute = Commute(spec)
     with workers:
         folder = ResultFolder(
-            out, commute.fingerprint(), keys=KEYS, columns=COLUMNS, kind="commute", resume=resume, overwrite=overwrite
-        )  # fmt: skip
+            out, commute.fingerprint(), table=TABLE, kind="commute", resume=resume, overwrite=overwrite
+        )
         maps = out / MAPS_FOLDER
         maps.mkdir(exist_ok=True)
         if not resume:

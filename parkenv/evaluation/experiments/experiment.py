@@ -29,6 +29,7 @@ from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.figures.registry import ComparisonResults, remove_figures
 from parkenv.evaluation.trips.calibration import Calibration
 from parkenv.files.spec_file import Spec
+from parkenv.perception.detector_registry import detector_version, make_detector
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec, SensorModelSpec
 from parkenv.world.flat_map import FlatMap
@@ -56,6 +57,9 @@ class Experiment:
         for scenario in self._base_scenarios:
             for agent in self.spec.agents:
                 make_agent(agent.name, scenario, **agent.options)
+        if self.spec.rig is not None:
+            for name in {self.spec.detector or scenario.detector for scenario in self._base_scenarios}:
+                make_detector(name)
         if self.spec.grid.blind and not any(_works_blind(agent) for agent in self.spec.agents):
             raise InputError(
                 "blind searches have no observations, and all agents plan on observations: "
@@ -135,7 +139,7 @@ class Experiment:
         ]
 
     def _case(self, scenario: Scenario, agent: AgentSpec, level: float | None = None) -> Case:
-        return Case(scenario, agent.name, level, self.spec.rig, agent.options)
+        return Case(scenario, agent.name, level, self.spec.rig, agent.options, self.spec.detector)
 
     def _settings(self, scenario: Scenario) -> list[Scenario]:
         settings = self._grid_settings(scenario)
@@ -152,7 +156,9 @@ class Experiment:
 
     def fingerprint(self) -> Row:
         """Return everything that affects the outcome of an episode; a resumed run must have the same settings."""
-        return {**spec_fingerprint(self.spec), "rig": self.spec.rig}
+        spec = self.spec
+        looks = {} if spec.detector is None else {"detector": detector_version(spec.detector)}
+        return {**spec_fingerprint(spec), "rig": spec.rig, **looks}
 
 
 def _works_blind(agent: AgentSpec) -> bool:

@@ -1,14 +1,15 @@
-"""Result folder of a comparison: finished episodes survive a crash.
+"""Result folder of a run: finished episodes survive a crash.
 
 `settings.json` holds the settings. Every finished search appends a line to `episodes.csv`, and one with the wall time
-of its decisions to `timings.csv`. `summary.json` is written at the end.
+of its decisions to `timings.csv`; a day with many cars, a line to `days.csv`. `summary.json` is written at the end.
 """
 
 from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,9 @@ from parkenv.files.typed_csv import (
     typed_records,
     wholes,
 )
+
+Row = dict[str, Any]
+Key = tuple[Any, ...]
 
 SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # of a grid, as columns
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
@@ -53,22 +57,62 @@ OUTCOME_COLUMNS = (
     "steps",
 )
 """Columns of an episode's outcome."""
-_KINDS = {
+DECISIONS = "decisions_us"
+"""Column of the wall times of an episode's decisions, µs."""
+KINDS: Mapping[str, Kind] = {
     **dict.fromkeys(("scenario", "map", "agent", "day", "slot"), TEXT),
     **dict.fromkeys(("seed", "course", "day_number", "driver"), WHOLE),
     **dict.fromkeys(("failed_parks", "slots_passed", "replans", "steps"), WHOLE),
     **dict.fromkeys(("parked", "truncated"), YES_OR_NO),
     **dict.fromkeys(("occupancy_level", "forecast_error"), NUMBER_OR_NOTHING),
-    "decisions_us": wholes(),
+    DECISIONS: wholes(),
 }
-"""What a column holds; all others hold numbers."""
+"""What a column of an episode holds; all others hold numbers."""
 
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
 
-Row = dict[str, Any]
-Key = tuple[Any, ...]
+
+@dataclass(frozen=True)
+class EpisodeTable:
+    """The table that a run appends a line to for every finished episode.
+
+    Args:
+        file: its name.
+        keys: columns that identify an episode.
+        columns: the other columns of an episode.
+        kinds: what a column holds; all others hold numbers.
+        timings: name of the table with the wall times of decisions; None for a run that measures none.
+    """
+
+    file: str = "episodes.csv"
+    keys: Sequence[str] = KEY_COLUMNS
+    columns: Sequence[str] = OUTCOME_COLUMNS
+    kinds: Mapping[str, Kind] = field(default_factory=lambda: KINDS)
+    timings: str | None = "timings.csv"
+
+    def key(self, row: Mapping[str, Any]) -> Key:
+        """Return the key of an episode."""
+        return tuple(row[c] for c in self.keys)
+
+    def read(self, path: Path) -> list[Row]:
+        """Read the complete lines of a file; none if there is no file.
+
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+        return self._read(path, (*self.keys, *self.columns))
+
+    def read_timings(self, path: Path) -> list[Row]:
+        """Read the complete lines of a file of wall times; see `read`."""
+        return self._read(path, (*self.keys, DECISIONS))
+
+    def _read(self, path: Path, columns: Sequence[str]) -> list[Row]:
+        def kind_of(column: str) -> Kind:
+            return self.kinds.get(column, NUMBER)
+
+        return [row for _, row in typed_records(path, kind_of, columns, whole_lines=True)]
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
@@ -171,8 +215,7 @@ class ResultFolder:
     Args:
         path: the folder; created if missing.
         settings: settings of the run; everything that affects the outcome of an episode.
-        keys: columns that identify an episode.
-        columns: the other columns of an episode.
+        table: the table of episodes.
         kind: kind of run, for messages.
         resume: continue an earlier run with the same settings.
         overwrite: replace the results of another run.
@@ -190,24 +233,22 @@ class ResultFolder:
         path: Path,
         settings: Mapping[str, Any],
         *,
-        keys: Sequence[str] = KEY_COLUMNS,
-        columns: Sequence[str] = OUTCOME_COLUMNS,
+        table: EpisodeTable | None = None,
         kind: str = "comparison",
         resume: bool = False,
         overwrite: bool = False,
     ) -> None:
         make_folder(path)
         self.path = path
-        self._keys = tuple(keys)
-        self._columns = {"episodes.csv": (*keys, *columns), "timings.csv": (*keys, "decisions_us")}
+        self._table = table = table or EpisodeTable()
         self.episodes: dict[Key, Row] = {}
         self._timings: dict[Key, Row] = {}
         if resume:
             settings = require_same_settings(path, settings, kind)
-            self.episodes, self._timings = (
-                self._by_key(read_rows(path / name, columns)) for name, columns in self._columns.items()
-            )
-        elif (path / "episodes.csv").exists() and not overwrite:
+            self.episodes = self._by_key(table.read(path / table.file))
+            if table.timings is not None:
+                self._timings = self._by_key(table.read_timings(path / table.timings))
+        elif (path / table.file).exists() and not overwrite:
             state = "a finished" if (path / SUMMARY).exists() else "an unfinished"
             raise InputError(
                 f"--out {path}: holds {state} {kind}; add --resume to go on with it, --overwrite to replace it, "
@@ -218,19 +259,19 @@ class ResultFolder:
         # Rewrite the readable lines: this drops a line truncated by a crash, and its episode runs again.
         self._write(self.episodes.values(), self._timings.values())
 
-    def add(self, rows: Sequence[Row], timings: Sequence[Row]) -> None:
-        """Append finished episodes, and flush them to disk."""
+    def add(self, rows: Sequence[Row], timings: Sequence[Row] = (), *, sync: bool = True) -> None:
+        """Append finished episodes, and flush them to disk; see `append_text`."""
         # Memory first: after an interruption, `finish` rewrites the files from it.
         self._timings |= self._by_key(timings)
         self.episodes |= self._by_key(rows)
-        # Timings before episodes: an episode in `episodes.csv` is finished, and would not run again for its timing.
-        for name, new in (("timings.csv", timings), ("episodes.csv", rows)):
-            append_text(self.path / name, csv_text(self._columns[name], new))
+        # Timings before episodes: a finished episode would not run again for its timing.
+        for file, columns, new in self._files(rows, timings):
+            append_text(file, csv_text(columns, new), sync=sync)
 
     def decision_s(self, key: Key) -> list[float]:
         """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
         row = self._timings.get(key)
-        return [int(us) * 1e-6 for us in row["decisions_us"].split()] if row else []
+        return [int(us) * 1e-6 for us in row[DECISIONS].split()] if row else []
 
     def finish(self, order: Iterable[Key], summary: Mapping[str, Any], *, complete: bool = True) -> None:
         """Put the episodes in order and write the summary.
@@ -247,11 +288,20 @@ class ResultFolder:
         write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
 
     def _by_key(self, rows: Iterable[Row]) -> dict[Key, Row]:
-        return {tuple(row[c] for c in self._keys): row for row in rows}
+        return {self._table.key(row): row for row in rows}
+
+    def _files(
+        self, rows: Iterable[Row], timings: Iterable[Row]
+    ) -> Iterator[tuple[Path, Sequence[str], Iterable[Row]]]:
+        """Yield each file with its columns and rows, timings first."""
+        table = self._table
+        if table.timings is not None:
+            yield self.path / table.timings, (*table.keys, DECISIONS), timings
+        yield self.path / table.file, (*table.keys, *table.columns), rows
 
     def _write(self, episodes: Iterable[Row], timings: Iterable[Row]) -> None:
-        for name, rows in (("episodes.csv", episodes), ("timings.csv", timings)):
-            write_csv(self.path / name, self._columns[name], rows)
+        for file, columns, rows in self._files(episodes, timings):
+            write_csv(file, columns, rows)
 
 
 def _write_text(path: Path, text: str) -> None:
@@ -259,17 +309,9 @@ def _write_text(path: Path, text: str) -> None:
         beside.write_text(text, encoding="utf-8")
 
 
-def read_rows(path: Path, columns: Sequence[str] = (*KEY_COLUMNS, *OUTCOME_COLUMNS)) -> list[Row]:
-    """Read the complete lines of `episodes.csv` or `timings.csv`; none if there is no file.
-
-    Raises:
-        InputError: the file is damaged, or not of this version.
-    """
-    return [row for _, row in typed_records(path, _kind_of, columns, whole_lines=True)]
-
-
-def _kind_of(column: str) -> Kind:
-    return _KINDS.get(column, NUMBER)
+def read_rows(path: Path) -> list[Row]:
+    """Read the complete lines of the `episodes.csv` of a comparison; see `EpisodeTable.read`."""
+    return EpisodeTable().read(path)
 
 
 def without_nan(value: Any) -> Any:

@@ -109,7 +109,12 @@ class _ObservationCounter(Observer):
 
 
 def count_observations(
-    scenario: Scenario, rig: str, agent: str, seeds: Sequence[int], weather: str | None = None
+    scenario: Scenario,
+    rig: str,
+    agent: str,
+    seeds: Sequence[int],
+    weather: str | None = None,
+    detector: str | None = None,
 ) -> ObservationCounts:
     """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
 
@@ -119,12 +124,15 @@ def count_observations(
         agent: name of the agent that searches.
         seeds: one seed per search.
         weather: the weather; None to draw it for each search.
+        detector: the detector; None: the scenario's.
 
     Raises:
         InputError: an unknown rig.
     """
     scenario = scenario.replace(sensor_model=_ASSUMED)
-    env = gym.make("parkenv/SearchPerception-v2", scenario=scenario, rig=rig, weather=weather)
+    env = gym.make(
+        "parkenv/SearchPerception-v2", scenario=scenario, rig=rig, weather=weather, detector=detector
+    )
     searcher, counter = make_agent(agent, scenario), _ObservationCounter(scenario)
     for seed in seeds:
         simulate(env, searcher, seed, (counter,))
@@ -138,6 +146,7 @@ def measure_sensors(
     *,
     seed: int = 0,
     weather: str | None = None,
+    detector: str | None = None,
     workers: Workers = HERE,
     on_progress: Callable[[], None] = lambda: None,
 ) -> ObservationCounts:
@@ -149,11 +158,12 @@ def measure_sensors(
         searches: number of searches per agent and scenario.
         seed: seed of the first search.
         weather: the weather; None to draw it for each search.
+        detector: the detector; None: the scenario's.
         workers: where the searches run; results do not depend on it.
         on_progress: called after each search.
     """
     tasks = [
-        partial(count_observations, scenario, rig, agent, [s], weather)
+        partial(count_observations, scenario, rig, agent, [s], weather, detector)
         for scenario in scenarios
         for s in range(seed, seed + searches)
         for agent in AGENTS

@@ -9,9 +9,17 @@ from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv.evaluation.experiments.agent_spec import AgentItem, AgentSpec
-from parkenv.files.known_names import SCENARIO_NAMES, BackendName, MapName, RigName, WeatherName
+from parkenv.files.known_names import (
+    KNOWLEDGE,
+    SCENARIO_NAMES,
+    BackendName,
+    KnowledgeName,
+    MapName,
+    RigName,
+    WeatherName,
+)
 from parkenv.files.limited_reading import is_there
-from parkenv.files.spec_file import Axis, FilePath, OrText, Several, Spec
+from parkenv.files.spec_file import Axis, DetectorName, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,
     Hours,
@@ -27,6 +35,8 @@ MAX_EPISODES = 10_000_000
 """Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
 MAX_DAYS = 3_650
 """Maximum number of days of a commute."""
+MAX_SETTINGS = 10_000
+"""Maximum number of settings of an experiment with many cars."""
 SPEC_FILE = "experiment.json"  # file in a run folder with the specification of its experiment
 DEFAULT_AGENTS = (
     "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
@@ -133,11 +143,16 @@ class ExperimentSpec(Workplace):
     episodes: int = Field(200, ge=1, le=MAX_EPISODES, description="Searches of each agent in each setting.")
     seed: int = Field(0, ge=0, lt=2**31, description="Episode i has the seed `seed` + i.")
     rig: RigName | None = Field(None, description="Observe slots through this rig's simulated sensors.")
+    detector: DetectorName | None = Field(
+        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    )
     figures: bool = True
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
         _require_distinct(self.agents, self.scenarios)
+        if self.detector is not None and self.rig is None:
+            raise PydanticCustomError("whole", "detector goes with a rig, such as laser")
         if (count := self.episode_count) > MAX_EPISODES:
             raise PydanticCustomError(
                 "whole",
@@ -200,6 +215,50 @@ class CommuteSpec(Workplace):
         return self
 
 
+ArrivalRate = Annotated[float, Field(gt=0.0, le=1e6)]
+Stay = Annotated[float, Field(ge=1.0, le=1e7)]  # s
+
+
+class FleetSpec(Workplace):
+    """Days on which many cars search one lot, and what they know."""
+
+    kind: Literal["fleet"] = "fleet"
+    agents: Several[AgentItem] = Field(
+        (AgentSpec(name="greedy-drive"),), min_length=1, max_length=1_000,
+        description="Each drives all cars in turn.",
+    )  # fmt: skip
+    scenario: ScenarioItem = scenario_spec("campus")
+    knows: Annotated[Axis[KnowledgeName], BeforeValidator(_listed)] = Field(
+        KNOWLEDGE, description="What members know: own, shared, reserve or full."
+    )
+    shares: Values[Probability] = Field((1.0,), description="Shares of the cars that are members.")
+    arrivals_per_hour: Values[ArrivalRate] = Field((60.0, 120.0, 240.0), description="Cars.")
+    days: int = Field(10, ge=1, le=100_000, description="Days of each setting.")
+    stay_s: Stay = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
+    patience_s: Stay = Field(600.0, description="Search time after which a car goes elsewhere, s.")
+    delay_s: float = Field(0.0, ge=0.0, le=1e5, description="Age of the live map, s.")
+    seed: int = Field(0, ge=0, lt=2**31)
+    figures: bool = True
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        _require_distinct(self.agents, ())
+        settings = len(self.agents) * len(self.knows) * len(self.shares) * len(self.arrivals_per_hour)
+        if settings > MAX_SETTINGS:
+            raise PydanticCustomError(
+                "whole",
+                "agents x knows x shares x arrivals_per_hour is {count} settings, want at most {most}",
+                {"count": settings, "most": MAX_SETTINGS},
+            )
+        if (count := settings * self.days) > MAX_EPISODES:
+            raise PydanticCustomError(
+                "whole",
+                "agents x knows x shares x arrivals_per_hour x days is {count} days, want at most {most}",
+                {"count": count, "most": MAX_EPISODES},
+            )
+        return self
+
+
 class BenchmarkSpec(Workplace):
     """A run of a benchmark suite, which defines scenarios, costs, speeds and seeds."""
 
@@ -229,7 +288,9 @@ class SurveySpec(Workplace):
     scenario: ScenarioItem = scenario_spec("campus")
     sessions: int = Field(6, ge=1, le=100_000)
     rig: RigName | None = Field(None, description="The scenario's if absent.")
-    detector: str = Field("hog", description="hog, side, front, a model file (.npz) or MODULE:CLASS.")
+    detector: DetectorName | None = Field(
+        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    )
     hours: Several[Hours] = Field(
         ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
         description="When drives begin, one window after the other, on the scenario's days.",
@@ -248,7 +309,9 @@ class DemoSpec(Workplace):
     sessions: int = Field(4, ge=1, le=100_000)
     episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
     every: CaptureDistance = Field(2.5, description="Between captures, m, in the survey and in the searches.")
-    detector: str = "hog"
+    detector: DetectorName | None = Field(
+        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    )
     seed: int = Field(0, ge=0, lt=2**31)
 
 
@@ -314,6 +377,7 @@ class TrainingSpec(Workplace):
 SPECS: dict[str, type[Workplace]] = {
     "compare": ExperimentSpec,
     "commute": CommuteSpec,
+    "fleet": FleetSpec,
     "benchmark": BenchmarkSpec,
     "survey": SurveySpec,
     "demo": DemoSpec,

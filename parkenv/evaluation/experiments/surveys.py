@@ -83,7 +83,7 @@ def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
         windows=tuple(ArrivalWindow.parse(hours, days) for hours in spec.hours),
         pose_noise=PoseNoise(spec.pose_noise, 0.02 * spec.pose_noise),
         seed=spec.seed,
-        detector=spec.detector,
+        detector=spec.detector or spec.scenario.detector,
     )
     return build(described), settings
 

@@ -4,32 +4,46 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+import time
+import warnings
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from parkenv import __version__
 from parkenv.envs.fleet import DriverKind, Fleet
-from parkenv.envs.fleet_records import KNOWLEDGE
 from parkenv.envs.fleet_rules import RULES
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
+from parkenv.evaluation.experiments.results import EpisodeTable, ResultFolder, Row
+from parkenv.evaluation.experiments.spec import SPEC_FILE, FleetSpec
 from parkenv.evaluation.experiments.statistics import mean_interval
-from parkenv.evaluation.experiments.workers import Workers
+from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.fleet.measures import MEANS, Roads, day_measures
+from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.scenarios.build import build
-from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.names import EXPECTS_RIVALS
 
-Row = dict[str, Any]
-
 OWN, ASSIGNED = "own", "reserve"
 SAMPLE_S = 300.0  # time between two samples of the occupancy, s
+SETTING_COLUMNS = ("scenario", "agents", "knows", "share", "arrivals_per_hour")
+TABLE = EpisodeTable(
+    "days.csv",
+    keys=(*SETTING_COLUMNS, "day"),
+    columns=("cars", *MEANS),
+    kinds=dict.fromkeys(("scenario", "agents", "knows"), TEXT)
+    | dict.fromkeys(("day", "cars"), WHOLE)
+    | dict.fromkeys(("members_s", "others_s"), NUMBER_OR_NAN),
+    timings=None,
+)
 WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
 """Measures whose summary has a 95 % interval over days."""
 DIFFERENCES = {
@@ -38,7 +52,11 @@ DIFFERENCES = {
     "others_difference_s": "others_s",
 }
 """Columns of paired differences, and the measures that are compared."""
+SYNC_S = 1.0  # least time between two flushes of finished days to disk, s
 _RESAMPLES = 9999
+
+Pairs = list[tuple[Row, Row]]
+"""The same days in two settings."""
 
 
 @dataclass(frozen=True)
@@ -46,172 +64,273 @@ class Setting:
     """What a row of the summary is about.
 
     Args:
-        agents: agent that drives every car, with any options in brackets.
+        agent: agent that drives every car.
         knows: what members know, one of `KNOWLEDGE`.
         share: share of the cars that are members; the others know their own observations.
         arrivals_per_hour: cars an hour.
     """
 
-    agents: str
+    agent: AgentSpec
     knows: str
     share: float
     arrivals_per_hour: float
 
     @property
     def columns(self) -> Row:
-        """The columns that identify the row."""
+        """The columns that identify the row, but for the scenario."""
         return {
-            "agents": self.agents, "knows": self.knows, "share": self.share,
+            "agents": self.agent.label, "knows": self.knows, "share": self.share,
             "arrivals_per_hour": self.arrivals_per_hour,
         }  # fmt: skip
 
+    def __str__(self) -> str:
+        agent, knows, share, per_hour = self.columns.values()
+        return f"{agent}, {knows}, share {share:g}, {per_hour:g} cars an hour"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, eq=False)
 class FleetExperiment:
-    """Settings, and what they have in common.
+    """The settings of an experiment, with its scenario made.
 
     Args:
-        scenario: lot, residents, hours of arrival, speeds and costs.
-        agents: agents, each of which drives all cars in turn.
-        knows: kinds of knowledge.
-        shares: shares of the cars that have it.
-        arrivals_per_hour: demand.
-        days: number of days of each setting; the same arrivals, stays and residents in all.
-        seed: seed of the days.
-        stay_s: mean of the exponentially distributed stays, s.
-        patience_s: time after which a searching car goes elsewhere, s.
-        delay_s: age of the live map, s.
+        spec: specification of the experiment.
 
     Raises:
-        InputError: a value out of its range, or an unknown name.
+        InputError: the scenario cannot be made.
     """
 
-    scenario: ScenarioSpec
-    agents: tuple[str, ...]
-    knows: tuple[str, ...] = KNOWLEDGE
-    shares: tuple[float, ...] = (1.0,)
-    arrivals_per_hour: tuple[float, ...] = (60.0, 120.0, 240.0)
-    days: int = 10
-    seed: int = 0
-    stay_s: float = 3600.0
-    patience_s: float = 600.0
-    delay_s: float = 0.0
+    spec: FleetSpec
 
-    def __post_init__(self) -> None:
-        for name in self.knows:
-            if name not in KNOWLEDGE:
-                raise InputError(f"knows: there is no knowledge {name!r}; {nearest(name, KNOWLEDGE)}")
-        for share in self.shares:
-            if not 0.0 <= share <= 1.0:
-                raise InputError(f"share is {share:g}, want a number from 0 to 1")
-        if self.days < 1:
-            raise InputError(f"days is {self.days}, want at least 1")
+    @cached_property
+    def scenario(self) -> Scenario:
+        """Lot, residents, hours of arrival, speeds and costs."""
+        return build(self.spec.scenario)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Workers make the scenario themselves."""
+        return {"spec": self.spec}
+
+    @cached_property
     def settings(self) -> list[Setting]:
-        """Return all settings. Without members only `own` is left: it is not repeated for each share."""
+        """All settings. Without members only `own` is left: it is not repeated for each share."""
+        spec = self.spec
+        # Agents have no hash: their options may be lists.
         made = dict.fromkeys(
-            Setting(agent, OWN if share == 0.0 else knows, 0.0 if knows == OWN else share, per_hour)
-            for per_hour, agent, knows, share in itertools.product(
-                self.arrivals_per_hour, self.agents, self.knows, self.shares
+            (per_hour, number, OWN if share == 0.0 else knows, 0.0 if knows == OWN else share)
+            for per_hour, number, knows, share in itertools.product(
+                spec.arrivals_per_hour, range(len(spec.agents)), spec.knows, spec.shares
             )
         )
-        return list(made)
+        return [
+            Setting(spec.agents[number], knows, share, per_hour) for per_hour, number, knows, share in made
+        ]
 
-    def demand(self, per_hour: float, scenario: Scenario) -> Demand:
+    def demand(self, per_hour: float) -> Demand:
         """Return the demand of a number of arrivals an hour in the hours of the scenario."""
-        window = scenario.arrival
+        window = self.scenario.arrival
         return Demand(
             PoissonArrivals(per_hour, window.start_s, window.end_s),
-            ExponentialTime(self.stay_s),
-            ConstantTime(self.patience_s),
+            ExponentialTime(self.spec.stay_s),
+            ConstantTime(self.spec.patience_s),
         )
 
-    def fleet(self, setting: Setting, scenario: Scenario) -> tuple[Fleet, list[Any]]:
-        """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled."""
-        spec = AgentSpec.of(setting.agents)
+    def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
+        """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled.
+
+        Raises:
+            InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
+        """
+        spec = setting.agent
         rule = None if spec.options else RULES.get(spec.name)
         # Who expects rivals is told how many arrive, as a forecast of traffic would.
         told = {"arrivals_per_hour": setting.arrivals_per_hour} if spec.name == EXPECTS_RIVALS else {}
-        agent = None if rule is not None else make_agent(spec.name, scenario, **{**told, **spec.options})
+        agent = None if rule is not None else make_agent(spec.name, self.scenario, **{**told, **spec.options})
         if isinstance(agent, ClairvoyantAgent):
-            raise InputError(
-                f"agent {setting.agents!r} knows the future of single searches, and drives no fleet"
-            )
+            raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
         kinds = [
             DriverKind(setting.share, rule, setting.knows, shares=setting.knows == "shared"),
             DriverKind(1.0 - setting.share, rule, OWN),
         ]
         fleet = Fleet(
-            scenario,
-            self.demand(setting.arrivals_per_hour, scenario),
+            self.scenario,
+            self.demand(setting.arrivals_per_hour),
             background="residents",
             drivers=kinds,
-            delay_s=self.delay_s,
+            delay_s=self.spec.delay_s,
             leave_full_lot=False,
         )
         return fleet, [agent, agent]
 
-    def run_day(self, setting: Setting, day: int) -> Row:
-        """Run a day of a setting, and return its measures."""
-        scenario = build(self.scenario)
-        fleet, agents = self.fleet(setting, scenario)
-        fleet.reset(self.seed, day)
-        window = scenario.arrival
-        taken = []
-        for second in np.arange(0.0, window.end_s - window.start_s, SAMPLE_S):
-            fleet.run(agents, until=fleet.begin + second)
-            taken.append(fleet.taken().mean())
-        fleet.run(agents)
-        members = fleet.cars["kind"] == 0
-        measured = day_measures(fleet, Roads(scenario), members, float(np.mean(taken)))
-        return {**setting.columns, "day": day, **measured}
+    def run_day(self, setting: Setting, day: int) -> tuple[Row, list[str]]:
+        """Run a day of a setting; return its row of `days.csv`, and the warnings of its agent.
 
-    def run(self, workers: Workers, on_day: Callable[[], None] = lambda: None) -> Iterator[list[Row]]:
-        """Run all settings; yield the days of each, in order, as soon as they are complete."""
-        settings = self.settings()
-        tasks = [partial(self.run_day, setting, day) for setting in settings for day in range(self.days)]
-        made = workers.in_order(tasks)
-        for _ in settings:
-            days = []
-            for _ in range(self.days):
-                days.append(next(made))
-                on_day()
-            yield days
+        Raises:
+            InputError: an agent raised an error; the message names setting, day, car and time.
+        """
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            fleet, agents = self.fleet(setting)
+            fleet.reset(self.spec.seed, day)
+            window = self.scenario.arrival
+            taken = []
+            try:
+                for second in np.arange(0.0, window.end_s - window.start_s, SAMPLE_S):
+                    fleet.run(agents, until=fleet.begin + second)
+                    taken.append(fleet.taken().mean())
+                fleet.run(agents)
+            except InputError as error:
+                raise InputError(f"{setting}, day {day}, {error}") from error
+        members = fleet.cars["kind"] == 0
+        measured = day_measures(fleet, Roads(self.scenario), members, float(np.mean(taken)))
+        row = {"scenario": self.scenario.name, **setting.columns, "day": day, **measured}
+        return row, [f"{setting.agent.label}: {w.message}" for w in caught]
+
+    def key(self, setting: Setting, day: int) -> tuple[Any, ...]:
+        """Return the key of a day in `days.csv`."""
+        return TABLE.key({"scenario": self.scenario.name, **setting.columns, "day": day})
+
+    def fingerprint(self) -> Row:
+        """Return everything that affects the outcome of a day; a resumed run must have the same settings."""
+        spec = self.spec
+        return {
+            "version": __version__,
+            "scenario": {spec.scenario.title: flat_tables(spec.scenario.model_dump(mode="json"))},
+            "files": fingerprints(spec.files()),
+            "agent files": agent_fingerprints(agent.name for agent in spec.agents),
+            **{name: getattr(spec, name) for name in ("stay_s", "patience_s", "delay_s", "seed")},
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class FleetResult:
+    """Result of an experiment."""
+
+    experiment: FleetExperiment
+    rows: list[Row]  # one row per setting with finished days, as in `summary.json`
+    complete: bool  # whether all days are finished
+
+
+def run_fleets(
+    spec: FleetSpec,
+    out: Path,
+    *,
+    command: Iterable[str] = (),
+    resume: bool = False,
+    overwrite: bool = False,
+    workers: Workers = HERE,
+    on_start: Callable[[int], None] = lambda _: None,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> FleetResult:
+    """Run an experiment with many cars, and write its results; skip days that the folder already holds.
+
+    The folder gets the specification (`experiment.json`), every day (`days.csv`), and the table (`summary.json`).
+    Ctrl-C stops the run; finished days stay in the folder.
+
+    Args:
+        spec: specification of the experiment.
+        out: result folder.
+        command: command line to record in the summary.
+        resume: continue an earlier run.
+        overwrite: replace the results of another run.
+        workers: where days run; results do not depend on it.
+        on_start: called with the number of days before the first one starts.
+        on_progress: called with the number of days just finished.
+
+    Raises:
+        InputError: a setting cannot be run, an agent raises an error, or the folder cannot be used.
+    """
+    experiment = FleetExperiment(spec)
+    for setting in experiment.settings:
+        experiment.fleet(setting)  # raises an error before anything is run
+    tasks = {
+        experiment.key(setting, day): partial(experiment.run_day, setting, day)
+        for setting in experiment.settings
+        for day in range(spec.days)
+    }
+    with workers:
+        folder = ResultFolder(
+            out, experiment.fingerprint(), table=TABLE, kind="fleet", resume=resume, overwrite=overwrite
+        )
+        spec.write(out / SPEC_FILE)
+        missing = [task for key, task in tasks.items() if key not in folder.episodes]
+        on_start(len(tasks))
+        on_progress(len(tasks) - len(missing))
+        try:
+            _run_days(missing, folder, workers, on_progress)
+            complete = True
+        except KeyboardInterrupt:
+            complete = False
+    by_setting: dict[tuple[Any, ...], list[Row]] = {}
+    for key in tasks:
+        if key in folder.episodes:
+            by_setting.setdefault(key[:-1], []).append(folder.episodes[key])
+    result = FleetResult(experiment, summarize_days(list(by_setting.values())), complete)
+    summary = {
+        "command": list(command),
+        "version": __version__,
+        "seed": spec.seed,
+        "complete": complete,
+        **{name: getattr(spec, name) for name in ("stay_s", "patience_s", "delay_s")},
+        "rows": result.rows,
+    }
+    folder.finish(tasks, summary, complete=complete)
+    return result
+
+
+def _run_days(
+    tasks: Sequence[Callable[[], tuple[Row, list[str]]]],
+    folder: ResultFolder,
+    workers: Workers,
+    on_progress: Callable[[int], None],
+) -> None:
+    told = set()
+    synced = -math.inf
+    for _, (row, messages) in workers.results(tasks):
+        # A day may take a millisecond, and a flush to disk a second.
+        sync = time.monotonic() >= synced + SYNC_S
+        folder.add([row], sync=sync)
+        synced = time.monotonic() if sync else synced
+        on_progress(1)
+        for message in messages:
+            if message not in told:
+                told.add(message)
+                warnings.warn(message, stacklevel=2)
 
 
 def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
-    """Return the summary, a row for each setting, from the days of each.
+    """Return the summary, a row for each setting, from the days of each, at least one.
 
     The *price of anarchy* of a row is the ratio of its mean total time to that of `reserve` for all cars, with the same
     agents and demand; its interval is a bootstrap over days. Differences are paired: to the mean total time of all cars
-    on the same days if nobody knows more than what it observes. Both are null where the other setting was not run.
+    on the same days if nobody knows more than what it observes. Both are over the days that both settings have; null if
+    there are none.
     """
-    names = ("agents", "knows", "share", "arrivals_per_hour")
-    by_setting = {tuple(days[0][name] for name in names): days for days in settings}
+    by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
 
-    def alike(days: list[Row], knows: str, share: float) -> list[Row] | None:
-        return by_setting.get((days[0]["agents"], knows, share, days[0]["arrivals_per_hour"]))
+    def paired(days: list[Row], knows: str, share: float) -> Pairs:
+        first = days[0]
+        key = (first["scenario"], first["agents"], knows, share, first["arrivals_per_hour"])
+        others = {day["day"]: day for day in by_setting.get(key, ())}
+        return [(day, others[day["day"]]) for day in days if day["day"] in others]
 
     return [
         {
-            **{name: days[0][name] for name in names},
+            **{name: days[0][name] for name in SETTING_COLUMNS},
             "days": len(days),
             "cars": sum(day["cars"] for day in days),
             **_means(days),
-            **_differences(days, alike(days, OWN, 0.0)),
-            **_price(days, alike(days, ASSIGNED, 1.0)),
+            **_differences(paired(days, OWN, 0.0)),
+            **_price(paired(days, ASSIGNED, 1.0)),
         }
         for days in settings
     ]
 
 
-def _differences(days: list[Row], own: list[Row] | None) -> Row:
+def _differences(pairs: Pairs) -> Row:
     row: Row = {}
     for name, column in DIFFERENCES.items():
-        paired = [
-            one[column] - other["total_s"] for one, other in zip(days, own or (), strict=own is not None)
-        ]
-        row[name], low, high = mean_interval([value for value in paired if not math.isnan(value)])
+        values = [one[column] - other["total_s"] for one, other in pairs]
+        row[name], low, high = mean_interval([value for value in values if not math.isnan(value)])
         row[f"{name}_ci95"] = [low, high]
     return row
 
@@ -229,10 +348,10 @@ def _means(days: list[Row]) -> Row:
     return row
 
 
-def _price(days: list[Row], assigned: list[Row] | None) -> Row:
-    if assigned is None:
+def _price(pairs: Pairs) -> Row:
+    if not pairs:
         return {"price_of_anarchy": float("nan"), "price_of_anarchy_ci95": [float("nan")] * 2}
-    mine, theirs = (np.array([day["total_s"] * day["cars"] for day in one]) for one in (days, assigned))
+    mine, theirs = np.array([[day["total_s"] * day["cars"] for day in pair] for pair in pairs]).T
     drawn = np.random.default_rng(0).integers(0, len(mine), (_RESAMPLES, len(mine)))
     ratios = mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1)
     low, high = np.percentile(ratios, [2.5, 97.5])

@@ -4,7 +4,7 @@
 const palette = {
   read() {
     const style = getComputedStyle(document.documentElement);
-    for (const name of ["ground", "asphalt", "paint", "building", "wall", "parked", "glass", "car", "goal", "halo", "ink", "soft", "view", "card", "entry"]) {
+    for (const name of ["ground", "asphalt", "paint", "building", "wall", "parked", "glass", "car", "goal", "halo", "ink", "soft", "view", "card", "entry", "failed", "queue", "member", "other", "resident"]) {
       this[name] = style.getPropertyValue(`--${name}`).trim();
     }
     const anchors = style.getPropertyValue("--belief").split(",").map((hex) => hex.trim()).map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)));

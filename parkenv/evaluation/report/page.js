@@ -35,6 +35,11 @@ if (data.worlds.length) {
   const replay = new SearchReplay(part("search-replay"), data);
   repaint.push(() => replay.redraw());
 }
+if (data.fleets.length) {
+  part("crowd").hidden = false;
+  const replay = new FleetReplay(part("fleet-replay"), data);
+  repaint.push(() => replay.redraw());
+}
 if (data.drives.length) {
   part("drive").hidden = false;
   const replay = new DriveReplay(part("drive-replay"), data);

@@ -30,7 +30,7 @@ SCHEMA = Path(__file__).with_name("report.schema.json")
 """JSON schema of the data in a page."""
 SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_replay.js",
-    "drive_replay.js", "page.js",
+    "drive_replay.js", "fleet_replay.js", "page.js",
 )  # fmt: skip
 """Scripts of the page, in order of dependence."""
 MOST_WIDTH = 1800
@@ -51,6 +51,7 @@ def page_data(
     run: RunFolder,
     encounters: Sequence[Mapping[str, Any]] = (),
     drives: Sequence[Mapping[str, Any]] = (),
+    fleets: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the data of a page, without the figures; see `report.schema.json`.
@@ -59,6 +60,7 @@ def page_data(
         run: the run.
         encounters: from `search_recording.record`.
         drives: from `drive_recording.record_drive`.
+        fleets: from `fleet_recording.FleetDay.record`.
         notes: notes for the reader, such as why there is no replay.
     """
     lots: list[Any] = []
@@ -86,6 +88,7 @@ def page_data(
         "lots": lots,
         "worlds": [{**e["world"], "lot": lot(e["lot"]), "searches": e["searches"]} for e in encounters],
         "drives": [{**d["drive"], "lot": lot(d["lot"])} for d in drives],
+        "fleets": [{**f["fleet"], "lot": lot(f["lot"])} for f in fleets],
     }
 
 
@@ -150,6 +153,8 @@ def _title(kind: str, summary: Mapping[str, Any]) -> str:
         return f"Agents compared{where}"
     if kind == "commute":
         return f"Maps that learn from every trip{where}"
+    if kind == "fleet":
+        return f"Many cars{where}"
     if kind == "survey":
         return f"Survey{where}"
     if kind == "demo":
@@ -169,6 +174,8 @@ def _findings(kind: str, summary: Mapping[str, Any]) -> list[str]:
     """Summarise the results in sentences."""
     if kind == "compare":
         return _comparison_findings(summary["rows"])
+    if kind == "fleet":
+        return _fleet_findings(summary["rows"])
     if kind == "survey":
         return [_survey_finding(row) for row in summary["rows"]]
     if kind == "demo":
@@ -176,6 +183,25 @@ def _findings(kind: str, summary: Mapping[str, Any]) -> list[str]:
     if kind == "train":
         return _training_findings(summary)
     return []
+
+
+def _fleet_findings(rows: Sequence[Row]) -> list[str]:
+    """Return a sentence for each agent and demand: what competition costs, and what the best guidance saves."""
+    groups: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["agents"], row["arrivals_per_hour"]), []).append(row)
+    findings = []
+    for (agent, per_hour), its in groups.items():
+        own = next((row for row in its if row["knows"] == "own"), its[0])
+        finding = (
+            f"{agent}, {per_hour:g} cars an hour, {own['occupancy']:.0%} of the slots taken: {own['total_s']:.1f} s a "
+            f"car, {own['balked_fraction']:.1%} find no slot"
+        )
+        interval = own["price_of_anarchy_ci95"]
+        if own["price_of_anarchy"] is not None and None not in interval and own["knows"] == "own":
+            finding += f"; the price of anarchy is {own['price_of_anarchy']:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]"
+        findings.append(f"{finding}.")
+    return findings
 
 
 def _training_findings(summary: Mapping[str, Any]) -> list[str]:

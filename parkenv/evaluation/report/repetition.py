@@ -1,4 +1,4 @@
-"""What of a run can be repeated for its report: searches and survey drives, from its specification."""
+"""What of a run can be repeated for its report: searches, survey drives and days of fleets, from its specification."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ from parkenv.evaluation.experiments.demo import demo_cases, demo_survey
 from parkenv.evaluation.experiments.experiment import Experiment, require_unchanged
 from parkenv.evaluation.experiments.results import read_settings
 from parkenv.evaluation.experiments.surveys import MAP_FILE, survey_of
+from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
 from parkenv.evaluation.report.drive_recording import record_drive
+from parkenv.evaluation.report.fleet_recording import MOST_CARS
 from parkenv.evaluation.report.run_folder import RunFolder
 from parkenv.evaluation.report.search_recording import MOST_SLOTS
 from parkenv.files.spec_file import Spec
@@ -29,17 +31,19 @@ BESIDE_MODELS = 3
 
 @dataclass(frozen=True, eq=False)
 class Repetition:
-    """The searches and survey drives of a run.
+    """The searches, survey drives and days of a run.
 
     Args:
         cases: the searches.
         survey: scenario and settings of the drives.
         sessions: number of drives.
+        fleets: the experiment with many cars.
     """
 
     cases: Cases
     survey: tuple[Scenario, SurveySettings] | None = None
     sessions: int = 0
+    fleets: FleetExperiment | None = None
 
     @classmethod
     def of_run(cls, run: RunFolder, spec: Spec | None) -> Repetition:
@@ -52,6 +56,9 @@ class Repetition:
             case specs.ExperimentSpec():
                 require_unchanged(spec, read_settings(run.path) or {})
                 return cls([*Experiment(spec).cases])
+            case specs.FleetSpec():
+                require_unchanged(spec, read_settings(run.path) or {})
+                return cls([], fleets=FleetExperiment(spec))
             case specs.BenchmarkSpec():
                 return cls([*Suite.named(spec.suite).cases(spec.agents)])
             case specs.SurveySpec():
@@ -80,6 +87,22 @@ def drawable(cases: Cases) -> tuple[Cases, list[str]]:
         for name, n in large.items()
     ]
     return [(case, its) for case, its in cases if case.scenario.name not in large], notes
+
+
+def drawable_settings(
+    fleets: FleetExperiment, settings: Sequence[Setting]
+) -> tuple[list[Setting], list[str]]:
+    """Return the settings with few enough cars, on a small enough lot, to draw, and notes on the others."""
+    if (n := fleets.scenario.lot.n_slots) > MOST_SLOTS:
+        return [], [f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
+    window = fleets.scenario.arrival
+    most = MOST_CARS / ((window.end_s - window.start_s) / 3600.0)
+    rates = dict.fromkeys(one.arrivals_per_hour for one in settings if one.arrivals_per_hour > most)
+    notes = [
+        f"days with {rate:g} cars an hour have more than the {MOST_CARS} cars that are drawn: no replay"
+        for rate in rates
+    ]
+    return [one for one in settings if one.arrivals_per_hour <= most], notes
 
 
 def differences(watched: Sequence[dict[str, Any]]) -> list[str]:

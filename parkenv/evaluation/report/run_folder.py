@@ -22,6 +22,7 @@ from parkenv.evaluation.experiments.results import (
 )
 from parkenv.evaluation.experiments.spec import SPEC_FILE, SPECS
 from parkenv.evaluation.experiments.surveys import read_sessions
+from parkenv.evaluation.fleet.experiment import TABLE
 from parkenv.evaluation.training.curve_file import CURVE, read_curve
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Spec, read_tables
@@ -102,6 +103,14 @@ class RunFolder:
             InputError: the file is damaged, or not of this version.
         """
         return {episode_key(row): row["total_s"] for row in read_rows(self.path / "episodes.csv")}
+
+    def day_totals(self) -> dict[tuple[Any, ...], float]:
+        """Read the mean total time, s, of every day in `days.csv`, by `FleetExperiment.key`; empty without the file.
+
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+        return {TABLE.key(row): row["total_s"] for row in TABLE.read(self.path / TABLE.file)}
 
     def sessions(self) -> list[Row]:
         """Read the drives of a survey from `sessions.csv`, NaN as None; none without the file.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from parkenv.evaluation.experiments.results import Row
@@ -33,6 +34,7 @@ class Column(NamedTuple):
     help: str = ""
 
 
+_MINUS_OWN = "total time, minus that of all cars if nobody knows more than it observes, on the same days"
 _KNOWN = {
     column.key: column
     for column in (
@@ -102,6 +104,24 @@ _KNOWN = {
         Column("detections", "detections", digits=0),
         Column("right", "correct", digits=0),
         Column("occupied_fraction", "occupied", share=True, digits=0),
+        Column("agents", "agents"),
+        Column("knows", "members know"),
+        Column("share", "members", share=True, digits=0),
+        Column("arrivals_per_hour", "cars an hour", digits=0),
+        Column("cars", "cars", digits=0),
+        Column("median_s", "median", "s", help="Median of the total times of a day's cars"),
+        Column("p95_s", "95 % quantile", "s", 0),
+        Column("gini", "Gini", digits=3, help="Inequality of total times: 0 if all are equal"),
+        Column("search_s", "search time", "s", help="From the entry to the end of the search"),
+        Column("failed_attempts", "failed attempts", digits=3),
+        Column("cruised_m", "cruised", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
+        Column("cruising_share", "traffic that cruises", share=True, digits=0),
+        Column("balked_fraction", "found no slot", share=True),
+        Column("members_s", "members", "s", help="Total time of members"),
+        Column("others_s", "others", "s", help="Total time of those who are no members"),
+        Column("members_difference_s", "members minus own", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
+        Column("others_difference_s", "others minus own", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
+        Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),
         Column("key", "drive"),
         Column("weather", "weather"),
         Column("rig", "rig"),
@@ -109,10 +129,23 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "agent", "seed", "total_s", "difference_s", "gap_to_exact", "regret_s", "drive_s", "failed_s", "walk_s",
-    "parking_cost_s", "gave_up_s", "parked_fraction",
+    "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "difference_s", "gap_to_exact",
+    "price_of_anarchy", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s",
+    "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
+_OF_FLEETS = {
+    column.key: column
+    for column in (
+        Column("days", "days", digits=0),
+        Column("difference_s", "minus own", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
+        Column("bound_s", "alone", "s", help="Mean total time of a car alone in an empty lot that it knows"),
+        Column(
+            "occupancy", "occupied", share=True, digits=0, help="Mean share of slots taken while cars arrive"
+        ),
+    )
+}
+"""Columns that mean something else in the table of `parkenv fleet`."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
 _UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
 
@@ -132,7 +165,14 @@ def column_of(key: str) -> Column:
     return Column(key, key.replace("_", " ").replace(".", ", "), digits=3)
 
 
-def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False) -> dict[str, Any]:
+def table_of(
+    name: str,
+    title: str,
+    rows: Sequence[Row],
+    *,
+    facts: bool = False,
+    columns: Mapping[str, Column] = MappingProxyType({}),
+) -> dict[str, Any]:
     """Build a table of the page's data.
 
     Intervals (`NAME_ci95`) are merged into the column of their value. Columns that are equal in all rows go to `same`,
@@ -143,7 +183,12 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         title: title above the table.
         rows: rows with mostly the same keys.
         facts: whether to show a single row from top to bottom.
+        columns: formats of columns that differ from `column_of`.
     """
+
+    def written(key: str) -> dict[str, Any]:
+        return described(columns.get(key) or column_of(key))
+
     flat = [_flat(row) for row in rows]
     keys = list(dict.fromkeys(key for row in flat for key in row))
     keys = [k for k in _ORDER if k in keys] + [k for k in keys if k not in _ORDER]
@@ -162,13 +207,9 @@ def table_of(name: str, title: str, rows: Sequence[Row], *, facts: bool = False)
         "name": name,
         "title": title,
         "facts": facts,
-        "columns": [described(column_of(key)) for key in shown],
+        "columns": [written(key) for key in shown],
         "rows": [[values[key][i] for key in shown] for i in range(len(rows))],
-        "same": [
-            {**described(column_of(key)), "value": values[key][0]}
-            for key in same
-            if values[key][0] is not None
-        ],
+        "same": [{**written(key), "value": values[key][0]} for key in same if values[key][0] is not None],
     }
 
 
@@ -209,7 +250,7 @@ def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) ->
     tables = []
     if kind != "survey":
         title = {"train": "Trained models", "demo": "Searches with simulated sensors"}.get(kind, "Results")
-        tables.append(table_of("rows", title, rows))
+        tables.append(table_of("rows", title, rows, columns=_OF_FLEETS if kind == "fleet" else {}))
     if summary.get("transfer"):
         tables.append(table_of("transfer", "Test in held-out worlds", summary["transfer"]))
     if summary.get("planners"):

@@ -106,13 +106,14 @@ class TripPlan:
     agent: str
     style: DrivingStyle  # driving style
     rig: str | None = None  # name of the sensor rig; None for the scenario's sensor model
+    detector: str | None = None  # the rig's detector; None for the scenario's
 
     def run(self, slots: str, seeds: Sequence[int]) -> list[Row]:
         """Drive the trips; return the `trip_row` of each."""
         scenario, rig = (
             (self.scenario, self.rig) if slots == OBSERVED else (blind_scenario(self.scenario), None)
         )
-        search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig)
+        search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig, detector=self.detector)
         return [trip_row(search.run(seed), slots) for seed in seeds]
 
 

@@ -150,6 +150,7 @@ class DrivenSearch:
             None to use the scenario's sensor model.
         weather: as in `parkenv/SearchPerception-v2`.
         captures: maximum number of captures per edge.
+        detector: the rig's detector, as in `parkenv/SearchPerception-v2`.
 
     Raises:
         InputError: an unknown agent, rig or weather, a speed above the car's maximum, or a lot without a slot that
@@ -173,8 +174,11 @@ class DrivenSearch:
         rig: str | SensorRig | None = None,
         weather: str | None = None,
         captures: int = 2,
+        detector: str | None = None,
     ) -> None:
-        perception = None if rig is None else OnboardPerception(scenario, rig, weather, captures)
+        perception = (
+            None if rig is None else OnboardPerception(scenario, rig, weather, captures, detector=detector)
+        )
         self.scenario = scenario if perception is None else perception.scenario
         self.agent = agent
         spec = AgentSpec.of(agent)

@@ -1,0 +1,119 @@
+"""Detect cars in image files and videos, and draw them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+
+from parkenv.errors import InputError
+from parkenv.evaluation.figures.survey_pictures import draw_detections
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
+from parkenv.files.videos import VIDEO_SUFFIXES, Video, film
+from parkenv.perception.detector import Detections, Detector
+
+Row = dict[str, Any]
+
+BOX_COLUMNS = ("file", "frame", "time_s", "left", "top", "right", "bottom", "probability", "view")
+"""Columns of `boxes.csv`; frame (from 0) and time_s are empty for images."""
+
+
+class VideoCars(NamedTuple):
+    """The cars in a video."""
+
+    row: Row  # of the video: file, frames, seconds, fps, boxes, most_cars
+    boxes: list[Row]  # rows of `boxes.csv`
+
+
+def require_readable(paths: Sequence[Path]) -> dict[Path, Video | None]:
+    """Return the images and videos that are named or in the named folders, in order; None stands for an image.
+
+    Raises:
+        InputError: a folder holds neither, or a file cannot be read.
+    """
+    files: list[Path] = []
+    for path in paths:
+        its = files_in(path, SUFFIXES + VIDEO_SUFFIXES) if path.is_dir() else [path]
+        files += its or images_in(path)  # says what is wanted
+    found: dict[Path, Video | None] = {}
+    for file in files:
+        if file.suffix.lower() in VIDEO_SUFFIXES:
+            found[file] = Video.of(file)
+        else:
+            read_image(file)
+            found[file] = None
+    return found
+
+
+def detect_in_image(file: Path, detector: Detector, threshold: float, drawn: Path | None) -> list[Row]:
+    """Return the cars of at least a probability in an image, as rows of `boxes.csv`, and draw them into a PNG file."""
+    image = read_image(file)
+    found = _likely(detector.detect(image), threshold)
+    if drawn is not None:
+        colored = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+        picture = draw_detections(colored, found)
+        with atomic_write(drawn) as beside:
+            beside.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    return _rows(file, found)
+
+
+def detect_in_video(
+    video: Video,
+    detector: Detector,
+    threshold: float,
+    step: int = 1,
+    drawn: Path | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+) -> VideoCars:
+    """Return the cars in every `step`-th frame of a video, and draw them into a film (MP4) of equal speed.
+
+    Raises:
+        InputError: the video has no frame that can be read, or the film cannot be written.
+    """
+    boxes: list[Row] = []
+    frames = most = 0
+    seconds = 0.0
+    with ExitStack() as stack:
+        made = None
+        if drawn is not None:
+            made = stack.enter_context(film(drawn, (video.width, video.height), video.fps / step))
+        for frame in video.read(step):
+            found = _likely(detector.detect(frame.image), threshold)
+            boxes += _rows(video.path, found, frame.number, frame.time)
+            frames, most, seconds = frames + 1, max(most, len(found)), frame.time
+            if made is not None:
+                made.add(draw_detections(frame.image, found))
+            on_frame()
+        if not frames:
+            raise InputError(f"{video.path}: has no frame that can be read")
+    row = {"file": str(video.path), "frames": frames, "seconds": round(seconds + 1.0 / video.fps, 3)}
+    return VideoCars(row | {"fps": video.fps, "boxes": len(boxes), "most_cars": most}, boxes)
+
+
+def _likely(found: Detections, threshold: float) -> Detections:
+    return found.select(found.probability >= threshold)
+
+
+def _rows(file: Path, found: Detections, frame: int | None = None, time: float | None = None) -> list[Row]:
+    values = zip(found.boxes.tolist(), found.probability.tolist(), found.end_on.tolist(), strict=True)
+    return [
+        dict(
+            zip(
+                BOX_COLUMNS,
+                (
+                    str(file),
+                    frame,
+                    None if time is None else round(time, 4),
+                    *box,
+                    p,
+                    "end" if end else "side",
+                ),
+                strict=True,
+            )
+        )
+        for box, p, end in values
+    ]

@@ -1,0 +1,157 @@
+"""Read videos frame by frame, and write films."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.images import MAX_PIXELS
+from parkenv.files.limited_reading import open_limited
+
+Image = NDArray[np.uint8]
+
+VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
+# FFmpeg reads it when it is first used; else it would write of damaged files to standard error.
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+_USUAL_FPS = 25.0
+_MOST_FPS = 1_000.0
+
+
+class VideoFrame(NamedTuple):
+    """One frame of a video."""
+
+    number: int  # from 0
+    time: float  # s since the first frame's time 0, never earlier than the frame before
+    image: Image  # (h, w, 3) uint8, RGB
+
+
+@dataclass(frozen=True)
+class Video:
+    """A video file.
+
+    Attributes:
+        path: the file.
+        width, height: px.
+        fps: frames per second, 25 where the file does not say.
+        frames: number of frames as the file says; None where it does not.
+    """
+
+    path: Path
+    width: int
+    height: int
+    fps: float
+    frames: int | None
+
+    @classmethod
+    def of(cls, path: Path) -> Video:
+        """Open a video file, and read its first frame.
+
+        Raises:
+            InputError: the file cannot be read, has no frames, or frames of over 100 million pixels.
+        """
+        with _opened(path) as capture:
+            there, first = capture.read()
+            if not there or first is None:
+                raise InputError(
+                    f"{path}: is no video with frames that can be read; want {', '.join(VIDEO_SUFFIXES)}"
+                )
+            fps, count = (capture.get(key) for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
+            height, width = first.shape[:2]
+            return cls(
+                path,
+                width,
+                height,
+                fps if math.isfinite(fps) and 0.0 < fps <= _MOST_FPS else _USUAL_FPS,
+                int(count) if math.isfinite(count) and 0 < count < 1e9 else None,
+            )
+
+    def read(self, step: int = 1) -> Iterator[VideoFrame]:
+        """Yield every `step`-th frame, the first one included, up to the last that can be read.
+
+        Raises:
+            InputError: see `of`.
+        """
+        with _opened(self.path) as capture:
+            number, last = 0, 0.0
+            while capture.grab():
+                if number % step == 0:
+                    there, frame = capture.retrieve()
+                    if not there or frame is None or frame.shape[:2] != (self.height, self.width):
+                        return
+                    stated = capture.get(cv2.CAP_PROP_POS_MSEC) / 1000.0
+                    # Some files have no times.
+                    known = math.isfinite(stated) and (stated > last or number == 0) and stated >= 0.0
+                    last = max(last, stated if known else number / self.fps)
+                    yield VideoFrame(number, last, np.asarray(cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)))
+                number += 1
+
+
+class Film:
+    """An MP4 film that is being written."""
+
+    def __init__(self, writer: Any, size: tuple[int, int]) -> None:
+        self._writer, self._size = writer, size
+
+    def add(self, image: Image) -> None:
+        """Append a frame, (h, w, 3) uint8, RGB."""
+        width, height = self._size
+        self._writer.write(np.ascontiguousarray(image[:height, :width, ::-1]))
+
+
+@contextmanager
+def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Film]:
+    """Write a film atomically, frame by frame.
+
+    Args:
+        path: the file, `.mp4`.
+        size: width and height, px; an odd last row or column is left out, as encoders want.
+        fps: frames per second.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    even = size[0] // 2 * 2, size[1] // 2 * 2
+    with atomic_write(path) as beside:
+        made = beside.with_name(f"{beside.name}.mp4")  # the encoder goes by the name
+        writer = cv2.VideoWriter(str(made), cv2.VideoWriter.fourcc(*"mp4v"), min(fps, 240.0), even)
+        try:
+            if not writer.isOpened():
+                raise InputError(f"{path}: cannot be written as a film of {even[0]}×{even[1]} px")
+            yield Film(writer, even)
+            writer.release()
+            made.replace(beside)
+        finally:
+            writer.release()
+            with suppress(OSError):
+                made.unlink()
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    with open_limited(path):  # says why a file cannot be read
+        pass
+    level = cv2.utils.logging.getLogLevel()
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    # A path that is absolute is no address of the network.
+    capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
+    try:
+        width, height = (capture.get(key) for key in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > MAX_PIXELS:
+            raise InputError(
+                f"{path}: has frames of {width:.0f}×{height:.0f} px, want at most {MAX_PIXELS:,}"
+            )
+        yield capture
+    finally:
+        capture.release()
+        cv2.utils.logging.setLogLevel(level)

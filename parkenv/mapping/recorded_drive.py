@@ -1,0 +1,613 @@
+"""Recorded drives: images, scans and poses in MCAP files and rosbags, written and read by the library rosbags.
+
+Each picture of the first camera is a capture. What other sensors measured nearest in time, at most `PAIR_S` away,
+joins it. The car's pose is interpolated to the picture's time: linearly between the poses before and after, at most
+`GAP_S` apart, the heading along the shorter arc; a pose at exactly that time is taken as it is. Pictures without pose
+or partner are left out. Times are those of the messages' headers, of messages without header those of the recording.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write, check_writable
+from parkenv.files.images import decode_image
+from parkenv.files.limited_reading import parse_json
+from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, Lens, StereoSpec
+from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.store import Session
+from parkenv.mapping.survey import Survey, update_grid
+from parkenv.perception.capture import TimedCapture
+from parkenv.perception.detector import Detector
+from parkenv.perception.pipeline import PerceptionPipeline
+from parkenv.perception.slot_filter import SlotFilter, SlotStates
+from parkenv.world.lot import ParkingLot
+from parkenv.world.week import DAY_S
+from sim_sensors.camera.models import Frame, StereoFrame
+from sim_sensors.errors import SensorError
+from sim_sensors.laser.scanner import LaserScanner
+from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+
+PAIR_S = 0.1
+"""Longest time between a picture and what other sensors measured with it, s."""
+GAP_S = 2.0
+"""Longest time between two poses that a pose is interpolated between, s."""
+HEAD, POSE = "/parkenv/drive", "/pose"
+SUFFIXES = (".mcap", ".db3", ".bag")
+_MONDAY_S = 4 * DAY_S  # 1970-01-05, the first Monday of Unix time
+_STRING, _POSE_2D = "std_msgs/msg/String", "geometry_msgs/msg/Pose2D"
+_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+_SCAN = "sensor_msgs/msg/LaserScan"
+_POSES = (
+    _POSE_2D, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry",
+)  # fmt: skip
+_NO_DEPTH, _NO_IDS = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
+
+
+class _Stream(NamedTuple):
+    """One sensor's messages."""
+
+    topic: str
+    types: tuple[str, ...]
+
+
+class Head(NamedTuple):
+    """What identifies a session: its key, start (s since Monday 00:00), rig and weather."""
+
+    key: str
+    time: float
+    rig: str
+    weather: str
+
+
+@dataclass(frozen=True, eq=False)
+class MappedDrive:
+    """A recorded drive, mapped."""
+
+    session: Session  # the record for the map file
+    states: SlotStates  # the filter's final estimate
+    grid: OccupancyGrid  # the occupancy grid
+    frames: int  # captures that were used
+
+
+class DriveWriter:
+    """Writes a drive to an MCAP file; see `recording`."""
+
+    def __init__(self, writer: Any, rig: SensorRig, store: Any) -> None:
+        self._writer, self._rig, self._store, self._last = writer, rig, store, 0
+        self._connections: dict[str, Any] = {}
+
+    def add(self, captured: TimedCapture, vehicle: FloatArray) -> None:
+        """Append a capture and the estimated pose of the vehicle, (3,)."""
+        stamp = round((_MONDAY_S + captured.time) * 1e9)
+        x, y, yaw = (float(v) for v in vehicle)
+        self._send(POSE, _POSE_2D, stamp, x=x, y=y, theta=yaw)
+        capture = captured.capture
+        for name, _, _ in self._rig.cameras:
+            self._send_image(f"/{name}/image/compressed", stamp, capture.images[name].image)
+        for name, _, _ in self._rig.stereo_cameras:
+            self._send_image(f"/{name}/left/image/compressed", stamp, capture.pairs[name].left.image)
+            self._send_image(f"/{name}/right/image/compressed", stamp, capture.pairs[name].right.image)
+        for name, laser, _ in self._rig.lasers:
+            self._send(
+                f"/{name}/scan", _SCAN, stamp, header=self._header(stamp, name), angle_min=laser.start,
+                angle_max=laser.start + (laser.n_beams - 1) * laser.step, angle_increment=laser.step,
+                time_increment=0.0, scan_time=0.0, range_min=0.0, range_max=laser.max_range, ranges=capture.scans[name],
+                intensities=np.zeros(0, np.float32),
+            )  # fmt: skip
+
+    def close(self, head: Head) -> None:
+        """Append what identifies the session."""
+        self._send(HEAD, _STRING, self._last, data=json.dumps(head._asdict()))
+
+    def _send_image(self, topic: str, stamp: int, image: NDArray[np.uint8]) -> None:
+        data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
+        self._send(topic, _COMPRESSED, stamp, header=self._header(stamp, topic), format="png", data=data)
+
+    def _send(self, topic: str, kind: str, stamp: int, **parts: Any) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+        message = self._store.types[kind](**parts)
+        self._last = max(self._last, stamp)
+        self._writer.write(self._connections[topic], stamp, self._store.serialize_cdr(message, kind))
+
+    def _header(self, stamp: int, frame: str) -> Any:
+        types = self._store.types
+        time = types["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9))
+        return types["std_msgs/msg/Header"](stamp=time, frame_id=frame)
+
+
+@contextmanager
+def recording(path: Path, rig: SensorRig) -> Iterator[DriveWriter]:
+    """Write a drive to an MCAP file, atomically; images are stored without loss.
+
+    Raises:
+        InputError: the file cannot be written, or the library rosbags is not installed.
+    """
+    require_recordable(path)
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    with atomic_write(path) as beside:
+        folder = Path(tempfile.mkdtemp(prefix=".drive", dir=path.absolute().parent))
+        try:
+            with Writer(folder / "drive", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+                yield DriveWriter(writer, rig, get_typestore(Stores.ROS2_HUMBLE))
+            (made,) = (folder / "drive").glob("*.mcap")
+            made.replace(beside)
+        finally:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def require_recordable(path: Path) -> None:
+    """Check that a drive can be written to a file, before any work.
+
+    Raises:
+        InputError: see `recording`.
+    """
+    require_rosbags()
+    if path.suffix != ".mcap":
+        raise InputError(f"{path}: want a name that ends in .mcap")
+    check_writable(path)
+
+
+def require_rosbags() -> None:
+    """Check that the library rosbags is installed.
+
+    Raises:
+        InputError: it is not; the message says how to install it.
+    """
+    try:
+        import rosbags.rosbag2  # noqa: F401
+    except ImportError as error:
+        raise InputError("recorded drives need the extra bags: pip install 'parkenv[bags]'") from error
+
+
+@dataclass(eq=False)
+class RecordedDrive:
+    """A recorded drive: an MCAP file, a rosbag of ROS 2 (folder, .mcap or .db3) or of ROS 1 (.bag).
+
+    Args:
+        path: the file or folder.
+        calibration: sensors and topics; None for a recording of `parkenv survey --record`.
+
+    Raises:
+        InputError: the recording cannot be read whole; a topic is missing or of another type; stamps go back in time;
+            or streams do not overlap in time.
+    """
+
+    path: Path
+    calibration: DriveCalibration | None = None
+    rig: SensorRig = field(init=False)
+    head: Head | None = field(init=False, default=None)
+    poses: FloatArray = field(init=False)  # (n, 3) x, y, yaw in the lot
+    pose_s: FloatArray = field(init=False)  # (n,) s, Unix time relative to `_start`
+
+    def __post_init__(self) -> None:
+        require_rosbags()
+        self._streams: dict[str, _Stream] = {}
+        self._lenses: dict[str, Lens] = {}
+        self._stamps: dict[str, list[int]] = {}
+        self._scans: dict[str, list[NDArray[np.float32]]] = {}
+        self._scanners: dict[str, LaserScanner] = {}
+        poses: list[tuple[float, float, float]] = []
+        with self._messages_open() as (topics, messages):
+            self._plan(topics)
+            wanted = {stream.topic: key for key, stream in self._streams.items()}
+            self._stamps = {key: [] for key in self._streams}
+            for topic, stamp, message in messages({*wanted, HEAD}):
+                if topic == HEAD:
+                    self._take_head(message.data)
+                    continue
+                key = wanted[topic]
+                self._add_stamp(key, _stamp_of(message, stamp))
+                if key == "pose":
+                    poses.append(_pose_of(message))
+                elif key.startswith("scan:"):
+                    self._add_scan(key[5:], message)
+        self._finish(np.array(poses, dtype=np.float64).reshape(-1, 3))
+
+    @property
+    def key(self) -> str:
+        """The key of the session."""
+        return self.head.key if self.head else f"{self.path.name}/{self._stamps['pose'][0]}"
+
+    @property
+    def start(self) -> float:
+        """Start of the session, s since Monday 00:00."""
+        if self.head is not None:
+            return self.head.time
+        zone = self.calibration.timezone_h * 3600.0 if self.calibration else 0.0
+        return (self._stamps["pose"][0] / 1e9 + zone - _MONDAY_S) % (7.0 * DAY_S)
+
+    def captures(self, every: float = 0.0) -> Iterator[tuple[TimedCapture, FloatArray]]:
+        """Yield the captures, and the vehicle's pose of each, (3,) x, y in m and yaw in rad.
+
+        Args:
+            every: m, least distance between the poses of captures.
+
+        Raises:
+            InputError: an image cannot be read, or is of another size than the calibration's.
+        """
+        plan = self._frames(every)
+        needed: dict[tuple[str, int], list[int]] = {}
+        for k, (_, partners, _) in enumerate(plan):
+            for key, index in partners.items():
+                if not key.startswith("scan:"):
+                    needed.setdefault((key, index), []).append(k)
+        images: list[dict[str, NDArray[np.uint8]]] = [{} for _ in plan]
+        count = dict.fromkeys(self._streams, -1)
+        cameras = {s.topic: key for key, s in self._streams.items() if key.startswith("image:")}
+        done = 0
+        with self._messages_open() as (_, messages):
+            for topic, _, message in messages(set(cameras)):
+                key = cameras[topic]
+                count[key] += 1
+                for k in needed.get((key, count[key]), ()):
+                    images[k][key] = self._decoded(key, message, count[key])
+                while done < len(plan) and len(images[done]) == len(cameras):
+                    yield self._capture(plan[done], images[done])
+                    images[done] = {}
+                    done += 1
+
+    def _plan(self, topics: dict[str, str]) -> None:
+        """Set the streams: from the calibration, or those of `recording`."""
+        image, pose = (_COMPRESSED, _IMAGE), self.calibration.pose if self.calibration else POSE
+        self._streams = {"pose": _Stream(pose, _POSES)}
+        sensors: Sequence[CameraSpec | StereoSpec | LaserSpec]
+        if self.calibration is None:
+            if HEAD not in topics:
+                raise InputError(
+                    f"{self.path}: is no recording of parkenv survey --record; describe its sensors: --calibration"
+                )
+            for topic, kind in topics.items():
+                name, _, what = topic[1:].partition("/")
+                if kind == _SCAN:
+                    self._streams[f"scan:{name}"] = _Stream(topic, (_SCAN,))
+                elif kind == _COMPRESSED:
+                    side = what.partition("/")[0] if what.startswith(("left", "right")) else "mono"
+                    self._streams[f"image:{name}:{side}"] = _Stream(topic, image)
+        else:
+            sensors = (*self.calibration.cameras, *self.calibration.stereo_cameras, *self.calibration.lasers)
+            for sensor in sensors:
+                if isinstance(sensor, LaserSpec):
+                    self._streams[f"scan:{sensor.name}"] = _Stream(sensor.topic, (_SCAN,))
+                    continue
+                if isinstance(sensor, StereoSpec):
+                    sides = {"left": sensor.left, "right": sensor.right}
+                else:
+                    sides = {"mono": sensor.topic}
+                for side, topic in sides.items():
+                    self._streams[f"image:{sensor.name}:{side}"] = _Stream(topic, image)
+                    self._lenses[f"image:{sensor.name}:{side}"] = sensor
+        for key, stream in self._streams.items():
+            if topics.get(stream.topic) not in stream.types:
+                what = {"pose": "poses", "scan": "scans"}.get(key.partition(":")[0], "images")
+                there = ", ".join(f"{t} ({kind})" for t, kind in sorted(topics.items())[:12]) or "nothing"
+                raise InputError(
+                    f"{self.path}: has no {what} in {stream.topic}, want {' or '.join(stream.types)}; it has {there}"
+                )
+
+    def _take_head(self, text: str) -> None:
+        content = parse_json(text, f"{self.path}: {HEAD}", finite=True)
+        head = content if isinstance(content, dict) else {}
+        kinds = {"key": str, "time": int | float, "rig": str, "weather": str}
+        if any(not isinstance(head.get(name), kind) for name, kind in kinds.items()):
+            raise InputError(f"{self.path}: {HEAD} is {text!r:.80}, want what parkenv survey --record wrote")
+        self.head = Head(head["key"], float(head["time"]), head["rig"], head["weather"])
+
+    def _add_stamp(self, key: str, stamp: int) -> None:
+        before = self._stamps[key]
+        if before and stamp <= before[-1]:
+            raise InputError(
+                f"{self.path}: {self._streams[key].topic}: time goes from {before[-1] / 1e9:.6f} to "
+                f"{stamp / 1e9:.6f} s at message {len(before) + 1}, want it to rise"
+            )
+        before.append(stamp)
+
+    def _add_scan(self, name: str, message: Any) -> None:
+        ranges = np.array(message.ranges, dtype=np.float32)
+        where = f"{self.path}: {self._streams[f'scan:{name}'].topic}"
+        if name not in self._scanners:
+            try:
+                self._scanners[name] = LaserScanner(
+                    len(ranges),
+                    float(message.angle_min),
+                    float(message.angle_increment),
+                    float(message.range_max),
+                )
+            except SensorError as error:
+                raise InputError(f"{where}: {error}") from error
+        if len(ranges) != self._scanners[name].n_beams:
+            raise InputError(
+                f"{where}: a scan has {len(ranges)} beams, the first {self._scanners[name].n_beams}"
+            )
+        with np.errstate(invalid="ignore"):
+            known = (ranges >= max(float(message.range_min), 0.0)) & (ranges <= message.range_max)
+        self._scans.setdefault(name, []).append(np.where(known, ranges, np.float32(np.inf)))
+
+    def _finish(self, poses: FloatArray) -> None:
+        """Check that the streams have something in common, and make the rig."""
+        spans = {}
+        for key, stamps in self._stamps.items():
+            topic = self._streams[key].topic
+            if not stamps:
+                raise InputError(f"{self.path}: {topic} has no messages")
+            spans[topic] = (stamps[0] / 1e9, stamps[-1] / 1e9)
+        low, high = max(s[0] for s in spans.values()), min(s[1] for s in spans.values())
+        if low > high + PAIR_S:
+            late, early = (t for value, k in ((low, 0), (high, 1)) for t, s in spans.items() if s[k] == value)
+            raise InputError(
+                f"{self.path}: {early} ends at {high:.3f} s, before {late} begins at {low:.3f} s; want streams that "
+                "overlap in time: do their clocks agree?"
+            )
+        if not np.isfinite(poses).all():
+            bad = int(np.flatnonzero(~np.isfinite(poses).all(axis=1))[0])
+            raise InputError(
+                f"{self.path}: {self._streams['pose'].topic}: pose {bad + 1} is {poses[bad].tolist()}"
+            )
+        self.poses = poses
+        if self.calibration is None:
+            if self.head is None or self.head.rig not in RIG_NAMES:
+                raise InputError(f"{self.path}: {HEAD} names no rig of {', '.join(RIG_NAMES)}")
+            self.rig = SensorRig.named(self.head.rig)
+            self._require_rig()
+        else:
+            try:
+                self.rig = self.calibration.rig(self._scanners)
+            except (InputError, SensorError) as error:
+                raise InputError(f"{self.calibration._file or 'calibration'}: {error}") from error
+            at = self.calibration.origin
+            if (at.x, at.y, at.yaw) != (0.0, 0.0, 0.0):
+                turn = math.radians(at.yaw)
+                c, s = math.cos(turn), math.sin(turn)
+                x, y, yaw = poses.T
+                self.poses = np.column_stack([at.x + c * x - s * y, at.y + s * x + c * y, yaw + turn])
+        start = self._stamps["pose"][0]
+        self.pose_s = (np.array(self._stamps["pose"], np.int64) - start) / 1e9
+
+    def _require_rig(self) -> None:
+        """Check that a recording of our own has the sensors of its rig."""
+        rig = self.rig
+        wanted = {f"image:{name}:mono" for name, _, _ in rig.cameras} | {
+            f"scan:{n}" for n, _, _ in rig.lasers
+        }
+        wanted |= {f"image:{name}:{side}" for name, _, _ in rig.stereo_cameras for side in ("left", "right")}
+        if missing := sorted(wanted - self._streams.keys()):
+            raise InputError(
+                f"{self.path}: has no {missing[0].replace(':', ' ')}, which its rig {self.head} has"
+            )
+        for name, laser, _ in rig.lasers:
+            if self._scanners[name].n_beams != laser.n_beams:
+                raise InputError(
+                    f"{self.path}: {name} has {self._scanners[name].n_beams} beams, want {laser.n_beams}"
+                )
+
+    def _frames(self, every: float) -> list[tuple[int, dict[str, int], FloatArray]]:
+        """Return the stamp, the index of each sensor's part, and the pose of each capture."""
+        others = {key: np.array(s, np.int64) for key, s in self._stamps.items() if key != "pose"}
+        first = next(key for key in others if key.startswith("image:"))
+        plan: list[tuple[int, dict[str, int], FloatArray]] = []
+        for stamp in self._stamps[first]:
+            nearest = {key: _nearest(stamps, stamp) for key, stamps in others.items()}
+            paired = all(abs(int(others[key][i]) - stamp) <= PAIR_S * 1e9 for key, i in nearest.items())
+            pose = self.pose_at(stamp)
+            if not paired or pose is None:
+                continue
+            if plan and every > 0.0 and float(np.hypot(*(pose - plan[-1][2])[:2])) < every:
+                continue
+            plan.append((stamp, nearest, pose))
+        if not plan:
+            raise InputError(
+                f"{self.path}: no picture of {self._streams[first].topic} has a pose and measurements of all other "
+                f"sensors within {PAIR_S} s"
+            )
+        return plan
+
+    def pose_at(self, stamp: int) -> FloatArray | None:
+        """Return the interpolated pose, (3,), at a time, ns of Unix time; None where there is none."""
+        stamps = self._stamps["pose"]
+        after = int(np.searchsorted(np.array(stamps, np.int64), stamp))
+        if after < len(stamps) and stamps[after] == stamp:
+            return np.array(self.poses[after], dtype=np.float64)
+        if after in (0, len(stamps)) or stamps[after] - stamps[after - 1] > GAP_S * 1e9:
+            return None
+        one, two = self.poses[after - 1], self.poses[after]
+        share = (stamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
+        turn = (two[2] - one[2] + math.pi) % (2.0 * math.pi) - math.pi
+        return np.array([*(one[:2] + share * (two[:2] - one[:2])), one[2] + share * turn])
+
+    def _capture(
+        self, frame: tuple[int, dict[str, int], FloatArray], images: dict[str, NDArray[np.uint8]]
+    ) -> tuple[TimedCapture, FloatArray]:
+        stamp, partners, pose = frame
+        its = {key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS) for key, image in images.items()}
+        capture = Capture(
+            pose,
+            {name: its[f"image:{name}:mono"] for name, _, _ in self.rig.cameras},
+            {
+                name: StereoFrame(its[f"image:{name}:left"], its[f"image:{name}:right"])
+                for name, _, _ in self.rig.stereo_cameras
+            },
+            {name: self._scans[name][partners[f"scan:{name}"]] for name, _, _ in self.rig.lasers},
+        )
+        return TimedCapture(self.start + (stamp - self._stamps["pose"][0]) / 1e9, capture), pose
+
+    def _decoded(self, key: str, message: Any, index: int) -> NDArray[np.uint8]:
+        """Return an image, (h, w, 3) RGB, without distortion."""
+        where = f"{self.path}: {self._streams[key].topic}: image {index + 1}"
+        image = (
+            decode_image(bytes(message.data), where) if hasattr(message, "format") else _raw(message, where)
+        )
+        image = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
+        name = key.split(":")[1]
+        camera = next(
+            c for n, c in (
+                *((n, c) for n, c, _ in self.rig.cameras), *((n, s.camera) for n, s, _ in self.rig.stereo_cameras),
+            ) if n == name
+        )  # fmt: skip
+        if image.shape[:2] != (camera.height, camera.width):
+            raise InputError(
+                f"{where} is {image.shape[1]}×{image.shape[0]} px, want {camera.width}×{camera.height} as calibrated"
+            )
+        lens = self._lenses.get(key)
+        if lens is not None and lens.distortion:
+            image = np.asarray(cv2.undistort(image, camera.matrix, np.array(lens.distortion)))
+        return image
+
+    @contextmanager
+    def _messages_open(
+        self,
+    ) -> Iterator[tuple[dict[str, str], Callable[[set[str]], Iterator[tuple[str, int, Any]]]]]:
+        """Open the recording: yield the type of each topic, and a function that reads the messages of some."""
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
+        from rosbags.typesys import Stores, get_typestore
+
+        if not self.path.exists():
+            raise InputError(f"{self.path}: No such file or directory")
+        is_ros1 = self.path.suffix == ".bag"
+        # Types are those of ROS, not what the file says they are.
+        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
+        deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
+
+        with self._in_words():
+            reader: Any = (Reader1 if is_ros1 else Reader2)(self.path)
+            reader.open()
+        try:
+
+            def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
+                chosen = [c for c in reader.connections if c.topic in topics]
+                found = reader.messages(connections=chosen) if chosen else iter(())
+                while True:
+                    with self._in_words():
+                        one = next(found, None)
+                        message = None if one is None else deserialize(one[2], one[0].msgtype)
+                    if one is None:
+                        return
+                    yield one[0].topic, one[1], message
+
+            yield {c.topic: c.msgtype for c in reader.connections}, messages
+        finally:
+            reader.close()
+
+    @contextmanager
+    def _in_words(self) -> Iterator[None]:
+        """Turn errors of the library, which are of many kinds for damaged files, into one."""
+        try:
+            yield
+        except InputError:
+            raise
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            raise InputError(
+                f"{self.path}: is no whole recording ({reason:.200}); want {', '.join(SUFFIXES)} or a rosbag's folder"
+            ) from error
+
+
+def map_drive(
+    drive: RecordedDrive,
+    lot: ParkingLot,
+    detector: str | Detector | None = None,
+    every: float = 0.0,
+    on_frame: Callable[[], None] = lambda: None,
+) -> MappedDrive:
+    """Run the perception pipeline and the mapping on a recorded drive.
+
+    Args:
+        drive: the recording.
+        lot: the lot with the slots.
+        detector: as in `make_detector`.
+        every: m, least distance between captures.
+        on_frame: called after every capture.
+
+    Raises:
+        InputError: see `RecordedDrive` and `make_detector`.
+    """
+    pipeline, slots = PerceptionPipeline(drive.rig, lot, detector), SlotFilter(lot)
+    low_x, low_y, high_x, high_y = lot.bounds()
+    grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
+    cars = [np.empty((0, 3))]
+    frames = 0
+    for captured, vehicle in drive.captures(every):
+        result = pipeline.process(captured, slots, vehicle)
+        for view in result.views:
+            update_grid(grid, view, vehicle)
+            cars.append(view.cars.poses)
+        frames += 1
+        on_frame()
+    states = slots.states()
+    p = np.where(states.in_view, states.p_occupied, np.nan)
+    rig, weather = (drive.head.rig, drive.head.weather) if drive.head else ("recorded", "unknown")
+    session = Session(drive.key, drive.start, rig, weather, p, np.concatenate(cars))
+    return MappedDrive(session, states, grid, frames)
+
+
+def record_drive(survey: Survey, number: int, path: Path) -> None:
+    """Drive a survey session, and write what its sensors measure to an MCAP file.
+
+    Raises:
+        InputError: see `recording`.
+    """
+    with recording(path, survey.pipeline.rig) as writer:
+        driven = survey.drive(
+            number, on_frame=lambda frame: writer.add(frame.result.captured, frame.result.vehicle)
+        )
+        its = driven.session
+        writer.close(Head(its.key, its.time, its.rig, its.weather))
+
+
+def _stamp_of(message: Any, recorded: int) -> int:
+    """Return the time of a message, ns."""
+    header = getattr(message, "header", None)
+    return recorded if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+def _pose_of(message: Any) -> tuple[float, float, float]:
+    if hasattr(message, "theta"):
+        return float(message.x), float(message.y), float(message.theta)
+    pose = message.pose if hasattr(message.pose, "position") else message.pose.pose
+    q, at = pose.orientation, pose.position
+    yaw = math.atan2(2.0 * (q.w * q.z + q.x * q.y), 1.0 - 2.0 * (q.y * q.y + q.z * q.z))
+    return float(at.x), float(at.y), yaw
+
+
+def _nearest(stamps: IntArray, stamp: int) -> int:
+    """Return the index of the nearest stamp, the earlier one of two."""
+    after = int(np.searchsorted(stamps, stamp))
+    if after == len(stamps) or (after and stamp - stamps[after - 1] <= stamps[after] - stamp):
+        return after - 1
+    return after
+
+
+def _raw(message: Any, where: str) -> NDArray[np.uint8]:
+    """Return an uncompressed image."""
+    channels = {"rgb8": 3, "bgr8": 3, "mono8": 1, "8UC1": 1, "8UC3": 3}.get(message.encoding)
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    if channels is None:
+        raise InputError(f"{where}: encoding is {message.encoding!r:.40}, want rgb8, bgr8 or mono8")
+    data = np.frombuffer(bytes(message.data), np.uint8)
+    if step < width * channels or height * step > len(data) or not height * width:
+        raise InputError(f"{where}: has {len(data):,} bytes for {width}×{height} px of {message.encoding}")
+    image = (
+        data[: height * step].reshape(height, step)[:, : width * channels].reshape(height, width, channels)
+    )
+    if channels == 1:
+        return image[..., 0]
+    return np.ascontiguousarray(image[..., ::-1] if message.encoding in ("bgr8", "8UC3") else image)

@@ -1,0 +1,121 @@
+"""Decode what networks of the YOLO and DETR kinds put out: boxes and P(car), in pixels of the network's input."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+
+Float32Array = NDArray[np.float32]
+
+Layout = Literal["yolo", "yolo5", "boxes", "detr"]
+Scores = Literal["probabilities", "logits", "softmax"]
+
+BOXES_MOST = 1_000  # most rows of a network that suppresses non-maxima itself
+_STRIDES = (8, 16, 32, 64)
+
+
+def guess_layout(shapes: Sequence[tuple[int, ...]], size: tuple[int, int]) -> Layout | None:
+    """Return the layout that outputs of these shapes can only have; None where they could have several.
+
+    Networks of the YOLO kind have a row (three before version 8) for every cell of grids of 8, 16, 32 and sometimes 64
+    pixels over the input.
+
+    Args:
+        shapes: shape of each output.
+        size: width and height of the input, px.
+
+    Examples:
+        >>> guess_layout([(1, 84, 8400)], (640, 640)), guess_layout([(1, 25200, 85)], (640, 640))
+        ('yolo', 'yolo5')
+        >>> guess_layout([(1, 300, 6)], (640, 640)), guess_layout([(1, 100, 92), (1, 100, 4)], (800, 800))
+        ('boxes', 'detr')
+    """
+    if any(len(shape) != 3 or shape[0] != 1 for shape in shapes):
+        return None
+    if len(shapes) == 2:
+        (_, n, a), (_, m, b) = shapes
+        return "detr" if n == m and (a == 4) != (b == 4) else None
+    if len(shapes) != 1:
+        return None
+    _, rows, columns = shapes[0]
+    cells = [math.ceil(size[0] / s) * math.ceil(size[1] / s) for s in _STRIDES]
+    grids = (sum(cells[:3]), sum(cells))
+    if columns in grids and rows > 4:
+        return "yolo"
+    if columns > 5 and rows in [3 * n for n in grids]:
+        return "yolo5"
+    if columns == 6 and rows <= BOXES_MOST and rows not in grids:
+        return "boxes"
+    return None
+
+
+def class_columns(layout: Layout, shapes: Sequence[tuple[int, ...]], grid: bool) -> int | None:
+    """Return the number of class scores of a row; None for `boxes`, which has the winning class instead.
+
+    Args:
+        layout: the layout.
+        shapes: shape of each output.
+        grid: for `yolo`, whether a candidate is a column (1, 4 + classes, n), not a row.
+
+    Raises:
+        InputError: the layout does not fit the shapes; the message says what it wants.
+    """
+    fits = all(len(shape) == 3 and shape[0] == 1 for shape in shapes)
+    if layout == "detr":
+        if fits and len(shapes) == 2 and shapes[0][1] == shapes[1][1] and shapes[1][2] == 4:
+            return shapes[0][2]
+        raise InputError("want scores (1, n, classes) and boxes (1, n, 4)")
+    if fits and len(shapes) == 1:
+        _, rows, columns = shapes[0]
+        width = rows if layout == "yolo" and grid else columns
+        if layout == "boxes" and width == 6:
+            return None
+        if layout == "yolo" and width > 4:
+            return width - 4
+        if layout == "yolo5" and width > 5:
+            return width - 5
+    wanted = {"yolo": "(1, 4 + classes, n)", "yolo5": "(1, n, 5 + classes)", "boxes": "(1, n, 6)"}
+    raise InputError(f"want one output {wanted[layout]}")
+
+
+def decode(
+    outputs: Sequence[Float32Array], layout: Layout, cars: Sequence[int], scores: Scores, *, grid: bool
+) -> tuple[Float32Array, Float32Array]:
+    """Return the boxes, (n, 4) as the network gives them, and P(car) of each, (n,).
+
+    P(car) is the greatest score of the classes that are cars; of `yolo5` times the objectness.
+
+    Args:
+        outputs: the outputs; of `detr` the scores first.
+        layout: their layout.
+        cars: the classes that are cars.
+        scores: what the scores are.
+        grid: for `yolo`, whether a candidate is a column.
+    """
+    if layout == "boxes":
+        rows = outputs[0][0]
+        is_car = np.isin(np.rint(rows[:, 5]), cars)
+        return rows[:, :4], np.where(is_car, _probability(rows[:, 4:5], scores)[:, 0], np.float32(0.0))
+    chosen = list(cars)
+    if layout == "detr":
+        return outputs[1][0], _probability(outputs[0][0], scores)[:, chosen].max(axis=1)
+    rows = outputs[0][0].T if layout == "yolo" and grid else outputs[0][0]
+    if layout == "yolo":
+        return rows[:, :4], _probability(rows[:, 4:], scores)[:, chosen].max(axis=1)
+    objectness = _probability(rows[:, 4:5], "logits" if scores == "logits" else "probabilities")[:, 0]
+    return rows[:, :4], objectness * _probability(rows[:, 5:], scores)[:, chosen].max(axis=1)
+
+
+def _probability(values: Float32Array, scores: Scores) -> Float32Array:
+    if scores == "logits":
+        return np.asarray(1.0 / (1.0 + np.exp(-np.clip(values, -80.0, 80.0))), dtype=np.float32)
+    if scores == "softmax":
+        power = np.exp(values - values.max(axis=1, keepdims=True))
+        return np.asarray(power / power.sum(axis=1, keepdims=True), dtype=np.float32)
+    return values

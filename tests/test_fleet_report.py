@@ -1,0 +1,165 @@
+"""The report of a fleet: its data are the run's, its replay the days of the run."""
+
+import itertools
+import json
+import shutil
+
+import jsonschema
+import numpy as np
+import pytest
+from command_line import parkenv
+from test_report import data_of
+
+from parkenv import make_scenario
+from parkenv.cli.arguments import Machines
+from parkenv.cli.report import Replays, make_report
+from parkenv.errors import InputError
+from parkenv.evaluation.experiments.spec import FleetSpec
+from parkenv.evaluation.fleet.experiment import FleetExperiment
+from parkenv.evaluation.report.fleet_recording import DRIVE, FAIL, QUEUE, choose_days
+from parkenv.evaluation.report.page import SCHEMA
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Two days on a small lot, with their report."""
+    out = tmp_path_factory.mktemp("report") / "fleet"
+    done = parkenv(
+        "fleet", "--scenario", "mini", "--hours", "08:00-08:30", "--arrivals-per-hour", "20,40", "--share", "0.5,1",
+        "--knows", "own,reserve", "-n", 2, "--jobs", 1, "--out", out, "--report",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+def test_the_data_keep_to_the_schema_and_replay_the_days_of_the_run(run):
+    data = data_of(run / "report.html")
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    assert data["run"]["title"] == "Many cars on mini"
+    assert len(data["run"]["findings"]) == 2
+    assert "the price of anarchy is" in data["run"]["findings"][0]
+    assert len(data["fleets"]) == 8
+    assert all(its["agrees"] for its in data["fleets"])
+    settings = [
+        (its["knows"], its["share"], its["arrivals_per_hour"]) for its in data["fleets"] if its["day"] == 0
+    ]
+    assert settings == [
+        (k, s, a) for a in (20, 40) for k, s in (("own", 0), ("reserve", 0.5), ("reserve", 1))
+    ]
+
+
+def test_cars_drive_along_the_lanes_and_no_slot_holds_two(run):
+    lot = make_scenario("mini").lot
+    for its in data_of(run / "report.html")["fleets"]:
+        edges = {(v, int(t)) for v in range(lot.n_vertices) for t in lot.neighbors[v] if t >= 0}
+        occupied = [[] for _ in range(lot.n_slots)]
+        for slot, leaves in zip(its["residents"][::2], its["residents"][1::2], strict=True):
+            occupied[slot].append((0, leaves))
+        for track, arrival, ended, slot, leaves in zip(
+            *(its[name] for name in ("tracks", "arrival", "ended", "slot", "leaves")), strict=True
+        ):
+            assert arrival + sum(track[1::2]) == ended
+            vertices = [track[0], *(code >> 2 for code in track[2::2])]
+            kinds = [code & 3 for code in track[2::2]]
+            for before, after, kind in zip(vertices, vertices[1:], kinds, strict=False):
+                assert (before == after) == (kind != DRIVE)
+                # Straight stretches are one line.
+                offset = lot.vertex_xy[after] - lot.vertex_xy[before]
+                assert kind != DRIVE or (before, after) in edges or min(abs(offset)) < 0.3
+            if slot >= 0:
+                assert vertices[-1] == slot
+                occupied[slot].append((ended, leaves))
+        for stays in occupied:
+            stays.sort()
+            assert all(one[1] <= two[0] for one, two in itertools.pairwise(stays))
+
+
+def test_failed_attempts_and_queues_are_on_the_track(monkeypatch):
+    spec = FleetSpec().changed(
+        scenario={"lot": "mini", "arrivals": {"hours": "08:00-08:30"}}, agents=["first-free"], knows=["own"],
+        arrivals_per_hour=[120], days=1,
+    )  # fmt: skip
+    experiment = FleetExperiment(spec)
+    make = FleetExperiment.fleet
+
+    def with_queues(self, setting):
+        fleet, agents = make(self, setting)
+        fleet.records["manoeuvre_s"] = 6.0
+        return fleet, agents
+
+    monkeypatch.setattr(FleetExperiment, "fleet", with_queues)
+    (day,) = choose_days(experiment, experiment.settings, 1)
+    its = day.record({})["fleet"]
+    fleet, agents = experiment.fleet(experiment.settings[0])
+    fleet.keep_steps()
+    fleet.reset(0, 0)
+    fleet.run(agents)
+    cars = fleet.cars
+    time_of = {kind: np.zeros(len(cars)) for kind in (FAIL, QUEUE)}
+    for car, track in enumerate(its["tracks"]):
+        for elapsed, code in zip(track[1::2], track[2::2], strict=True):
+            if code & 3 in time_of:
+                time_of[code & 3][car] += elapsed / 100
+    assert np.allclose(time_of[FAIL], cars["failed_s"], atol=0.1)
+    assert np.allclose(time_of[QUEUE], cars["queued_s"], atol=0.5)
+    assert cars["queued_s"].max() > 0.0
+    steps = fleet.steps
+    assert len(steps) == (cars["n_steps"] - (cars["slot"] >= 0)).sum()
+    assert (np.diff(steps["begin"]) >= 0.0).all()
+
+
+def test_days_and_agents_can_be_chosen(run, tmp_path):
+    made = tmp_path / "chosen.html"
+    make_report(run, Machines(jobs=1), Replays(replay="1", agents="greedy-drive"), out=made)
+    assert [its["day"] for its in data_of(made)["fleets"]] == [1] * 6
+    make_report(run, Machines(jobs=1), Replays(episodes=0), out=made)
+    assert data_of(made)["fleets"] == []
+    for options, message in (
+        ({"replay": "2"}, "--replay has 2; this run's are 0 to 1"),
+        ({"agents": "belief"}, "--agents has 'belief'; known: greedy-drive"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_report(run, Machines(jobs=1), Replays(**options), out=made)
+
+
+def test_a_day_that_differs_from_the_results_is_noted(run, tmp_path):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    days = (copy / "days.csv").read_text().splitlines()
+    cells = days[1].split(",")
+    cells[days[0].split(",").index("total_s")] = "1.0"
+    (copy / "days.csv").write_text("\n".join([days[0], ",".join(cells), *days[2:]]) + "\n")
+    done = parkenv("report", copy, "--episodes", 1, "--jobs", 1)
+    assert done.returncode == 0
+    assert "days.csv says 1.00 s" in " ".join(done.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("file", "old", "new", "message"),
+    [
+        ("days.csv", ",own,", ",own,x", "want a number"),
+        ("days.csv", "total_s", "time_s", "not written by this version of parkenv"),
+        ("summary.json", '"knows": "own"', '"knows": "all"', "is not as a command wrote it"),
+        ("summary.json", '"occupancy": ', '"occupancy": "full", "x": ', "is not as a command wrote it"),
+        ("experiment.json", '"delay_s": 0.0', '"delay_s": -1.0', "There is no replay"),
+    ],
+)
+def test_a_damaged_folder_is_refused_in_a_line(run, tmp_path, file, old, new, message):
+    copy = shutil.copytree(run, tmp_path / "copy")
+    text = (copy / file).read_text()
+    assert old in text
+    (copy / file).write_text(text.replace(old, new))
+    done = parkenv("report", copy, "--jobs", 1)
+    said = " ".join((done.stdout + done.stderr).split())
+    assert message in said
+    assert done.returncode == (0 if "There is no replay" in message else 2)
+    assert len(done.stderr.splitlines()) == (done.returncode == 2)
+
+
+def test_days_with_too_many_cars_are_not_replayed(run, tmp_path, monkeypatch):
+    monkeypatch.setattr("parkenv.evaluation.report.repetition.MOST_CARS", 15)
+    make_report(run, Machines(jobs=1), out=tmp_path / "page.html")
+    data = data_of(tmp_path / "page.html")
+    assert {its["arrivals_per_hour"] for its in data["fleets"]} == {20.0}
+    assert data["run"]["notes"] == [
+        "days with 40 cars an hour have more than the 15 cars that are drawn: no replay"
+    ]

@@ -1,0 +1,286 @@
+"""Recorded drives: there and back through MCAP, poses between messages, and recordings that are refused."""
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+from command_line import parkenv
+
+from parkenv import InputError, make_scenario
+from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.recorded_drive import Head, RecordedDrive, map_drive, recording
+from parkenv.mapping.store import MapStore
+from parkenv.perception.capture import TimedCapture
+from parkenv.perception.detector import Detections
+from sim_sensors.camera.models import Frame
+from sim_sensors.rig import Capture, SensorRig
+
+pytest.importorskip("rosbags.rosbag2", reason="the extra bags is not installed")
+
+WIDTH, HEIGHT = 64, 48
+START = 345_600 * 10**9 + 9 * 3600 * 10**9  # Monday 9:00 of Unix time, ns
+TENTH = 10**8
+CALIBRATION = """
+pose = "/odom"
+timezone_h = 1.0
+[[cameras]]
+name = "right"
+topic = "/camera"
+width = 64
+height = 48
+fx = 32.0
+fy = 32.0
+cx = 32.0
+cy = 24.0
+mount = { z = 1.3, yaw = -90.0 }
+[[lasers]]
+name = "front"
+topic = "/scan"
+mount = { z = 0.5 }
+"""
+
+
+class Nothing:
+    """Finds no car."""
+
+    def detect(self, image):
+        return Detections(np.zeros((0, 4)), np.zeros(0))
+
+
+def image(k):
+    picture = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    picture[:, : 5 * k + 1] = (10 * k, 200, 50)
+    return picture
+
+
+def bag(
+    folder,
+    poses=11,
+    pictures=5,
+    scans=11,
+    pose_type="nav_msgs/msg/Odometry",
+    shift=None,
+    order=None,
+    raw=True,
+):
+    """Write a rosbag of somebody's car: poses every 0.1 s, pictures every 0.2 s, scans 0.02 s after poses."""
+    from rosbags.rosbag2 import StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    t = store.types
+    shift = shift or {}
+
+    def header(stamp):
+        return t["std_msgs/msg/Header"](t["builtin_interfaces/msg/Time"](*divmod(stamp, 10**9)), "")
+
+    def pose(stamp, k):
+        yaw = math.pi - 0.05 + 0.01 * k
+        point = t["geometry_msgs/msg/Point"](0.3 * k, 1.0, 0.0)
+        turned = t["geometry_msgs/msg/Quaternion"](0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))
+        at = t["geometry_msgs/msg/Pose"](point, turned)
+        if pose_type.endswith("PoseStamped"):
+            return t[pose_type](header(stamp), at)
+        none = t["geometry_msgs/msg/Vector3"](0.0, 0.0, 0.0)
+        zeros = np.zeros(36)
+        twist = t["geometry_msgs/msg/TwistWithCovariance"](t["geometry_msgs/msg/Twist"](none, none), zeros)
+        return t[pose_type](header(stamp), "", t["geometry_msgs/msg/PoseWithCovariance"](at, zeros), twist)
+
+    def picture(stamp, k):
+        if raw:
+            return t["sensor_msgs/msg/Image"](
+                header(stamp), HEIGHT, WIDTH, "bgr8", 0, 3 * WIDTH, image(k)[..., ::-1].ravel()
+            )
+        data = cv2.imencode(".png", image(k)[..., ::-1])[1].ravel()
+        return t["sensor_msgs/msg/CompressedImage"](header(stamp), "png", data)
+
+    def scan(stamp, k):
+        ranges = np.array([0.0, 2.0 + k, np.nan, 40.0, 5.0], np.float32)
+        return t["sensor_msgs/msg/LaserScan"](
+            header(stamp), -1.0, 1.0, 0.5, 0.0, 0.0, 0.1, 30.0, ranges, np.zeros(0, np.float32)
+        )
+
+    image_type = f"sensor_msgs/msg/{'Image' if raw else 'CompressedImage'}"
+    kinds = {
+        "/odom": (pose_type, poses, TENTH, 0, pose),
+        "/camera": (
+            image_type,
+            pictures,
+            2 * TENTH,
+            TENTH // 4,
+            picture,
+        ),
+        "/scan": ("sensor_msgs/msg/LaserScan", scans, TENTH, TENTH // 5, scan),
+    }
+    with Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        for topic, (kind, count, every, late, make) in kinds.items():
+            if not count:
+                continue
+            connection = writer.add_connection(topic, kind, typestore=store)
+            for i, k in enumerate((order or {}).get(topic, range(count))):
+                begin = START + late + int(shift.get(topic, 0) * 1e9)
+                message = make(begin + k * every, k)
+                writer.write(connection, begin + i * every, store.serialize_cdr(message, kind))
+    return next(folder.glob("*.mcap"))
+
+
+def calibrated(tmp_path, text=CALIBRATION):
+    (tmp_path / "car.toml").write_text(text)
+    return DriveCalibration.read(tmp_path / "car.toml")
+
+
+@pytest.mark.parametrize(
+    ("raw", "pose_type"), [(True, "nav_msgs/msg/Odometry"), (False, "geometry_msgs/msg/PoseStamped")]
+)
+def test_a_bag_of_somebodys_car_becomes_captures(tmp_path, raw, pose_type):
+    file = bag(tmp_path / "bag", raw=raw, pose_type=pose_type)
+    drive = RecordedDrive(file, calibrated(tmp_path))
+    assert drive.start == 10 * 3600.0
+    captures = list(drive.captures())
+    assert len(captures) == 5
+    for k, (captured, pose) in enumerate(captures):
+        # Pictures are taken a quarter between two poses; the heading passes π.
+        x, yaw = 0.3 * (2 * k + 0.25), math.pi - 0.05 + 0.01 * (2 * k + 0.25)
+        assert pose[:2] == pytest.approx([x, 1.0], abs=1e-6)
+        assert math.remainder(pose[2] - yaw, 2 * math.pi) == pytest.approx(0.0, abs=1e-6)
+        assert captured.time == pytest.approx(36_000.025 + 0.2 * k)
+        np.testing.assert_array_equal(captured.capture.images["right"].image, image(k))
+        wanted = np.array([np.inf, 2.0 + 2 * k, np.inf, np.inf, 5.0], np.float32)
+        np.testing.assert_array_equal(captured.capture.scans["front"], wanted)
+    assert len(list(drive.captures(every=1.0))) == 3
+    again = RecordedDrive(tmp_path / "bag", calibrated(tmp_path))  # the folder of the bag
+    np.testing.assert_array_equal(again.poses, drive.poses)
+    moved = calibrated(
+        tmp_path, CALIBRATION.replace("timezone_h", "origin = { x = 5.0, yaw = 90.0 }\ntimezone_h")
+    )
+    np.testing.assert_allclose(
+        RecordedDrive(file, moved).poses[4], [4.0, 1.2, drive.poses[4, 2] + math.pi / 2], atol=1e-9
+    )
+
+
+def test_a_drive_is_mapped(tmp_path):
+    drive = RecordedDrive(bag(tmp_path / "bag"), calibrated(tmp_path))
+    lot = make_scenario("mini").lot
+    found = map_drive(drive, lot, Nothing())
+    assert found.frames == 5
+    assert found.session.p_occupied.shape == (lot.n_slots,)
+    assert (found.session.rig, found.session.weather) == ("recorded", "unknown")
+
+
+def test_what_a_rig_measures_comes_back_to_the_bit(tmp_path):
+    rng = np.random.default_rng(0)
+    rig = SensorRig.thesis()
+    none = np.zeros((0, 0), np.float32), np.zeros((0, 0), np.float32), np.zeros((0, 0), np.int32)
+    made = []
+    for k in range(3):
+        small = rng.integers(0, 256, (12, 16, 3), dtype=np.uint8)
+        picture = cv2.resize(small, (640, 480), interpolation=cv2.INTER_NEAREST)
+        ranges = rng.uniform(0.0, 30.0, 1081).astype(np.float32)
+        ranges[::7] = np.inf
+        pose = rng.normal(0.0, 3.0, 3)
+        capture = Capture(pose, {"right": Frame(picture, *none)}, {}, {"laser": ranges})
+        made.append((TimedCapture(200_000.123456789 + 0.45 * k, capture), pose + 0.01))
+    head = Head("mini/key", 200_000.123456789, "laser", "rain")
+    with recording(tmp_path / "d.mcap", rig) as writer:
+        for captured, pose in made:
+            writer.add(captured, pose)
+        writer.close(head)
+    drive = RecordedDrive(tmp_path / "d.mcap")
+    assert drive.head == head
+    assert drive.rig == rig
+    back = list(drive.captures())
+    assert len(back) == 3
+    for (captured, pose), (was, at) in zip(back, made, strict=True):
+        np.testing.assert_array_equal(pose, at)
+        np.testing.assert_array_equal(
+            captured.capture.images["right"].image, was.capture.images["right"].image
+        )
+        np.testing.assert_array_equal(captured.capture.scans["laser"], was.capture.scans["laser"])
+    assert {path.name for path in tmp_path.iterdir()} == {"d.mcap"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (
+            {"poses": 0},
+            r"has no poses in /odom, want .*Odometry; it has /camera \(sensor_msgs/msg/Image\), /scan",
+        ),
+        ({"scans": 0}, r"has no scans in /scan, want sensor_msgs/msg/LaserScan"),
+        (
+            {"shift": {"/odom": 100.0}},
+            r"/camera ends at .* before /odom begins at .*: do their clocks agree\?",
+        ),
+        (
+            {"shift": {"/scan": -3.0}},
+            r"/scan ends at .* before /.* begins at .*; want streams that overlap in time",
+        ),
+        (
+            {"order": {"/odom": [0, 1, 3, 2, 4]}},
+            r"/odom: time goes from .* to .* s at message 4, want it to rise",
+        ),
+        (
+            {"order": {"/camera": [0, 2, 2]}},
+            r"/camera: time goes from .* to .* s at message 3, want it to rise",
+        ),
+    ],
+)
+def test_clocks_and_topics_that_do_not_fit_are_named_in_a_line(tmp_path, options, message):
+    file = bag(tmp_path / "bag", **options)
+    with pytest.raises(InputError, match=message) as caught:
+        RecordedDrive(file, calibrated(tmp_path))
+    assert str(caught.value).startswith(str(file))
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_recordings_are_refused_in_a_line(tmp_path):
+    whole = bag(tmp_path / "bag").read_bytes()
+    calibration = calibrated(tmp_path)
+    file = tmp_path / "bad.mcap"
+    for content in (b"", b"I am text", whole[:100], whole[: len(whole) // 2], whole[:-20]):
+        file.write_bytes(content)
+        with pytest.raises(
+            InputError, match=r"bad\.mcap: is no whole recording \(.*\); want \.mcap"
+        ) as caught:
+            list(RecordedDrive(file, calibration).captures())
+        assert "\n" not in str(caught.value)
+    file.write_bytes(whole)
+    for path, given, message in (
+        (file, None, "is no recording of parkenv survey --record; describe its sensors"),
+        (tmp_path / "none.mcap", None, "none.mcap: No such file"),
+        (tmp_path / "car.toml", None, "car.toml: is no whole recording"),
+    ):
+        with pytest.raises(InputError, match=message):
+            RecordedDrive(path, given)
+    with pytest.raises(InputError, match=r"/camera: image 1 is 64×48 px, want 96×48 as calibrated"):
+        list(RecordedDrive(file, calibrated(tmp_path, CALIBRATION.replace("64", "96"))).captures())
+    with pytest.raises(InputError, match=r"car\.toml: has no camera, or nothing to measure distances"):
+        RecordedDrive(file, calibrated(tmp_path, CALIBRATION.partition("[[lasers]]")[0]))
+    with pytest.raises(InputError, match=r"car\.toml: cameras\.0\.fx is -1\.0, want a number above 0"):
+        calibrated(tmp_path, CALIBRATION.replace("fx = 32.0", "fx = -1.0"))
+    done = parkenv("survey", "--scenario", "mini", "--record", tmp_path / "x.bag", "--out", tmp_path / "s")
+    assert "x.bag: want a name that ends in .mcap" in " ".join(done.stderr.split())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("rig", ["laser", "stereo"])
+def test_a_recorded_survey_gives_the_same_map_to_the_last_bit(tmp_path, rig):
+    file, words = tmp_path / "drive.mcap", ("--scenario", "mini")
+    driven = ("--sessions", 1, "--every", 5, "--pose-noise", 0.1, "--rig", rig, "--jobs", 1, "--record", file)
+    done = parkenv("survey", *words, *driven, "--out", tmp_path / "survey")
+    assert done.returncode == 0, done.stderr
+    done = parkenv("map-drive", file, *words, "--out", tmp_path / "mapped")
+    assert done.returncode == 0, done.stderr
+    lot = make_scenario("mini").lot
+    sessions = []
+    for folder in ("survey", "mapped"):
+        with MapStore(tmp_path / folder / "map.sqlite", lot, create=False) as store:
+            sessions += store.sessions()
+    one, two = sessions
+    assert (one.key, one.time, one.rig, one.weather) == (two.key, two.time, two.rig, two.weather)
+    np.testing.assert_array_equal(one.p_occupied, two.p_occupied)
+    np.testing.assert_array_equal(one.cars, two.cars)
+    assert len(one.cars) > 1
+    again = parkenv("map-drive", file, *words, "--out", tmp_path / "mapped")
+    assert "holds the drive" in " ".join(again.stderr.split())
