@@ -3,7 +3,6 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from parkenv.evaluation.fleet.spec import FleetSpec
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.day_belief import DayBelief, RivalRates
@@ -11,6 +10,7 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.envs.fleet_rules import RULES
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.spec import FleetSpec
 from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
