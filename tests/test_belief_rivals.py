@@ -7,13 +7,10 @@ import pytest
 from parkenv import InputError, make_scenario
 from parkenv.belief.day_belief import DayBelief, RivalRates
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.envs.fleet import DriverKind, Fleet
-from parkenv.envs.fleet_rules import RULES
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.spec import FleetSpec
 from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.lot import PARK
 from planners import make_agent
 from planners.belief.rivals import PASSED, _take_rates
@@ -119,18 +116,3 @@ def test_an_experiment_tells_it_the_demand():
     for name, rate in (("belief-rivals", 120.0), ("belief-rivals(arrivals_per_hour=30)", 30.0)):
         _, (agent, _) = its.fleet(Setting(AgentSpec.of(name), "own", 0.0, 120.0))
         assert agent.arrivals_per_hour == rate
-
-
-@pytest.mark.slow
-def test_in_a_crowd_it_is_faster_than_belief():
-    scenario = make_scenario("campus")
-    begin = scenario.arrival.start_s
-    demand = Demand(PoissonArrivals(160.0, begin, begin + 1800.0), ExponentialTime(3600.0))
-    total_s = {}
-    for name, options in (("belief", {}), ("belief-rivals", {"arrivals_per_hour": 160.0})):
-        fleet = Fleet(scenario, demand, drivers=[DriverKind(), DriverKind(0.0, RULES["greedy-drive"])])
-        fleet.reset(0, 100)
-        fleet.run([make_agent(name, scenario, budget_ms=0.1, **options), None])
-        cars = fleet.cars
-        total_s[name] = sum(cars[term].mean() for term in ("drive_s", "failed_s", "walk_s", "gave_up_s"))
-    assert total_s["belief-rivals"] < total_s["belief"]
