@@ -85,6 +85,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
         "lots": [],
         "worlds": [],
         "drives": [],
+        "fleets": [],
     }  # fmt: skip
 
 
