@@ -65,7 +65,7 @@ STAGES = (
     ),
     Stage("ruff", ".venv/bin/ruff check . && .venv/bin/ruff format --check .", needs=("README: install",)),
     Stage("README: tests", TESTS, needs=("README: install", "browser", "ruff"), cores=CORES),
-    Stage("slow tests", ".venv/bin/pytest -n auto -m slow", needs=("README: tests",), cores=CORES),
+    Stage("slow tests", ".venv/bin/pytest -n auto -m slow tests", needs=("README: tests",), cores=CORES),
     Stage("mypy", ".venv/bin/mypy", needs=("README: tests",)),
     Stage(
         "documentation",
@@ -108,17 +108,21 @@ STAGES = (
         needs=("README: tests",),
     ),
     # They warn of what newer ones have mended. Every module is imported; then what each library is used for, in tests
-    # that compile little: their version of numba has everything to compile again.
+    # that compile little: their version of numba has everything to compile again. Of two processes each begins with one
+    # half of the tests, so what compiles the same stands together.
     Stage(
         "oldest versions: tests",
         """
         oldest=("$SCRATCH/oldest/bin/pytest" -p no:cacheprovider -W ignore::DeprecationWarning)
         "${oldest[@]}" --collect-only -qq
-        "${oldest[@]}" -n auto tests/test_{compilation,lot,lot_files,mapping,figures,hog,drive_env}.py \\
+        "${oldest[@]}" -n auto \\
+            tests/test_training.py::test_a_resumed_training_equals_an_unbroken_one \\
             "tests/test_search_env.py::test_every_id_passes_the_checker_without_a_warning[mini-parkenv/Search-v2]" \\
             tests/test_compare.py::test_figures_and_occupancy_levels \\
+            tests/test_{compilation,lot_files,hog,lot}.py \\
+            --deselect tests/test_lot_files.py::test_commands_state_parking_costs_and_draw_them \\
             tests/test_survey.py::test_survey_and_map_on_the_command_line \\
-            tests/test_training.py::test_a_resumed_training_equals_an_unbroken_one
+            tests/test_{mapping,figures,drive_env}.py
         """,
         needs=("oldest versions: install", "README: tests"),
         cores=CORES,

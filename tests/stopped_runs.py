@@ -16,6 +16,7 @@ import uuid
 from pathlib import Path
 
 from command_line import parkenv
+from few_searches import few_searches
 
 from parkenv.evaluation.training.rl_training import MODEL
 
@@ -23,7 +24,7 @@ COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
     "fleet": "fleet --scenario mini --hours 08:00-09:00 --agents first-free(within_m=100) --knows own "
     "--arrivals-per-hour 20 -n 40 --no-figures",
-    "survey": "survey --scenario mini --sessions 3 --every 6",
+    "survey": "survey --scenario mini --sessions 3 --every 12",
     "calibrate": "calibrate --scenario mini -n 3",
     "benchmark": "benchmark run v1 --agents first-free",
     "train": "train ppo --scenario mini --steps 16000 --trainings 2 --evaluate-every 4000 --evaluation-episodes 16 "
@@ -40,12 +41,16 @@ class Run:
 
     def __init__(self, name, out, *options):
         script = out.with_name("parkenv")
-        script.write_text("from parkenv.cli import main\nif __name__ == '__main__':\n    main()\n")
+        script.write_text(
+            "from parkenv.cli import main\nfrom few_searches import few_searches\n"
+            "if __name__ == '__main__':\n    with few_searches():\n        main()\n"
+        )
+        path = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
         self.mark = f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
         self.started = time.monotonic()
         self.process = subprocess.Popen(
             [sys.executable, script, *COMMANDS[name].split(), "--jobs", "2", "--out", out, *options],
-            env=dict([*os.environ.items(), self.mark.split("=")]),
+            env={**os.environ, "PYTHONPATH": path} | dict([self.mark.split("=")]),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -88,7 +93,8 @@ class Run:
 
 def finished(name, out, *options):
     """Run a command to its end, in this process; other workers, same result."""
-    done = parkenv(*COMMANDS[name].split(), "--jobs", 1, "--out", out, *options)
+    with few_searches():
+        done = parkenv(*COMMANDS[name].split(), "--jobs", 1, "--out", out, *options)
     assert done.returncode == 0, (done.stdout, done.stderr)
 
 

@@ -82,7 +82,8 @@ def test_the_code_of_a_page_runs_from_top_to_bottom(name, tmp_path):
     done = subprocess.run(
         [sys.executable, "-c", f"from command_line import parkenv as run_parkenv\n{PROGRAMS[name]}"],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": path},
+        # Each core has a test process already: commands work in the page's own.
+        env={**os.environ, "PYTHONPATH": path, "LOKY_MAX_CPU_COUNT": "1"},
         capture_output=True,
         text=True,
         timeout=1800,

@@ -527,9 +527,10 @@ def test_success_is_drawn_by_kind(tmp_path):
 # One on-policy algorithm, and one with a replay buffer.
 @pytest.mark.slow
 @pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algorithm):
+def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, monkeypatch, algorithm):
+    monkeypatch.setitem(DRIVE_CONFIGS, algorithm, FULL_SIZE[algorithm])  # that of the command's own process
     out = tmp_path / "out"
-    steps = 40_000 if algorithm == "ppo" else 4_000
+    steps = 20_000 if algorithm == "ppo" else 4_000  # two rollouts; a thousand steps with updates
     every = steps // 4
     command = [
         "train", algorithm, "--env", "drive", "--lot", "mini", "--steps", str(steps),
@@ -550,7 +551,7 @@ def test_the_command_trains_is_killed_resumes_and_its_models_park(tmp_path, algo
     survived = read_curve(out / "seed_0" / "curve.csv", ("steps", "success"))
     refused = parkenv(*command)
     assert (refused.returncode, "--resume" in refused.stderr) == (2, True)
-    assert parkenv(*command, "--resume").returncode == 0
+    assert parkenv(*command, "--resume", "--jobs", 1).returncode == 0
     curve = read_curve(out / "seed_0" / "curve.csv", ("steps", "success"))
     # What came after the last checkpoint is trained again, and takes another time.
     kept, again = ([row | {"wall_s": 0.0} for row in rows[: len(survived)]] for rows in (survived, curve))

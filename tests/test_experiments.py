@@ -212,7 +212,7 @@ def test_the_documentation_says_how_files_are_refused(tmp_path, kind, text, answ
 def test_the_examples_of_the_documentation_are_run(tmp_path):
     sweep = ExperimentSpec.read(COURTYARD / "sweep.toml").changed(episodes=1, jobs=1)
     rows = run_experiment(sweep, tmp_path / "sweep").rows
-    assert len(rows) == 5 * 3 * 3 * 2
+    assert len(rows) == 5 * 3 * 2 * 2
     assert {row["scenario"] for row in rows} == {"courtyard", "mini", "garage"}
     planned = parkenv("plan", "--scenario", COURTYARD / "courtyard.toml", "--out", tmp_path / "plan")
     assert planned.returncode == 0, planned.stderr

@@ -105,7 +105,7 @@ def test_a_path_that_a_terminal_would_obey_is_printed_escaped(tmp_path):
         pytest.param(
             ["sensors", "preview", "--drive", 0, "--weather", "dusk"], ("sensors",), marks=pytest.mark.slow
         ),
-        pytest.param(["survey", "--sessions", 1], ("map", "session"), marks=pytest.mark.slow),
+        pytest.param(["survey", "--sessions", 1, "--every", 12], ("map", "session"), marks=pytest.mark.slow),
         pytest.param(["calibrate", "--episodes", 1, "--jobs", 1], ("calibration",), marks=pytest.mark.slow),
     ],
 )

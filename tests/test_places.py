@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from functools import partial
 
 import gymnasium as gym
 import numpy as np
@@ -15,6 +16,7 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.evaluation.bench.env import grids
 from parkenv.evaluation.experiments.spec import ExperimentSpec, TrainingSpec
+from parkenv.evaluation.training.cloning import clone
 from parkenv.evaluation.training.search_task import SearchTask
 from parkenv.evaluation.training.search_training import SearchTraining, episode_times
 from parkenv.lots import write_lot
@@ -316,6 +318,7 @@ def test_a_curriculum_opens_places_by_size():
 
 
 def small(monkeypatch):
+    """Fewer environments, and searches of at most 60 decisions: an untrained agent drives in circles."""
     import dataclasses
 
     from parkenv.evaluation.training.configs import SEARCH_CONFIGS
@@ -325,6 +328,7 @@ def small(monkeypatch):
         config, n_envs=16, settings={**config.settings, "batch_size": 256, "n_steps": 32}
     )
     monkeypatch.setitem(SEARCH_CONFIGS, "ppo", few)
+    monkeypatch.setattr("parkenv.evaluation.training.search_training.MAX_STEPS", 60)
 
 
 def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
@@ -333,7 +337,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     training = SearchTraining(
         "ppo",
         2_048,
-        512,
+        1_024,
         tuple(PLACES[:4]),
         range(2_000_000, 2_000_024),
         held_out=tuple(PLACES[4:]),
@@ -429,7 +433,8 @@ def test_bad_options_of_held_out_places_are_one_line(tmp_path, options, message)
 
 
 @pytest.mark.slow
-def test_the_command_learns_on_some_places_and_tests_on_others(folder):
+def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
+    monkeypatch.setattr("parkenv.evaluation.training.search_training.clone", partial(clone, updates=50))
     out = folder / "trained"
     done = parkenv(
         "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 20_000, "--trainings", 1,

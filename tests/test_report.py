@@ -340,7 +340,7 @@ def test_intervals_and_nested_figures_become_cells():
 def test_a_survey_is_driven_again(tmp_path):
     out = tmp_path / "survey"
     done = parkenv(
-        "survey", "--scenario", "mini", "--sessions", 2, "--every", 4, "--weather", "sunny", "--jobs", 1, "--out", out,
+        "survey", "--scenario", "mini", "--sessions", 2, "--every", 6, "--weather", "sunny", "--jobs", 1, "--out", out,
         "--report",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
