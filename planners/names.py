@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+EXPECTS_RIVALS = "belief-rivals"
+"""The agent with the option `arrivals_per_hour`: rivals an hour."""
 AGENTS: dict[str, tuple[str, str]] = {
     "mdp": ("planners.thesis.replanning", "ReplanningAgent"),
     "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
@@ -11,6 +13,7 @@ AGENTS: dict[str, tuple[str, str]] = {
     "random": ("planners.greedy", "RandomAgent"),
     "oracle": ("planners.bounds.oracle", "OracleAgent"),
     "belief": ("planners.belief.agent", "BeliefAgent"),
+    EXPECTS_RIVALS: ("planners.belief.rivals", "BeliefRivalsAgent"),
     "network": ("planners.network.agent", "NetworkAgent"),
     "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
     "exact": ("planners.bounds.exact", "ExactAgent"),

@@ -153,11 +153,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     def _search_of(self, near: Neighborhood, belief: SlotBelief) -> BeliefSearch:
         n = near.n_slots
-        known = belief.take(near.slots)
         return BeliefSearch(
             near=near,
             n_unobserved=n,
-            day=DayBelief(known, self._nearness[near.slots], certain=not self._day),
+            day=self._day_belief(near, belief),
             state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
             time=belief.time,
@@ -165,6 +164,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             targets=np.zeros(0, dtype=np.int64),
             paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
         )
+
+    def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:
+        """Return the belief about the day and the slots of a part, before its observations."""
+        return DayBelief(belief.take(near.slots), self._nearness[near.slots], certain=not self._day)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
         """Update the memory, search for the best path, and take its first step or park."""

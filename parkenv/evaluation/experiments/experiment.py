@@ -38,7 +38,7 @@ from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import agent_file, make_agent
 
-NEEDS_OBSERVATIONS = ("belief", "mdp-tuned", "exact", "network")
+NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
 """Agents that require observations of slots before an attempt."""
 MAP_SAYS = "-map-says-"  # separator between the name of a scenario and the constant probability of its map
 

@@ -33,6 +33,7 @@ AGENT_COLORS = {
     "random": "#8c8c8c",
     "oracle": "#000000",
     "belief": "#cc79a7",
+    "belief-rivals": "#661100",
     "exact": "#882255",
     "network": "#44aa99",
     "dqn": "#999933",

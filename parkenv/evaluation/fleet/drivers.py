@@ -19,23 +19,29 @@ from parkenv.world.demand import Demand
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.learned import LearnedAgent
+from planners.names import EXPECTS_RIVALS
 
 Row = dict[str, Any]
 _WITHOUT_NETWORK_RULE = ("recurrent-ppo",)
 
 
-def driver_of(spec: AgentSpec, scenario: Scenario) -> tuple[Rule | None, Any]:
+def driver_of(
+    spec: AgentSpec, scenario: Scenario, arrivals_per_hour: float | None = None
+) -> tuple[Rule | None, Any]:
     """Return the compiled driver of an agent, or else the agent itself, which decides in Python.
 
     Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
     actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
+    An agent that expects rivals is told how many cars arrive in an hour, if that is given, as a forecast of traffic would.
 
     Raises:
         InputError: there is no such agent, or it is none for fleets.
     """
     if not spec.options and spec.name in RULES:
         return RULES[spec.name], None
-    agent = make_agent(spec.name, scenario, **spec.options)
+    expects = spec.name == EXPECTS_RIVALS and arrivals_per_hour is not None
+    told = {"arrivals_per_hour": arrivals_per_hour} if expects else {}
+    agent = make_agent(spec.name, scenario, **told | spec.options)
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
     if isinstance(agent, LearnedAgent) and agent.card.algorithm not in _WITHOUT_NETWORK_RULE:

@@ -138,7 +138,7 @@ class FleetExperiment:
         Raises:
             InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
         """
-        rule, agent = driver_of(setting.agent, self.scenario)
+        rule, agent = driver_of(setting.agent, self.scenario, setting.arrivals_per_hour)
         kinds = [
             DriverKind(setting.share, rule, setting.knows, shares=setting.knows == "shared"),
             DriverKind(1.0 - setting.share, rule, OWN),

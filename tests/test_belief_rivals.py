@@ -1,0 +1,118 @@
+"""The planner that expects rivals: what it prefers, when it is `belief`, and how it is asked."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from parkenv import InputError, make_scenario
+from parkenv.belief.day_belief import DayBelief, RivalRates
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.spec import FleetSpec
+from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
+from parkenv.scenarios.spec import scenario_specs
+from parkenv.world.lot import PARK
+from planners import make_agent
+from planners.belief.rivals import PASSED, _take_rates
+
+
+def actions(agent, scenario, seed):
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    observation, _ = env.reset(seed=seed)
+    chosen, memory, over = [], None, False
+    while not over:
+        action, memory = agent.predict(observation, memory)
+        chosen.append(int(action))
+        observation, _, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+    return chosen
+
+
+def test_without_rivals_it_is_belief_action_for_action():
+    scenario = make_scenario("mini")
+    belief, nobody = (
+        make_agent("belief", scenario),
+        make_agent("belief-rivals", scenario, arrivals_per_hour=0),
+    )
+    for seed in range(3):
+        assert actions(belief, scenario, seed) == actions(nobody, scenario, seed)
+
+
+def test_equal_seeds_give_equal_actions_and_batches_are_single_predictions():
+    scenario = make_scenario("mini")
+    agent = make_agent("belief-rivals", scenario)
+    assert actions(agent, scenario, 3) == actions(make_agent("belief-rivals", scenario), scenario, 3)
+    observations = [gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=seed)[0] for seed in range(4)]
+    batch = {name: np.stack([one[name] for one in observations]) for name in observations[0]}
+    together, _ = agent.predict(batch)
+    assert together.tolist() == [int(agent.predict(one)[0]) for one in observations]
+
+
+def in_view_of_a_free_slot(scenario):
+    """A car beside a free slot; nearer to the goal, another one was seen free."""
+    walk_s, lot = scenario.walk_s, scenario.lot
+    drive = scenario.move_s
+    for vertex in np.argsort(-walk_s):
+        for move in range(4):
+            ahead = lot.neighbors[vertex, move]
+            if 0 <= ahead < lot.n_slots and walk_s[ahead] + drive[vertex, move] < walk_s[vertex] - 1.2:
+                return int(vertex), int(ahead)
+    raise AssertionError("no such pair")
+
+
+def test_where_slots_vanish_it_prefers_the_free_slot_at_hand_to_a_better_one_further_on():
+    scenario = make_scenario("campus")
+    here, better = in_view_of_a_free_slot(scenario)
+    n = scenario.lot.n_slots
+    belief = SlotBelief.of_forecast(np.full(n, 0.7), np.full(n, 1e-3))
+    belief = belief.update([here, better], [False, False])
+    observation = {
+        "vertex": np.int64(here), "time": np.array([8 * 3600.0, 0.0]), "action_mask": np.ones(5, np.int8),
+        **belief.to_observation(),
+    }  # fmt: skip
+    calm, _ = make_agent("belief", scenario).predict(observation)
+    crowded, _ = make_agent("belief-rivals", scenario, arrivals_per_hour=20_000).predict(observation)
+    assert calm != PARK
+    assert crowded == PARK
+
+
+def test_rivals_take_the_best_slots_first_and_all_find_one():
+    n, per_s = 60, 0.02
+    p_free, leaving = np.full(n, 0.4), np.full(n, 1.0 / 1800.0)
+    order = np.random.default_rng(0).permutation(n)
+    rates = _take_rates(p_free, leaving, order, per_s, PASSED)
+    assert (np.diff(rates[order]) < 0.0).all(), "the best first"
+    free = 1.0 / (1.0 / p_free + rates / leaving)
+    assert (free * rates).sum() == pytest.approx(per_s, rel=0.1), "as many park as arrive"
+    assert not _take_rates(p_free, np.zeros(n), order, per_s, PASSED).any(), "nothing ever changes"
+
+
+def test_a_slot_taken_soon_after_it_was_free_speaks_for_rivals():
+    n = 40
+    belief = SlotBelief.of_forecast(np.full(n, 0.6), np.full(n, 1e-3))
+    near = np.linspace(1.0, -1.0, n)
+    rates = np.zeros((2, n))
+    rates[1, :10] = 0.05
+    calm = DayBelief(belief, near)
+    crowd = DayBelief(belief, near, rivals=RivalRates(rates, np.array([0.5, 0.5])))
+    for seen_taken in (False, True):
+        belief = belief.update([0], [seen_taken])
+        for day in (calm, crowd):
+            day.update(belief)
+        belief = belief.decay(2.0)
+    assert crowd.p_occupied(belief)[5] > calm.p_occupied(belief)[5] + 0.05
+    assert crowd.p_occupied(belief)[5] > crowd.p_occupied(belief)[20], "the best slots are the rivals'"
+
+
+def test_wrong_rates_are_refused():
+    for rate in (-1.0, float("inf"), float("nan")):
+        with pytest.raises(InputError, match="arrivals_per_hour is"):
+            make_agent("belief-rivals", make_scenario("mini"), arrivals_per_hour=rate)
+
+
+def test_an_experiment_tells_it_the_demand():
+    (scenario,) = scenario_specs("mini")
+    its = FleetExperiment(FleetSpec().changed(scenario=scenario))
+    for name, rate in (("belief-rivals", 120.0), ("belief-rivals(arrivals_per_hour=30)", 30.0)):
+        _, (agent, _) = its.fleet(Setting(AgentSpec.of(name), "own", 0.0, 120.0))
+        assert agent.arrivals_per_hour == rate
