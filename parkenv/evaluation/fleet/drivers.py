@@ -32,7 +32,7 @@ def driver_of(
 
     Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
     actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
-    An agent that expects rivals is told how many cars arrive in an hour, if that is given, as a forecast of traffic would.
+    An agent that expects rivals is told how many cars arrive in an hour, if that is given, as by a forecast of traffic.
 
     Raises:
         InputError: there is no such agent, or it is none for fleets.
