@@ -155,8 +155,8 @@ def fresh(*words, **environment):
     ("line", "wanted"),
     [
         ("parkenv compare --scenario ca", ["campus"]),
-        ("parkenv compare --agents mdp,be", ["mdp,belief"]),
-        ("parkenv benchmark run v1 --agents be", ["belief"]),
+        ("parkenv compare --agents mdp,be", ["mdp,belief", "mdp,belief-rivals"]),
+        ("parkenv benchmark run v1 --agents be", ["belief", "belief-rivals"]),
         ("parkenv plan --sensor-model las", ["laser"]),
         ("parkenv survey --weather r", ["rain"]),
         ("parkenv run examples/courtyard/s", ["examples/courtyard/sweep.toml"]),
