@@ -159,6 +159,9 @@ def run_survey_of(
     if run.shown is not None:
         pictures.save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
         pictures.save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
+        if settings.localise != "none":
+            name = file_name(f"localised_{its.name}", ".png")
+            pictures.save_localisation(its.lot, run.shown, out / name)
         pictures.save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
     scored = score_discovery(found, its.lot)
     pictures.save_found_slots(its.lot, found, scored, out / file_name(f"slots_found_{its.name}", ".png"))

@@ -172,7 +172,7 @@ def _to_points(ends: FloatArray, submap: FloatArray, tree: cKDTree | None) -> _F
     """Fit points to the lines through their neighbours among earlier points."""
     if tree is None:
         return _Fit(np.empty(0, np.int64), np.empty(0), np.empty((0, 2)), np.empty(0))
-    distance, index = tree.query(ends, k=NEIGHBORS, distance_upper_bound=POINT_GATE)
+    distance, index = map(np.asarray, tree.query(ends, k=NEIGHBORS, distance_upper_bound=POINT_GATE))
     enough = np.isfinite(distance).sum(axis=1) >= 3
     there = np.isfinite(distance[enough])[..., None]
     neighbors = submap[np.where(there[..., 0], index[enough], 0)]

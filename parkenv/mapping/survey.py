@@ -84,6 +84,7 @@ class SessionResult:
     odometry: FloatArray  # (f, 3) x, y, yaw of the vehicle by its odometry, one for each capture
     poses: FloatArray  # (f, 3) the same as estimated
     true_poses: FloatArray  # (f, 3) the same in truth
+    car_captures: NDArray[np.int64]  # (n,) the capture in which each of `session.cars` was located
     frame_s: FloatArray  # (f,) s, processing time of each capture
     grid: OccupancyGrid  # the occupancy grid of the session
     shown: tuple[PerceptionResult, ...]  # results of some captures with many cars, for figures
@@ -172,6 +173,7 @@ class Survey:
         low_x, low_y, high_x, high_y = lot.bounds()
         grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
         cars: list[FloatArray] = []
+        at: list[int] = []
         frame_s = []
         for i, (pose, measured, time) in enumerate(zip(poses, odometry, times.tolist(), strict=True)):
             scene = scenes.at(time, pose)
@@ -183,6 +185,7 @@ class Survey:
             for view in result.views:
                 update_grid(grid, view, vehicle)
                 cars.append(view.cars.poses)
+                at.append(i)
             frame_s.append(clock.perf_counter() - begun)
             observed_at[slots.updated] = time
             if on_frame is not None:
@@ -196,13 +199,15 @@ class Survey:
             [world.occupied([s], t)[0] for s, t in enumerate(observed_at.tolist())], dtype=np.bool_
         )
         states = slots.states()
+        car_captures = np.repeat(np.array(at, dtype=np.int64), [len(c) for c in cars])
         found_cars = np.concatenate(cars) if cars else np.empty((0, 3))
         p = np.where(states.in_view, states.p_occupied, np.nan)
         session = Session(self.key_of(number), arrival.time, settings.rig, preset, p, found_cars)
         return SessionResult(
             session, arrival, states, truth,
             int(truth.sum()), int((truth & score.found).sum()), score,
-            odometry, estimated, poses, np.array(frame_s), grid, tuple(shown.values()),
+            odometry, estimated, poses, car_captures,
+            np.array(frame_s), grid, tuple(shown.values()),
         )  # fmt: skip
 
 
