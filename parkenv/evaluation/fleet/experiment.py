@@ -24,11 +24,13 @@ from parkenv.evaluation.experiments.spec import SPEC_FILE, FleetSpec
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
 from parkenv.evaluation.fleet.clairvoyant_bound import clairvoyant_bound_s
-from parkenv.evaluation.fleet.drivers import driver_of
+from parkenv.evaluation.fleet.decision_limit import LimitedAgent
+from parkenv.evaluation.fleet.drivers import demand_in, driver_of
 from parkenv.evaluation.fleet.measures import MEANS, Roads, day_measures
+from parkenv.evaluation.trips.calibration import Calibration
 from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.scenarios.build import build
-from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
+from parkenv.world.demand import Demand
 from parkenv.world.scenario import Scenario
 
 OWN, ASSIGNED = "own", "reserve"
@@ -51,6 +53,8 @@ DIFFERENCES = {
     "others_difference_s": "others_s",
 }
 """Columns of paired differences, and the measures that are compared."""
+OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
+"""Fields of the specification that all settings have in common."""
 SYNC_S = 1.0  # least time between two flushes of finished days to disk, s
 _RESAMPLES = 9999
 
@@ -95,7 +99,7 @@ class FleetExperiment:
         spec: specification of the experiment.
 
     Raises:
-        InputError: the scenario cannot be made.
+        InputError: the scenario cannot be made, or the calibration is of another one.
     """
 
     spec: FleetSpec
@@ -103,7 +107,25 @@ class FleetExperiment:
     @cached_property
     def scenario(self) -> Scenario:
         """Lot, residents, hours of arrival, speeds and costs."""
-        return build(self.spec.scenario)
+        scenario = build(self.spec.scenario)
+        return scenario if self.calibration is None else self.calibration.applied(scenario)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The measured speed, failure cost and manoeuvre, if any."""
+        if (path := self.spec.calibrated) is None:
+            return None
+        measured = Calibration.from_file(path)
+        if measured.scenario != (name := build(self.spec.scenario).name):
+            raise InputError(f"{path} was measured on {measured.scenario!r}, the fleet drives on {name!r}")
+        return measured
+
+    @property
+    def manoeuvre_s(self) -> float:
+        """Time for which a car that parks or leaves blocks its lane, s."""
+        if self.spec.manoeuvre_s is not None:
+            return self.spec.manoeuvre_s
+        return 0.0 if self.calibration is None else self.calibration.manoeuvre_s
 
     @cached_property
     def _roads(self) -> Roads:
@@ -130,12 +152,7 @@ class FleetExperiment:
 
     def demand(self, per_hour: float) -> Demand:
         """Return the demand of a number of arrivals an hour in the hours of the scenario."""
-        window = self.scenario.arrival
-        return Demand(
-            PoissonArrivals(per_hour, window.start_s, window.end_s),
-            ExponentialTime(self.spec.stay_s),
-            ConstantTime(self.spec.patience_s),
-        )
+        return demand_in(self.scenario, per_hour, self.spec.stay_s, self.spec.patience_s)
 
     def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
         """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled.
@@ -153,16 +170,19 @@ class FleetExperiment:
             self.demand(setting.arrivals_per_hour),
             background="residents",
             drivers=kinds,
-            delay_s=self.spec.delay_s,
             leave_full_lot=False,
+            manoeuvre_s=self.manoeuvre_s,
+            **{name: getattr(self.spec, name) for name in ("delay_s", "leaving_soon_s", "sees_cars")},
         )
+        if agent is not None and self.spec.decision_limit_s is not None:
+            agent = LimitedAgent(agent, self.spec.decision_limit_s)
         return fleet, [agent, agent]
 
     def run_day(self, setting: Setting, day: int) -> tuple[Row, list[str]]:
         """Run a day of a setting; return its row of `days.csv`, and the warnings of its agent.
 
         Raises:
-            InputError: an agent raised an error; the message names setting, day, car and time.
+            InputError: an agent raised an error or took too long; the message names setting, day, car and time.
         """
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
@@ -195,7 +215,8 @@ class FleetExperiment:
             "scenario": {spec.scenario.title: flat_tables(spec.scenario.model_dump(mode="json"))},
             "files": fingerprints(spec.files()),
             "agent files": agent_fingerprints(agent.name for agent in spec.agents),
-            **{name: getattr(spec, name) for name in ("stay_s", "patience_s", "delay_s", "seed")},
+            "manoeuvre_s": self.manoeuvre_s,
+            **{name: getattr(spec, name) for name in (*OPTIONS, "seed")},
         }
 
 
@@ -235,7 +256,8 @@ def run_fleets(
         on_progress: called with the number of days just finished.
 
     Raises:
-        InputError: a setting cannot be run, an agent raises an error, or the folder cannot be used.
+        InputError: a setting cannot be run, an agent raises an error or exceeds its time limit, or the folder cannot be
+            used.
     """
     experiment = FleetExperiment(spec)
     for setting in experiment.settings:
@@ -268,7 +290,8 @@ def run_fleets(
         "version": __version__,
         "seed": spec.seed,
         "complete": complete,
-        **{name: getattr(spec, name) for name in ("stay_s", "patience_s", "delay_s")},
+        "manoeuvre_s": experiment.manoeuvre_s,
+        **{name: getattr(spec, name) for name in OPTIONS},
         "rows": result.rows,
     }
     folder.finish(tasks, summary, complete=complete)

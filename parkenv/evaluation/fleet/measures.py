@@ -16,8 +16,8 @@ FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 
 MEANS = (
-    "total_s", "median_s", "p95_s", "gini", "search_s", "failed_attempts", "driven_m", "cruised_m", "cruising_share",
-    "balked_fraction", "occupancy", "members_s", "others_s", "bound_s", "clairvoyant_s",
+    "total_s", "median_s", "p95_s", "gini", "search_s", "queued_s", "failed_attempts", "driven_m", "cruised_m",
+    "cruising_share", "balked_fraction", "occupancy", "members_s", "others_s", "bound_s", "clairvoyant_s",
 )  # fmt: skip
 """Measures of a day, of which a summary has the mean over days."""
 
@@ -110,6 +110,7 @@ def day_measures(
         "p95_s": float(np.quantile(times, 0.95)),
         "gini": gini(times),
         "search_s": float((cars["ended_at"] - cars["arrival"]).mean()),
+        "queued_s": float(cars["queued_s"].mean()),
         "failed_attempts": float(cars["failed_parks"].mean()),
         "driven_m": driven_m / len(cars),
         "cruised_m": float(cruised_m.mean()),

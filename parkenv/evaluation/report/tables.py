@@ -113,6 +113,7 @@ _KNOWN = {
         Column("p95_s", "95 % quantile", "s", 0),
         Column("gini", "Gini", digits=3, help="Inequality of total times: 0 if all are equal"),
         Column("search_s", "search time", "s", help="From the entry to the end of the search"),
+        Column("queued_s", "in queues", "s", help="Behind cars that park, leave or stand; part of the search time"),
         Column("failed_attempts", "failed attempts", digits=3),
         Column("cruised_m", "cruised", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
         Column("cruising_share", "traffic that cruises", share=True, digits=0),
