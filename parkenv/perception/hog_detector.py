@@ -39,8 +39,8 @@ class HogDetector:
         scale_step: ratio of one region size to the next smaller one.
         threshold: probability from which a window is reported as a car.
         overlap: intersection over union from which only the better of two boxes is kept.
-        inside: fraction of the smaller of two boxes from which it only counts as the other's part, or as its frame, and
-            the better one is kept; 1: such boxes count as two cars.
+        inside: fraction of the smaller of two boxes from which only the better one is kept, because one shows a part of
+            the other's car. 1: they are two cars, as where rows of cars hide one another.
         margin: cars may reach beyond the image by this fraction of their region; the border pixels are replicated.
 
     Raises:
@@ -53,7 +53,7 @@ class HogDetector:
     scale_step: float = 1.2
     threshold: float = 0.5
     overlap: float = 0.4
-    inside: float = 0.6
+    inside: float = 1.0
     margin: float = 0.25
 
     def __post_init__(self) -> None:
@@ -84,10 +84,10 @@ class HogDetector:
 
     @classmethod
     def for_evaluation(cls, model: CarModel, least_height: float, most_height: float) -> HogDetector:
-        """Search regions of these heights, px, in small steps, and report weak detections and those at the border."""
+        """Search regions of these heights, px, in small steps, for cars that stand apart, also weak ones."""
         return cls(
             (model,), least_height=least_height, most_height=most_height,
-            scale_step=1.08, threshold=LEAST_SCORED, overlap=0.3, margin=0.35,
+            scale_step=1.05, threshold=LEAST_SCORED, overlap=0.3, inside=0.6, margin=0.35,
         )  # fmt: skip
 
     def detect(self, image: Image) -> Detections:
