@@ -83,7 +83,7 @@ def test_measures_of_a_day_are_those_of_its_cars():
     assert 0.5 < day["occupancy"] <= 1.0
     assert 0.0 < day["cruising_share"] < 1.0
     assert day["cruised_m"] < day["driven_m"]
-    assert day["bound_s"] < day["total_s"]
+    assert day["bound_s"] <= day["clairvoyant_s"] < day["total_s"]
     assert day["search_s"] == pytest.approx((cars["drive_s"] + cars["failed_s"]).mean())
 
 
@@ -117,6 +117,8 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     for row in rows:
         low, high = row["price_of_anarchy_ci95"]
         assert low <= row["price_of_anarchy"] <= high
+        low_over, high_over = row["price_over_bound_ci95"]
+        assert 1.0 < low_over <= row["price_over_bound"] <= high_over
         if row["knows"] == "reserve":
             assert (low, row["price_of_anarchy"], high) == (1.0, 1.0, 1.0)
     own, reserve = days[0], days[1]

@@ -145,7 +145,7 @@ def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
     if result.rows:
         headings = (
             "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
-            "cruising", "occupancy", "price of anarchy",
+            "cruising", "occupancy", "price of anarchy", "over bound",
         )  # fmt: skip
         console.print(make_table(title, headings, map(_cells, result.rows)))
     if not result.complete:
@@ -177,4 +177,5 @@ def _cells(row: Row) -> tuple[str, ...]:
         f"{row['cruising_share']:.0%}",
         f"{row['occupancy']:.0%}",
         "" if price != price else f"{price:.3f} [{cheap:.3f}, {dear:.3f}]",
+        f"{row['price_over_bound']:.3f}",
     )

@@ -23,6 +23,7 @@ from parkenv.evaluation.experiments.results import EpisodeTable, ResultFolder, R
 from parkenv.evaluation.experiments.spec import SPEC_FILE, FleetSpec
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
+from parkenv.evaluation.fleet.clairvoyant_bound import clairvoyant_bound_s
 from parkenv.evaluation.fleet.decision_limit import LimitedAgent
 from parkenv.evaluation.fleet.drivers import demand_in, driver_of
 from parkenv.evaluation.fleet.measures import MEANS, Roads, day_measures
@@ -126,6 +127,10 @@ class FleetExperiment:
             return self.spec.manoeuvre_s
         return 0.0 if self.calibration is None else self.calibration.manoeuvre_s
 
+    @cached_property
+    def _roads(self) -> Roads:
+        return Roads(self.scenario)
+
     def __getstate__(self) -> dict[str, Any]:
         """Workers make the scenario themselves."""
         return {"spec": self.spec}
@@ -183,6 +188,7 @@ class FleetExperiment:
             warnings.simplefilter("default")
             fleet, agents = self.fleet(setting)
             fleet.reset(self.spec.seed, day)
+            bound_s = clairvoyant_bound_s(self._roads.parking_day(fleet))
             window = self.scenario.arrival
             taken = []
             try:
@@ -193,7 +199,7 @@ class FleetExperiment:
             except InputError as error:
                 raise InputError(f"{setting}, day {day}, {error}") from error
         members = fleet.cars["kind"] == 0
-        measured = day_measures(fleet, Roads(self.scenario), members, float(np.mean(taken)))
+        measured = day_measures(fleet, self._roads, members, float(np.mean(taken)), bound_s)
         row = {"scenario": self.scenario.name, **setting.columns, "day": day, **measured}
         return row, [f"{setting.agent.label}: {w.message}" for w in caught]
 
@@ -316,7 +322,8 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
     """Return the summary, a row for each setting, from the days of each, at least one.
 
     The *price of anarchy* of a row is the ratio of its mean total time to that of `reserve` for all cars, with the same
-    agents and demand; its interval is a bootstrap over days. Differences are paired: to the mean total time of all cars
+    agents and demand; its interval is a bootstrap over days. The *price over the bound* is the ratio to the clairvoyant
+    lower bound of the same days, likewise. Differences are paired: to the mean total time of all cars
     on the same days if nobody knows more than what it observes. Both are over the days that both settings have; null if
     there are none.
     """
@@ -336,6 +343,7 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
             **_means(days),
             **_differences(paired(days, OWN, 0.0)),
             **_price(paired(days, ASSIGNED, 1.0)),
+            **_ratio("price_over_bound", days, days, "clairvoyant_s"),
         }
         for days in settings
     ]
@@ -364,13 +372,17 @@ def _means(days: list[Row]) -> Row:
 
 
 def _price(pairs: Pairs) -> Row:
-    if not pairs:
-        return {"price_of_anarchy": float("nan"), "price_of_anarchy_ci95": [float("nan")] * 2}
-    mine, theirs = np.array([[day["total_s"] * day["cars"] for day in pair] for pair in pairs]).T
+    mine, theirs = zip(*pairs, strict=True) if pairs else ((), ())
+    return _ratio("price_of_anarchy", mine, theirs, "total_s")
+
+
+def _ratio(name: str, days: Sequence[Row], others: Sequence[Row], column: str) -> Row:
+    """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
+    if not days:
+        return {name: float("nan"), f"{name}_ci95": [float("nan")] * 2}
+    mine = np.array([day["total_s"] * day["cars"] for day in days])
+    theirs = np.array([day[column] * day["cars"] for day in others])
     drawn = np.random.default_rng(0).integers(0, len(mine), (_RESAMPLES, len(mine)))
     ratios = mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1)
     low, high = np.percentile(ratios, [2.5, 97.5])
-    return {
-        "price_of_anarchy": float(mine.sum() / theirs.sum()),
-        "price_of_anarchy_ci95": [float(low), float(high)],
-    }
+    return {name: float(mine.sum() / theirs.sum()), f"{name}_ci95": [float(low), float(high)]}

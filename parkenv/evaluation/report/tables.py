@@ -123,6 +123,8 @@ _KNOWN = {
         Column("members_difference_s", "members minus own", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
         Column("others_difference_s", "others minus own", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
         Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),
+        Column("clairvoyant_s", "clairvoyant bound", "s", help="Lower bound that knows all arrivals and stays"),
+        Column("price_over_bound", "over the bound", digits=3, help="Total time over the clairvoyant lower bound"),
         Column("key", "drive"),
         Column("weather", "weather"),
         Column("rig", "rig"),
@@ -131,8 +133,8 @@ _KNOWN = {
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
     "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "difference_s", "gap_to_exact",
-    "price_of_anarchy", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s",
-    "parked_fraction",
+    "price_of_anarchy", "price_over_bound", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
+    "gave_up_s", "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 _OF_FLEETS = {
