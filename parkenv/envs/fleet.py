@@ -415,7 +415,7 @@ class Fleet:
                 k = getattr(agent, "local_k", None)  # models observe `local`
                 observation = self.observation(car) if k is None else self.local_observation(car, k)
                 action, memory[car] = agent.predict(observation, memory.get(car))
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise InputError(
                     f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
                 ) from error
@@ -639,8 +639,8 @@ class Fleet:
         xy, ahead = self.scenario.lot.vertex_xy, records["vertex"]
         behind, left = records["previous_vertex"], records["time"] - self.time
         share = np.clip(left / np.maximum(records["step_drive_s"], 1e-9), 0.0, 1.0)
-        # A failed attempt, or a wait: the car stands.
-        share[records["step_failed_s"] > 0.0] = 0.0
+        # A failed attempt, a wait or a queue: the car stands.
+        share[(records["step_failed_s"] > 0.0) | (cars["queues_since"] <= self.time)] = 0.0
         step = xy[behind] - xy[ahead]
         yaw = np.where(
             behind == ahead, self.scenario.lot.vertex_yaw[ahead], np.arctan2(-step[:, 1], -step[:, 0])
