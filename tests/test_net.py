@@ -207,7 +207,12 @@ def test_pictures_are_kept_and_read_again(tmp_path):
     folder = tmp_path / "pictures"
     folder.mkdir()
     (folder / "street_0_0.npz").write_bytes(b"no pictures")
-    with pytest.raises(InputError, match=r"street_0_0\.npz: is no file of pictures; remove it"):
+    with pytest.raises(InputError, match=r"street_0_0\.npz"):
+        next(simulated_scenes(1, 0, folder))
+    np.savez(folder / "street_0_0.npz", grey_0=np.zeros((4, 4), np.uint8))
+    with pytest.raises(
+        InputError, match=r"street_0_0\.npz: holds no array 'car_0', want pictures of a street"
+    ):
         next(simulated_scenes(1, 0, folder))
 
 

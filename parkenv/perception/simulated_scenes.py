@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.archives import read_arrays
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.simulated_streets import Street
 from sim_sensors.camera.models import PinholeCamera, camera_pose
@@ -167,11 +168,9 @@ def _write(file: Path, scenes: list[SimulatedScene]) -> None:
 
 
 def _read(file: Path) -> Iterator[SimulatedScene]:
+    stored = read_arrays(file)
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            scenes = [
-                SimulatedScene(**{name: stored[f"{name}_{i}"] for name in _ARRAYS}) for i in range(FRAMES)
-            ]
-    except (OSError, ValueError, KeyError, EOFError) as error:
-        raise InputError(f"{file}: is no file of pictures; remove it ({error})") from error
-    yield from scenes
+        for i in range(FRAMES):
+            yield SimulatedScene(**{name: stored[f"{name}_{i}"] for name in _ARRAYS})
+    except KeyError as error:
+        raise InputError(f"{file}: holds no array {error}, want pictures of a street; remove it") from error

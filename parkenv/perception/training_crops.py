@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.files.images import decode_image
 from parkenv.perception.backdrops import random_texture
 from parkenv.perception.simulated_scenes import DEPTH_STEPS, SimulatedScene
 from sim_sensors.ground_truth import View
@@ -201,7 +202,7 @@ class ExampleMaker:
             image = np.clip(noisy, 0.0, 255.0).astype(np.uint8)
         if rng.random() < 0.25:
             _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, int(rng.integers(20, 90))])
-            image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+            image = decode_image(data.tobytes(), "example")
         return np.asarray(image, dtype=np.uint8)
 
     def _exposure(self, values: Float32Array) -> Image:
