@@ -16,6 +16,7 @@ from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_t
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.cross_validation import cross_validated
 from parkenv.perception.detection_scores import matches, recall_at, recall_precision
+from parkenv.perception.detector import GroundBand
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
 from parkenv.perception.training import TrainingSettings, train
@@ -56,6 +57,25 @@ def street(rng, places):
         car = toy_car(rng, (width, round(0.4 * width)))
         image[y : y + car.shape[0], x : x + width] = car
     return image
+
+
+def test_cars_on_the_ground_are_those_of_the_whole_image(model):
+    rng = np.random.default_rng(8)
+    image = street(rng, [(20, 20, 100), (150, 100, 130), (290, 180, 90)])
+    detector = HogDetector((model, model), scale_step=1.1, threshold=0.01)
+    band = GroundBand.of(110.0, 1.3, 0.7, (0.8, 3.2), 1.5)
+    assert (band.least, band.most) == pytest.approx((0.24, 4 / 3))
+    everything, near = detector.scan(model, image), detector.scan(model, image, band)
+    height = everything.boxes[:, 3] - everything.boxes[:, 1]
+    below = (everything.boxes[:, 3] - band.horizon) / height
+    inside = (below > band.least - 1e-4) & (below < band.most + 1e-4)
+    assert 0 < inside.sum() < len(inside)
+    np.testing.assert_allclose(near.boxes, everything.boxes[inside], atol=1e-3)
+    np.testing.assert_allclose(near.score, everything.score[inside], atol=1e-5)
+    found = detector.detect_on_ground(image, band)
+    assert found.probability.max() == near.probability.max()
+    nowhere = detector.detect_on_ground(image, GroundBand(-1000.0, 0.24, 1.3))
+    assert not len(nowhere)
 
 
 def test_cars_are_found_where_they_are_at_every_size(model):

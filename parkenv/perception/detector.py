@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +88,42 @@ class Detector(Protocol):
         Returns:
             One box per car (without overlapping boxes of the same car), with at least `LEAST_PROBABILITY`.
         """
+        ...
+
+
+class GroundBand(NamedTuple):
+    """Where the boxes of cars on the ground lie in the images of a camera without roll.
+
+    A box of height h has its lower edge between `horizon` + `least`·h and `horizon` + `most`·h.
+    """
+
+    horizon: float  # px, row of the horizon, below the image's upper edge
+    least: float
+    most: float
+
+    @classmethod
+    def of(
+        cls, horizon: float, eye: float, off_ground: float, top: tuple[float, float], least_height: float
+    ) -> GroundBand:
+        """Return the band of boxes whose lower edge is near the ground and whose upper edge has a car's height.
+
+        Args:
+            horizon: px, row of the horizon.
+            eye: m, height of the camera.
+            off_ground: m, tolerance of the lower edge's height above or below the ground.
+            top: m, least and greatest height of the upper edge.
+            least_height: m, least difference of the two.
+        """
+        most = (eye + off_ground) / max(top[0] + off_ground, least_height)
+        return cls(horizon, (eye - off_ground) / (top[1] - off_ground), most)
+
+
+@runtime_checkable
+class BandDetector(Protocol):
+    """A detector that is faster if it knows where in the image the cars can be."""
+
+    def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
+        """Find the cars in one image as `Detector.detect` does, only those whose boxes lie in the band."""
         ...
 
 

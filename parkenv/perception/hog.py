@@ -230,7 +230,7 @@ def _pool(sums: Float32Array, tent: Float32Array, out: Float32Array) -> None:
             out[k, c] = total
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
 def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
     """`cell_histograms` of an image with a border of one pixel."""
     width = columns * CELL
@@ -261,7 +261,7 @@ def _histograms(padded: Image, rows: int, columns: int) -> Float32Array:
     return out
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
 def _by_cell(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     out = np.empty_like(cells)
@@ -300,7 +300,7 @@ def _block_scales(cells: Float32Array) -> Float32Array:
     return scale
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
 def _by_neighbors(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     scale = _block_scales(cells)
@@ -318,7 +318,7 @@ def _by_neighbors(cells: Float32Array) -> Float32Array:
     return out
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
 def _by_blocks(cells: Float32Array) -> Float32Array:
     rows, values, columns = cells.shape
     out = np.empty((max(rows - 1, 0), 4 * values, max(columns - 1, 0)), dtype=np.float32)
@@ -342,7 +342,7 @@ def _by_blocks(cells: Float32Array) -> Float32Array:
     return out
 
 
-@compiled(fastmath=_FAST, error_model="numpy")
+@compiled(fastmath=_FAST, error_model="numpy", nogil=True)
 def correlate(features: Float32Array, weights: Float32Array) -> Float32Array:
     """Correlate: the dot product of the weights with every window of the features.
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
-from parkenv.perception.detector import Detections
-from parkenv.perception.hog import CELL, correlate
+from parkenv.perception.detector import Detections, GroundBand
+from parkenv.perception.hog import CELL, Descriptor, correlate
+from parkenv.perception.threads import in_threads
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
@@ -85,8 +86,19 @@ class HogDetector:
         Raises:
             InputError: an image of another shape or dtype.
         """
-        grey = as_grey(image)
-        found = [self.scan(model, grey) for model in self.models]
+        return self._best(as_grey(image), None)
+
+    def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
+        """Find the cars whose boxes lie in a band; the rows of the image that cannot have one are not looked at.
+
+        Args:
+            image: as for `detect`.
+            band: where the boxes lie.
+        """
+        return self._best(as_grey(image), band)
+
+    def _best(self, grey: Image, band: GroundBand | None) -> Detections:
+        found = in_threads(lambda model: self.scan(model, grey, band), self.models)
         all_models = Detections(
             *(
                 np.concatenate([getattr(f, name) for f in found])
@@ -95,8 +107,14 @@ class HogDetector:
         )
         return all_models.select(best_boxes(all_models.boxes, all_models.probability, self.overlap))
 
-    def scan(self, model: CarModel, grey: Image) -> Detections:
-        """Return all windows above the threshold, before non-maximum suppression; `grey` is (h, w) uint8."""
+    def scan(self, model: CarModel, grey: Image, band: GroundBand | None = None) -> Detections:
+        """Return all windows above the threshold, before non-maximum suppression.
+
+        Args:
+            model: one of the models.
+            grey: (h, w) uint8.
+            band: where the boxes lie; None: anywhere.
+        """
         height, width = grey.shape
         most = self.most_height or max(height, width / model.region_aspect) * (1.0 + 2.0 * self.margin)
         window = model.descriptor
@@ -117,11 +135,18 @@ class HogDetector:
             scaled = _scaled(grey if smaller is None else smaller, (width * scale_x, height * scale_y))
             if scale_x <= 1.0 and scale_y <= 1.0:
                 smaller = scaled
-            score = correlate(
-                window.features(_bordered(scaled, edge_x * scale_x, edge_y * scale_y)), model.weights
-            )
+            level = _bordered(scaled, edge_x * scale_x, edge_y * scale_y)
+            first, end = 0, level.shape[0] // CELL
+            if band is not None:
+                tops = (np.array(_region_tops(model, region_height, band)) + edge_y) * (scale_y / CELL)
+                first = max(math.ceil(tops[0]), 0)
+                end = min(math.floor(tops[1]) + window.height // CELL, end)
+                if end - first < window.height // CELL:
+                    continue
+            score = correlate(_features_of_rows(window, level, first, end), model.weights)
             row, column = np.nonzero(score > enough - model.bias)
             scores.append(score[row, column] + np.float32(model.bias))
+            row += first
             left, top = column * CELL / scale_x - edge_x, row * CELL / scale_y - edge_y
             regions.append(
                 np.stack([left, top, left + region_width, top + region_height], axis=1).astype(np.float32)
@@ -134,6 +159,22 @@ class HogDetector:
         )
         end_on = np.full(len(value), model.end_on)
         return Detections(boxes, model.probability(value), end_on, value, region)
+
+
+def _region_tops(model: CarModel, region_height: float, band: GroundBand) -> tuple[float, float]:
+    """Return the first and last row, px, at which a region may begin if its car lies in the band."""
+    _, top, _, bottom = model.car
+    height = (bottom - top) * region_height
+    below = band.horizon - bottom * region_height
+    return below + band.least * height, below + band.most * height
+
+
+def _features_of_rows(window: Descriptor, level: Image, first: int, end: int) -> Float32Array:
+    """Return the features of the rows of cells from `first` to `end` - 1 of an image, as in the whole image."""
+    # The features of a cell depend on the next cells, and their histograms on the pixels of those after them.
+    start, stop = max(first - 2, 0), min(end + 2, level.shape[0] // CELL)
+    whole = window.features(level[CELL * start : CELL * stop if stop < level.shape[0] // CELL else None])
+    return whole[first - start : first - start + (end - first) + window.shape[0] - window.height // CELL]
 
 
 def as_grey(image: Image) -> Image:

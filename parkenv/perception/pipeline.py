@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,10 +12,17 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
-from parkenv.perception.detector import Detections, Detector
+from parkenv.perception.detector import BandDetector, Detections, Detector, GroundBand
 from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
-from parkenv.perception.ranging import LocatedCars, localize_cars, localize_disparity, localize_median
+from parkenv.perception.ranging import (
+    CAR_HEIGHT,
+    OFF_GROUND,
+    LocatedCars,
+    localize_cars,
+    localize_disparity,
+    localize_median,
+)
 from parkenv.perception.slot_filter import SlotFilter, SlotObservation
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
@@ -107,7 +115,7 @@ class PerceptionPipeline:
             slots.update_from_scan(scan)  # T §3.3.2, from beams
         for name, camera, mount, image in self._images(captured.capture):
             scan = scans[self._ranging_sensor(name)]
-            found = self.detector.detect(image)  # T §3.2.1, §3.2.2
+            found = self._detect(image, camera, mount)  # T §3.2.1, §3.2.2
             cars = localize_cars(found, scan, camera, mount, vehicle)  # eq. 3.2
             found, cars = _confirmed(found, cars)
             placed = slots.update_from_cars(cars)  # T §3.3.2, from detections
@@ -126,6 +134,14 @@ class PerceptionPipeline:
         slots = SlotFilter(self.lot)
         results = tuple(self.process(captured, slots) for captured in captures)
         return results, slots.observation()
+
+    def _detect(self, image: NDArray[np.uint8], camera: PinholeCamera, mount: Mount) -> Detections:
+        """Find the cars; a detector that can do so looks only where a car on the ground can be."""
+        if not isinstance(self.detector, BandDetector):
+            return self.detector.detect(image)
+        horizon = camera.cy + camera.fy * math.tan(mount.pitch)
+        band = GroundBand.of(horizon, mount.z, OFF_GROUND, CAR_HEIGHT, CAR_HEIGHT[0] + OFF_GROUND)
+        return self.detector.detect_on_ground(image, band)
 
     def _ranging_sensor(self, camera: str) -> str:
         """Return the name of the sensor whose ranges locate the detections of a camera."""
