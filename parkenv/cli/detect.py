@@ -303,10 +303,10 @@ def evaluate_detector(
 ) -> None:
     """Measure recall and precision of a detector on UIUC's test sets, or compare detectors on simulated drives.
 
-    On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars. A --detector
-    looks as it does in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the sets label
-    neither. On drives, every detector reports so many boxes that it has equally many false positives; a car counts if
-    it is within 20 m, 16 px high, and 30 % of it are visible.
+    On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars. Any other
+    detector looks as it does in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the sets
+    label neither. On drives, every detector reports so many boxes that it has equally many false positives; a car
+    counts if it is within 20 m, 16 px high, and 30 % of it are visible.
 
     Examples:
         parkenv evaluate-detector --uiuc CarData --model side
