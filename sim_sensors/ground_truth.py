@@ -57,7 +57,7 @@ def vehicle_boxes(camera: PinholeCamera, scene: Drawable, pose: FloatArray, fram
     """
     pose = checked_pose(scene, pose)
     size = (camera.width, camera.height)
-    triangles = project(scene.pool, scene.instances, pose, camera.intrinsics, size, camera.coarse_beyond)
+    triangles = project(scene.pool, scene.instances, pose, camera.intrinsics, size, camera.coarse_from)
     alone, box = _extents_alone(triangles.corners, triangles.instance, len(scene.instances.ids), *size)
     greatest = int(scene.instances.ids.max(initial=0))
     seen, visible_box = _extents_seen(frame.ids, greatest + 1)

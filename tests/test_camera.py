@@ -1,10 +1,13 @@
 """Pictures: deterministic, well exposed, with true depth, ids and boxes; stereo; what is refused."""
 
 import math
+import pickle
 from dataclasses import replace
 
+import cv2
 import numba
 import numpy as np
+import plain_sky
 import pytest
 from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
@@ -12,6 +15,7 @@ from parkenv.perception.range_scan import disparity
 from sim_sensors.camera.image_sensor import ImageSensor
 from sim_sensors.camera.light_maps import light_maps, open_sky, sunlit
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_truth import View, vehicle_boxes
@@ -50,6 +54,33 @@ def test_every_weather_is_deterministic_and_well_exposed(scene, preset):
     assert 60 < frame.image.mean() < 170
     assert frame.image.std() > 15
     assert np.mean(frame.image == 255) < 0.2
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_the_sky_is_that_of_plain_numpy(preset):
+    weather = Weather.draw(preset, 5)
+    sharp, blurred = plain_sky.sky_domes(weather)
+    assert np.abs(mirrored_sky(weather) - blurred).mean() < 0.01 * blurred.mean()
+    camera = PinholeCamera.from_field_of_view(160, 120)
+    rotation = camera_pose(0.0, 0.0, 1.0, 2.0, 0.3)[:3, :3]
+    view = sky_of_view(weather, rotation, camera.intrinsics, (160, 120))
+    assert view is sky_of_view(weather, rotation.copy(), camera.intrinsics, (160, 120))
+    v, u = np.mgrid[0.5:120, 0.5:160]
+    ray = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones_like(u)], -1)
+    ray = ray @ rotation.T / np.linalg.norm(ray, axis=-1, keepdims=True)
+    up = ray[..., 2] > 0.01
+    place = (ray[..., :2] / (1.0 + ray[..., 2:]) * 0.5 + 0.5) * len(sharp) - 0.5
+    plain = cv2.remap(sharp, *np.moveaxis(place.astype(np.float32), -1, 0), cv2.INTER_LINEAR)
+    assert up.mean() > 0.6
+    assert np.abs(view - plain)[up].mean() < 0.02 * plain[up].mean()
+
+
+def test_truth_is_computed_when_asked_for_and_travels(scene):
+    frame = CAMERA.render(scene, POSE)
+    again = pickle.loads(pickle.dumps(frame))
+    np.testing.assert_array_equal(again.depth, frame.depth)
+    np.testing.assert_array_equal(again.ids, frame.ids)
+    assert pickle.loads(pickle.dumps(frame)).glass_depth.shape == frame.glass_depth.shape
 
 
 def test_noise_follows_the_seed_and_geometry_does_not(scene):

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_sensors.camera.light_maps import LightMaps, open_sky
-from sim_sensors.camera.sky import look_up, sky_domes
+from sim_sensors.camera.sky import look_up, mirrored_sky
 from sim_sensors.camera.textures import LEAF
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
@@ -30,7 +30,8 @@ class Light(NamedTuple):
         sun_direction: (3,) float64, unit vector to the sun, world frame.
         sun, sky, horizon: (3,) float64, as in `Weather`.
         haze, wetness, lit_windows: as in `Weather`.
-        background, mirrored: (n, n, 3) float32, the sky, sharp and blurred, for `look_up`.
+        background: (h, w, 3) float32, the sky behind every pixel.
+        mirrored: (n, n, 3) float32, the blurred sky, for `look_up`.
         ground: (3,) float64, radiance of open ground in reflections and as bounced light.
     """
 
@@ -46,14 +47,18 @@ class Light(NamedTuple):
     ground: FloatArray
 
 
-def daylight(weather: Weather) -> Light:
-    """Return the light of a weather."""
-    background, mirrored = sky_domes(weather)
+def daylight(weather: Weather, background: Float32Array) -> Light:
+    """Return the light of a weather.
+
+    Args:
+        weather: the weather.
+        background: (h, w, 3) float32, the sky of the view.
+    """
     sun, sky = np.array(weather.sun), np.array(weather.sky)
     ground = _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky)
     strengths = weather.haze, weather.wetness, weather.lit_windows
     direction, horizon = np.array(weather.sun_direction), np.array(weather.horizon)
-    return Light(direction, sun, sky, horizon, *strengths, background, mirrored, ground)
+    return Light(direction, sun, sky, horizon, *strengths, background, mirrored_sky(weather), ground)
 
 
 @compiled(**LEAF)

@@ -181,7 +181,9 @@ def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -
 
 
 @compiled(**LEAF)
-def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tuple[float, float, int, int]:
+def sample_ground(
+    texture: GroundTexture, x: float, y: float, level: int
+) -> tuple[float, float, np.uint64, np.uint64]:
     """Sample the ground at (x, y), m: grey albedo and fraction of grass, bilinear; and the texel and the one below."""
     level = min(max(level, 0), texture.shape.shape[0] - 1)
     columns = texture.shape[level, 1]
@@ -192,20 +194,21 @@ def sample_ground(texture: GroundTexture, x: float, y: float, level: int) -> tup
     row = int(v)
     a = u - column
     b = v - row
-    i = texture.start[level] + row * columns + column
-    j = i + columns
+    i = np.uint64(texture.start[level] + row * columns + column)
+    j = i + np.uint64(columns)
+    one = np.uint64(1)
     t = texture.texels
-    above = t[i, 0] + a * (float(t[i + 1, 0]) - t[i, 0])
-    below = t[j, 0] + a * (float(t[j + 1, 0]) - t[j, 0])
+    above = t[i, 0] + a * (float(t[i + one, 0]) - t[i, 0])
+    below = t[j, 0] + a * (float(t[j + one, 0]) - t[j, 0])
     root = (above + b * (below - above)) / 255.0
     return root * root, t[i, 1] / 255.0, i, j
 
 
 @compiled(**LEAF)
-def sample_water(texture: GroundTexture, i: int, j: int) -> float:
+def sample_water(texture: GroundTexture, i: np.uint64, j: np.uint64) -> float:
     """Return how much water can collect between the texels i and j of `sample_ground`."""
-    t = texture.texels
-    return float(float(t[i, 2]) + t[i + 1, 2] + t[j, 2] + t[j + 1, 2]) / 1020.0
+    t, one = texture.texels, np.uint64(1)
+    return float(float(t[i, 2]) + t[i + one, 2] + t[j, 2] + t[j + one, 2]) / 1020.0
 
 
 @compiled(**LEAF)

@@ -237,15 +237,15 @@ def sunlit(maps: LightMaps, x: float, y: float, z: float, bias: float) -> float:
     if u < 0.0 or v < 0.0 or u >= n - 1 or v >= n - 1:
         return 1.0
     height = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + bias
-    column = int(u)
-    row = int(v)
-    a = u - column
-    b = v - row
+    left, right = np.uint64(int(u)), np.uint64(int(u) + 1)
+    top, bottom = np.uint64(int(v)), np.uint64(int(v) + 1)
+    a = u - int(u)
+    b = v - int(v)
     s = maps.shadow
-    s00 = 0.0 if s[row, column] > height else 1.0
-    s01 = 0.0 if s[row, column + 1] > height else 1.0
-    s10 = 0.0 if s[row + 1, column] > height else 1.0
-    s11 = 0.0 if s[row + 1, column + 1] > height else 1.0
+    s00 = 0.0 if s[top, left] > height else 1.0
+    s01 = 0.0 if s[top, right] > height else 1.0
+    s10 = 0.0 if s[bottom, left] > height else 1.0
+    s11 = 0.0 if s[bottom, right] > height else 1.0
     above = s00 * (1 - a) + s01 * a
     below = s10 * (1 - a) + s11 * a
     return float(above + b * (below - above))
@@ -259,11 +259,11 @@ def open_sky(maps: LightMaps, x: float, y: float) -> float:
     n = maps.contact.shape[0]
     if u < 0.0 or v < 0.0 or u >= n - 1 or v >= n - 1:
         return 1.0
-    column = int(u)
-    row = int(v)
-    a = u - column
-    b = v - row
+    left, right = np.uint64(int(u)), np.uint64(int(u) + 1)
+    top, bottom = np.uint64(int(v)), np.uint64(int(v) + 1)
+    a = u - int(u)
+    b = v - int(v)
     c = maps.contact
-    above = c[row, column] * (1 - a) + c[row, column + 1] * a
-    below = c[row + 1, column] * (1 - a) + c[row + 1, column + 1] * a
+    above = c[top, left] * (1 - a) + c[top, right] * a
+    below = c[bottom, left] * (1 - a) + c[bottom, right] * a
     return float(1.0 - (above * (1 - b) + below * b) / 255.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -23,6 +24,7 @@ from sim_sensors.mesh import Ground, Instances, MeshPool
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
+_FOCAL = 520.0  # px, focal length to which `coarse_beyond` refers
 _AHEAD = 12.0  # m ahead of the camera: the middle of the area that is lit in detail
 
 
@@ -66,6 +68,36 @@ class Frame:
     ids: NDArray[np.int32]
 
 
+class _RenderedFrame(Frame):
+    """A frame whose ground truth is computed when it is first asked for."""
+
+    def __init__(
+        self,
+        image: NDArray[np.uint8],
+        visibility: Visibility,
+        instance: NDArray[np.int32],
+        ids: NDArray[np.int32],
+    ) -> None:
+        self.__dict__.update(image=image, _seen=(visibility, instance, ids))
+
+    @cached_property
+    def _truth(self) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
+        depth, glass_depth, ids = _geometry(*self.__dict__.pop("_seen"))
+        return depth, glass_depth, ids
+
+    @property
+    def depth(self) -> Float32Array:
+        return self._truth[0]
+
+    @property
+    def glass_depth(self) -> Float32Array:
+        return self._truth[1]
+
+    @property
+    def ids(self) -> NDArray[np.int32]:
+        return self._truth[2]
+
+
 @dataclass(frozen=True)
 class PinholeCamera:
     """A pinhole camera without distortion. Pixel (row, column) has its centre at (column + 0.5, row + 0.5).
@@ -77,7 +109,8 @@ class PinholeCamera:
         sensor: exposure, blur and noise.
         supersampling: 1, or 2 for four samples per pixel: smoother edges at four times the cost. Depth and ids are
             always taken at the pixel's centre.
-        coarse_beyond: m; farther objects are drawn with coarse meshes if the pool has them.
+        coarse_beyond: m, at a focal length of 520 px; objects that are smaller in the image than from there are drawn
+            with coarse meshes if the pool has them.
 
     Raises:
         SensorError: a size is below 1, a focal length is not positive, or a value is not finite.
@@ -91,7 +124,7 @@ class PinholeCamera:
     cy: float = 240.0
     sensor: ImageSensor = field(default_factory=ImageSensor)
     supersampling: int = 1
-    coarse_beyond: float = 25.0
+    coarse_beyond: float = 20.0
 
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
@@ -129,6 +162,11 @@ class PinholeCamera:
         return self.fx, self.fy, self.cx, self.cy
 
     @property
+    def coarse_from(self) -> float:
+        """m; farther objects are drawn with coarse meshes."""
+        return self.coarse_beyond * max(self.fx, self.fy) / _FOCAL
+
+    @property
     def matrix(self) -> FloatArray:
         """(3, 3) float64, from the camera frame to homogeneous pixels."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
@@ -159,34 +197,32 @@ class PinholeCamera:
         """
         weather = Weather() if weather is None else weather
         pose = checked_pose(scene, pose)
-        radiance, geometry = self._render_radiance(scene, pose, weather)
+        radiance, triangles, visibility = self._render_radiance(scene, pose, weather)
         chosen = self.sensor.gain(radiance) if gain is None else gain
         image = self.sensor.expose(radiance, seed, chosen, rain=weather.rain)
-        return Frame(image, *geometry)
+        return _RenderedFrame(image, visibility, triangles.instance, scene.instances.ids)
 
     def _render_radiance(
         self, scene: Drawable, pose: FloatArray, weather: Weather
-    ) -> tuple[Float32Array, tuple[Float32Array, Float32Array, NDArray[np.int32]]]:
-        """Return the radiance; and depth, glass depth and ids."""
-        triangles, visibility = self.visibility(scene, pose)
-        geometry = _geometry(visibility, triangles.instance, scene.instances.ids)
+    ) -> tuple[Float32Array, ScreenTriangles, Visibility]:
+        """Return the radiance, and what is seen at the pixels' centres."""
+        seen = self.visibility(scene, pose)
         texture = ground_texture(scene.ground)
         x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
         maps = light_maps(scene.pool, scene.instances, weather, float(x), float(y))
         if self.supersampling == 1:
-            return shade(triangles, visibility, pose, self.intrinsics, weather, texture, maps), geometry
+            return shade(*seen, pose, self.intrinsics, weather, texture, maps), *seen
         fine = PinholeCamera(
             2 * self.width, 2 * self.height, 2 * self.fx, 2 * self.fy, 2 * self.cx, 2 * self.cy,
-            coarse_beyond=self.coarse_beyond,
+            coarse_beyond=self.coarse_beyond / 2,
         )  # fmt: skip
-        triangles, visibility = fine.visibility(scene, pose)
-        radiance = shade(triangles, visibility, pose, fine.intrinsics, weather, texture, maps)
-        return _halved(radiance), geometry
+        radiance = shade(*fine.visibility(scene, pose), pose, fine.intrinsics, weather, texture, maps)
+        return _halved(radiance), *seen
 
     def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
         """Return the visible triangle of each pixel: geometry without light."""
         size = (self.width, self.height)
-        triangles = project(scene.pool, scene.instances, pose, self.intrinsics, size, self.coarse_beyond)
+        triangles = project(scene.pool, scene.instances, pose, self.intrinsics, size, self.coarse_from)
         # A ray meets the ground z = 0 where its z component times the depth equals the camera's height.
         down = -pose[2, :3] / pose[2, 3]
         floor_x, floor_y = down[0] / self.fx, down[1] / self.fy
@@ -242,9 +278,10 @@ class StereoCamera:
         frames = []
         gain = None
         for side, eye in enumerate((pose, self.right_pose(pose))):
-            radiance, geometry = self.camera._render_radiance(scene, checked_pose(scene, eye), weather)
+            radiance, triangles, seen = self.camera._render_radiance(scene, checked_pose(scene, eye), weather)
             gain = sensor.gain(radiance) if gain is None else gain
-            frames.append(Frame(sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain), *geometry))
+            image = sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain)
+            frames.append(_RenderedFrame(image, seen, triangles.instance, scene.instances.ids))
         return StereoFrame(*frames)
 
 
@@ -291,7 +328,7 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
     if not np.isfinite(pose).all():
         raise SensorError(f"camera pose is {pose.tolist()}, want finite numbers")
     rotation = pose[:3, :3]
-    if not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-6) or np.linalg.det(rotation) < 0.0:
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-5 or np.linalg.det(rotation) < 0.0:
         raise SensorError(f"camera pose has axes {rotation.tolist()}, want a rotation")
     if pose[2, 3] <= 0.0:
         raise SensorError(f"camera height is {pose[2, 3]} m, want above the ground, z = 0")

@@ -12,6 +12,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from sim_sensors.camera.textures import FAST, LEAF
@@ -23,6 +24,7 @@ FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 NEAR = 0.05  # m; nothing nearer is drawn
+_MOST_PARTS = 8
 
 # Materials of closed objects, whose inside is never visible. A car's shell is not closed: its inside is visible through
 # the windows.
@@ -68,7 +70,8 @@ def project(
         away = np.linalg.norm(instances.pose[visible, :3] - pose[:3, 3], axis=1) > coarse_beyond
         mesh = np.where(away, pool.coarse[mesh], mesh)
     # A clipped triangle may become two.
-    capacity = 2 * int((pool.triangle_start[mesh + 1] - pool.triangle_start[mesh]).sum())
+    room = 2 * np.concatenate([[0], np.cumsum(pool.triangle_start[mesh + 1] - pool.triangle_start[mesh])])
+    capacity = int(room[-1])
     most_vertices = int((pool.vertex_start[mesh + 1] - pool.vertex_start[mesh]).max(initial=0))
     out = ScreenTriangles(
         np.empty((capacity, 6), dtype=np.float32),
@@ -78,7 +81,12 @@ def project(
         np.empty((capacity, 3), dtype=np.uint8),
         np.empty(capacity, dtype=np.int32),
     )
-    count = _project(
+    # Each thread takes instances with about as many triangles as the others'.
+    parts = min(get_num_threads(), _MOST_PARTS)
+    share = np.searchsorted(room, np.linspace(0, capacity, parts + 1)[1:-1])
+    begin = np.concatenate([[0], share, [len(visible)]]).astype(np.int64)
+    end = room[begin[:-1]]
+    _project_parts(
         pool.vertices,
         pool.normals,
         pool.triangles,
@@ -93,12 +101,16 @@ def project(
         *intrinsics,
         *size,
         _CLOSED,
-        np.empty((most_vertices, 3)),
-        np.empty((3, 4)),
-        np.empty((3, 3)),
-        np.empty((4, 2)),
+        begin,
+        end,
+        most_vertices,
         out,
     )
+    count = int(end[0])
+    for first, last in zip(room[begin[1:-1]].tolist(), end[1:].tolist(), strict=True):
+        for column in out:
+            column[count : count + last - first] = column[first:last]
+        count += last - first
     return ScreenTriangles(
         out.corners[:count],
         out.inverse_depth[:count],
@@ -128,6 +140,41 @@ def _visible_instances(
     return np.flatnonzero(seen).astype(np.int32)
 
 
+@compiled(parallel=True, fastmath=FAST)
+def _project_parts(
+    vertices: Float32Array,
+    normals: Float32Array,
+    triangles: IntArray,
+    material: NDArray[np.uint8],
+    color: NDArray[np.uint8],
+    vertex_start: NDArray[np.int64],
+    triangle_start: NDArray[np.int64],
+    visible: IntArray,
+    mesh: IntArray,
+    poses: FloatArray,
+    camera: FloatArray,
+    fx: float,
+    fy: float,
+    cx: float,
+    cy: float,
+    width: int,
+    height: int,
+    closed: NDArray[np.bool_],
+    begin: NDArray[np.int64],
+    end: NDArray[np.int64],
+    most_vertices: int,
+    out: ScreenTriangles,
+) -> None:
+    """Project instances `begin[k]` to `begin[k + 1]` into `out` from row `end[k]` on, and set that to the next row."""
+    for part in prange(end.shape[0]):
+        end[part] = _project(
+            vertices, normals, triangles, material, color, vertex_start, triangle_start,
+            visible, mesh, poses, camera, fx, fy, cx, cy, width, height, closed,
+            begin[part], begin[part + 1], end[part],
+            np.empty((most_vertices, 3)), np.empty((3, 4)), np.empty((3, 3)), np.empty((4, 2)), out,
+        )  # fmt: skip
+
+
 @compiled(fastmath=FAST, _nrt=False)
 def _project(
     vertices: Float32Array,
@@ -148,15 +195,17 @@ def _project(
     width: int,
     height: int,
     closed: NDArray[np.bool_],
+    first_instance: int,
+    end_instance: int,
+    count: int,
     moved: FloatArray,
     to_camera: FloatArray,
     cross: FloatArray,
     polygon: FloatArray,
     out: ScreenTriangles,
 ) -> int:
-    """Fill `out` and return the number of triangles; `moved` to `polygon` are work arrays."""
-    count = 0
-    for index in range(visible.shape[0]):
+    """Fill `out` from row `count` on, and return the row after the last; `moved` to `polygon` are work arrays."""
+    for index in range(first_instance, end_instance):
         q = visible[index]
         first_vertex = vertex_start[mesh[index]]
         cosine = math.cos(poses[q, 3])

@@ -66,14 +66,15 @@ def rasterize(
         np.empty(glazed, dtype=np.int32),
         np.empty(glazed, dtype=np.uint8),
     )
-    start, members = _sort_into_bands(triangles.corners, (height + BAND - 1) // BAND, height)
+    start, members = _sort_into_bands(
+        triangles.corners, triangles.material, (height + BAND - 1) // BAND, height, panes
+    )
     _rasterize(
         triangles.corners,
         triangles.inverse_depth,
-        triangles.material,
         start,
         members,
-        interleaved(len(start) - 1),
+        interleaved(len(start) // 2),
         floor,
         minimum,
         out.inverse_depth,
@@ -97,27 +98,36 @@ def interleaved(n: int) -> NDArray[np.int64]:
 
 
 @compiled
-def _sort_into_bands(corners: Float32Array, n_bands: int, height: int) -> tuple[NDArray[np.int64], IntArray]:
-    """Return the triangles of each band in their order, `members[start[b]:start[b + 1]]`."""
+def _sort_into_bands(
+    corners: Float32Array, material: NDArray[np.uint8], n_bands: int, height: int, panes: bool
+) -> tuple[NDArray[np.int64], IntArray]:
+    """Return the triangles of each band in their order: for band b, `members[start[2·b]:start[2·b + 1]]` are opaque.
+
+    The panes of the band follow, up to `start[2·b + 2]`; without `panes` there are none.
+    """
     n = corners.shape[0]
     first = np.empty(n, dtype=np.int32)
     last = np.empty(n, dtype=np.int32)
-    start = np.zeros(n_bands + 1, dtype=np.int64)
+    start = np.zeros(2 * n_bands + 1, dtype=np.int64)
     for t in range(n):
         top = min(corners[t, 1], corners[t, 3], corners[t, 5])
         bottom = max(corners[t, 1], corners[t, 3], corners[t, 5])
         first[t] = int(min(max(top, 0.0), height - 1.0)) // BAND
         last[t] = int(min(max(bottom, 0.0), height - 1.0)) // BAND
+        glass = material[t] == _GLASS
+        if glass and not panes:
+            last[t] = first[t] - 1
         for band in range(first[t], last[t] + 1):
-            start[band + 1] += 1
-    for band in range(n_bands):
-        start[band + 1] += start[band]
-    members = np.empty(start[n_bands], dtype=np.int32)
+            start[2 * band + glass + 1] += 1
+    for place in range(2 * n_bands):
+        start[place + 1] += start[place]
+    members = np.empty(start[2 * n_bands], dtype=np.int32)
     fill = start[:-1].copy()
     for t in range(n):
+        glass = material[t] == _GLASS
         for band in range(first[t], last[t] + 1):
-            members[fill[band]] = t
-            fill[band] += 1
+            members[fill[2 * band + glass]] = t
+            fill[2 * band + glass] += 1
     return start, members
 
 
@@ -150,7 +160,6 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,
-    material: NDArray[np.uint8],
     start: NDArray[np.int64],
     members: IntArray,
     order: NDArray[np.int64],
@@ -180,10 +189,8 @@ def _rasterize(
                 n_panes[y] = 0
         # Draw glass second, since it is drawn only in front of opaque surfaces.
         for is_glass in range(2 if pane.shape[0] > 0 else 1):
-            for member in range(start[band], start[band + 1]):
+            for member in range(start[2 * band + is_glass], start[2 * band + is_glass + 1]):
                 t = members[member]
-                if (material[t] == _GLASS) != (is_glass == 1):
-                    continue
                 ax, ay, bx, by, cx, cy = sorted_by_row(corners[t])
                 slope_ac = edge_slope(ax, ay, cx, cy)
                 slope_ab = edge_slope(ax, ay, bx, by)

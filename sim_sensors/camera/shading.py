@@ -19,7 +19,7 @@ from sim_sensors.camera.light_maps import LightMaps
 from sim_sensors.camera.materials import LINEAR, RESPONSE, Materials, surface_radiance, through_glass
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.rasterizer import BAND, Visibility, interleaved
-from sim_sensors.camera.sky import look_up
+from sim_sensors.camera.sky import sky_of_view
 from sim_sensors.camera.textures import FAST, LEAF, Tile, cloud_tile, grain_tile, hash_unit
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
@@ -63,8 +63,8 @@ def shade(
         (h, w, 3) float32, linear RGB, relative (see `Weather`).
     """
     height, width = visibility.triangle.shape
-    light = daylight(weather)
     view = _View(np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3]), *intrinsics)
+    light = daylight(weather, sky_of_view(weather, view.rotation, intrinsics, (width, height)))
     image = np.empty((height, width, 3), dtype=np.float32)
     order = interleaved((height + BAND - 1) // BAND)
     grain, cloud = grain_tile(), cloud_tile()
@@ -116,17 +116,23 @@ def _shade_row(
     level = ground_level(row_z, view.position[2], view.fx, ground.texel)
     grain_level = level + math.log2(ground.texel / (3.0 / 512))
     for x in range(width):
+        inverse_depth = visibility.inverse_depth[y, x]
+        pane = visibility.pane[y, x]
+        if inverse_depth <= 0.0 and pane < 0:
+            for channel in range(3):
+                image[y, x, channel] = light.background[y, x, channel]
+            continue
         u = (x + 0.5 - view.cx) / view.fx
         dx = r[0, 0] * u + row_x
         dy = r[1, 0] * u + row_y
         dz = r[2, 0] * u + row_z
         inverse_length = 1.0 / math.sqrt(u * u + v * v + 1.0)
-        inverse_depth = visibility.inverse_depth[y, x]
         t = visibility.triangle[y, x]
         ray = (dx * inverse_length, dy * inverse_length, dz * inverse_length)
-        if inverse_depth <= 0.0:
-            red, green, blue = look_up(light.background, ray[0], ray[1], max(ray[2], 0.0))
-        else:
+        red = float(light.background[y, x, 0])
+        green = float(light.background[y, x, 1])
+        blue = float(light.background[y, x, 2])
+        if inverse_depth > 0.0:
             depth = 1.0 / inverse_depth
             point = _along(view, dx, dy, dz, depth)
             if t < 0:
@@ -146,7 +152,6 @@ def _shade_row(
             red += (light.horizon[0] - red) * fog
             green += (light.horizon[1] - green) * fog
             blue += (light.horizon[2] - blue) * fog
-        pane = visibility.pane[y, x]
         if pane >= 0:
             normal = _normal(triangles.normal[pane], u, v)
             point = _along(view, dx, dy, dz, 1.0 / visibility.pane_inverse_depth[y, x])

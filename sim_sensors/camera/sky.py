@@ -1,119 +1,240 @@
-"""The sky as a paraboloid map, which allows look-ups by direction without trigonometry."""
+"""The sky: its radiance in any direction, as the background of a view, and as a blurred dome for reflections.
+
+Above the horizon a view depends only on weather and rotation, so a camera that drives straight on draws its sky once.
+"""
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
-from sim_sensors.camera.textures import LEAF, cloud_tile, fractal_noise
+from sim_sensors.camera.textures import FAST, LEAF, cloud_tile, fractal_noise
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
 
-_SHARP = 1536  # texels across the hemisphere: one is about 0.1°
-_BLURRED = 160
+_DOME = 160  # texels across the hemisphere
+_SAMPLES = 3  # along each side of a texel
+_BEARINGS = 1024  # steps of the skyline
+_BELOW = -0.1  # z of a ray; nothing lower is sky, from any height below 100 m
+_KEPT_VIEWS = 4
+_NOISE = 256
+
+
+class Sky(NamedTuple):
+    """A weather's sky for compiled code; colours are linear RGB radiance.
+
+    Attributes:
+        zenith, horizon, sun_direction: (3,) float64, as in `Weather`.
+        glow: strength of the brightness around the sun.
+        clouds: (256, 256) float32, tileable noise; there are clouds where it is above `threshold`.
+        threshold: see `clouds`.
+        white: (3,) float64, colour of a cloud.
+        top: (1024,) float64, z of the skyline by azimuth.
+        built: (1024,) bool, whether the skyline is a roof there rather than trees.
+        light: (3,) float64, light on the skyline.
+        veil: fraction of the skyline's colour that haze replaces.
+        speckle: (512, 512) float32, noise of leaves and walls.
+    """
+
+    zenith: FloatArray
+    horizon: FloatArray
+    sun_direction: FloatArray
+    glow: float
+    clouds: Float32Array
+    threshold: float
+    white: FloatArray
+    top: FloatArray
+    built: NDArray[np.bool_]
+    light: FloatArray
+    veil: float
+    speckle: Float32Array
 
 
 @lru_cache(maxsize=8)
-def sky_domes(weather: Weather) -> tuple[Float32Array, Float32Array]:
-    """Return the upper hemisphere, sharp for the background and blurred for reflections.
+def sky_of(weather: Weather) -> Sky:
+    """Draw clouds and skyline of a weather: distant trees and roofs, up to about 8° high, in haze."""
+    rng = np.random.default_rng([weather.seed, 7])
+    noise = (0.5 + 0.2 * fractal_noise(_NOISE, rng, 1.5)).astype(np.float32)
+    crowns = 0.05 + 0.022 * fractal_noise(_BEARINGS, rng, 0.9)[0]
+    roofs = np.repeat(rng.uniform(0.02, 0.13, 64), _BEARINGS // 64)
+    built = np.repeat(rng.random(64) < 0.3, _BEARINGS // 64)
+    sky, sun, tile = np.array(weather.sky), np.array(weather.sun), cloud_tile()
+    return Sky(
+        np.array(weather.zenith),
+        np.array(weather.horizon),
+        np.array(weather.sun_direction),
+        0.35 * (1 - weather.clouds),
+        noise,
+        float(np.quantile(noise, 1.0 - weather.clouds)) if weather.clouds > 0.0 else 2.0,
+        0.95 * sky + 0.12 * sun,
+        np.where(built, roofs, np.clip(crowns, 0.012, 0.16)),
+        built,
+        sky + 0.35 * sun,
+        min(0.85, 0.12 + weather.haze * 120.0),
+        tile.levels[: tile.size**2].reshape(tile.size, tile.size),
+    )
 
-    Both are paraboloid maps: direction (x, y, z) with z ≥ 0 lies at ((x, y) / (1 + z) + 1) / 2 of the side. They
-    include the skyline of distant trees and roofs.
+
+@compiled(**LEAF)
+def sky_radiance(sky: Sky, x: float, y: float, z: float) -> tuple[float, float, float]:
+    """Return the radiance in the unit direction (x, y, z), z ≥ 0."""
+    sun = sky.sun_direction
+    near = min(max(x * sun[0] + y * sun[1] + z * sun[2], 0.0), 1.0)
+    near *= near
+    near *= near * near  # to the power of 6
+    disc = near * near
+    disc *= disc
+    disc *= disc * near * near  # 60
+    point = disc * disc
+    point *= point
+    point *= disc  # 300
+    point *= point * point * point * point
+    glow = 1.0 + sky.glow * (near + 3.0 * disc + 12.0 * point)
+    low = (1.0 - z) ** 2.2
+    # A layer of clouds at unit height, stretched towards the horizon but not infinitely.
+    span = 0.17 * _NOISE / (z + 0.2)
+    column, row = math.floor(x * span), math.floor(y * span)
+    a, b = x * span - column, y * span - row
+    c = sky.clouds
+    left, right = int(column) & (_NOISE - 1), (int(column) + 1) & (_NOISE - 1)
+    above, below = int(row) & (_NOISE - 1), (int(row) + 1) & (_NOISE - 1)
+    sheet = (c[above, left] * (1.0 - a) + c[above, right] * a) * (1.0 - b)
+    sheet += (c[below, left] * (1.0 - a) + c[below, right] * a) * b
+    cover = min(max((sheet - sky.threshold + 0.06) * 4.0, 0.0), 1.0)
+    bright = cover * (0.75 + 0.5 * min(max(sheet, 0.0), 1.0))
+    clear = glow * (1.0 - cover)
+    red = (sky.zenith[0] * (1.0 - low) + sky.horizon[0] * low) * clear + sky.white[0] * bright
+    green = (sky.zenith[1] * (1.0 - low) + sky.horizon[1] * low) * clear + sky.white[1] * bright
+    blue = (sky.zenith[2] * (1.0 - low) + sky.horizon[2] * low) * clear + sky.white[2] * bright
+    if z < 0.17:
+        azimuth = math.atan2(y, x) * (0.5 / math.pi)
+        azimuth -= math.floor(azimuth)
+        bearing = min(int(azimuth * _BEARINGS), _BEARINGS - 1)
+        mask = min(max((sky.top[bearing] - z) * 400.0 + 0.5, 0.0), 1.0)
+        if mask > 0.0:
+            n = sky.speckle.shape[0]
+            speckle = sky.speckle[int(z * 2200.0) % n, int(azimuth * 6000.0) % n]
+            far = sky.light
+            if sky.built[bearing]:
+                tone = (0.8 + 0.4 * speckle) * (1.0 - sky.veil)
+                f_red, f_green, f_blue = 0.3 * tone, 0.27 * tone, 0.24 * tone
+            else:
+                tone = (0.3 + 1.4 * speckle) * (1.0 - sky.veil)
+                f_red, f_green, f_blue = 0.05 * tone, 0.075 * tone, 0.03 * tone
+            red += (f_red * far[0] + sky.horizon[0] * sky.veil - red) * mask
+            green += (f_green * far[1] + sky.horizon[1] * sky.veil - green) * mask
+            blue += (f_blue * far[2] + sky.horizon[2] * sky.veil - blue) * mask
+    return red, green, blue
+
+
+@lru_cache(maxsize=8)
+def mirrored_sky(weather: Weather) -> Float32Array:
+    """Return the upper hemisphere as reflections show it, blurred.
+
+    It is a paraboloid map, which allows look-ups without trigonometry: direction (x, y, z) with z ≥ 0 lies at
+    ((x, y) / (1 + z) + 1) / 2 of the side.
 
     Returns:
-        two arrays (n, n, 3) float32, linear RGB radiance.
+        (160, 160, 3) float32, linear RGB radiance.
     """
-    rng = np.random.default_rng([weather.seed, 7])
-    side = (np.arange(_SHARP) + 0.5) / _SHARP * 2.0 - 1.0
-    u, v = np.meshgrid(side, side)
-    square = u * u + v * v
-    inside = np.minimum(square, 1.0)
-    z = (1.0 - inside) / (1.0 + inside)
-    # Corners outside the unit disc repeat the horizon, so bilinear look-ups at the rim are valid.
-    stretch = np.where(square > 1.0, 1.0 / np.sqrt(square), 1.0)
-    x = 2.0 * u * stretch / (1.0 + inside)
-    y = 2.0 * v * stretch / (1.0 + inside)
-
-    toward_horizon = ((1.0 - z) ** 2.2)[..., None]
-    dome = np.array(weather.zenith) * (1.0 - toward_horizon) + np.array(weather.horizon) * toward_horizon
-    dome *= (1.0 + 0.35 * (1 - weather.clouds) * _glow(weather, x, y, z))[..., None]
-    dome = _with_clouds(dome, weather, rng, x, y, z)
-    dome = _with_skyline(dome, weather, rng, x, y, z)
-    sharp = np.ascontiguousarray(dome, dtype=np.float32)
-    blurred = cv2.resize(sharp, (_BLURRED, _BLURRED), interpolation=cv2.INTER_AREA)
-    return sharp, np.ascontiguousarray(blurred, dtype=np.float32)
+    dome = np.empty((_DOME * _SAMPLES, _DOME * _SAMPLES, 3), dtype=np.float32)
+    _fill_dome(sky_of(weather), dome)
+    return np.asarray(cv2.resize(dome, (_DOME, _DOME), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-def _glow(weather: Weather, x: FloatArray, y: FloatArray, z: FloatArray) -> FloatArray:
-    """Return the brightness of the sky around the sun."""
-    sun = weather.sun_direction
-    cosine = np.clip(x * sun[0] + y * sun[1] + z * sun[2], 0.0, 1.0)
-    glow: FloatArray = cosine**6 + 3.0 * cosine**60 + 12.0 * cosine**1500
-    return glow
+@compiled(parallel=True, fastmath=FAST)
+def _fill_dome(sky: Sky, dome: Float32Array) -> None:
+    n = dome.shape[0]
+    for row in prange(n):
+        v = (row + 0.5) / n * 2.0 - 1.0
+        for column in range(n):
+            u = (column + 0.5) / n * 2.0 - 1.0
+            square = u * u + v * v
+            # Corners outside the unit disc repeat the horizon, so bilinear look-ups at the rim are valid.
+            inside = min(square, 1.0)
+            stretch = 2.0 / (1.0 + inside) / math.sqrt(max(square, 1.0))
+            z = (1.0 - inside) / (1.0 + inside)
+            red, green, blue = sky_radiance(sky, u * stretch, v * stretch, z)
+            dome[row, column, 0] = red
+            dome[row, column, 1] = green
+            dome[row, column, 2] = blue
 
 
-def _with_clouds(
-    dome: FloatArray, weather: Weather, rng: np.random.Generator, x: FloatArray, y: FloatArray, z: FloatArray
-) -> FloatArray:
-    noise = (0.5 + 0.2 * fractal_noise(256, rng, 1.5)).astype(np.float32)
-    # A layer of clouds at unit height, stretched towards the horizon but not infinitely.
-    column = (x / (z + 0.2) * 0.17 * 256) % 256
-    row = (y / (z + 0.2) * 0.17 * 256) % 256
-    sheet = cv2.remap(
-        noise, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR, borderMode=cv2.BORDER_WRAP
-    )
-    threshold = np.quantile(noise, 1.0 - weather.clouds) if weather.clouds > 0.0 else 2.0
-    cover = np.clip((sheet - threshold + 0.06) * 4.0, 0.0, 1.0)[..., None]
-    brightness = 0.75 + 0.5 * np.clip(sheet, 0.0, 1.0)[..., None]
-    white = np.array(weather.sky) * 0.95 + np.array(weather.sun) * 0.12
-    blended: FloatArray = dome * (1.0 - cover) + white * brightness * cover
-    return blended
+def sky_of_view(
+    weather: Weather,
+    rotation: FloatArray,
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+) -> Float32Array:
+    """Return the sky behind every pixel of a view; the last views are kept.
+
+    Args:
+        weather: the weather.
+        rotation: (3, 3) float64, camera to world.
+        intrinsics: fx, fy, cx, cy, px.
+        size: width, height, px.
+
+    Returns:
+        (h, w, 3) float32, linear RGB radiance; the horizon's far below it. It must not be changed.
+    """
+    return _sky_of_view(weather, tuple(rotation.ravel().tolist()), intrinsics, size)
 
 
-def _with_skyline(
-    dome: FloatArray, weather: Weather, rng: np.random.Generator, x: FloatArray, y: FloatArray, z: FloatArray
-) -> FloatArray:
-    """Draw distant trees and roofs, up to about 8° high, in haze."""
-    azimuth = np.mod(np.arctan2(y, x) / (2.0 * np.pi), 1.0)
-    bins = 1024
-    crowns = 0.05 + 0.022 * fractal_noise(bins, rng, 0.9)[0]
-    roofs = np.repeat(rng.uniform(0.02, 0.13, 64), bins // 64)
-    is_roof = np.repeat(rng.random(64) < 0.3, bins // 64)
-    top = np.where(is_roof, roofs, np.clip(crowns, 0.012, 0.16))
-    height = top[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
-    built = is_roof[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
-    tile = cloud_tile()
-    noise = tile.levels[: tile.size**2].reshape(tile.size, tile.size)
-    speckle = noise[(z * 2200).astype(np.int64) % tile.size, (azimuth * 6000).astype(np.int64) % tile.size]
-    light = np.array(weather.sky) + 0.35 * np.array(weather.sun)
-    leaf = np.array([0.05, 0.075, 0.03]) * (0.3 + 1.4 * speckle[..., None])
-    wall = np.array([0.3, 0.27, 0.24]) * (0.8 + 0.4 * speckle[..., None])
-    far = np.where(built[..., None], wall, leaf) * light
-    veil = min(0.85, 0.12 + weather.haze * 120.0)
-    far = far * (1.0 - veil) + np.array(weather.horizon) * veil
-    mask = np.clip((height - z) * 400.0 + 0.5, 0.0, 1.0)[..., None]
-    blended: FloatArray = dome * (1.0 - mask) + far * mask
-    return blended
+@lru_cache(maxsize=_KEPT_VIEWS)
+def _sky_of_view(
+    weather: Weather,
+    rotation: tuple[float, ...],
+    intrinsics: tuple[float, float, float, float],
+    size: tuple[int, int],
+) -> Float32Array:
+    view = np.empty((size[1], size[0], 3), dtype=np.float32)
+    _fill_view(sky_of(weather), np.array(rotation).reshape(3, 3), *intrinsics, view)
+    return view
+
+
+@compiled(parallel=True, fastmath=FAST)
+def _fill_view(
+    sky: Sky, rotation: FloatArray, fx: float, fy: float, cx: float, cy: float, view: Float32Array
+) -> None:
+    r = rotation
+    for y in prange(view.shape[0]):
+        v = (y + 0.5 - cy) / fy
+        for x in range(view.shape[1]):
+            u = (x + 0.5 - cx) / fx
+            scale = 1.0 / math.sqrt(u * u + v * v + 1.0)
+            dz = (r[2, 0] * u + r[2, 1] * v + r[2, 2]) * scale
+            red, green, blue = sky.horizon[0], sky.horizon[1], sky.horizon[2]
+            if dz > _BELOW:
+                dx = (r[0, 0] * u + r[0, 1] * v + r[0, 2]) * scale
+                dy = (r[1, 0] * u + r[1, 1] * v + r[1, 2]) * scale
+                red, green, blue = sky_radiance(sky, dx, dy, max(dz, 0.0))
+            view[y, x, 0] = red
+            view[y, x, 1] = green
+            view[y, x, 2] = blue
 
 
 @compiled(**LEAF)
 def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0."""
+    """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0, in a map like `mirrored_sky`."""
     n = dome.shape[0]
     scale = 0.5 / (1.0 + z)
     u = (x * scale + 0.5) * n - 0.5
     v = (y * scale + 0.5) * n - 0.5
-    column = min(max(int(u), 0), n - 2)
-    row = min(max(int(v), 0), n - 2)
-    a = min(max(u - column, 0.0), 1.0)
-    b = min(max(v - row, 0.0), 1.0)
+    left = min(max(int(u), 0), n - 2)
+    top = min(max(int(v), 0), n - 2)
+    a = min(max(u - left, 0.0), 1.0)
+    b = min(max(v - top, 0.0), 1.0)
     weights = ((1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b)
+    row, column = np.uint64(top), np.uint64(left)
     return (
         _mixed(dome, row, column, 0, weights),
         _mixed(dome, row, column, 1, weights),
@@ -123,11 +244,16 @@ def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, fl
 
 @compiled(**LEAF)
 def _mixed(
-    dome: Float32Array, row: int, column: int, channel: int, weights: tuple[float, float, float, float]
+    dome: Float32Array,
+    row: np.uint64,
+    column: np.uint64,
+    channel: int,
+    weights: tuple[float, float, float, float],
 ) -> float:
+    one = np.uint64(1)
     return float(
         dome[row, column, channel] * weights[0]
-        + dome[row, column + 1, channel] * weights[1]
-        + dome[row + 1, column, channel] * weights[2]
-        + dome[row + 1, column + 1, channel] * weights[3]
+        + dome[row, column + one, channel] * weights[1]
+        + dome[row + one, column, channel] * weights[2]
+        + dome[row + one, column + one, channel] * weights[3]
     )

@@ -14,6 +14,7 @@ Float32Array = NDArray[np.float32]
 
 # All fastmath flags except the one that excludes infinities: the depth of the sky is infinite.
 FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
+# Indices are unsigned in such functions: numba lets negative ones count from the end, which takes a comparison each.
 # For functions that are called per pixel or triangle and do not allocate: numba's reference counting of their array
 # arguments would cost ten times the computation.
 LEAF = {"fastmath": FAST, "_nrt": False, "forceinline": True}
@@ -82,8 +83,8 @@ def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
     bottom = tile.start[level] + ((row + 1) & mask) * n
     left = column & mask
     right = (column + 1) & mask
-    above = tile.levels[top + left] * (1 - a) + tile.levels[top + right] * a
-    below = tile.levels[bottom + left] * (1 - a) + tile.levels[bottom + right] * a
+    above = tile.levels[np.uint64(top + left)] * (1 - a) + tile.levels[np.uint64(top + right)] * a
+    below = tile.levels[np.uint64(bottom + left)] * (1 - a) + tile.levels[np.uint64(bottom + right)] * a
     return float(above * (1 - b) + below * b)
 
 

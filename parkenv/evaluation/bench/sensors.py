@@ -118,7 +118,7 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
         return poses[i % len(poses)]
 
     def transform(i: int) -> object:
-        return project(scene.pool, scene.instances, pose(i), camera.intrinsics, size, camera.coarse_beyond)
+        return project(scene.pool, scene.instances, pose(i), camera.intrinsics, size, camera.coarse_from)
 
     def shaded(_: int) -> NDArray[np.float32]:
         return shade(triangles, visibility, poses[0], camera.intrinsics, weather, ground, maps)
