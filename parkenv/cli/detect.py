@@ -163,7 +163,8 @@ def train_detector(
         parkenv train-detector --labels coco.json --images pictures -o side.npz
         parkenv train-detector --labels yolo --front -o front.npz
         parkenv train-detector --crops kitti --front --out front.npz \
-            --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0 --enlarged 0
+            --normalization blocks --penalty 0.02 \
+            --jitter 0 --misaligned 0 --enlarged 0
 
     Options:
         out, -o (FILE.npz): The model file to write.
