@@ -139,3 +139,15 @@ def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day(monkeypatc
     new.carry_over(old, np.arange(30), np.arange(20, 50))
     new.update(seen.take(second))
     np.testing.assert_allclose(new.p_occupied(seen.take(second)), at_once.p_occupied(seen)[second], rtol=1e-9)
+
+
+def test_what_is_observed_last_holds_even_if_it_was_excluded():
+    """A guidance system's word is final until its next one: what it withdraws is taken, not free."""
+    _, near, before = forecast_of(10, decay_rate=0.0)
+    day, slots = DayBelief(before, near), np.arange(10)
+    for reserved in (3, 7, 2):
+        before = before.decay(5.0).update(slots, slots != reserved)
+        # Bayes' rule cannot turn a certain state round.
+        before.p_observed[:] = before.p_occupied[:] = slots != reserved
+        day.update(before)
+        np.testing.assert_allclose(day.p_occupied(before), slots != reserved, atol=1e-9)

@@ -15,6 +15,7 @@ from parkenv.evaluation.experiments.spec import FleetSpec
 from parkenv.evaluation.figures.fleet_figure import looks_s
 from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting, summarize_days
 from parkenv.evaluation.fleet.measures import MEANS, Roads, gini
+from parkenv.evaluation.trips.calibration import Calibration
 from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import scenario_specs
@@ -82,7 +83,7 @@ def test_measures_of_a_day_are_those_of_its_cars():
     assert 0.5 < day["occupancy"] <= 1.0
     assert 0.0 < day["cruising_share"] < 1.0
     assert day["cruised_m"] < day["driven_m"]
-    assert day["bound_s"] < day["total_s"]
+    assert day["bound_s"] <= day["clairvoyant_s"] < day["total_s"]
     assert day["search_s"] == pytest.approx((cars["drive_s"] + cars["failed_s"]).mean())
 
 
@@ -116,6 +117,8 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     for row in rows:
         low, high = row["price_of_anarchy_ci95"]
         assert low <= row["price_of_anarchy"] <= high
+        low_over, high_over = row["price_over_bound_ci95"]
+        assert 1.0 < low_over <= row["price_over_bound"] <= high_over
         if row["knows"] == "reserve":
             assert (low, row["price_of_anarchy"], high) == (1.0, 1.0, 1.0)
     own, reserve = days[0], days[1]
@@ -173,7 +176,19 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
         (("--arrivals-per-hour", "0"), "--arrivals-per-hour is 0.0, want a number above 0"),
         (("--stay-min", "0"), "--stay-min: want 0.1 <= X <= 100000"),
         (("--stay-min", "inf"), "--stay-min: want 0.1 <= X <= 100000"),
+        (
+            ("--hours", "08:00-08:00"),
+            "the arrivals of 'mini' are at one time, want hours in which cars arrive",
+        ),
+        (
+            ("--decision-limit", "1", "--backend", "dask"),
+            "decision_limit_s goes with the backends loky and ray",
+        ),
         (("-n", "0"), "--episodes: want N >= 1"),
+        (("--manoeuvre", "-1"), "--manoeuvre: want 0.0 <= X <= 3600"),
+        (("--leaving-soon", "nan"), "--leaving-soon: want 0.0 <= X <= 3600"),
+        (("--decision-limit", "0"), "--decision-limit: want 0.01 <= X <= 100000"),
+        (("--calibrated", "nothing.json"), "nothing.json"),
         (("--arrivals-per-hour", "1e6"), "cars arrive in the window, want at most 1,000,000"),
         (("--agents", "oracle"), "agent 'oracle' knows the future of single searches"),
         (("--agents", "greedy"), "unknown agent 'greedy'"),
@@ -235,9 +250,33 @@ def test_a_part_of_the_days_is_compared_with_the_same_days():
     assert row["difference_s"] == pytest.approx(reserve[1]["total_s"] - own[1]["total_s"])
 
 
+def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
+    crowded = experiment(arrivals_per_hour=(60.0,), knows=("own",), days=1)
+    for name, value in (("leaving_soon_s", 20.0), ("manoeuvre_s", 12.0), ("sees_cars", True)):
+        changed = FleetExperiment(crowded.spec.changed(**{name: value}))
+        assert changed.fingerprint() != crowded.fingerprint()
+        fleet, _ = changed.fleet(changed.settings[0])
+        expected = value if name == "sees_cars" else float(value)
+        found = fleet.sees_cars if name == "sees_cars" else float(fleet.records[name][0])
+        assert found == expected
+    measured = Calibration("mini", 2.0, 15.0, 14.0, 40, 2.8)
+    measured.to_file(tmp_path / "calibrated.json")
+    calibrated = FleetExperiment(crowded.spec.changed(calibrated=tmp_path / "calibrated.json"))
+    assert (calibrated.scenario.v_drive, calibrated.scenario.failure_s) == (2.0, 15.0)
+    assert calibrated.manoeuvre_s == 14.0
+    assert FleetExperiment(calibrated.spec.changed(manoeuvre_s=0.0)).manoeuvre_s == 0.0
+    (day,), (queueing,) = days_of(crowded)[0], days_of(calibrated)[0]
+    assert (day["queued_s"], queueing["cars"]) == (0.0, day["cars"])
+    assert 0.0 < queueing["queued_s"] < queueing["search_s"]
+    with pytest.raises(InputError, match="was measured on 'mini', the fleet drives on 'street'"):
+        _ = FleetExperiment(calibrated.spec.changed(scenario=scenario_specs("street")[0])).scenario
+
+
 @pytest.mark.parametrize(
     ("module", "body", "message"),
     [
+        ("leaving", "raise SystemExit(3)", ": its agent raised SystemExit at"),
+        ("endless", "while True: pass", "its agent raised TimeoutError at"),
         ("raising", "raise RuntimeError('no idea')", ": its agent raised RuntimeError at"),
         ("mistaken", "return 17, state", "action is 17, want a whole number from 0 to 4"),
     ],
@@ -257,6 +296,7 @@ def test_an_agent_that_fails_is_named_with_setting_day_and_car_and_earlier_days_
     )
     out = tmp_path / "out"
     words = (*WORDS[:4], "--arrivals-per-hour", "3", "--knows", "own", "-n", 30)
+    words += ("--decision-limit", "0.5")
     done = parkenv("fleet", "--agents", f"{module}:Failing", *words, "--jobs", 1, "--out", out, cwd=tmp_path)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1

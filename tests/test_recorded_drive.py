@@ -159,6 +159,44 @@ def test_a_bag_of_somebodys_car_becomes_captures(tmp_path, raw, pose_type):
     )
 
 
+def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
+    from rosbags.rosbag1 import Writer as WriterOfRos1
+    from rosbags.rosbag2 import Reader, StoragePlugin, Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    file, ros1, ros2 = (
+        bag(tmp_path / "bag"),
+        get_typestore(Stores.ROS1_NOETIC),
+        get_typestore(Stores.ROS2_HUMBLE),
+    )
+    sqlite = tmp_path / "sqlite"
+    with (
+        Reader(file) as reader,
+        Writer(sqlite, version=9, storage_plugin=StoragePlugin.SQLITE3) as new,
+        WriterOfRos1(tmp_path / "one.bag") as old,
+    ):
+        for topic in reader.connections:
+            in_new = new.add_connection(topic.topic, topic.msgtype, typestore=ros2)
+            in_old = old.add_connection(topic.topic, topic.msgtype, typestore=ros1)
+            for _, stamp, data in reader.messages(connections=[topic]):
+                new.write(in_new, stamp, data)
+                message = ros2.deserialize_cdr(data, topic.msgtype)
+                message.header = ros1.types["std_msgs/msg/Header"](0, message.header.stamp, "")
+                old.write(in_old, stamp, ros1.serialize_ros1(message, topic.msgtype))
+    calibration = calibrated(tmp_path)
+    wanted = list(RecordedDrive(file, calibration).captures())
+    for path in (sqlite, sqlite / "sqlite.db3", tmp_path / "one.bag"):
+        found = list(RecordedDrive(path, calibration).captures())
+        assert len(found) == len(wanted) == 5
+        for (one, pose), (other, other_pose) in zip(wanted, found, strict=True):
+            assert one.time == other.time
+            np.testing.assert_array_equal(pose, other_pose)
+            np.testing.assert_array_equal(
+                one.capture.images["right"].image, other.capture.images["right"].image
+            )
+            np.testing.assert_array_equal(one.capture.scans["front"], other.capture.scans["front"])
+
+
 def test_a_drive_is_mapped(tmp_path):
     drive = RecordedDrive(bag(tmp_path / "bag"), calibrated(tmp_path))
     lot = make_scenario("mini").lot

@@ -266,9 +266,10 @@ def _update(
             p = p_taken[s, h]
             if not first:
                 p = decay_to_prior(p, rate * (1.0 - forecast) / (1.0 - p), p_then[s, h], gap)
-            likelihood = max(if_taken * p + if_free * (1.0 - p), 1e-300)
-            p_then[s, h] = if_taken * p / likelihood
-            log_weight[h] += math.log(likelihood)
+            likelihood = if_taken * p + if_free * (1.0 - p)
+            # What a hypothesis excludes has been observed all the same.
+            p_then[s, h] = if_taken * p / likelihood if likelihood > 0.0 else parts[2, s]
+            log_weight[h] += math.log(max(likelihood, 1e-300))
         observed_at[s], p_observed[s] = time, parts[2, s]
 
 

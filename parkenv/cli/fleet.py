@@ -34,6 +34,11 @@ def fleet(
     knows: str | None = None,
     share: str | None = None,
     delay: float | None = None,
+    manoeuvre: float | None = None,
+    calibrated: Path | None = None,
+    leaving_soon: float | None = None,
+    sees_cars: bool | None = None,
+    decision_limit: float | None = None,
     world: args.ObservedSearches,
     figures: bool | None = None,
     trust: bool = False,
@@ -52,6 +57,7 @@ def fleet(
         parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
+        parkenv fleet --manoeuvre 15 --leaving-soon 10
         parkenv fleet --resume --episodes 20
 
     Options:
@@ -74,6 +80,18 @@ def fleet(
         share (X[,...]): Shares of the cars that are members, from 0 to 1; the others know what they observe.
             [default: 1]
         delay (0.0 <= X <= 100000): Age of the live map, s.  [default: 0]
+
+    Interactions:
+        manoeuvre (0.0 <= X <= 3600): Seconds for which a car that parks or leaves blocks its lane; queues form behind
+            it, and behind a car that stands.  [default: as in --calibrated; else 0, cars pass through each other]
+        calibrated (FILE): Take driving speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`.
+        leaving_soon (0.0 <= X <= 3600): Seconds for which cars show that they leave; a car that stands before such a
+            slot holds it.  [default: 0]
+        sees_cars: Let agents observe other cars in view, in a further key of the observation.  [default: no-sees-cars]
+
+    Agents:
+        decision_limit (0.01 <= X <= 100000): Stop the run if an agent in Python takes longer for a decision, in seconds
+            of wall time, compiling included.  [default: none]
 
     Results:
         figures: Draw the picture.  [default: figures]
@@ -102,6 +120,11 @@ def fleet(
         spec = spec.changed("--patience-min", patience_s=60.0 * patience_min)
     if delay is not None:
         spec = spec.changed("--delay", delay_s=delay)
+    if calibrated is not None:
+        spec = spec.changed("--calibrated", calibrated=calibrated)
+    spec = spec.changed(**args.not_none(
+        manoeuvre_s=manoeuvre, leaving_soon_s=leaving_soon, sees_cars=sees_cars, decision_limit_s=decision_limit,
+    ))  # fmt: skip
     with writing_into(out, f"--resume --out {out}"):
         run_fleet_of(spec, out, folder)
 
@@ -122,7 +145,7 @@ def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
     if result.rows:
         headings = (
             "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
-            "cruising", "occupancy", "price of anarchy",
+            "cruising", "occupancy", "price of anarchy", "over bound",
         )  # fmt: skip
         console.print(make_table(title, headings, map(_cells, result.rows)))
     if not result.complete:
@@ -154,4 +177,5 @@ def _cells(row: Row) -> tuple[str, ...]:
         f"{row['cruising_share']:.0%}",
         f"{row['occupancy']:.0%}",
         "" if price != price else f"{price:.3f} [{cheap:.3f}, {dear:.3f}]",
+        f"{row['price_over_bound']:.3f}",
     )

@@ -8,17 +8,9 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from importlib.machinery import ExtensionFileLoader, SourceFileLoader
 from types import FrameType
 
-_IMPORTS = (
-    ExtensionFileLoader.create_module.__code__,
-    ExtensionFileLoader.exec_module.__code__,
-    SourceFileLoader.get_data.__code__,
-)
-"""Functions of importlib that import a compiled module, and that read a file of a module in Python."""
-_CALLED_BY_NUMBA = {"_numba_unpickle", "_raw_object_cache_notify", "_raw_object_cache_getbuffer"}
-"""Functions of numba and llvmlite that compiled code calls: for the result of a function, and while LLVM compiles."""
+from parkenv.evaluation.interruption import unsafe_to_raise
 
 
 @contextmanager
@@ -31,7 +23,7 @@ def stop_signals() -> Iterator[list[int]]:
     received: list[int] = []
 
     def stop(number: int, frame: FrameType | None) -> None:
-        if _does_harm(frame):
+        if unsafe_to_raise(frame):
             _thread.start_new_thread(os.kill, (os.getpid(), number))
             return
         received.append(number)
@@ -48,17 +40,3 @@ def stop_signals() -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def _does_harm(frame: FrameType | None) -> bool:
-    """Whether an exception raised here would end the process, be lost or leave a file open.
-
-    Compiled code that called this code may end the process or lose the exception: modules in C++ while they are
-    imported, and numba while it compiles and while it makes Python objects. A file stays open where importlib has
-    opened a module's file and not yet entered its `with`: Python warns of that where warnings are on.
-    """
-    while frame is not None:
-        if frame.f_code in _IMPORTS or frame.f_code.co_name in _CALLED_BY_NUMBA:
-            return True
-        frame = frame.f_back
-    return False

@@ -415,7 +415,7 @@ class Fleet:
                 k = getattr(agent, "local_k", None)  # models observe `local`
                 observation = self.observation(car) if k is None else self.local_observation(car, k)
                 action, memory[car] = agent.predict(observation, memory.get(car))
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise InputError(
                     f"car {car}: its agent raised {type(error).__name__} at {self.time - self.begin:.1f} s: {error}"
                 ) from error

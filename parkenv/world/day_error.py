@@ -28,7 +28,8 @@ _Z_STEP, _Z_MOST = 0.25, 8.0
 _NODES = np.arange(-_Z_MOST, _Z_MOST + _Z_STEP / 2, _Z_STEP)
 _WEIGHTS = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
 _ITERATIONS = 100
-_ACCURACY = 1e-13
+_FAR = 500.0  # logits
+_LAST_STEP = 1e-7  # Newton's method: the error after a step is of the order of its square
 
 
 @dataclass(frozen=True)
@@ -92,24 +93,30 @@ def centred_logits(p: ArrayLike, deviation: ArrayLike) -> FloatArray:
 
 
 @compiled(error_model="numpy")
-def centred_logit(p: float, deviation: float) -> float:
-    """Return `centred_logits` of one probability."""
-    if p <= 0.0 or p >= 1.0 or deviation == 0.0:
-        return math.log(p / (1.0 - p))
+def _centred_logit(p: float, deviation: float, factors: FloatArray) -> float:
+    """Return `centred_logits` of one probability; `factors` are exp(deviation·z) at the nodes."""
     wanted = math.log(p / (1.0 - p))
+    if p <= 0.0 or p >= 1.0 or deviation == 0.0:
+        return wanted
+    far = wanted + math.copysign(0.5 * deviation * deviation, wanted)  # where the sigmoid is an exponential
+    if abs(wanted) > _FAR:
+        return far
     # Newton's method on the logit of the mean, which is nearly linear in x; the approximation by a probit starts it.
     x = wanted * math.sqrt(1.0 + math.pi * deviation * deviation / 8.0)
+    x = math.copysign(min(abs(x), abs(far)), wanted)
     for _ in range(_ITERATIONS):
         taken = free = slope = 0.0
+        odds = math.exp(x)
         for k in range(_NODES.size):
             # Both tails by themselves: 1 - taken would lose all digits near 1.
-            odds = math.exp(min(max(x + deviation * _NODES[k], -700.0), 700.0))
-            taken += _WEIGHTS[k] * (odds / (1.0 + odds))
-            free += _WEIGHTS[k] / (1.0 + odds)
-            slope += _WEIGHTS[k] * (odds / (1.0 + odds)) / (1.0 + odds)
+            p_free = 1.0 / (1.0 + odds * factors[k])
+            p_taken = odds * factors[k] * p_free
+            taken += _WEIGHTS[k] * p_taken
+            free += _WEIGHTS[k] * p_free
+            slope += _WEIGHTS[k] * p_taken * p_free
         step = (wanted - math.log(taken / free)) * taken * free / slope
         x += step
-        if abs(step) < _ACCURACY * max(1.0, abs(x)):
+        if abs(step) < _LAST_STEP * max(1.0, abs(x)):
             break
     return x
 
@@ -139,9 +146,11 @@ def centring_table(day_error: DayError) -> FloatArray:
     return factors
 
 
-@compiled
+@compiled(error_model="numpy")
 def _centred_logits(p: FloatArray, deviation: FloatArray) -> FloatArray:
-    centres = np.empty_like(p)
+    centres, factors = np.empty_like(p), np.ones(_NODES.size)
     for i in range(p.size):
-        centres[i] = centred_logit(p[i], deviation[i])
+        if i == 0 or deviation[i] != deviation[i - 1]:
+            factors[:] = np.exp(deviation[i] * _NODES)
+        centres[i] = _centred_logit(p[i], deviation[i], factors)
     return centres

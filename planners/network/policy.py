@@ -1,4 +1,4 @@
-"""The network's weights: their file, and the network itself in NumPy.
+"""The network's weights: their file, and the network itself.
 
 The file is a model file as of `planners.model_file`; it is read without PyTorch and the library of safetensors.
 """
@@ -21,8 +21,10 @@ from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
 from planners.model_header import CARD_KEY, read_header
 from planners.network.features import (
+    ACTION_COUNT,
     ACTION_FEATURES,
     BEST_KNOWN_FREE,
+    CANDIDATES,
     DAY_SHIFT,
     DAY_SPREAD,
     EXPECTED_REGRET,
@@ -40,11 +42,15 @@ from planners.network.features import (
     TOKEN_FEATURES,
     Features,
 )
+from sim_sensors.compilation import compiled
+
+FloatArray = NDArray[np.float32]
 
 FORMAT = "parkenv-network-1"
 SHIPPED = Path(__file__).with_name("models") / "network.safetensors"
 _MAX_BYTES, _MAX_WEIGHT = 8_000_000, 1e4
 
+LAYERS = "token_1", "token_2", "attention", "action_1", "action_2", "score_1", "score_2"
 Part = Literal["lookahead", "tokens", "day", "memory"]
 
 
@@ -67,11 +73,9 @@ class NetworkCard(Spec):
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of every weight."""
         t, w = self.token_width, self.width
-        layers = {
-            "token_1": (TOKEN_FEATURES, t), "token_2": (t, t), "attention": (t, 1),
-            "action_1": (ACTION_FEATURES + 2 * t, w), "action_2": (w, w),
-            "score_1": (3 * w, w), "score_2": (w, 1),
-        }  # fmt: skip
+        of_tokens = (TOKEN_FEATURES, t), (t, t), (t, 1)
+        of_actions = (ACTION_FEATURES + 2 * t, w), (w, w), (3 * w, w), (w, 1)
+        layers = dict(zip(LAYERS, of_tokens + of_actions, strict=True))
         return {f"{name}.weight": shape for name, shape in layers.items()} | {
             f"{name}.bias": shape[1:] for name, shape in layers.items()
         }
@@ -90,6 +94,13 @@ def feature_masks(without: tuple[Part, ...]) -> tuple[NDArray[np.float32], NDArr
     if "memory" in without:
         actions[[IS_RETURN, LAST_VISIT]] = tokens[LAST_OBSERVED] = 0.0
     return actions, tokens
+
+
+class Layer(NamedTuple):
+    """A linear layer."""
+
+    weight: FloatArray  # (n_inputs, n_outputs) float32
+    bias: FloatArray  # (n_outputs,) float32
 
 
 class NetworkPolicy(NamedTuple):
@@ -138,31 +149,94 @@ class NetworkPolicy(NamedTuple):
         Args:
             features: the observation of a decision, or of many: arrays with further axes before theirs.
         """
-        w, without = self.weights, self.card.without
         own, tokens = features.actions, features.tokens
-        if without:
+        if without := self.card.without:
             of_actions, of_tokens = feature_masks(without)
             own, tokens = own * of_actions, tokens * of_tokens
-        h = np.maximum(tokens @ w["token_1.weight"] + w["token_1.bias"], 0.0)
-        h = np.maximum(h @ w["token_2.weight"] + w["token_2.bias"], 0.0)
-        absent = tokens[..., IS_SLOT, None] == 0.0
-        attention = h @ w["attention.weight"] + w["attention.bias"] - 1e4 * absent
-        attention = np.exp(attention - attention.max(axis=-2, keepdims=True))
-        attention /= attention.sum(axis=-2, keepdims=True)
-        pooled = (attention * h).sum(axis=-2), (h * ~absent).max(axis=-2)
-        x = np.concatenate([own, *pooled], axis=-1)
-        x = np.maximum(x @ w["action_1.weight"] + w["action_1.bias"], 0.0)
-        x = np.maximum(x @ w["action_2.weight"] + w["action_2.bias"], 0.0)
-        there = features.allowed[..., None]
-        x = x * there
-        mean = x.sum(axis=-2, keepdims=True) / np.maximum(there.sum(axis=-2, keepdims=True), 1)
-        most = x.max(axis=-2, keepdims=True)
-        x = np.concatenate([x, *np.broadcast_arrays(mean, most, x)[:2]], axis=-1)
-        x = np.maximum(x @ w["score_1.weight"] + w["score_1.bias"], 0.0)
-        score = (x @ w["score_2.weight"] + w["score_2.bias"])[..., 0]
-        if "lookahead" not in without:
-            score = score - features.actions[..., LOOKAHEAD]
-        return np.where(features.allowed, score, -np.inf).astype(np.float32)
+        shape = features.allowed.shape
+        scores = np.empty((int(np.prod(shape[:-1])), ACTION_COUNT), np.float32)
+        _score(
+            own.reshape(-1, *own.shape[-2:]),
+            tokens.reshape(-1, *tokens.shape[-3:]),
+            features.allowed.reshape(-1, ACTION_COUNT),
+            tuple(Layer(self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]) for name in LAYERS),
+            "lookahead" not in without,
+            scores,
+        )
+        return scores.reshape(shape)
+
+
+@compiled(error_model="numpy")
+def _linear(x: FloatArray, layer: Layer, out: FloatArray) -> None:
+    """Write the outputs, (n_outputs,), of a layer; sums are in the order of the inputs on every machine."""
+    weight, bias = layer
+    for j in range(len(out)):
+        out[j] = bias[j]
+    for k in range(len(x)):
+        if x[k] != 0.0:  # as half of the inputs behind a ReLU
+            for j in range(len(out)):
+                out[j] += x[k] * weight[k, j]
+
+
+@compiled(error_model="numpy")
+def _rectified(x: FloatArray, layer: Layer, out: FloatArray) -> None:
+    """Write the outputs of a layer followed by a ReLU."""
+    _linear(x, layer, out)
+    for j in range(len(out)):
+        out[j] = max(out[j], np.float32(0.0))
+
+
+@compiled(error_model="numpy")
+def _score(
+    actions: FloatArray,
+    tokens: FloatArray,
+    allowed: NDArray[np.bool_],
+    layers: tuple[Layer, ...],
+    ahead: bool,
+    scores: FloatArray,
+) -> None:
+    """Write the scores, (n, 6), of n decisions; with `ahead`, the look-ahead's regret is subtracted."""
+    token_1, token_2, attention, action_1, action_2, score_1, score_2 = layers
+    n_own, t, w = actions.shape[2], len(token_1.bias), len(action_1.bias)
+    hidden = np.empty((CANDIDATES, t), np.float32)
+    weight, between = np.empty(CANDIDATES, np.float32), np.empty(max(t, w), np.float32)
+    seen, of_action = np.empty(n_own + 2 * t, np.float32), np.empty((ACTION_COUNT, w), np.float32)
+    of_all = np.empty(3 * w, np.float32)
+    for i in range(len(scores)):
+        of_all[:], n_allowed = 0.0, 0
+        for a in range(ACTION_COUNT):
+            if not allowed[i, a]:
+                continue
+            for c in range(CANDIDATES):
+                _rectified(tokens[i, a, c], token_1, between[:t])
+                _rectified(between[:t], token_2, hidden[c])
+                _linear(hidden[c], attention, weight[c : c + 1])
+                if tokens[i, a, c, IS_SLOT] == 0.0:
+                    weight[c] -= np.float32(1e4)
+            weight[:] = np.exp(weight - weight.max())
+            weight /= weight.sum()
+            seen[:n_own], seen[n_own:] = actions[i, a], 0.0
+            for c in range(CANDIDATES):
+                there = tokens[i, a, c, IS_SLOT] != 0.0
+                for j in range(t):
+                    seen[n_own + j] += weight[c] * hidden[c, j]
+                    if there:
+                        seen[n_own + t + j] = max(seen[n_own + t + j], hidden[c, j])
+            _rectified(seen, action_1, between[:w])
+            _rectified(between[:w], action_2, of_action[a])
+            n_allowed += 1
+            for j in range(w):
+                of_all[w + j] += of_action[a, j]
+                of_all[2 * w + j] = max(of_all[2 * w + j], of_action[a, j])
+        of_all[w : 2 * w] /= np.float32(max(n_allowed, 1))
+        for a in range(ACTION_COUNT):
+            scores[i, a] = -np.inf
+            if allowed[i, a]:
+                of_all[:w] = of_action[a]
+                _rectified(of_all, score_1, between[:w])
+                _linear(between[:w], score_2, scores[i, a : a + 1])
+                if ahead:
+                    scores[i, a] -= actions[i, a, LOOKAHEAD]
 
 
 def _offsets(

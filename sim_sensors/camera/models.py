@@ -86,15 +86,15 @@ class _RenderedFrame(Frame):
         return depth, glass_depth, ids
 
     @property
-    def depth(self) -> Float32Array:  # type: ignore[override]
+    def depth(self) -> Float32Array:
         return self._truth[0]
 
     @property
-    def glass_depth(self) -> Float32Array:  # type: ignore[override]
+    def glass_depth(self) -> Float32Array:
         return self._truth[1]
 
     @property
-    def ids(self) -> NDArray[np.int32]:  # type: ignore[override]
+    def ids(self) -> NDArray[np.int32]:
         return self._truth[2]
 
 

@@ -237,12 +237,34 @@ class FleetSpec(Workplace):
     stay_s: Stay = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
     patience_s: Stay = Field(600.0, description="Search time after which a car goes elsewhere, s.")
     delay_s: float = Field(0.0, ge=0.0, le=1e5, description="Age of the live map, s.")
+    manoeuvre_s: float | None = Field(
+        None, ge=0.0, le=3600.0,
+        description="Time for which a car that parks or leaves blocks its lane, s; if absent, as calibrated, or 0.",
+    )  # fmt: skip
+    leaving_soon_s: float = Field(
+        0.0,
+        ge=0.0,
+        le=3600.0,
+        description="Time for which a car shows that it leaves, s; who waits has the slot.",
+    )
+    sees_cars: bool = Field(False, description="Whether agents observe the other cars in view.")
+    calibrated: FilePath | None = Field(
+        None, description="Speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`."
+    )
+    decision_limit_s: float | None = Field(
+        None, ge=0.01, le=1e5, description="Wall time after which a decision in Python stops the run, s."
+    )
     seed: int = Field(0, ge=0, lt=2**31)
     figures: bool = True
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
         _require_distinct(self.agents, ())
+        if self.decision_limit_s is not None and self.backend == "dask":
+            raise PydanticCustomError(
+                "whole",
+                "decision_limit_s goes with the backends loky and ray; threads of Dask get no timer signal",
+            )
         settings = len(self.agents) * len(self.knows) * len(self.shares) * len(self.arrivals_per_hour)
         if settings > MAX_SETTINGS:
             raise PydanticCustomError(

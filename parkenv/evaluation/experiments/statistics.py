@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
 RESAMPLES = 9999
+_ROUNDING = 1e-12
+"""Relative difference of values that count as the same."""
 
 
 def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, float, float]:
@@ -20,8 +22,8 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
         confidence: coverage of the interval.
 
     Returns:
-        Mean, lower and upper end. The ends equal the mean if all values are the same, and are NaN for fewer than two
-        values. The resampling has a fixed seed: equal samples have equal intervals.
+        Mean, lower and upper end. The ends equal the mean if all values are the same but for rounding, and are NaN for
+        fewer than two values. The resampling has a fixed seed: equal samples have equal intervals.
 
     Examples:
         >>> mean_interval([1.0, 1.0, 1.0])
@@ -33,7 +35,7 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
     mean = float(sample.mean())
     if len(sample) < 2:
         return mean, np.nan, np.nan
-    if np.ptp(sample) == 0.0:
+    if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
         return mean, mean, mean
     interval = stats.bootstrap(
         (sample,),

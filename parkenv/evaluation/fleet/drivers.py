@@ -15,7 +15,7 @@ from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import Workers
-from parkenv.world.demand import Demand
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.learned import LearnedAgent
@@ -50,6 +50,31 @@ def driver_of(
         sampled = agent.card.algorithm != "dqn"
         return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     return None, agent
+
+
+def demand_in(scenario: Scenario, per_hour: float, stay_s: float, patience_s: float) -> Demand:
+    """Return the demand of a number of cars an hour in the hours of a scenario.
+
+    Args:
+        scenario: its hours of arrival are meant.
+        per_hour: cars an hour.
+        stay_s: mean of the exponentially distributed stays, s.
+        patience_s: search time after which a car goes elsewhere, s.
+
+    Raises:
+        InputError: the hours end when they begin, or a number is out of range.
+    """
+    window = scenario.arrival
+    if window.end_s <= window.start_s:
+        raise InputError(
+            f"the arrivals of {scenario.name!r} are at one time, want hours in which cars arrive; "
+            "set --hours, e.g. 08:00-12:00"
+        )
+    return Demand(
+        PoissonArrivals(per_hour, window.start_s, window.end_s),
+        ExponentialTime(stay_s),
+        ConstantTime(patience_s),
+    )
 
 
 @dataclass(frozen=True)

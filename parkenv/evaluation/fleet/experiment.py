@@ -23,11 +23,14 @@ from parkenv.evaluation.experiments.results import EpisodeTable, ResultFolder, R
 from parkenv.evaluation.experiments.spec import SPEC_FILE, FleetSpec
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.experiments.workers import HERE, Workers
-from parkenv.evaluation.fleet.drivers import driver_of
+from parkenv.evaluation.fleet.clairvoyant_bound import clairvoyant_bound_s
+from parkenv.evaluation.fleet.decision_limit import LimitedAgent
+from parkenv.evaluation.fleet.drivers import demand_in, driver_of
 from parkenv.evaluation.fleet.measures import MEANS, Roads, day_measures
+from parkenv.evaluation.trips.calibration import Calibration
 from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.scenarios.build import build
-from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
+from parkenv.world.demand import Demand
 from parkenv.world.scenario import Scenario
 
 OWN, ASSIGNED = "own", "reserve"
@@ -50,6 +53,8 @@ DIFFERENCES = {
     "others_difference_s": "others_s",
 }
 """Columns of paired differences, and the measures that are compared."""
+OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
+"""Fields of the specification that all settings have in common."""
 SYNC_S = 1.0  # least time between two flushes of finished days to disk, s
 _RESAMPLES = 9999
 
@@ -94,7 +99,7 @@ class FleetExperiment:
         spec: specification of the experiment.
 
     Raises:
-        InputError: the scenario cannot be made.
+        InputError: the scenario cannot be made, or the calibration is of another one.
     """
 
     spec: FleetSpec
@@ -102,7 +107,29 @@ class FleetExperiment:
     @cached_property
     def scenario(self) -> Scenario:
         """Lot, residents, hours of arrival, speeds and costs."""
-        return build(self.spec.scenario)
+        scenario = build(self.spec.scenario)
+        return scenario if self.calibration is None else self.calibration.applied(scenario)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The measured speed, failure cost and manoeuvre, if any."""
+        if (path := self.spec.calibrated) is None:
+            return None
+        measured = Calibration.from_file(path)
+        if measured.scenario != (name := build(self.spec.scenario).name):
+            raise InputError(f"{path} was measured on {measured.scenario!r}, the fleet drives on {name!r}")
+        return measured
+
+    @property
+    def manoeuvre_s(self) -> float:
+        """Time for which a car that parks or leaves blocks its lane, s."""
+        if self.spec.manoeuvre_s is not None:
+            return self.spec.manoeuvre_s
+        return 0.0 if self.calibration is None else self.calibration.manoeuvre_s
+
+    @cached_property
+    def _roads(self) -> Roads:
+        return Roads(self.scenario)
 
     def __getstate__(self) -> dict[str, Any]:
         """Workers make the scenario themselves."""
@@ -125,12 +152,7 @@ class FleetExperiment:
 
     def demand(self, per_hour: float) -> Demand:
         """Return the demand of a number of arrivals an hour in the hours of the scenario."""
-        window = self.scenario.arrival
-        return Demand(
-            PoissonArrivals(per_hour, window.start_s, window.end_s),
-            ExponentialTime(self.spec.stay_s),
-            ConstantTime(self.spec.patience_s),
-        )
+        return demand_in(self.scenario, per_hour, self.spec.stay_s, self.spec.patience_s)
 
     def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
         """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled.
@@ -148,21 +170,25 @@ class FleetExperiment:
             self.demand(setting.arrivals_per_hour),
             background="residents",
             drivers=kinds,
-            delay_s=self.spec.delay_s,
             leave_full_lot=False,
+            manoeuvre_s=self.manoeuvre_s,
+            **{name: getattr(self.spec, name) for name in ("delay_s", "leaving_soon_s", "sees_cars")},
         )
+        if agent is not None and self.spec.decision_limit_s is not None:
+            agent = LimitedAgent(agent, self.spec.decision_limit_s)
         return fleet, [agent, agent]
 
     def run_day(self, setting: Setting, day: int) -> tuple[Row, list[str]]:
         """Run a day of a setting; return its row of `days.csv`, and the warnings of its agent.
 
         Raises:
-            InputError: an agent raised an error; the message names setting, day, car and time.
+            InputError: an agent raised an error or took too long; the message names setting, day, car and time.
         """
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("default")
             fleet, agents = self.fleet(setting)
             fleet.reset(self.spec.seed, day)
+            bound_s = clairvoyant_bound_s(self._roads.parking_day(fleet))
             window = self.scenario.arrival
             taken = []
             try:
@@ -173,7 +199,7 @@ class FleetExperiment:
             except InputError as error:
                 raise InputError(f"{setting}, day {day}, {error}") from error
         members = fleet.cars["kind"] == 0
-        measured = day_measures(fleet, Roads(self.scenario), members, float(np.mean(taken)))
+        measured = day_measures(fleet, self._roads, members, float(np.mean(taken)), bound_s)
         row = {"scenario": self.scenario.name, **setting.columns, "day": day, **measured}
         return row, [f"{setting.agent.label}: {w.message}" for w in caught]
 
@@ -189,7 +215,8 @@ class FleetExperiment:
             "scenario": {spec.scenario.title: flat_tables(spec.scenario.model_dump(mode="json"))},
             "files": fingerprints(spec.files()),
             "agent files": agent_fingerprints(agent.name for agent in spec.agents),
-            **{name: getattr(spec, name) for name in ("stay_s", "patience_s", "delay_s", "seed")},
+            "manoeuvre_s": self.manoeuvre_s,
+            **{name: getattr(spec, name) for name in (*OPTIONS, "seed")},
         }
 
 
@@ -229,7 +256,8 @@ def run_fleets(
         on_progress: called with the number of days just finished.
 
     Raises:
-        InputError: a setting cannot be run, an agent raises an error, or the folder cannot be used.
+        InputError: a setting cannot be run, an agent raises an error or exceeds its time limit, or the folder cannot be
+            used.
     """
     experiment = FleetExperiment(spec)
     for setting in experiment.settings:
@@ -262,7 +290,8 @@ def run_fleets(
         "version": __version__,
         "seed": spec.seed,
         "complete": complete,
-        **{name: getattr(spec, name) for name in ("stay_s", "patience_s", "delay_s")},
+        "manoeuvre_s": experiment.manoeuvre_s,
+        **{name: getattr(spec, name) for name in OPTIONS},
         "rows": result.rows,
     }
     folder.finish(tasks, summary, complete=complete)
@@ -293,7 +322,8 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
     """Return the summary, a row for each setting, from the days of each, at least one.
 
     The *price of anarchy* of a row is the ratio of its mean total time to that of `reserve` for all cars, with the same
-    agents and demand; its interval is a bootstrap over days. Differences are paired: to the mean total time of all cars
+    agents and demand; its interval is a bootstrap over days. The *price over the bound* is the ratio to the clairvoyant
+    lower bound of the same days, likewise. Differences are paired: to the mean total time of all cars
     on the same days if nobody knows more than what it observes. Both are over the days that both settings have; null if
     there are none.
     """
@@ -313,6 +343,7 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
             **_means(days),
             **_differences(paired(days, OWN, 0.0)),
             **_price(paired(days, ASSIGNED, 1.0)),
+            **_ratio("price_over_bound", days, days, "clairvoyant_s"),
         }
         for days in settings
     ]
@@ -341,13 +372,17 @@ def _means(days: list[Row]) -> Row:
 
 
 def _price(pairs: Pairs) -> Row:
-    if not pairs:
-        return {"price_of_anarchy": float("nan"), "price_of_anarchy_ci95": [float("nan")] * 2}
-    mine, theirs = np.array([[day["total_s"] * day["cars"] for day in pair] for pair in pairs]).T
+    mine, theirs = zip(*pairs, strict=True) if pairs else ((), ())
+    return _ratio("price_of_anarchy", mine, theirs, "total_s")
+
+
+def _ratio(name: str, days: Sequence[Row], others: Sequence[Row], column: str) -> Row:
+    """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
+    if not days:
+        return {name: float("nan"), f"{name}_ci95": [float("nan")] * 2}
+    mine = np.array([day["total_s"] * day["cars"] for day in days])
+    theirs = np.array([day[column] * day["cars"] for day in others])
     drawn = np.random.default_rng(0).integers(0, len(mine), (_RESAMPLES, len(mine)))
     ratios = mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1)
     low, high = np.percentile(ratios, [2.5, 97.5])
-    return {
-        "price_of_anarchy": float(mine.sum() / theirs.sum()),
-        "price_of_anarchy_ci95": [float(low), float(high)],
-    }
+    return {name: float(mine.sum() / theirs.sum()), f"{name}_ci95": [float(low), float(high)]}

@@ -113,6 +113,7 @@ _KNOWN = {
         Column("p95_s", "95 % quantile", "s", 0),
         Column("gini", "Gini", digits=3, help="Inequality of total times: 0 if all are equal"),
         Column("search_s", "search time", "s", help="From the entry to the end of the search"),
+        Column("queued_s", "in queues", "s", help="Behind cars that park, leave or stand; part of the search time"),
         Column("failed_attempts", "failed attempts", digits=3),
         Column("cruised_m", "cruised", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
         Column("cruising_share", "traffic that cruises", share=True, digits=0),
@@ -122,6 +123,8 @@ _KNOWN = {
         Column("members_difference_s", "members minus own", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
         Column("others_difference_s", "others minus own", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
         Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),
+        Column("clairvoyant_s", "clairvoyant bound", "s", help="Lower bound that knows all arrivals and stays"),
+        Column("price_over_bound", "over the bound", digits=3, help="Total time over the clairvoyant lower bound"),
         Column("key", "drive"),
         Column("weather", "weather"),
         Column("rig", "rig"),
@@ -130,8 +133,8 @@ _KNOWN = {
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
     "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "difference_s", "gap_to_exact",
-    "price_of_anarchy", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s",
-    "parked_fraction",
+    "price_of_anarchy", "price_over_bound", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
+    "gave_up_s", "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 _OF_FLEETS = {

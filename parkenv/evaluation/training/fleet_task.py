@@ -13,7 +13,7 @@ from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
-from parkenv.evaluation.fleet.drivers import MixedFleet, driver_of
+from parkenv.evaluation.fleet.drivers import MixedFleet, demand_in, driver_of
 from parkenv.evaluation.plurals import plural
 from parkenv.evaluation.training.configs import FLEET_CONFIGS, config_of
 from parkenv.evaluation.training.fleet_training import FleetTraining
@@ -29,7 +29,6 @@ from parkenv.evaluation.training.training_task import (
     table_of_tests,
 )
 from parkenv.scenarios.build import build
-from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import HOUR_S
 
@@ -64,12 +63,13 @@ class FleetTask(TrainingTask):
     @cached_property
     def fleet(self) -> MixedFleet:
         """The fleet to train in."""
-        window, spec = self.scenario.arrival, self.spec
-        demand = Demand(
-            PoissonArrivals(spec.arrivals_per_hour or 120.0, window.start_s, window.end_s),
-            ExponentialTime(spec.stay_s or HOUR_S),
-            ConstantTime(spec.patience_s or 600.0),
+        spec = self.spec
+        rate, stay_s, patience_s = (
+            spec.arrivals_per_hour or 120.0,
+            spec.stay_s or HOUR_S,
+            spec.patience_s or 600.0,
         )
+        demand = demand_in(self.scenario, rate, stay_s, patience_s)
         share = 1.0 if spec.among is None else spec.learners or FEW
         return MixedFleet(self.scenario, demand, spec.knows or "own", share, spec.among)
 

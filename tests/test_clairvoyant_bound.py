@@ -1,0 +1,108 @@
+"""The lower bound that knows all arrivals: below the best schedule on tiny days, below every driver on large ones."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from parkenv.envs.fleet import total_s
+from parkenv.evaluation.experiments.spec import FleetSpec
+from parkenv.evaluation.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
+from parkenv.evaluation.fleet.experiment import FleetExperiment
+from parkenv.evaluation.fleet.measures import Roads
+from parkenv.scenarios.spec import scenario_specs
+
+
+def best_schedule_s(day):
+    """Return the least total time over all assignments of cars to slots and all orders in each slot."""
+    n_cars, n_slots = len(day.arrival), len(day.cost_s)
+    best = math.inf
+    for places in itertools.product(range(-1, n_slots), repeat=n_cars):
+        total = day.give_up_s * places.count(-1)
+        for slot in range(n_slots):
+            cars = [car for car in range(n_cars) if places[car] == slot]
+            total += min(in_order_s(day, slot, order) for order in itertools.permutations(cars))
+        best = min(best, total)
+    return best
+
+
+def in_order_s(day, slot, cars):
+    free_from, total = day.free_from[slot], 0.0
+    for car in cars:
+        parks_at = max(free_from, day.arrival[car] + day.drive_s[day.entry[car], slot])
+        if parks_at > day.arrival[car] + day.patience_s[car]:
+            return math.inf
+        total += parks_at - day.arrival[car] + day.cost_s[slot]
+        free_from = parks_at + day.stay_s[car]
+    return total
+
+
+def random_day(rng):
+    n_cars, n_slots, n_entries = rng.integers(1, 5), rng.integers(1, 4), rng.integers(1, 3)
+    free_from = rng.uniform(0.0, 900.0, n_slots)
+    free_from[rng.random(n_slots) < 0.5] = -math.inf
+    free_from[rng.random(n_slots) < 0.1] = math.inf
+    drive_s = rng.uniform(5.0, 60.0, (n_entries, n_slots))
+    drive_s[rng.random(drive_s.shape) < 0.1] = math.inf
+    return ParkingDay(
+        arrival=np.sort(rng.uniform(0.0, 900.0, n_cars)) + rng.choice([0.0, 1e6]),
+        stay_s=rng.exponential(rng.choice([200.0, 2000.0]), n_cars),
+        patience_s=np.full(n_cars, rng.choice([50.0, 400.0, math.inf])),
+        entry=rng.integers(0, n_entries, n_cars),
+        drive_s=drive_s,
+        cost_s=rng.uniform(5.0, 120.0, n_slots),
+        free_from=free_from,
+        give_up_s=float(rng.choice([200.0, 1800.0])),
+    )
+
+
+def later(day, seconds):
+    return day._replace(arrival=day.arrival + seconds, free_from=day.free_from + seconds)
+
+
+def test_it_is_never_above_the_best_schedule_of_a_tiny_day():
+    rng = np.random.default_rng(1)
+    gaps = []
+    for _ in range(60):
+        day = random_day(rng)
+        bound_s, best_s = clairvoyant_bound_s(day), best_schedule_s(day)
+        assert bound_s <= best_s
+        gaps.append(1.0 - bound_s / best_s)
+    assert np.median(gaps) < 0.05
+
+
+def test_without_competition_it_is_the_time_of_each_car_alone():
+    day = ParkingDay(
+        arrival=np.array([0.0, 10_000.0]), stay_s=np.full(2, 600.0), patience_s=np.full(2, math.inf),
+        entry=np.array([0, 1]), drive_s=np.array([[10.0, 20.0], [20.0, 10.0]]), cost_s=np.array([30.0, 30.0]),
+        free_from=np.full(2, -math.inf), give_up_s=900.0,
+    )  # fmt: skip
+    assert clairvoyant_bound_s(day) == pytest.approx(80.0)
+    assert clairvoyant_bound_s(later(day, 5e5)) == pytest.approx(80.0)
+    assert clairvoyant_bound_s(day._replace(free_from=np.full(2, math.inf))) == pytest.approx(1800.0)
+
+
+def test_a_stay_for_ever_may_end_after_the_day():
+    day = ParkingDay(
+        arrival=np.array([0.0, 5.0]), stay_s=np.array([math.inf, math.inf]), patience_s=np.full(2, 600.0),
+        entry=np.zeros(2, np.int64), drive_s=np.array([[10.0]]), cost_s=np.array([20.0]),
+        free_from=np.array([-math.inf]), give_up_s=900.0,
+    )  # fmt: skip
+    assert 60.0 < clairvoyant_bound_s(day) <= best_schedule_s(day) == 930.0
+
+
+@pytest.mark.parametrize("knows", ["own", "reserve", "full"])
+def test_no_fleet_is_below_it(knows):
+    (scenario,) = scenario_specs("mini")
+    scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
+    spec = FleetSpec().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
+    its = FleetExperiment(spec)
+    roads = Roads(its.scenario)
+    for setting in its.settings:
+        for day in range(3):
+            fleet, agents = its.fleet(setting)
+            fleet.reset(2, day)
+            bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
+            fleet.run(agents)
+            assert roads.alone_s(fleet.cars).sum() - 1e-4 <= bound_s <= total_s(fleet.cars).sum()
