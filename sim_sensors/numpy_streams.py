@@ -130,12 +130,13 @@ def next_64(state: NDArray[np.uint64]) -> np.uint64:
 def next_32(state: NDArray[np.uint64]) -> np.uint64:
     """Return the next 32 random bits: the low half of 64, then the high one."""
     if state[4] != _U64(0):
-        kept = state[4] & _LOW_WORD
+        kept: np.uint64 = state[4] & _LOW_WORD
         state[4] = _U64(0)
         return kept
     both = next_64(state)
     state[4] = (both >> _U64(32)) | (_ONE << _U64(32))
-    return both & _LOW_WORD
+    low: np.uint64 = both & _LOW_WORD
+    return low
 
 
 @plain
@@ -167,7 +168,7 @@ def normal(state: NDArray[np.uint64]) -> float:
         bits >>= _U64(8)
         negative = bits & _ONE
         place = (bits >> _ONE) & _MANTISSA
-        x = float(place) * _WI[layer]
+        x: float = float(place) * _WI[layer]
         x = -x if negative else x
         if place < _KI[layer]:
             return x
@@ -176,7 +177,8 @@ def normal(state: NDArray[np.uint64]) -> float:
                 beyond = -_INVERSE_TAIL * math.log1p(-unit(state))
                 other = -math.log1p(-unit(state))
                 if other + other > beyond * beyond:
-                    return -(_TAIL + beyond) if (place >> _U64(8)) & _ONE else _TAIL + beyond
+                    far: float = _TAIL + beyond
+                    return -far if (place >> _U64(8)) & _ONE else far
         elif (_FI[layer - _ONE] - _FI[layer]) * unit(state) + _FI[layer] < math.exp(-0.5 * x * x):
             return x
 
