@@ -14,10 +14,10 @@ from planners.agent import make_agent
 
 FILM_S, FRAMES_PER_S = 120, 15
 
-# From nine o'clock on, a car arrives every ten seconds, on average. It stays for half an hour; if it has found no slot
-# after a quarter of an hour, it goes elsewhere.
+# From nine o'clock on, a car arrives every twelve seconds, on average. It stays for half an hour; if it has found no
+# slot after a quarter of an hour, it goes elsewhere.
 demand = Demand(
-    PoissonArrivals(per_hour=360, start_s=9 * 3600, end_s=9.25 * 3600),
+    PoissonArrivals(per_hour=300, start_s=9 * 3600, end_s=9.25 * 3600),
     stay=ExponentialTime(1800),
     patience=ConstantTime(900),
 )
@@ -42,9 +42,9 @@ for name, values in found.items():
 
 if len(sys.argv) > 1:  # the name of a film, such as fleet.gif
     film, renderer = Path(sys.argv[1]), FleetRenderer(fleet)
-    fleet.reset(0)
+    fleet.reset(11)
     frames = []
-    for second in np.arange(240.0, 240.0 + FILM_S, 0.5):
+    for second in np.arange(600.0, 600.0 + FILM_S, 0.5):
         fleet.run(agents, until=fleet.begin + second)
         frames.append(Image.fromarray(renderer.frame()).quantize(48, dither=Image.Dither.NONE))
     frames[0].save(

@@ -19,6 +19,7 @@ from parkenv.perception.detection_scores import matches, recall_at, recall_preci
 from parkenv.perception.detector import GroundBand
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
+from parkenv.perception.made_photos import made_photos
 from parkenv.perception.training import TrainingSettings, train
 
 
@@ -169,6 +170,50 @@ def test_of_boxes_that_overlap_the_best_is_kept():
     assert best_boxes(boxes, np.array([0.5, 0.9, 0.1], np.float32), 0.4).tolist() == [1, 2]
 
 
+def test_a_part_of_a_large_car_is_no_second_car_but_a_neighbour_is():
+    # A car, its front wheel, a neighbour that hides a tenth of it, and a far car above its bonnet.
+    boxes = np.array([[0, 0, 200, 80], [10, 40, 75, 66], [180, 0, 380, 80], [0, -20, 90, 16]], np.float32)
+    by_overlap = best_boxes(boxes, np.array([0.9, 0.8, 0.7, 0.6], np.float32), 0.4)
+    assert by_overlap.tolist() == [0, 1, 2, 3]
+    assert best_boxes(boxes, np.array([0.9, 0.8, 0.7, 0.6], np.float32), 0.4, 0.6).tolist() == [0, 2, 3]
+    # The better one is kept, whichever is larger.
+    assert best_boxes(boxes, np.array([0.5, 0.8, 0.7, 0.6], np.float32), 0.4, 0.6).tolist() == [1, 2, 3]
+
+
+def test_parts_of_cars_are_mined_where_there_are_no_photographs(crops):
+    plain, closer = (
+        train(*crops, settings=TrainingSettings(rounds=2, enlarged=by), trained_on="toys")
+        for by in (0.0, 2.0)
+    )
+    rng = np.random.default_rng(3)
+    wheels = [
+        cv2.resize(toy_car(rng), (300, 120))[60:120, 75 * k : 75 * k + 150]
+        for k in (0, 1, 2)
+        for _ in range(20)
+    ]
+    windows = np.stack([cv2.resize(w, (128, 64)) for w in wheels])
+    cars = np.stack([cv2.resize(toy_car(rng), (128, 64)) for _ in range(20)])
+    assert closer.scores(windows).max() < plain.scores(windows).max()
+    assert closer.scores(cars).min() > closer.scores(windows).max()
+
+
+def test_made_photographs_hold_the_cars_where_they_say(crops):
+    cars = [np.full((40, 100), 250, np.uint8)] * 3
+    photos = made_photos(Crops(cars, [np.full((40, 100), 20, np.uint8)]), 30, seed=4)
+    widths = np.concatenate([photo.boxes[:, 2] - photo.boxes[:, 0] for photo in photos])
+    assert len(widths) >= 30
+    assert widths.min() >= 80
+    assert 180 < widths.max() <= 220
+    for photo in photos:
+        bright = np.zeros(photo.image.shape, bool)
+        for left, top, right, bottom in photo.boxes.astype(int):
+            bright[top:bottom, left:right] = True
+            assert photo.image[(top + bottom) // 2, (left + right) // 2] == 250
+        assert photo.image[~bright].max() == 20
+    again = made_photos(Crops(cars, [np.full((40, 100), 20, np.uint8)]), 30, seed=4)
+    assert all(np.array_equal(a.image, b.image) for a, b in zip(photos, again, strict=True))
+
+
 def test_recall_and_precision_of_a_known_case():
     truth = [np.array([[0, 0, 100, 40], [200, 0, 300, 40]], float), np.array([[0, 0, 100, 40]], float)]
     found = [
@@ -292,6 +337,8 @@ def test_too_little_to_train_on_is_said(crops):
         train(crops[0][:3], crops[1])
     with pytest.raises(InputError, match="penalty is 0"):
         TrainingSettings(penalty=0.0)
+    with pytest.raises(InputError, match=r"enlarged is 0\.5, want 0 or 1 to 8"):
+        TrainingSettings(enlarged=0.5)
 
 
 @pytest.mark.parametrize(
@@ -302,6 +349,7 @@ def test_too_little_to_train_on_is_said(crops):
         ({"scale_step": 1.0}, "scale_step is 1.0"),
         ({"threshold": 1.0}, "threshold is 1.0"),
         ({"margin": -0.1}, "margin is -0.1"),
+        ({"inside": 1.2}, "inside is 1.2, want 0 to 1"),
     ],
 )
 def test_bad_detectors_are_named(model, settings, message):
@@ -314,11 +362,13 @@ def test_a_model_wants_weights_of_its_window():
         CarModel(Descriptor(), np.zeros(3, np.float32), 0.0, 2.5)
 
 
-def test_held_out_blocks_are_judged_once_each(crops):
+def test_held_out_blocks_are_judged_once_each(crops, monkeypatch):
+    monkeypatch.setattr("parkenv.perception.cross_validation.MADE_PHOTOS", 5)
     scores = cross_validated(Crops(*crops), folds=3, seed=1, settings=TrainingSettings(rounds=0, jitter=0))
     assert sum(s.n_cars for s in scores) == len(crops[0])
     assert sum(s.n_others for s in scores) == len(crops[1])
     assert min(s.auc for s in scores) > 0.8
+    assert min(s.equal_error for s in scores) > 0.5
     with pytest.raises(InputError, match="folds is 1, want 2 to 30"):
         cross_validated(Crops(*crops), folds=1)
 

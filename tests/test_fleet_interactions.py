@@ -6,6 +6,7 @@ import pytest
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, lot_v0
 from parkenv.envs.fleet import DriverKind, Fleet
+from parkenv.envs.fleet_records import SEARCHING
 from parkenv.envs.fleet_rules import RULES
 from parkenv.lots import grid_lot
 from parkenv.world.demand import (
@@ -215,3 +216,18 @@ def test_the_pettingzoo_forms_take_these_options():
     with pytest.raises(InputError, match="manoeuvre_s is -1"):
         lot_v0.parallel_env(manoeuvre_s=-1)
     assert parkenv.make_scenario("campus").name == parallel.scenario.name
+
+
+def test_a_car_in_a_queue_stands_still_in_pictures():
+    near, far = by_distance()[[0, -1]]
+    fleet = Fleet(SCENARIO, arriving(0.0, 0.5), background="none", manoeuvre_s=30.0)
+    fleet.reset(0)
+    policy, at = ParkIn([near, far]), {}
+    for second in np.arange(0.0, 40.0, 0.5):
+        while (car := fleet.next_decision(fleet.begin + second)) is not None:
+            fleet.act(policy.action(car, int(fleet.observation(car)["vertex"])))
+        if 1 in (searching := np.flatnonzero(fleet.cars["state"] == SEARCHING)):
+            at[second] = fleet.poses().xy[list(searching).index(1)]
+    hops = np.hypot(*np.diff(np.array(list(at.values())), axis=0).T)
+    assert hops.max() <= 0.55 * SCENARIO.v_drive, "it does not jump back"
+    assert (hops == 0.0).sum() >= 55, "it waits for half a minute"

@@ -74,20 +74,12 @@ def test_cars_drive_along_the_lanes_and_no_slot_holds_two(run):
             assert all(one[1] <= two[0] for one, two in itertools.pairwise(stays))
 
 
-def test_failed_attempts_and_queues_are_on_the_track(monkeypatch):
+def test_failed_attempts_and_queues_are_on_the_track():
     spec = FleetSpec().changed(
         scenario={"lot": "mini", "arrivals": {"hours": "08:00-08:30"}}, agents=["first-free"], knows=["own"],
-        arrivals_per_hour=[120], days=1,
+        arrivals_per_hour=[120], days=1, manoeuvre_s=6.0,
     )  # fmt: skip
     experiment = FleetExperiment(spec)
-    make = FleetExperiment.fleet
-
-    def with_queues(self, setting):
-        fleet, agents = make(self, setting)
-        fleet.records["manoeuvre_s"] = 6.0
-        return fleet, agents
-
-    monkeypatch.setattr(FleetExperiment, "fleet", with_queues)
     (day,) = choose_days(experiment, experiment.settings, 1)
     its = day.record({})["fleet"]
     fleet, agents = experiment.fleet(experiment.settings[0])

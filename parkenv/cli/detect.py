@@ -146,21 +146,24 @@ def train_detector(
     seed: int = 0,
     *,
     normalization: Literal["neighbors", "cell", "blocks"] = "neighbors",
-    penalty: float = 0.01,
+    penalty: float = 0.03,
     rounds: int = 3,
-    jitter: int = 2,
+    jitter: int = 4,
     misaligned: int = 2,
+    enlarged: float = 2.0,
 ) -> None:
     r"""Train a car model on photographs: with labelled boxes, or aligned crops of cars and images without cars.
 
-    With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car.
+    With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car. The
+    cars that are held out are also searched in made photographs: pasted at 0.8 to 2.2 times their size into mosaics of
+    the images without cars that are held out.
 
     Examples:
         parkenv train-detector --uiuc CarData --out side.npz
         parkenv train-detector --labels coco.json --images pictures -o side.npz
         parkenv train-detector --labels yolo --front -o front.npz
         parkenv train-detector --crops kitti --front --out front.npz \
-            --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0
+            --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0 --enlarged 0
 
     Options:
         out, -o (FILE.npz): The model file to write.
@@ -180,6 +183,8 @@ def train_detector(
         rounds (N >= 0): Rounds of hard-negative mining.
         jitter (N >= 0): Shifted copies of each car; 0 if the crops are not aligned.
         misaligned (N >= 0): Misaligned crops of each car as negatives; 0 if the crops are not aligned.
+        enlarged (X): Crops are also mined enlarged so many times, so that parts of large cars become negatives; 0:
+            none, if the crops are not aligned. With --labels, the photographs are mined instead.
     """
     from parkenv.files.atomic_write import check_writable
     from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
@@ -207,7 +212,7 @@ def train_detector(
         data = read_uiuc_training(uiuc) if uiuc is not None else read_crop_folder(Path(str(crops)))
     descriptor = Descriptor(128, 128 if front else 64, normalization)
     settings = TrainingSettings(
-        penalty=penalty, rounds=rounds, jitter=jitter, misaligned=misaligned, seed=seed
+        penalty=penalty, rounds=rounds, jitter=jitter, misaligned=misaligned, enlarged=enlarged, seed=seed
     )
     console = make_console()
     with console.status("Training") as status:
@@ -240,15 +245,18 @@ def train_detector(
 def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
     from parkenv.perception.cross_validation import FALSE_POSITIVES
 
-    def cells(part: str, cars: str, others: str, auc: float, recall: Sequence[float]) -> tuple[str, ...]:
-        return part, cars, others, f"{auc:.4f}", *(f"{r:.3f}" for r in recall)
+    def cells(part: str, cars: str, others: str, values: Sequence[float]) -> tuple[str, ...]:
+        return part, cars, others, *(f"{v:.4f}" for v in values)
 
-    n = len(scores)
-    mean = [sum(s.recall[k] for s in scores) / n for k in range(len(FALSE_POSITIVES))]
-    rows = [cells(str(i + 1), str(s.n_cars), str(s.n_others), s.auc, s.recall) for i, s in enumerate(scores)]
+    values = [(s.auc, *s.recall, s.equal_error) for s in scores]
+    rows = [
+        cells(str(i + 1), str(s.n_cars), str(s.n_others), v)
+        for i, (s, v) in enumerate(zip(scores, values, strict=True))
+    ]
+    rows.append(cells("mean", "", "", [sum(column) / len(scores) for column in zip(*values, strict=True)]))
     rates = [f"recall at {rate:.1%} false positives" for rate in FALSE_POSITIVES]
-    rows.append(cells("mean", "", "", sum(s.auc for s in scores) / n, mean))
-    return make_table("Held-out crops", ["part", "cars", "others", "AUC", *rates], rows)
+    columns = ["part", "cars", "others", "AUC", *rates, "equal error, made photographs"]
+    return make_table("Held out", columns, rows)
 
 
 def evaluate_detector(
@@ -272,10 +280,11 @@ def evaluate_detector(
     """
     from rich.progress import Progress
 
-    from parkenv.evaluation.experiments.detector_scores import LEAST_SCORED, save_curves, score_on_uiuc
+    from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
     from parkenv.perception.detector_registry import make_detector
+    from parkenv.perception.hog_detector import LEAST_SCORED
 
     name = detector or model
     is_model = detector is None and (name in PACKAGED_MODELS or name.lower().endswith(".npz"))

@@ -17,6 +17,7 @@ from parkenv.files.known_names import SCENARIO_NAMES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.scenarios.spec import ScenarioSpec
 
 
@@ -25,7 +26,7 @@ def publish(
     /,
     out: Path,
     scenario: str | None = None,
-    episodes: int = 500,
+    episodes: int | None = None,
     seed: int | None = None,
     *,
     trust: bool = False,
@@ -34,11 +35,12 @@ def publish(
     """Make a folder with a trained model that the Hugging Face Hub takes as it is; nothing is uploaded.
 
     Of a training, the best model is published, with its learning curve. The model is evaluated beside planners in the
-    same worlds, by default in the scenarios that it was tested in; the model card gives results with 95 % intervals
-    and the command that repeats them.
+    same worlds, by default in the scenarios that it was tested in, and if it was trained in a fleet, in fleets with
+    that demand; the model card gives results with 95 % intervals and the command that repeats them.
 
     Examples:
         parkenv publish results/maskable-ppo --out hub/maskable-ppo
+        parkenv publish results/fleet-maskable-ppo --out hub/fleet
         parkenv publish mine.safetensors --scenario my_lot.toml --out hub/mine
 
     Options:
@@ -46,10 +48,12 @@ def publish(
         out, -o (DIR): The folder to make.
         scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
             those of the training's test]
-        episodes, -n (N >= 2): Episodes of the evaluation in each scenario.
+        episodes, -n (N >= 2): Episodes of the evaluation in each scenario; in a fleet, days.  [default: 500; in a
+            fleet, 16]
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
     from parkenv.evaluation.experiments.results import make_folder, write_summary
+    from parkenv.evaluation.fleet.publication import FleetPublication
     from parkenv.evaluation.publication import CARD, FILM, MODEL, Publication
     from parkenv.evaluation.training.training_task import FIGURE, TEST_SEED
     from parkenv.scenarios.build import build
@@ -58,12 +62,18 @@ def publish(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out {out}: exists; name a new folder")
     seed = TEST_SEED if seed is None else seed
-    model, tested = _best(trained, trust) if trained.is_dir() else (trained, None)
+    spec, model, tested = _best(trained, trust) if trained.is_dir() else (None, trained, None)
     card = ModelCard.of_file(model)
+    if spec is None and "fleet" in card.settings:
+        raise InputError(f"{model}: was trained in a fleet; name the folder of its training")
     if scenario is not None:
         tested = args.scenario_specs(scenario)
     named = {_file_of(spec): spec for spec in (tested or _trained_on(model, card.scenarios))}
-    published = Publication(model, {name: build(spec) for name, spec in named.items()}, episodes, seed)
+    published = (
+        FleetPublication.of_training(spec, model, named, episodes or 16, seed)
+        if spec is not None and spec.env == "fleet"
+        else Publication(model, {name: build(each) for name, each in named.items()}, episodes or 500, seed)
+    )
     make_folder(out)
     console = make_console()
     with console.status("Evaluating"), machines.workers() as workers:
@@ -72,10 +82,10 @@ def publish(
         published.film(out / FILM)
     shutil.copyfile(model, out / MODEL)
     further = ""
-    for name, spec in named.items():
+    for name, each in named.items():
         if name.endswith(".json"):
-            spec.write(out / name)
-            if files := spec.files():
+            each.write(out / name)
+            if files := each.files():
                 further += f"\n`{name}` needs files that are not here: {', '.join(f.name for f in files)}.\n"
     if (curve := trained / FIGURE).exists():
         shutil.copyfile(curve, out / FIGURE)
@@ -87,8 +97,8 @@ def publish(
     console.print(f"To upload it: hf upload USER/NAME {shlex.quote(str(out))}")
 
 
-def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | None]:
-    """Return the best model of a training, and the scenarios of its test.
+def _best(folder: Path, trust: bool) -> tuple[TrainingSpec, Path, Sequence[ScenarioSpec] | None]:
+    """Return the specification of a training, its best model, and the scenarios of its test.
 
     Raises:
         InputError: the folder holds no finished training.
@@ -103,13 +113,13 @@ def _best(folder: Path, trust: bool) -> tuple[Path, Sequence[ScenarioSpec] | Non
         raise InputError(f"{folder}: holds a run of {run.kind}, want one of train")
     require_trust(spec, folder, trust)
     rows = run.summary["rows"]
-    key = "total_s" if spec.env == "search" else "success"
-    best = (min if spec.env == "search" else max)(rows, key=lambda row: float(row[key]))
+    key, better = ("success", max) if spec.env == "drive" else ("total_s", min)
+    best = better(rows, key=lambda row: float(row[key]))
     tested = spec.test_on or spec.evaluate_on or spec.scenarios
     if spec.test_on is None and spec.held_out is not None and spec.scenarios is not None:
         kept = set(run.summary["settings"]["held_out"])
         tested = tuple(each for each in spec.scenarios if each.title in kept)
-    return folder / f"seed_{int(best['seed'])}" / MODEL, tested
+    return spec, folder / f"seed_{int(best['seed'])}" / MODEL, tested
 
 
 def _trained_on(model: Path, names: Sequence[str]) -> list[ScenarioSpec]:

@@ -639,8 +639,8 @@ class Fleet:
         xy, ahead = self.scenario.lot.vertex_xy, records["vertex"]
         behind, left = records["previous_vertex"], records["time"] - self.time
         share = np.clip(left / np.maximum(records["step_drive_s"], 1e-9), 0.0, 1.0)
-        # A failed attempt, or a wait: the car stands.
-        share[records["step_failed_s"] > 0.0] = 0.0
+        # A failed attempt, a wait or a queue: the car stands.
+        share[(records["step_failed_s"] > 0.0) | (cars["queues_since"] <= self.time)] = 0.0
         step = xy[behind] - xy[ahead]
         yaw = np.where(
             behind == ahead, self.scenario.lot.vertex_yaw[ahead], np.arctan2(-step[:, 1], -step[:, 0])

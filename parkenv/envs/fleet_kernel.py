@@ -270,6 +270,7 @@ def _reach(fleet: Any, number: int) -> None:
 @inlined
 def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None:
     """Let a car wait before a blocked vertex until a time, s."""
+    car.queues_since = min(car.queues_since, fleet.time)
     before = search.step_drive_s
     search.step_drive_s += until - fleet.time
     search.time = until
@@ -340,6 +341,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         search.vertex = action - TAKE_SLOT
         action = PARK
     origin = search.vertex
+    car.queues_since = np.inf
     drive_or_park(search, action)
     car.stands, car.vertex = search.vertex == car.vertex, search.vertex
     if search.parked:

@@ -59,6 +59,7 @@ CAR = np.dtype(
         ("vertex", np.int64),
         ("stands", np.bool_),
         ("queued_s", np.float64),
+        ("queues_since", np.float64),
         ("holds", np.int64),
         # Sums of the search, complete when it has ended.
         ("drive_s", np.float64),

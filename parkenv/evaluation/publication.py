@@ -109,10 +109,40 @@ class Publication:
             shown = [frame for seed in seeds for frame in park_once(drive, parker, seed, every=2).frames]
             save_film(shown, path, fps=10.0, colors=128)
 
+    @property
+    def environment(self) -> str:
+        """Environment of the evaluation."""
+        return "parkenv/Search-v2" if self.card.task == "search" else "parkenv/Drive-v1"
+
+    @property
+    def purpose(self) -> str:
+        """What the model does, and where, as a part of a sentence."""
+        does = (
+            "searches a parking lot for a free slot"
+            if self.card.task == "search"
+            else "drives a car into a slot"
+        )
+        return f"{does}, in [Gymnasium](https://gymnasium.farama.org) environments"
+
+    @property
+    def evaluation(self) -> str:
+        """What the evaluation consists of, a sentence."""
+        return (
+            f"{self.episodes:,} episodes in each scenario, in the same worlds for all agents; "
+            "95 % intervals in brackets."
+        )
+
+    def table(self, rows: Sequence[Row]) -> str:
+        """Return the results of `evaluate` as a table in Markdown."""
+        return _table(rows)
+
+    def usage(self) -> str:
+        """Return lines of Python that use the model."""
+        return _usage(self.card, next(iter(self.scenarios)))
+
     def metadata(self, rows: Sequence[Row]) -> Row:
         """Return the model card's metadata as the Hub specifies it, with a `model-index` of the results."""
-        card = self.card
-        env = "parkenv/Search-v2" if card.task == "search" else "parkenv/Drive-v1"
+        card, env = self.card, self.environment
         results = [
             {
                 "task": {"type": "reinforcement-learning", "name": f"{card.task} for parking"},
@@ -140,25 +170,21 @@ class Publication:
         card = self.card
         trained = f"`{shlex.join(card.command)}`" if card.command else "a script of its author"
         lots = ", ".join(card.scenarios) or "unknown scenarios"
-        act = (
-            "searches a parking lot for a free slot" if card.task == "search" else "drives a car into a slot"
-        )
         text = f"""---
 {yaml.safe_dump(self.metadata(rows), sort_keys=False, allow_unicode=True)}---
 
 # {card.algorithm}, trained to {card.task}
 
-A policy that {act}, in [Gymnasium](https://gymnasium.farama.org) environments of parkenv.
+A policy that {self.purpose} of parkenv.
 {card.steps:,} decisions of training on {lots}, seed {card.seed}, with parkenv {card.parkenv}, by {trained}.
 
 ![Its first episodes]({FILM})
 
 ## Results
 
-{_table(rows)}
+{self.table(rows)}
 
-{self.episodes:,} episodes in each scenario, in the same worlds for all agents; 95 % intervals in brackets. In this
-folder,
+{self.evaluation} In this folder,
 
 ```sh
 {shlex.join(self.command)}
@@ -171,7 +197,7 @@ gives the same numbers with parkenv {__version__}.
 `{MODEL}` holds the weights and a card, as safetensors: opening it runs no code.
 
 ```python
-{_usage(card, next(iter(self.scenarios)))}
+{self.usage()}
 ```
 {extra}"""
         with atomic_write(path) as beside:

@@ -29,7 +29,7 @@ FOLDER = Path(__file__).parent / "models"
 
 def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], None]) -> dict[str, CarModel]:
     """Train the side and the front model on simulated images."""
-    settings = TrainingSettings(penalty=0.1, jitter=4, seed=seed)
+    settings = TrainingSettings(penalty=0.1, shift=0.03, resize=0.05, seed=seed)
     empty = [p.labelled.image for p in photos if not len(p.labelled.boxes)]
     peopled = [p.labelled for p in photos if len(p.labelled.boxes)]
     told = f"{len(photos)} simulated pictures, seed {seed}"

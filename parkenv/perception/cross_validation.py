@@ -13,33 +13,39 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.perception.car_datasets import Crops
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.detection_scores import recall_at
+from parkenv.perception.detection_scores import RecallPrecision, recall_at, recall_precision
+from parkenv.perception.hog_detector import HogDetector
+from parkenv.perception.made_photos import SIZES, made_photos
 from parkenv.perception.training import train
 
 BLOCKS = 30
 """Number of blocks of consecutive files; images of the same car are neighbours and should share a block."""
 FALSE_POSITIVES = (0.001, 0.002, 0.01)
+MADE_PHOTOS = 150
+"""Number of made photographs per fold."""
 _Image = NDArray[np.uint8]
 
 
 @dataclass(frozen=True)
 class CropScore:
-    """Classification scores of a model on held-out crops.
+    """Scores of a model on held-out crops.
 
     Attributes:
         auc: area under the curve of true against false positives.
         recall: fraction of the cars found at each false-positive rate of `FALSE_POSITIVES`.
         n_cars, n_others: number of crops.
+        equal_error: equal-error rate on photographs made of them, with cars of many sizes.
     """
 
     auc: float
     recall: tuple[float, ...]
     n_cars: int
     n_others: int
+    equal_error: float
 
 
-def score_on_crops(model: CarModel, crops: Crops) -> CropScore:
-    """Score a model on crops, each resized to its window."""
+def score_on_crops(model: CarModel, crops: Crops, seed: int = 0) -> CropScore:
+    """Score a model on crops, each resized to its window, and on photographs made of them with this seed."""
     from sklearn.metrics import roc_auc_score
 
     window = (model.descriptor.width, model.descriptor.height)
@@ -55,6 +61,25 @@ def score_on_crops(model: CarModel, crops: Crops) -> CropScore:
         tuple(recall_at(rate, scores[0], scores[1]) for rate in FALSE_POSITIVES),
         len(scores[0]),
         len(scores[1]),
+        score_on_made_photos(model, crops, MADE_PHOTOS, seed).equal_error,
+    )
+
+
+def score_on_made_photos(model: CarModel, crops: Crops, n: int, seed: int = 0) -> RecallPrecision:
+    """Search photographs made of the crops for cars of all sizes, and smaller and larger ones.
+
+    Args:
+        model: a model that has not been trained on the crops.
+        crops: aligned crops of cars, and images without cars.
+        n: number of photographs.
+        seed: seed of the photographs.
+    """
+    photos = made_photos(crops, n, seed)
+    height = crops.positives[0].shape[0]
+    detector = HogDetector.for_evaluation(model, 0.8 * SIZES[0] * height, 1.2 * SIZES[1] * height)
+    found = [detector.detect(photo.image) for photo in photos]
+    return recall_precision(
+        [f.regions for f in found], [f.score for f in found], [photo.boxes for photo in photos]
     )
 
 
@@ -97,7 +122,7 @@ def cross_validated(
             positives=_part(crops.positives, fold_of, fold, True),
             negatives=_part(crops.negatives, fold_of, fold, True),
         )
-        scores.append(score_on_crops(model, held_out))
+        scores.append(score_on_crops(model, held_out, seed + fold))
     return scores
 
 

@@ -22,6 +22,8 @@ from parkenv.perception.threads import in_threads
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
+LEAST_SCORED = 0.002
+"""Least probability of a detection that counts in an evaluation: curves go on to many false positives."""
 _ZOOM = 1.6
 _MOST_WINDOWS = 2000  # only the best are kept; a useful model does not report more
 
@@ -38,6 +40,8 @@ class HogDetector:
         scale_step: ratio of one region size to the next smaller one.
         threshold: probability from which a window is reported as a car.
         overlap: intersection over union from which only the better of two boxes is kept.
+        inside: fraction of the smaller of two boxes from which only the better one is kept, because one shows a part of
+            the other's car. 1: they are two cars, as where rows of cars hide one another.
         margin: cars may reach beyond the image by this fraction of their region; the border pixels are replicated.
 
     Raises:
@@ -50,6 +54,7 @@ class HogDetector:
     scale_step: float = 1.2
     threshold: float = 0.5
     overlap: float = 0.4
+    inside: float = 1.0
     margin: float = 0.25
 
     def __post_init__(self) -> None:
@@ -66,8 +71,9 @@ class HogDetector:
         for name in ("threshold", "overlap"):
             if not 0.0 < getattr(self, name) < 1.0:
                 raise InputError(f"{name} is {getattr(self, name)}, want between 0 and 1")
-        if not 0.0 <= self.margin <= 1.0:
-            raise InputError(f"margin is {self.margin}, want 0 to 1")
+        for name in ("inside", "margin"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise InputError(f"{name} is {getattr(self, name)}, want 0 to 1")
 
     @classmethod
     def load(
@@ -76,6 +82,14 @@ class HogDetector:
         """Load packaged models or model files; both packaged models if none is named."""
         models = tuple(CarModel.load(name) for name in names or PACKAGED_MODELS)
         return cls(models, least_height=least_height, threshold=threshold)
+
+    @classmethod
+    def for_evaluation(cls, model: CarModel, least_height: float, most_height: float) -> HogDetector:
+        """Search regions of these heights, px, in small steps, for cars that stand apart, also weak ones."""
+        return cls(
+            (model,), least_height=least_height, most_height=most_height,
+            scale_step=1.05, threshold=LEAST_SCORED, overlap=0.3, inside=0.6, margin=0.35,
+        )  # fmt: skip
 
     def detect(self, image: Image) -> Detections:
         """Find the cars in an image, best first.
@@ -105,7 +119,9 @@ class HogDetector:
                 for name in ("boxes", "probability", "end_on", "score", "regions")
             )
         )
-        return all_models.select(best_boxes(all_models.boxes, all_models.probability, self.overlap))
+        return all_models.select(
+            best_boxes(all_models.boxes, all_models.probability, self.overlap, self.inside)
+        )
 
     def scan(self, model: CarModel, grey: Image, band: GroundBand | None = None) -> Detections:
         """Return all windows above the threshold, before non-maximum suppression.
@@ -194,13 +210,19 @@ def as_grey(image: Image) -> Image:
     )
 
 
-def best_boxes(boxes: Float32Array, value: Float32Array, overlap: float) -> NDArray[np.int64]:
-    """Suppress non-maxima: return the rows of boxes that overlap no better box by more than `overlap`, best first.
+def best_boxes(
+    boxes: Float32Array, value: Float32Array, overlap: float, inside: float = 1.0
+) -> NDArray[np.int64]:
+    """Suppress non-maxima: return the rows of the boxes that no better box claims for its own car, best first.
+
+    A box that is much smaller or larger than a better one has little of its union in common with it: a wheel in a car
+    counts as another car by `overlap`, but not by `inside`.
 
     Args:
         boxes: (n, 4) left, top, right, bottom.
         value: (n,) score of each.
-        overlap: intersection over union.
+        overlap: largest intersection over union of two boxes that are kept.
+        inside: largest intersection over the area of the smaller one.
     """
     order = np.argsort(-value, kind="stable")[:_MOST_WINDOWS]
     area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
@@ -210,7 +232,8 @@ def best_boxes(boxes: Float32Array, value: Float32Array, overlap: float) -> NDAr
         kept.append(best)
         inner = np.minimum(boxes[best, 2:], boxes[rest, 2:]) - np.maximum(boxes[best, :2], boxes[rest, :2])
         common = np.clip(inner, 0.0, None).prod(axis=1)
-        order = rest[common <= overlap * (area[best] + area[rest] - common)]
+        apart = common <= overlap * (area[best] + area[rest] - common)
+        order = rest[apart & (common <= inside * np.minimum(area[best], area[rest]))]
     return np.array(kept, dtype=np.int64)
 
 

@@ -29,13 +29,16 @@ _NO_CARS = np.empty((0, 4))
 class TrainingSettings:
     """Parameters of the training."""
 
-    penalty: float = 0.01  # C of the support vector machine
+    penalty: float = 0.03  # C of the support vector machine
     rounds: int = 3  # rounds of hard-negative mining, each on another part of the images
-    jitter: int = 2  # number of shifted and scaled copies of each positive
-    shift: float = 0.03  # largest shift of a copy, as a fraction of the window
-    resize: float = 0.05  # largest change of a copy's size, as a fraction
+    jitter: int = 4  # number of shifted and scaled copies of each positive
+    shift: float = 0.015  # largest shift of a copy, as a fraction of the window
+    resize: float = 0.025  # largest change of a copy's size, as a fraction
     misaligned: int = 2  # number of misaligned crops of each positive that become negatives
     per_image: int = 5  # largest number of hard negatives from one image per round
+    enlarged: float = (
+        2.0  # without photographs, crops enlarged so much take their place in the mining; 0: none do
+    )
     positives_weight: float = 1.0  # weight of a positive relative to a negative
     seed: int = 0  # seed of the jitter and the solver
 
@@ -46,6 +49,8 @@ class TrainingSettings:
         for name in ("rounds", "jitter", "misaligned", "per_image", "seed"):
             if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 0):
                 raise InputError(f"{name} is {getattr(self, name)!r}, want a whole number of at least 0")
+        if not (self.enlarged == 0.0 or 1.0 <= self.enlarged <= 8.0):
+            raise InputError(f"enlarged is {self.enlarged}, want 0 or 1 to 8")
         for name in ("shift", "resize"):
             if not 0.0 <= getattr(self, name) < 0.5:
                 raise InputError(f"{name} is {getattr(self, name)}, want a share below 0.5")
@@ -68,12 +73,14 @@ def train(
 
     All crops are mirrored, and positives are jittered; windows with half a car are negatives from the start. In each
     following round the model scans the negative images, and its false positives join the negatives (Dalal and Triggs
-    2005). Probabilities are calibrated on cross-validated scores (Platt 1999).
+    2005): so do those in the photographs, or, where there are none, in the enlarged crops of cars and of others, for a
+    model that has only seen whole cars finds small ones in the parts of a large one. Probabilities are calibrated on
+    cross-validated scores (Platt 1999).
 
     Args:
         positives: aligned grey crops of cars, uint8; resized to the window.
         negatives: grey images of any size without cars.
-        photos: images with all cars labelled; false positives beside the cars are mined, too.
+        photos: images with all cars labelled; false positives beside and within the cars are mined, too.
         descriptor: None: 128×64, for side views.
         region_aspect: width over height of the crops; None: that of the first crop.
         car: left, top, right, bottom of the car in the crops, as fractions.
@@ -109,12 +116,13 @@ def train(
     model = CarModel(
         descriptor, np.zeros(descriptor.shape, np.float32), 0.0, aspect, car, (1.0, 0.0), end_on, trained_on
     )
+    images = [LabelledImage("", n, _NO_CARS) for n in negatives]
+    images += photos or _enlarged(positives, negatives, car, settings.enlarged)
     for round_number in range(settings.rounds + 1):
         progress(f"round {round_number}: {len(yes)} positives, {len(no)} negatives")
         model = _fitted(model, yes, no, settings)
         if round_number == settings.rounds:
             break
-        images = [*(LabelledImage("", n, _NO_CARS) for n in negatives), *photos]
         hard = mined(model, images[round_number :: settings.rounds], settings.per_image)
         if not len(hard):
             progress(f"round {round_number}: no false positives are left")
@@ -122,6 +130,28 @@ def train(
         no = np.concatenate([no, hard])
     progress("calibrating scores")
     return replace(model, calibration=_calibration(yes, no, settings))
+
+
+def _enlarged(
+    positives: Sequence[Image],
+    negatives: Sequence[Image],
+    car: tuple[float, float, float, float],
+    by: float,
+) -> list[LabelledImage]:
+    """Return images without cars and crops with one, enlarged."""
+    if not by:
+        return []
+
+    def larger(image: Image) -> Image:
+        return np.asarray(cv2.resize(image, None, fx=by, fy=by, interpolation=cv2.INTER_CUBIC))
+
+    others = [LabelledImage("", larger(n), _NO_CARS) for n in negatives]
+    for crop in positives:
+        image = larger(crop)
+        height, width = image.shape
+        box = np.array([car]) * [width, height, width, height]
+        others.append(LabelledImage("", image, box))
+    return others
 
 
 def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> Float32Array:

@@ -138,7 +138,7 @@ class MixedFleet:
 
 def summary(days: Sequence[Row]) -> Row:
     """Return the row of some days; days without members, or without others, do not count for their means."""
-    row: Row = {"episodes": len(days), "cars": sum(day["cars"] for day in days)}
+    row: Row = {"days": len(days), "cars": sum(day["cars"] for day in days)}
     for name in ("parked_fraction", "total_s", "search_s", "others_s"):
         values = [day[name] for day in days if not np.isnan(day[name])]
         row[name], low, high = mean_interval(values)

@@ -44,7 +44,7 @@ _KNOWN = {
         Column("agent", "agent"),
         Column("map", "map at first", help="fixed: right, does not learn; none: the agent uses no map"),
         Column("day", "day", digits=0),
-        Column("days", "days"),
+        Column("days", "days", digits=0),
         Column("courses", "drivers", digits=0),
         Column("forecast_error", "forecast error", digits=3, help="Brier score of P(taken) at the arrival"),
         Column("failure_cost_s", "failure cost", "s", 0, help="Time of a failed parking attempt"),
@@ -140,7 +140,6 @@ _ORDER = (
 _OF_FLEETS = {
     column.key: column
     for column in (
-        Column("days", "days", digits=0),
         Column("difference_s", "minus own", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
         Column("bound_s", "alone", "s", help="Mean total time of a car alone in an empty lot that it knows"),
         Column(
