@@ -1,6 +1,6 @@
 """`belief-rivals`: the planner in belief space, in a lot that other searching cars fill.
 
-Rivals arrive at a rate that is known, or one of several hypotheses. Each passes the free slots in the order of the
+Rivals arrive at a rate that is known, or follows from the forecast. Each passes the free slots in the order of the
 total time from the entry to the goal, and takes each with the same probability. So the best slots are taken most of the
 time, whatever the forecast says, and are gone soon where they are free; slots that are out of the way keep their
 forecast.
@@ -27,21 +27,26 @@ FloatArray = NDArray[np.float64]
 
 PASSED = 3.0
 """Mean number of free slots that a rival passes, or drives on from to the next, before it takes one."""
-RATES = {0.0: 0.5, 60.0: 0.125, 120.0: 0.125, 240.0: 0.125, 480.0: 0.125}
-"""Rivals an hour -> prior probability, where the rate is not known."""
+CROWD = 2.5
+"""Expected rate of rivals as a multiple of the usual rate of arrivals, where it is not known.
+
+To expect too few costs more than to expect too many: who expects few drives to the best slots, with all the others,
+and circles there; who expects many stops early, and walks a little further.
+"""
 
 
 class BeliefRivalsAgent(BeliefAgent):
     """`belief-rivals`: `belief`, which expects that rivals take free slots, the best ones first.
 
-    Beside how the day differs from its forecast, the agent learns from its observations how many rivals arrive: slots
-    near the entry that are taken against the forecast, and slots that were observed free and then taken, speak for
-    many. Rivals stay as long as the forecast's cars do. In a lot whose slots never change, according to the forecast,
-    nobody arrives, and the agent is `belief`.
+    Where the rate of rivals is not known, it is taken to be `CROWD` times the rate at which cars usually arrive. In the
+    long run that is the rate at which cars leave (Little's law), which follows from the forecast and its decay rates.
+    It is not learned from the slots that are observed: those near the entry are free however many rivals want the best
+    ones, and would soon prove that there are none. In a lot whose slots never change, according to the forecast, nobody
+    arrives, and the agent is `belief`.
 
     Args:
         problem: lot, goal, speeds and costs.
-        arrivals_per_hour: rivals an hour; None: not known. With 0 the agent is `belief`, action for action.
+        arrivals_per_hour: rivals an hour; None: not known, see above. With 0 the agent is `belief`, action for action.
         budget_ms: as of `belief`.
         day: as of `belief`.
         most_vertices: as of `belief`.
@@ -63,28 +68,33 @@ class BeliefRivalsAgent(BeliefAgent):
         explore: float = 0.0,
     ) -> None:
         super().__init__(problem, budget_ms, day, most_vertices, explore)
-        if arrivals_per_hour is None:
-            rates = RATES
-        elif 0.0 <= arrivals_per_hour < math.inf:
-            rates = {float(arrivals_per_hour): 1.0}
-        else:
+        if arrivals_per_hour is not None and not 0.0 <= arrivals_per_hour < math.inf:
             raise InputError(f"arrivals_per_hour is {arrivals_per_hour}, want a finite number of at least 0")
         self.arrivals_per_hour = arrivals_per_hour
-        self._per_s = np.array(list(rates)) / 3600.0
-        self._rate_weight = np.array(list(rates.values()))
         lot = self.problem.lot
         drive_m = dijkstra(lot.drive_matrix(), indices=np.unique(lot.entry_vertices), min_only=True)
         rival_s = drive_m[: lot.n_slots] / self.problem.v_drive + self.problem.arrival_cost_s
         self._order = np.argsort(rival_s, kind="stable")
 
     def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:
-        forecast, decay_rate = belief.forecast.astype(np.float64), belief.decay_rate.astype(np.float64)
-        taken_per_s = [
-            _take_rates(1.0 - forecast, decay_rate * (1.0 - forecast), self._order, per_s, PASSED)
-            for per_s in self._per_s
-        ]
-        rivals = RivalRates(np.array(taken_per_s)[:, near.slots], self._rate_weight)
+        forecast = belief.forecast.astype(np.float64)
+        leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
+        per_s = CROWD * usual_arrivals(forecast, leaving)
+        if self.arrivals_per_hour is not None:
+            per_s = self.arrivals_per_hour / 3600.0
+        take_rates = _take_rates(1.0 - forecast, leaving, self._order, per_s, PASSED)
+        rivals = RivalRates(take_rates[None, near.slots], np.ones(1))
         return DayBelief(belief.take(near.slots), self._nearness[near.slots], not self._day, rivals)
+
+
+def usual_arrivals(forecast: FloatArray, leaving: FloatArray) -> float:
+    """Return how many cars per second arrive at a lot in the long run: as many as leave it (Little's law).
+
+    Args:
+        forecast: (n_slots,) P(taken).
+        leaving: (n_slots,) 1/s, rate at which a taken slot becomes free.
+    """
+    return float(leaving @ forecast)
 
 
 @compiled(error_model="numpy")
