@@ -49,7 +49,7 @@ class Stops(NamedTuple):
         time: (n, captures) float64, s since Monday 00:00.
     """
 
-    count: IntArray
+    count: IntArray  # type: ignore[assignment]  # hides tuple.count
     pose: FloatArray
     time: FloatArray
 
@@ -358,17 +358,19 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
         self._stops = Stops(self._seen["count"], np.zeros((n, k, 3)), np.zeros((n, k)))
         self._library, quads, others = CarLibrary.of(slot_lot(lot))
         self._lanes = _lanes_of(world.lot, k, float(every), laser.max_range)
-        each = (others.corners, others.x, others.y, others.radius)
         self._planes = Planes(
             tuple(quads),
-            *(np.repeat(array[None], n, axis=0) for array in each),
+            np.repeat(others.corners[None], n, axis=0),
+            np.repeat(others.x[None], n, axis=0),
+            np.repeat(others.y[None], n, axis=0),
+            np.repeat(others.radius[None], n, axis=0),
             others.label,
             others.cell_start,
             others.frame,
             int(others.k),
             np.zeros((n, lot.n_slots), np.int32),
         )
-        self._laser = _laser_of(laser, (mount.x, mount.y, mount.yaw))
+        self._laser = _laser_of(laser, (float(mount.x), float(mount.y), float(mount.yaw)))
         self._cursors = np.zeros(n * lot.n_slots, CURSOR)
 
     @property
@@ -423,7 +425,7 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
 def _laser_of(laser: LaserScanner, mount: tuple[float, float, float]) -> Laser:
     beams, heading = laser.beams
     table, limits = noise_table(), (laser.noise_sd, laser.lost_below, laser.max_range)
-    return Laser(tuple(map(float, mount)), heading, beams, table, *(np.float32(value) for value in limits))
+    return Laser(mount, heading, beams, table, *(np.float32(value) for value in limits))
 
 
 def _lanes_of(lot: Any, captures: int, every: float, max_range: float) -> Lanes:

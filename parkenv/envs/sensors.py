@@ -109,6 +109,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
     | `every` | 1.0 | m, least distance between captures on an edge |
+    | `picture_width` | the rig's | px, of the cameras' pictures; smaller ones are drawn faster |
     | `observation` | `full` | `scan`: without images; the cameras of the rig are not drawn |
 
     ```python
@@ -136,12 +137,13 @@ class SearchSensorsEnv(SensingSearchEnv):
         captures: int = 4,
         every: float = 1.0,
         observation: str = "full",
+        picture_width: int | None = None,
         **changes: Any,
     ) -> None:
         if observation not in OBSERVATIONS:
             raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
         super().__init__(make_scenario(scenario, **changes), render_mode)
-        sensors = make_rig(rig, self.scenario)
+        sensors = make_rig(rig, self.scenario, picture_width)
         if observation == "scan":
             if not sensors.lasers:
                 raise InputError('observation is "scan", want a rig with a laser')

@@ -162,12 +162,14 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
 def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     """Measure the steps per second of random drives on `campus` through sensors, resets included."""
     few = 10.0 * seconds  # an episode begins with a new world, weather and sky
-    rows = []
-    for name, options, case in (
+    rows: list[BenchRow] = []
+    no_pictures: dict[str, Any] = {"observation": "scan"}
+    drives: tuple[tuple[str, dict[str, Any], str], ...] = (
         ("SearchSensors", {}, "pictures and scans, up to 4 a step"),
         ("SearchPerception", {}, "seen by the pipeline, up to 2 a step"),
-        ("SearchSensors", {"observation": "scan"}, "scans alone, up to 4 a step"),
-    ):
+        ("SearchSensors", no_pictures, "scans alone, up to 4 a step"),
+    )
+    for name, options, case in drives:
         env: gym.Env[Any, Any] = gym.make(f"parkenv/{name}-v2", scenario="campus", **options)
         rows += rate(
             "environment", f"{name}-v2 on campus, {case}", _steps_per_second(env, seed, few), "steps/s"
@@ -179,7 +181,7 @@ def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     def step(_: int) -> None:
         nonlocal observation
         chosen = (rng.random((_SEARCHES, PARK)) * observation["action_mask"][:, :PARK]).argmax(axis=1)
-        observation, *_ = envs.step(chosen)
+        observation = envs.step(chosen)[0]
 
     batch = _SEARCHES / seconds_each(step, few)
     case = f"SearchSensors-v2 on campus, scans alone, {_SEARCHES} at once"
