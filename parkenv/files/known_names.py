@@ -13,8 +13,8 @@ LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
 RigName = Literal["laser", "stereo", "both_sides"]
-DETECTORS = ("hog", "side", "front")
-"""Packaged detectors: hog has both HOG models, side and front; any other is a network in parkenv/perception/models."""
+DETECTORS = ("hog", "net", "side", "front")
+"""Packaged detectors: hog has both HOG models, side and front; net is a network in parkenv/perception/models."""
 DETECTOR_SUFFIXES = (".npz", ".onnx")
 WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
