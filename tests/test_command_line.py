@@ -57,8 +57,8 @@ def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
 
 
 OPTIONAL = (
-    "address", "agents", "beside", "bounds", "calibrated", "car_park", "clone", "crops", "lot", "map_says", "model",
-    "labels", "picture", "replay", "rerun", "rig", "uiuc",
+    "address", "agents", "beside", "bounds", "calibrated", "car_park", "clone", "crops", "drives", "lot", "map_says",
+    "model", "labels", "picture", "replay", "rerun", "rig", "simulated", "uiuc",
 )  # fmt: skip
 """Options that do nothing unless they are given."""
 

@@ -289,7 +289,7 @@ def test_specifications_name_detectors(tmp_path):
         (
             'lot = "mini"\ndetector = "mod:Mine"',
             ScenarioSpec,
-            "want hog, side, front or a file.*class of your own",
+            "want hog, net, side, front or a file.*class of your own",
         ),
         (
             'lot = "mini"\ndetector = "b.onnx"',

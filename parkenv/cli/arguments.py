@@ -16,8 +16,9 @@ Sensors:
     rig (laser|stereo|both_sides): Observe slots through simulated sensors, detector and all, instead of the sensor
         model: about a second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and
         a camera to each side.
-    detector (NAME|FILE|MODULE:CLASS): hog: the packaged models; side or front: one of them; a file of
-        `parkenv train-detector` (.npz) or a network (.onnx); MODULE:CLASS: your own.  [default: the scenario's, hog]
+    detector (NAME|FILE|MODULE:CLASS): hog: the packaged HOG models; side or front: one of them; net: the packaged
+        network; a file of `parkenv train-detector` (.npz) or a network (.onnx); MODULE:CLASS: your own.  [default: the
+        scenario's, hog]
     weather (NAME): {weathers}.  [default: drawn each time]
 
 World:

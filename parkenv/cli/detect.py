@@ -42,8 +42,8 @@ def detect(
     Options:
         images (FILE|DIR): Images, videos, or folders of them.
         model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; repeatable.  [default: side and front]
-        detector (NAME|FILE|MODULE:CLASS): Instead of models: a network (.onnx), or a class of your own.  [default:
-            none]
+        detector (NAME|FILE|MODULE:CLASS): Instead of models: net, the packaged network, another (.onnx), or a class
+            of your own.  [default: none]
         threshold (P): Least probability of a reported car.
         least_height (PX >= 8): Height of the smallest regions searched, px.  [default: the model's]
         step (N >= 1): Of a video, look at every N-th frame.
@@ -139,6 +139,7 @@ def train_detector(
     uiuc: Path | None = None,
     crops: Path | None = None,
     labels: Path | None = None,
+    simulated: int | None = None,
     images: Path | None = None,
     classes: str | None = None,
     front: bool = False,
@@ -151,8 +152,13 @@ def train_detector(
     jitter: int = 4,
     misaligned: int = 2,
     enlarged: float = 2.0,
+    steps: int = 9_000,
+    pictures: Path | None = None,
 ) -> None:
-    r"""Train a car model on photographs: with labelled boxes, or aligned crops of cars and images without cars.
+    r"""Train a car model on photographs, or a network on simulated pictures.
+
+    A HOG model (.npz) learns from photographs with labelled boxes, or from aligned crops of cars and images without
+    cars; a network like the packaged `net` (.onnx) from simulated pictures alone.
 
     With `--folds`, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car. The
     cars that are held out are also searched in made photographs: pasted at 0.8 to 2.2 times their size into mosaics of
@@ -163,21 +169,24 @@ def train_detector(
         parkenv train-detector --labels coco.json --images pictures -o side.npz
         parkenv train-detector --labels yolo --front -o front.npz
         parkenv train-detector --crops kitti --front --out front.npz \
-            --normalization blocks --penalty 0.02 --jitter 0 --misaligned 0 --enlarged 0
+            --normalization blocks --penalty 0.02 \
+            --jitter 0 --misaligned 0 --enlarged 0
+        parkenv train-detector --simulated 94 --out my-net.onnx
 
     Options:
-        out, -o (FILE.npz): The model file to write.
+        out, -o (FILE.npz|FILE.onnx): The file to write: a HOG model, or with --simulated a network.
         uiuc (DIR): UIUC's folder: trains on TrainImages (or TrainImages.tar.gz).
         crops (DIR): Instead: a folder with positives/, negatives/ (or vehicles/, non-vehicles/).
         labels (FILE.json|DIR): Instead: labelled photographs, a file of COCO, or a folder of YOLO (images/ and labels/,
             or .txt beside the pictures; names in data.yaml or classes.txt).
+        simulated (N >= 2): Instead: streets, 20 pictures of each; trains a network (needs the extra detector).
         images (DIR): Folder of the pictures of COCO.  [default: the file's]
         classes (NAME[,...]): Classes of the labels that are cars.  [default: car, van, truck, bus and the like]
         front: Train a model of fronts and rears, with a square window.
         folds (N >= 0): Folds of a cross-validation on the crops; 0: none.
-        seed (N >= 0): Seed of jitter, solver and folds.
+        seed (N >= 0): Seed of jitter, solver and folds; of pictures and weights of a network.
 
-    Training:
+    Training of a HOG model:
         normalization (NAME): neighbors, cell (the thesis's), or blocks.
         penalty (C): Penalty of the support vector machine.
         rounds (N >= 0): Rounds of hard-negative mining.
@@ -185,17 +194,25 @@ def train_detector(
         misaligned (N >= 0): Misaligned crops of each car as negatives; 0 if the crops are not aligned.
         enlarged (X): Crops are also mined enlarged so many times, so that parts of large cars become negatives; 0:
             none, if the crops are not aligned. With --labels, the photographs are mined instead.
+
+    Training of a network:
+        steps (N >= 1): Steps, each with 16 new examples.
+        pictures (DIR): Folder in which the simulated pictures are kept; those of an earlier training are read.
+            [default: none]
     """
     from parkenv.files.atomic_write import check_writable
     from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
+    from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
     from parkenv.perception.cross_validation import cross_validated
     from parkenv.perception.hog import Descriptor
     from parkenv.perception.labelled_folders import crops_of, read_labels
-    from parkenv.perception.simulated_photos import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
     from parkenv.perception.training import TrainingSettings, train
 
-    if sum(source is not None for source in (uiuc, crops, labels)) != 1:
-        raise InputError("give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER")
+    if sum(source is not None for source in (uiuc, crops, labels, simulated)) != 1:
+        raise InputError("give one of --uiuc FOLDER, --crops FOLDER, --labels FILE|FOLDER and --simulated N")
+    if simulated is not None:
+        _train_network(out, simulated, steps, seed, pictures)
+        return
     if labels is None and (images is not None or classes is not None):
         raise InputError("--images and --classes go with --labels")
     if out.suffix != ".npz":
@@ -242,6 +259,30 @@ def train_detector(
     console.print(f"Trained on {model.trained_on}. Written: {out}")
 
 
+def _train_network(out: Path, streets: int, steps: int, seed: int, pictures: Path | None) -> None:
+    from parkenv.files.atomic_write import atomic_write, check_writable
+
+    if out.suffix != ".onnx":
+        raise InputError(f"--out {out}: want a name that ends in .onnx for a network")
+    check_writable(out)
+    try:
+        from parkenv.perception.center_training import CenterTrainingSettings, build_network
+    except ImportError as error:
+        raise InputError(
+            f"--simulated needs {error.name}, which is not installed: pip install 'parkenv[detector]'"
+        ) from error
+    console = make_console()
+    with console.status("Training") as status:
+        built = build_network(
+            streets, CenterTrainingSettings(steps=steps, seed=seed), pictures, progress=status.update
+        )
+    with atomic_write(out) as beside:
+        beside.write_bytes(built.data)
+    with atomic_write(out.with_suffix(".toml")) as beside:
+        beside.write_text(built.settings)
+    console.print(f"Trained on {built.card['trained_on']}. Written: {out}, {out.with_suffix('.toml').name}")
+
+
 def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
     from parkenv.perception.cross_validation import FALSE_POSITIVES
 
@@ -260,24 +301,90 @@ def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
 
 
 def evaluate_detector(
-    uiuc: Path, model: str = "side", out: Path = Path("results/detector"), *, detector: str | None = None
+    uiuc: Path | None = None,
+    model: str = "side",
+    out: Path = Path("results/detector"),
+    *,
+    detector: str | None = None,
+    drives: str | None = None,
+    pictures: int = 40,
+    false_positives: float = 0.1,
+    seed: int = 0,
 ) -> None:
-    """Measure recall and precision of a detector on UIUC's test sets, by their matching rule.
+    """Measure recall and precision of a detector on UIUC's test sets, or compare detectors on simulated drives.
 
-    A HOG model (--model) is searched at the sizes of the set's cars, a --detector looks as it does in a survey.
+    On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars. Any other
+    detector looks as it does in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the sets
+    label neither. On drives, every detector reports so many boxes that it has equally many false positives; a car
+    counts if it is within 20 m, 16 px high, and 30 % of it are visible.
 
     Examples:
         parkenv evaluate-detector --uiuc CarData --model side
-        parkenv evaluate-detector --uiuc CarData --detector yolo.onnx
+        parkenv evaluate-detector --uiuc CarData --detector net
+        parkenv evaluate-detector --drives campus --detector hog,net
 
     Options:
         uiuc (DIR): UIUC's folder as published (CarData).
         model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; any other detector is taken as with
             --detector.
-        detector (NAME|FILE|MODULE:CLASS): Instead of a model: hog, a network (.onnx), or a class of your own.
-            [default: none]
+        detector (NAME|FILE|MODULE:CLASS): Instead of a model: hog, net, a network (.onnx), or a class of your own; with
+            --drives several, separated by commas.  [default: none]
         out, -o (DIR): Folder for summary.json and the curves.
+
+    On drives:
+        drives (SCENARIO): Instead of --uiuc: pictures along the survey's route of a scenario.
+        pictures (N >= 1): Pictures in each of the five weathers.
+        false_positives (X >= 0): Boxes without a car in a picture, on average.
+        seed (N >= 0): Seed of cars, light and noise.
     """
+    if (uiuc is None) == (drives is None):
+        raise InputError("give one of --uiuc FOLDER and --drives SCENARIO")
+    if drives is not None:
+        names = words("--detector", detector or model)
+        _evaluate_on_drives(drives, names, pictures, false_positives, seed, out)
+    elif uiuc is not None:
+        _evaluate_on_uiuc(uiuc, model, detector, out)
+
+
+def _evaluate_on_drives(
+    scenario: str, names: Sequence[str], pictures: int, false_positives: float, seed: int, out: Path
+) -> None:
+    from parkenv.evaluation.experiments.detector_drives import drive_pictures, score_on_drives
+    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.perception.detector_registry import make_detector
+    from parkenv.scenarios.build import make_scenario
+
+    if pictures < 1:
+        raise InputError(f"--pictures is {pictures}, want at least 1")
+    if not 0.0 <= false_positives <= 100.0:
+        raise InputError(f"--false-positives is {false_positives}, want 0 to 100")
+    if seed < 0:
+        raise InputError(f"--seed is {seed}, want at least 0")
+    detectors = {name: make_detector(name, 0.01) for name in names}
+    its = make_scenario(scenario)
+    make_folder(out)
+    console = make_console()
+    with progress_bar(console, "pictures") as progress:
+        task = progress.add_task("Drawing", total=None)
+        taken = []
+        for picture in drive_pictures(its, pictures, seed):
+            taken.append(picture)
+            progress.advance(task)
+        task = progress.add_task("Detecting", total=len(taken) * len(names))
+        rows = score_on_drives(detectors, taken, false_positives, lambda: progress.advance(task))
+    cells = [
+        (row["part"], str(row["cars"]), *("" if row[n] is None else f"{row[n]:.1%}" for n in names))
+        for row in rows
+    ]
+    console.print(make_table(None, ["part", "cars", *names], cells))
+    save_summary(out, None, rows)
+    console.print(
+        f"Recall on {plural(len(taken), 'picture')} at {false_positives:g} false positives in a picture. "
+        f"Written: {out / 'summary.json'}"
+    )
+
+
+def _evaluate_on_uiuc(uiuc: Path, model: str, detector: str | None, out: Path) -> None:
     from rich.progress import Progress
 
     from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc

@@ -13,11 +13,14 @@ LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
 RigName = Literal["laser", "stereo", "both_sides"]
-DETECTORS = ("hog", "side", "front")
-"""Packaged detectors: hog has both HOG models, side and front; any other is a network in parkenv/perception/models."""
+DETECTORS = ("hog", "net", "side", "front")
+"""Packaged detectors: hog has both HOG models, side and front; net is a network in parkenv/perception/models."""
 DETECTOR_SUFFIXES = (".npz", ".onnx")
 WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
+LocaliserName = Literal["none", "scan-matching"]
+LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
+"""What corrects the pose of a survey's car; see `parkenv.mapping.localisation`."""
 MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 MAP_NAMES: tuple[MapName, ...] = get_args(MapName)

@@ -12,16 +12,9 @@ import typer
 from rich.progress import track
 
 from parkenv.perception.car_model import CarModel
+from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.simulated_photos import (
-    END_ASPECT,
-    END_CAR,
-    FRAMES,
-    SIDE_ASPECT,
-    SIDE_CAR,
-    SimulatedPhoto,
-    simulated_photos,
-)
+from parkenv.perception.simulated_photos import FRAMES, SimulatedPhoto, simulated_photos
 from parkenv.perception.training import TrainingSettings, train
 
 FOLDER = Path(__file__).parent / "models"

@@ -25,10 +25,10 @@ def make_detector(name: str | Detector | None = None, threshold: float | None = 
     """Make a detector.
 
     Args:
-        name: `hog` (the packaged HOG models, of sides and of fronts and rears), `side` or `front` (one of them), the
-            path of a model file written by `parkenv train-detector` (`.npz`) or of a network (`.onnx`, see
-            `OnnxDetector`), or `MODULE:CLASS` for a custom detector (see `Detector`; the module may be in the working
-            directory). A detector is returned unchanged; None is `hog`.
+        name: `hog` (the packaged HOG models, of sides and of fronts and rears), `net` (the packaged network), `side` or
+            `front` (one HOG model), the path of a model file written by `parkenv train-detector` (`.npz`) or of a
+            network (`.onnx`, see `OnnxDetector`), or `MODULE:CLASS` for a custom detector (see `Detector`; the module
+            may be in the working directory). A detector is returned unchanged; None is `hog`.
         threshold: least probability of a box of the packaged detectors and of files; None: `LEAST_PROBABILITY`, of a
             network that of its settings.
 
@@ -50,7 +50,7 @@ def make_detector(name: str | Detector | None = None, threshold: float | None = 
     if name in PACKAGED_MODELS:
         return HogDetector.load(name, threshold=least)
     if name in DETECTORS:
-        return OnnxDetector.load(str(MODELS / f"{name}.onnx"), threshold)
+        return OnnxDetector.load(str(MODELS / f"{name}.onnx"), threshold, is_known=True)
     if name.lower().endswith(".onnx"):
         return OnnxDetector.load(name, threshold)
     if name.lower().endswith(DETECTOR_SUFFIXES) or (is_there(name) and Path(name).is_file()):

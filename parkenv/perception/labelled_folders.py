@@ -17,9 +17,9 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
 from parkenv.perception.car_datasets import Crops, LabelledImage
+from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.onnx_detector import CAR_NAMES
-from parkenv.perception.simulated_photos import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.training import cut_out
 
 Image = NDArray[np.uint8]

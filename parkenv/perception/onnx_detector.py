@@ -16,9 +16,17 @@ from pydantic import Field
 from parkenv.errors import InputError
 from parkenv.files.onnx_file import OnnxFile, OnnxValue, read_onnx
 from parkenv.files.spec_file import Several, Spec
+from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.detector import LEAST_PROBABILITY, Detections
 from parkenv.perception.hog_detector import as_grey, best_boxes
-from parkenv.perception.onnx_outputs import Layout, Scores, class_columns, decode, guess_layout
+from parkenv.perception.onnx_outputs import (
+    Layout,
+    Scores,
+    class_columns,
+    decode,
+    decode_centers,
+    guess_layout,
+)
 from parkenv.perception.onnx_trial import require_runs
 
 Image = NDArray[np.uint8]
@@ -50,7 +58,8 @@ class OnnxSettings(Spec):
         description="What the network puts out. yolo: (1, 4 + classes, n), box and class scores (YOLOv8 and later, "
         "RT-DETR of ultralytics); yolo5: (1, n, 5 + classes), with an objectness (YOLOv5, v7, decoded YOLOX); boxes: "
         "(1, n, 6), corners, score and class, after non-maximum suppression (YOLOv10, YOLO26, end to end); detr: "
-        "scores (1, n, classes) and boxes (1, n, 4) as two outputs.",
+        "scores (1, n, classes) and boxes (1, n, 4) as two outputs; centers: (1, 9, rows, columns), for each cell "
+        "P(car), the box's sides from its centre in px, P(end), P(oblique), P(side) of the view, visible fraction.",
     )
     outputs: Several[str] | None = Field(
         None, max_length=2, description="Names of the outputs to read; of detr the scores first."
@@ -61,6 +70,9 @@ class OnnxSettings(Spec):
     resize: Literal["letterbox", "stretch"] | None = Field(
         None,
         description="letterbox: as large as fits, centred on grey borders; stretch, the default of detr.",
+    )
+    enlarge: float = Field(
+        1_000.0, gt=0.0, le=1_000.0, description="Largest magnification of a small image in a letterbox."
     )
     pad: int = Field(114, ge=0, le=255, description="Grey level of the borders of a letterbox.")
     channels: Literal["rgb", "bgr", "grey"] | None = Field(
@@ -123,6 +135,7 @@ class _Plan:
     outputs: tuple[str, ...]
     size: tuple[int, int]
     letterbox: bool
+    enlarge: float
     pad: int
     channels: str
     mean: Float32Array
@@ -144,31 +157,38 @@ class OnnxDetector:
     Args:
         file: the network.
         settings: how it is fed and read; None: guessed.
+        is_known: whether the file is known to be whole: it is not tried in a process of its own.
 
     Raises:
         InputError: OpenCV cannot run the network, or settings are missing or do not fit it.
     """
 
-    def __init__(self, file: OnnxFile, settings: OnnxSettings | None = None) -> None:
+    def __init__(
+        self, file: OnnxFile, settings: OnnxSettings | None = None, *, is_known: bool = False
+    ) -> None:
         self._file = file
         self.settings = settings or OnnxSettings()
         self._net: Any = None
-        self._plan = _planned(file, self.settings, self._run)
+        self._plan = _planned(file, self.settings, self._run, is_known=is_known)
 
     @classmethod
-    def load(cls, path: str | Path, threshold: float | None = None) -> OnnxDetector:
+    def load(
+        cls, path: str | Path, threshold: float | None = None, *, is_known: bool = False
+    ) -> OnnxDetector:
         """Read a network, and the settings beside it (`sidecar_of`).
 
         Args:
             path: the file, `.onnx`.
             threshold: replaces that of the settings.
+            is_known: see the class.
 
         Raises:
             InputError: a file cannot be read, or see the class.
         """
         file, beside = read_onnx(path), sidecar_of(path)
         settings = OnnxSettings() if beside is None else OnnxSettings.read(beside)
-        return cls(file, settings if threshold is None else settings.changed(threshold=threshold))
+        settings = settings if threshold is None else settings.changed(threshold=threshold)
+        return cls(file, settings, is_known=is_known)
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"_net": None}  # read again where it is needed
@@ -181,9 +201,12 @@ class OnnxDetector:
         """
         plan, name = self._plan, self._file.name
         fed, scale, offset = _fed(image, plan)
-        boxes, score = decode(
-            self._run(fed, plan.outputs), plan.layout, plan.cars, plan.scores, grid=plan.grid
-        )
+        outputs = self._run(fed, plan.outputs)
+        end_on = None
+        if plan.layout == "centers":
+            boxes, score, end_on, _ = decode_centers(outputs[0], plan.size, 0.5 * self.settings.threshold)
+        else:
+            boxes, score = decode(outputs, plan.layout, plan.cars, plan.scores, grid=plan.grid)
         if not (np.isfinite(boxes).all() and np.isfinite(score).all()):
             raise InputError(f"{name}: put out numbers that are not finite, want boxes and scores")
         if len(score) and not (score.min() >= -1e-4 and score.max() <= 1.0 + 1e-4):
@@ -193,6 +216,7 @@ class OnnxDetector:
             )
         likely = score >= self.settings.threshold
         boxes, score = boxes[likely].astype(np.float64), np.clip(score[likely], 0.0, 1.0)
+        end_on = None if end_on is None else end_on[likely]
         if not plan.corners:
             half = 0.5 * boxes[:, 2:]
             boxes = np.hstack([boxes[:, :2] - half, boxes[:, :2] + half])
@@ -203,8 +227,11 @@ class OnnxDetector:
         drawn = np.isfinite(boxes).all(axis=1) & (size > 0.0).all(axis=1)
         boxes, score, size = boxes[drawn], score[drawn], size[drawn]
         kept = best_boxes(boxes, score, plan.overlap)
-        end_on = size[:, 0] < self.settings.end_on_below * size[:, 1]
-        return Detections(boxes[kept], score[kept], end_on[kept])
+        if end_on is None:
+            end_on = size[:, 0] < self.settings.end_on_below * size[:, 1]
+            return Detections(boxes[kept], score[kept], end_on[kept])
+        end_on = end_on[drawn][kept]
+        return Detections(boxes[kept], score[kept], end_on, regions=_regions(boxes[kept], end_on))
 
     def _run(self, fed: Float32Array, outputs: Sequence[str]) -> list[Float32Array]:
         """Return the named outputs for an input, (1, channels, height, width)."""
@@ -238,7 +265,7 @@ def sidecar_of(path: str | Path) -> Path | None:
     return found[0] if found else None
 
 
-def _planned(file: OnnxFile, settings: OnnxSettings, run: Any) -> _Plan:
+def _planned(file: OnnxFile, settings: OnnxSettings, run: Any, *, is_known: bool) -> _Plan:
     """Complete the settings of a network from its shapes and metadata, and from what it makes of an empty image."""
     beside, s = _beside(file.name), settings
     value, count = _image_input(file)
@@ -258,7 +285,8 @@ def _planned(file: OnnxFile, settings: OnnxSettings, run: Any) -> _Plan:
             )
     names = s.outputs or names
     empty = np.full((1, count, size[1], size[0]), 0.5, np.float32)
-    require_runs(file.data, file.name, empty.shape)
+    if not is_known:
+        require_runs(file.data, file.name, empty.shape)
     made = dict(zip(names, run(empty, names), strict=True))
     shapes = [o.shape for o in made.values()]
     layout = s.layout or guess_layout(shapes, size)
@@ -267,7 +295,7 @@ def _planned(file: OnnxFile, settings: OnnxSettings, run: Any) -> _Plan:
         several = " and outputs" if len(names) > 1 else ""
         raise InputError(
             f"{file.name}: puts out {described}, of which the layout cannot be told; write "
-            f'layout = "yolo", "yolo5", "boxes" or "detr"{several} in {beside}'
+            f'layout = "yolo", "yolo5", "boxes", "detr" or "centers"{several} in {beside}'
         )
     if layout == "detr" and len(shapes) == 2 and not s.outputs and shapes[0][-1:] == (4,):
         names, shapes = names[::-1], shapes[::-1]
@@ -284,15 +312,16 @@ def _planned(file: OnnxFile, settings: OnnxSettings, run: Any) -> _Plan:
         outputs=names,
         size=size,
         letterbox=(s.resize or ("stretch" if many else "letterbox")) == "letterbox",
+        enlarge=s.enlarge,
         pad=s.pad,
         channels=channels,
         mean=_per_channel("mean", s.mean or mean, count, beside),
         std=_per_channel("std", s.std or std, count, beside),
-        corners=(s.box or ("corners" if layout == "boxes" else "center")) == "corners",
+        corners=(s.box or ("corners" if layout in ("boxes", "centers") else "center")) == "corners",
         fractions=(s.unit or ("fractions" if many else "pixels")) == "fractions",
         scores=s.scores
         or ("probabilities" if not many else "softmax" if classes in (2, 92) else "logits"),
-        cars=_cars(file, s, classes, named, beside),
+        cars=() if layout == "centers" else _cars(file, s, classes, named, beside),
         overlap=s.overlap or (1.0 if layout == "boxes" else 0.5),
         grid=grid,
     )  # fmt: skip
@@ -385,7 +414,7 @@ def _fed(image: Image, plan: _Plan) -> tuple[Float32Array, tuple[float, float], 
     fit = (width, height)
     left = top = 0
     if plan.letterbox:
-        ratio = min(width / columns, height / rows)
+        ratio = min(width / columns, height / rows, plan.enlarge)
         fit = max(1, round(columns * ratio)), max(1, round(rows * ratio))
         left, top = (width - fit[0]) // 2, (height - fit[1]) // 2
     resized = np.ascontiguousarray(image)
@@ -395,6 +424,15 @@ def _fed(image: Image, plan: _Plan) -> tuple[Float32Array, tuple[float, float], 
     canvas[top : top + fit[1], left : left + fit[0]] = resized.reshape(fit[1], fit[0], -1)
     fed = (canvas.transpose(2, 0, 1)[None].astype(np.float32) - plan.mean) / plan.std
     return np.ascontiguousarray(fed), (fit[0] / columns, fit[1] / rows), (float(left), float(top))
+
+
+def _regions(boxes: Float32Array, end_on: NDArray[np.bool_]) -> Float32Array:
+    """Return the windows around cars that labelled crops have, as those of the HOG models."""
+    regions = [
+        region_of(box, END_CAR, END_ASPECT) if end else region_of(box, SIDE_CAR, SIDE_ASPECT)
+        for box, end in zip(boxes.astype(np.float64), end_on, strict=True)
+    ]
+    return np.array(regions, dtype=np.float32).reshape(-1, 4)
 
 
 def _beside(name: str) -> str:

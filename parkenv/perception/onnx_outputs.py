@@ -1,11 +1,12 @@
-"""Decode what networks of the YOLO and DETR kinds put out: boxes and P(car), in pixels of the network's input."""
+"""Decode what networks of the YOLO and DETR kinds put out, and our own: boxes and P(car), in pixels of the input."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,11 +14,12 @@ from parkenv.errors import InputError
 
 Float32Array = NDArray[np.float32]
 
-Layout = Literal["yolo", "yolo5", "boxes", "detr"]
+Layout = Literal["yolo", "yolo5", "boxes", "detr", "centers"]
 Scores = Literal["probabilities", "logits", "softmax"]
 
 BOXES_MOST = 1_000  # most rows of a network that suppresses non-maxima itself
 _STRIDES = (8, 16, 32, 64)
+_CENTER_NUMBERS = 9
 
 
 def guess_layout(shapes: Sequence[tuple[int, ...]], size: tuple[int, int]) -> Layout | None:
@@ -36,6 +38,8 @@ def guess_layout(shapes: Sequence[tuple[int, ...]], size: tuple[int, int]) -> La
         >>> guess_layout([(1, 300, 6)], (640, 640)), guess_layout([(1, 100, 92), (1, 100, 4)], (800, 800))
         ('boxes', 'detr')
     """
+    if len(shapes) == 1 and _is_centers(shapes[0]):
+        return "centers"
     if any(len(shape) != 3 or shape[0] != 1 for shape in shapes):
         return None
     if len(shapes) == 2:
@@ -56,7 +60,7 @@ def guess_layout(shapes: Sequence[tuple[int, ...]], size: tuple[int, int]) -> La
 
 
 def class_columns(layout: Layout, shapes: Sequence[tuple[int, ...]], grid: bool) -> int | None:
-    """Return the number of class scores of a row; None for `boxes`, which has the winning class instead.
+    """Return the number of class scores of a row; None for `boxes`, which has the winning class, and `centers`.
 
     Args:
         layout: the layout.
@@ -66,6 +70,10 @@ def class_columns(layout: Layout, shapes: Sequence[tuple[int, ...]], grid: bool)
     Raises:
         InputError: the layout does not fit the shapes; the message says what it wants.
     """
+    if layout == "centers":
+        if len(shapes) == 1 and _is_centers(shapes[0]):
+            return None
+        raise InputError(f"want one output (1, {_CENTER_NUMBERS}, rows, columns)")
     fits = all(len(shape) == 3 and shape[0] == 1 for shape in shapes)
     if layout == "detr":
         if fits and len(shapes) == 2 and shapes[0][1] == shapes[1][1] and shapes[1][2] == 4:
@@ -110,6 +118,48 @@ def decode(
         return rows[:, :4], _probability(rows[:, 4:], scores)[:, chosen].max(axis=1)
     objectness = _probability(rows[:, 4:5], "logits" if scores == "logits" else "probabilities")[:, 0]
     return rows[:, :4], objectness * _probability(rows[:, 5:], scores)[:, chosen].max(axis=1)
+
+
+class Centers(NamedTuple):
+    """The cars that a network of the layout `centers` sees."""
+
+    boxes: Float32Array  # (n, 4) px of the input: left, top, right, bottom
+    score: Float32Array  # (n,) P(car)
+    end_on: NDArray[np.bool_]  # (n,) whether a front or rear is more likely than a side
+    visible: Float32Array  # (n,) visible fraction
+
+
+def decode_centers(output: Float32Array, size: tuple[int, int], threshold: float) -> Centers:
+    """Return the cells that score higher than their neighbours.
+
+    Args:
+        output: (1, 9, rows, columns): P(car), the box's sides from the cell's centre in px, P(end), P(oblique) and
+            P(side) of the view, visible fraction.
+        size: width and height of the input, px.
+        threshold: least P(car).
+    """
+    cells = output[0]
+    # Above the cells before it and not below those after it: of equal neighbours one is left.
+    before = np.ones((3, 3), np.uint8)
+    before[1, 1:] = before[2] = 0
+    after = np.ascontiguousarray(before[::-1, ::-1])
+    score = np.ascontiguousarray(cells[0])
+    top = (score > _highest(score, before)) & (score >= _highest(score, after))
+    row, column = np.nonzero(top & (score >= threshold))
+    left, above, right, below, end, _, side, visible = cells[1:, row, column]
+    x = (column + np.float32(0.5)) * np.float32(size[0] / score.shape[1])
+    y = (row + np.float32(0.5)) * np.float32(size[1] / score.shape[0])
+    boxes = np.stack([x - left, y - above, x + right, y + below], axis=1).astype(np.float32)
+    return Centers(boxes, score[row, column], end > side, visible)
+
+
+def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array:
+    highest = cv2.dilate(score, neighbours, borderType=cv2.BORDER_CONSTANT, borderValue=-1.0)
+    return np.asarray(highest, dtype=np.float32)
+
+
+def _is_centers(shape: tuple[int, ...]) -> bool:
+    return len(shape) == 4 and shape[:2] == (1, _CENTER_NUMBERS)
 
 
 def _probability(values: Float32Array, scores: Scores) -> Float32Array:

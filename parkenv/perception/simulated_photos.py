@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.perception.backdrops import with_backdrop
 from parkenv.perception.car_datasets import LabelledImage
+from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.simulated_streets import Street
 from sim_sensors.camera.models import PinholeCamera, camera_pose
@@ -20,12 +21,6 @@ from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
 
 Image = NDArray[np.uint8]
 FloatArray = NDArray[np.float64]
-
-SIDE_CAR = (0.08, 0.22, 0.92, 0.885)
-"""Left, top, right, bottom of the car in a side view's region, as fractions; as in UIUC's crops."""
-SIDE_ASPECT = 2.5
-END_CAR = (0.08, 0.12, 0.92, 0.92)  # the same for a front or rear view
-END_ASPECT = 1.0
 
 _CLEAR = 0.8  # visible fraction from which a car is a positive
 _NEGLIGIBLE = 0.25  # visible fraction below which a car may be missed
@@ -66,21 +61,6 @@ def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
         for frame in range(FRAMES):
             name = f"street {number}, frame {frame}"
             yield _photo(street, weathers[frame % _WEATHERS], rng, name, empty=frame % 5 == 4)
-
-
-def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: float) -> FloatArray:
-    """Return the image region of a window that is aligned to a car's box.
-
-    Args:
-        box: (4,) px, left, top, right, bottom of the car.
-        car: left, top, right, bottom of the car in the window, as fractions.
-        aspect: width over height of the window.
-    """
-    width = (box[2] - box[0]) / (car[2] - car[0])
-    height = width / aspect
-    left = box[0] - car[0] * width
-    top = box[3] - car[3] * height
-    return np.array([left, top, left + width, top + height])
 
 
 def roughened(image: Image, rng: np.random.Generator) -> Image:

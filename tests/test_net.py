@@ -1,0 +1,265 @@
+"""The packaged network `net`: the shipped file, how it is read, its training pictures, and a training of seconds."""
+
+import json
+import pickle
+import zipfile
+
+import cv2
+import numpy as np
+import pytest
+from command_line import parkenv
+from onnx import load as load_onnx
+from onnx import numpy_helper
+
+from parkenv import InputError
+from parkenv.files.onnx_file import read_onnx
+from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
+from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
+from parkenv.perception.onnx_outputs import class_columns, decode_centers, guess_layout
+from parkenv.perception.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
+from parkenv.perception.training_crops import SIZES, ExampleMaker
+from sim_sensors.camera.models import PinholeCamera, camera_pose
+from sim_sensors.camera.weather import Weather
+from sim_sensors.ground_truth import View, vehicle_boxes
+from sim_sensors.scene import Fleet, Scene
+from sim_sensors.surroundings import Surroundings
+from sim_sensors.vehicles.vehicle import VehicleModel
+
+FILE = MODELS / "net.onnx"
+
+
+@pytest.fixture(scope="module")
+def net():
+    return make_detector("net")
+
+
+@pytest.fixture(scope="module")
+def street():
+    """A picture of three parked cars, one of them end-on, with their true boxes."""
+    models = tuple(VehicleModel.from_seed(body, 3) for body in ("hatchback", "estate", "sedan"))
+    fleet = Fleet(models, Surroundings(paved=[[[-12, -2], [12, -2], [12, 12], [-12, 12]]]))
+    scene = Scene(np.array([[-5.0, 8.0, 0.0], [0.6, 8.0, 0.0], [5.5, 8.5, np.pi / 2]]), np.arange(3), fleet)
+    camera, pose = PinholeCamera(), camera_pose(0.0, 0.0, 1.4, np.pi / 2, -0.05)
+    frame = camera.render(scene, pose, Weather.draw("overcast", 1), 1)
+    return frame.image, vehicle_boxes(camera, scene, pose, frame)
+
+
+def overlap(a, b):
+    inner = np.minimum(a[2:], b[2:]) - np.maximum(a[:2], b[:2])
+    common = np.clip(inner, 0, None).prod()
+    return common / ((a[2:] - a[:2]).prod() + (b[2:] - b[:2]).prod() - common)
+
+
+def test_the_shipped_file_is_small_and_holds_nothing_but_a_network(net):
+    data = FILE.read_bytes()
+    assert len(data) < 2_000_000
+    assert data[:1] != b"\x80"
+    assert not zipfile.is_zipfile(str(FILE))
+    model = load_onnx(str(FILE))
+    kinds = {node.op_type for node in model.graph.node}
+    assert kinds <= {
+        "Add",
+        "Cast",
+        "Clip",
+        "Concat",
+        "Conv",
+        "Exp",
+        "Mul",
+        "Relu",
+        "Resize",
+        "Sigmoid",
+        "Softmax",
+    }
+    assert all(np.isfinite(numpy_helper.to_array(t)).all() for t in model.graph.initializer)
+    card = {key: json.loads(value) for key, value in read_onnx(str(FILE)).metadata.items()}
+    slope, offset = card["calibration"]
+    assert slope > 0.0
+    assert np.isfinite(offset)
+    assert "seed 0" in card["trained_on"]
+    assert detector_version("net") == "net"
+    assert isinstance(net, OnnxDetector)
+
+
+def test_it_finds_the_cars_of_a_picture(net, street):
+    image, truth = street
+    found = net.detect(image)
+    sure = found.select(found.probability > 0.5)
+    assert len(sure) == 3
+    for box, view in zip(truth.visible_box, truth.view, strict=True):
+        best = max(range(3), key=lambda i: overlap(sure.boxes[i], box))
+        assert overlap(sure.boxes[best], box) > 0.7
+        if view != View.OBLIQUE:
+            assert sure.end_on[best] == (view == View.END)
+
+
+def test_equal_pictures_give_equal_boxes(net, street):
+    image, _ = street
+    found, again = net.detect(image), pickle.loads(pickle.dumps(net)).detect(image)
+    assert np.array_equal(found.boxes, again.boxes)
+    assert np.array_equal(found.probability, again.probability)
+    assert (found.probability[:-1] >= found.probability[1:]).all()
+    assert ((found.probability >= 0.0) & (found.probability <= 1.0)).all()
+
+
+def test_grey_pictures_and_other_sizes(net, street):
+    image, truth = street
+    grey = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
+    colored, plain = net.detect(image), net.detect(grey)
+    assert np.array_equal(colored.boxes, plain.boxes)  # it looks at grey levels only
+    for width, height in ((1280, 960), (320, 240), (640, 400)):
+        small = cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        found = net.detect(small)
+        sure = found.select(found.probability > 0.4)
+        for box in truth.visible_box:
+            scaled = box * np.tile([width / 640, height / 480], 2)
+            assert max(overlap(b, scaled) for b in sure.boxes) > 0.6, (width, height)
+    assert len(net.detect(np.full((20, 30), 90, np.uint8)).select(slice(0, 1)).boxes) in (0, 1)
+    assert not (net.detect(np.full((480, 640), 90, np.uint8)).probability > 0.3).any()
+
+
+def test_windows_of_labelled_crops_surround_the_cars(net, street):
+    found = net.detect(street[0])
+    side = ~found.end_on
+    size = found.regions[:, 2:] - found.regions[:, :2]
+    assert size[side, 0] == pytest.approx(2.5 * size[side, 1], rel=1e-4)
+    assert size[~side, 0] == pytest.approx(size[~side, 1], rel=1e-4)
+    assert (found.regions[:, 0] <= found.boxes[:, 0]).all()
+
+
+def test_centers_are_decoded_cell_by_cell():
+    rng = np.random.default_rng(0)
+    cells = rng.uniform(0.0, 1.0, (1, 9, 12, 16)).astype(np.float32)
+    cells[0, 1:5] *= 40.0
+    cells[0, 0, 3:5, 3:6] = 0.99  # equal neighbours: one car
+    found = decode_centers(cells, (128, 96), 0.2)
+    wanted, score = [], np.pad(cells[0, 0], 1, constant_values=-1.0)
+    for row in range(12):
+        for column in range(16):
+            s = cells[0, 0, row, column]
+            around = [score[row + dy, column + dx] for dy in range(3) for dx in range(3)]
+            if s >= 0.2 and all(s > v for v in around[:4]) and all(s >= v for v in around[5:]):
+                left, top, right, bottom, end, _, side, visible = cells[0, 1:, row, column]
+                x, y = 8 * column + 4, 8 * row + 4
+                wanted.append([x - left, y - top, x + right, y + bottom, s, end > side, visible])
+    wanted = np.array(wanted)
+    assert len(wanted) > 5
+    assert np.allclose(found.boxes, wanted[:, :4], atol=1e-4)
+    assert np.array_equal(found.score, wanted[:, 4].astype(np.float32))
+    assert np.array_equal(found.end_on, wanted[:, 5] == 1.0)
+    assert np.allclose(found.visible, wanted[:, 6])
+    assert guess_layout([(1, 9, 60, 80)], (640, 480)) == "centers"
+    with pytest.raises(InputError, match=r"want one output \(1, 9, rows, columns\)"):
+        class_columns("centers", [(1, 8, 60, 80)], False)
+
+
+def test_small_pictures_are_enlarged_no_more_than_told(street):
+    image = cv2.resize(street[0], (160, 120), interpolation=cv2.INTER_AREA)
+    file = read_onnx(str(FILE))
+    settings = OnnxSettings(layout="centers", mean=(114.0,), std=(64.0,), threshold=0.3)
+    framed = cv2.copyMakeBorder(image, 180, 180, 240, 240, cv2.BORDER_CONSTANT, value=(114, 114, 114))
+    found = OnnxDetector(file, settings.changed(enlarge=1.0)).detect(image)
+    within = OnnxDetector(file, settings).detect(framed)
+    assert np.allclose(found.boxes, within.boxes - (240, 180, 240, 180), atol=1e-3)
+
+
+def test_what_takes_detectors_takes_net(tmp_path, street):
+    cv2.imwrite(str(tmp_path / "photo.png"), street[0][..., ::-1])
+    done = parkenv("detect", tmp_path / "photo.png", "--detector", "net", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    assert "3 cars in 1 image" in done.stdout
+    assert (tmp_path / "out" / "photo_cars.png").is_file()
+
+
+def made_scene(seed=0):
+    """A picture with a light car, half of it behind the border, and a dark one."""
+    rng = np.random.default_rng(seed)
+    grey = rng.integers(80, 120, (96, 128), dtype=np.uint8)
+    car = np.zeros((96, 128), np.uint8)
+    car[40:70, 30:90], car[50:66, 0:20] = 1, 2
+    grey[car == 1], grey[car == 2] = 200, 20
+    depth = np.where(car > 0, 64, 120).astype(np.uint8)
+    visible, view = np.array([0.9, 1.0], np.float32), np.array([View.SIDE, View.END], np.int8)
+    return SimulatedScene(grey, car, depth, visible, view, np.array([7.0, 9.0], np.float32))
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_examples_have_the_boxes_of_their_cars(size):
+    maker = ExampleMaker([made_scene()], np.random.default_rng(1), textures=3)
+    again = ExampleMaker([made_scene()], np.random.default_rng(1), textures=3)
+    found = 0
+    for _ in range(30):
+        example, same = maker.draw(size), again.draw(size)
+        assert np.array_equal(example.image, same.image)
+        assert example.image.shape == size[::-1]
+        assert example.image.dtype == np.uint8
+        for boxes in (example.boxes, example.either):
+            assert (boxes[:, :2] >= 0).all()
+            assert (boxes[:, 2:] <= size).all()
+            assert (boxes[:, 2:] > boxes[:, :2]).all()
+        assert len(example.boxes) == len(example.view) == len(example.visible)
+        assert (example.view == View.SIDE).all()  # the other car is cut off by its picture
+        assert ((example.visible >= 0.3) & (example.visible <= 1.0)).all()
+        found += len(example.boxes)
+    assert found > 15
+
+
+def test_pictures_are_kept_and_read_again(tmp_path):
+    folder = tmp_path / "pictures"
+    folder.mkdir()
+    (folder / "street_0_0.npz").write_bytes(b"no pictures")
+    with pytest.raises(InputError, match=r"street_0_0\.npz"):
+        next(simulated_scenes(1, 0, folder))
+    np.savez(folder / "street_0_0.npz", grey_0=np.zeros((4, 4), np.uint8))
+    with pytest.raises(
+        InputError, match=r"street_0_0\.npz: holds no array 'car_0', want pictures of a street"
+    ):
+        next(simulated_scenes(1, 0, folder))
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--simulated", 1, "--out", "net.onnx"], "--simulated: want N >= 2"),
+        (["--simulated", 2, "--out", "net.npz"], "--out net.npz: want a name that ends in .onnx"),
+        (["--simulated", 2, "--steps", 0, "--out", "net.onnx"], "--steps: want N >= 1"),
+        (["--simulated", 2, "--uiuc", ".", "--out", "net.onnx"], "give one of --uiuc FOLDER"),
+    ],
+)
+def test_a_training_that_cannot_be_is_refused_in_one_line(tmp_path, words, message):
+    done = parkenv("train-detector", *words, cwd=tmp_path)
+    assert done.returncode == 2
+    assert message in " ".join(done.stderr.split())
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_short_training_learns_and_repeats(tmp_path):
+    torch = pytest.importorskip("torch")
+    from parkenv.perception.center_network import INPUT, CenterNetwork, to_onnx
+    from parkenv.perception.center_training import CenterTrainingSettings, as_input, train_centers
+
+    scenes = [*simulated_scenes(1, 0, tmp_path)]
+    assert len(scenes) == FRAMES
+    read = [*simulated_scenes(1, 0, tmp_path)]
+    assert all(
+        np.array_equal(a.grey, b.grey) and np.array_equal(a.car, b.car)
+        for a, b in zip(scenes, read, strict=True)
+    )
+    told = []
+    settings = CenterTrainingSettings(steps=30, batch=4, averaging=0.8)
+    network = train_centers(scenes, settings, told.append)
+    again = train_centers(scenes, settings)
+    assert all(torch.equal(a, b) for a, b in zip(network.parameters(), again.parameters(), strict=True))
+    # The file gives what the network gives, but for weights of 16 bits.
+    (tmp_path / "net.onnx").write_bytes(to_onnx(network, (0.5, -1.0), {"steps": 30}))
+    image = cv2.resize(scenes[0].grey, INPUT)
+    with torch.no_grad():
+        made = network(as_input([image]))[0].numpy()
+    runner = cv2.dnn.readNetFromONNX(str(tmp_path / "net.onnx"))
+    runner.setInput(as_input([image]).contiguous().numpy())
+    cells = runner.forward()[0]
+    assert cells[0] == pytest.approx(1.0 / (1.0 + np.exp(-(0.5 * made[0] - 1.0))), abs=2e-3)
+    assert cells[1:5] == pytest.approx(16.0 * np.exp(made[1:5].clip(-4, 4)), rel=2e-2)
+    assert cells[5:8].sum(axis=0) == pytest.approx(np.ones((60, 80)), abs=1e-5)
+    untrained = CenterNetwork()
+    assert sum(p.numel() for p in untrained.parameters()) < 1_000_000
