@@ -82,7 +82,11 @@ for _name, _entry_point, _vector_entry_point in (
         "parkenv.envs.search:SearchEnv",
         "parkenv.envs.search_vector:ParkSearchVectorEnv",
     ),
-    ("parkenv/SearchSensors-v2", "parkenv.envs.sensors:SearchSensorsEnv", None),
+    (
+        "parkenv/SearchSensors-v2",
+        "parkenv.envs.sensors:SearchSensorsEnv",
+        "parkenv.envs.scan_vector:ScanSearchVectorEnv",
+    ),
     ("parkenv/SearchPerception-v2", "parkenv.envs.perception:SearchPerceptionEnv", None),
 ):
     if _name not in registry:

@@ -6,6 +6,12 @@ import signal
 import time
 from pathlib import Path
 
+from parkenv.errors import InputError
+
+
+def refuse(value: int) -> None:
+    raise InputError(f"value is {value}")
+
 
 def square(number: int) -> int:
     return number * number

@@ -302,10 +302,17 @@ def test_damaged_recordings_are_refused_in_a_line(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rig", ["laser", "stereo"])
-def test_a_recorded_survey_gives_the_same_map_to_the_last_bit(tmp_path, rig):
-    file, words = tmp_path / "drive.mcap", ("--scenario", "mini")
-    driven = ("--sessions", 1, "--every", 5, "--pose-noise", 0.1, "--rig", rig, "--jobs", 1, "--record", file)
+@pytest.mark.parametrize(
+    ("rig", "errors", "localise"),
+    [
+        ("laser", ("--pose-noise", 0.1), "none"),
+        ("laser", ("--odometry-drift", 0.05), "scan-matching"),
+        ("stereo", ("--pose-noise", 0.1), "scan-matching"),
+    ],
+)
+def test_a_recorded_survey_gives_the_same_map_to_the_last_bit(tmp_path, rig, errors, localise):
+    file, words = tmp_path / "drive.mcap", ("--scenario", "mini", "--localise", localise)
+    driven = ("--sessions", 1, "--every", 5, *errors, "--rig", rig, "--jobs", 1, "--record", file)
     done = parkenv("survey", *words, *driven, "--out", tmp_path / "survey")
     assert done.returncode == 0, done.stderr
     done = parkenv("map-drive", file, *words, "--out", tmp_path / "mapped")

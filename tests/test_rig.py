@@ -51,6 +51,19 @@ def test_the_thesis_rig_has_camera_and_laser_on_one_axis():
     assert not SensorRig.stereo().lasers
 
 
+def test_smaller_pictures_show_the_same(scene, pose):
+    large, small = SensorRig.thesis(), SensorRig.thesis().resized(320)
+    (_, camera, _), (_, half, _) = large.cameras[0], small.cameras[0]
+    assert (half.width, half.height, half.fx) == (320, 240, camera.fx / 2)
+    one, other = (rig.capture(scene, pose, seed=1).images["right"].image for rig in (large, small))
+    halved = one.reshape(240, 2, 320, 2, 3).mean(axis=(1, 3))
+    assert np.abs(halved - other).mean() < 8.0
+    stereo = SensorRig.stereo().resized(400)
+    assert stereo.stereo_cameras[0][1].camera.height == 300
+    with pytest.raises(SensorError, match="image size is 0×1 px"):
+        large.resized(0)
+
+
 def test_equal_seeds_give_equal_captures_and_other_seeds_other_noise(scene, pose):
     rig = small(Mount(z=1.1, yaw=RIGHT))
     one, same, other = (

@@ -107,6 +107,16 @@ def test_scans_alone_are_those_beside_the_pictures():
         assert data_equivalence({name: full[name] for name in without}, scan, exact=True)
 
 
+def test_pictures_of_another_width():
+    env = make(picture_width=160)
+    assert env.reset(seed=1)[0]["image.right"].shape[1:] == (120, 160, 3)
+    seen = gym.make("parkenv/SearchPerception-v2", scenario="mini", picture_width=320).unwrapped
+    assert seen.rig.cameras[0][1].width == 320
+    for wrong in (True, 12, 3.5):
+        with pytest.raises(InputError, match="picture_width is"):
+            make(picture_width=wrong)
+
+
 def test_a_scan_shows_max_range_where_nothing_is_met():
     observation, _ = make(rig=LASER_ONLY).reset(seed=0)
     scan = observation["scan.laser"][0]

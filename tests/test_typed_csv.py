@@ -13,6 +13,7 @@ SESSION = {
     **{f"thesis_{name}": "0.01" for name in ERROR_COLUMNS}, "slot_accuracy": "1.0", "slot_accuracy_seen": "1.0",
     "unknown_fraction": "0.0", "occupied_fraction": "0.5", "seconds_per_frame": "0.05",
     "cars_in_frame": "2 1 0 0 0 0", "cars_detected": "2 0 0 0 0 0",
+    "odometry_error_m": "1.5", "pose_error_m": "0.1", "pose_error_max_m": "0.2",
 }  # fmt: skip
 EPISODE = {
     "scenario": "mini", "occupancy_level": "", "agent": "mdp", "failure_cost_s": "10.0", "v_walk_kmh": "4.0",

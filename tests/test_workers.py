@@ -43,6 +43,13 @@ def test_results_carry_the_number_of_their_task_and_come_in_order_where_asked():
 
 
 @pytest.mark.parametrize("backend", ["loky", *(pytest.param(c, marks=pytest.mark.slow) for c in CLUSTERS)])
+@pytest.mark.filterwarnings("ignore")
+def test_bad_input_that_a_worker_finds_is_named_as_it_is(backend):
+    with of(backend) as workers, pytest.raises(InputError, match=r"^value is 3$"):
+        list(workers.results([partial(killed_once.refuse, 3)] * 2))
+
+
+@pytest.mark.parametrize("backend", ["loky", *(pytest.param(c, marks=pytest.mark.slow) for c in CLUSTERS)])
 @pytest.mark.filterwarnings("default")  # the libraries' own, about sockets and workers that died
 def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend):
     marker = str(tmp_path / "killed")

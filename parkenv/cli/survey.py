@@ -12,7 +12,7 @@ from parkenv.cli.tables import make_console, make_table, print_recorded, progres
 from parkenv.errors import InputError, nearest
 from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
-from parkenv.files.known_names import RigName, WeatherName
+from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 
 if TYPE_CHECKING:
     from parkenv.evaluation.experiments.spec import SurveySpec
@@ -35,6 +35,8 @@ def survey(
     detector: str | None = None,
     weather: WeatherName | None = None,
     pose_noise: float = 0.0,
+    odometry_drift: float = 0.0,
+    localise: LocaliserName = "none",
     rerun: Path | None = None,
     record: Path | None = None,
     folder: args.ReportedRun,
@@ -50,6 +52,7 @@ def survey(
         parkenv survey --sessions 21
         parkenv survey --scenario street --rig stereo --weather rain
         parkenv survey --hours 12:00-13:00 --days weekend
+        parkenv survey --odometry-drift 0.02 --localise scan-matching
         parkenv survey --scenario mini --sessions 1 --rerun drive.rrd
 
     Options:
@@ -65,6 +68,8 @@ def survey(
         rig (laser|stereo|both_sides): laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a
             laser and a camera to each side.  [default: the scenario's, laser]
         pose_noise (M >= 0): Localisation error of the car, m.
+        odometry_drift (0 <= P <= 0.5): Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.
+        localise (none|scan-matching): scan-matching: correct the odometry by parked cars, walls and slots.
 
     Results:
         record (FILE.mcap): Also record images, scans and poses of the first session (extra bags), for `parkenv
@@ -75,7 +80,8 @@ def survey(
     windows = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
     spec = SurveySpec().changed(
         scenario=traffic.on(world.spec(scenario), BUSY), sessions=sessions, rig=rig, detector=detector,
-        weather=weather, every=every, pose_noise=pose_noise, seed=seed, **windows, **machines.given,
+        weather=weather, every=every, pose_noise=pose_noise, odometry_drift=odometry_drift, localise=localise,
+        seed=seed, **windows, **machines.given,
     )  # fmt: skip
     with writing_into(out, "the same command"):
         run_survey_of(spec, out, folder, rerun, record)
@@ -153,6 +159,9 @@ def run_survey_of(
     if run.shown is not None:
         pictures.save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
         pictures.save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
+        if settings.localise != "none":
+            name = file_name(f"localised_{its.name}", ".png")
+            pictures.save_localisation(its.lot, run.shown, out / name)
         pictures.save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
     scored = score_discovery(found, its.lot)
     pictures.save_found_slots(its.lot, found, scored, out / file_name(f"slots_found_{its.name}", ".png"))
@@ -170,6 +179,14 @@ def run_survey_of(
         ("occupancy_mae", f"{mae:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})"),
         ("seconds_per_frame", f"{row['seconds_per_frame']:.4f}"),
     )
+    its_poses = row["pose_error_m"]
+    if its_poses["odometry"] > 0.0 or settings.localise != "none":
+        figures += (
+            (
+                "pose_error_m",
+                f"{its_poses['estimated']:.2f}, at most {its_poses['max']:.2f} (odometry: {its_poses['odometry']:.2f})",
+            ),
+        )
     console.print(make_table(None, ["figure", "value"], figures))
     by_weather = (
         (name, str(r["sessions"]), f"{r['car_detection_rate']:.1%}", f"{r['slot_accuracy']:.1%}")
@@ -202,6 +219,7 @@ def map_drive(
     *,
     lot: str | None = None,
     detector: str | None = None,
+    localise: LocaliserName = "none",
 ) -> None:
     """Map a recorded drive: images, scans and poses of a car of your own become a session of a map file.
 
@@ -216,6 +234,7 @@ def map_drive(
         recording (FILE|DIR): An MCAP file, or a rosbag of ROS 2 (folder, .db3) or of ROS 1 (.bag); extra bags.
         calibration (FILE): Sensors, mounts and topics (.toml).  [default: those of the recording]
         every (M >= 0): Least distance between captures, m.
+        localise (none|scan-matching): scan-matching: the poses are odometry that drifts; correct it.
         out, -o (DIR): Folder for map.sqlite, to which the session is added, map.png and summary.json.
     """
     from parkenv.evaluation.experiments.results import make_folder
@@ -238,7 +257,7 @@ def map_drive(
         if store.has(drive.key):
             raise InputError(f"{out / 'map.sqlite'}: holds the drive {drive.key!r} already")
         task = progress.add_task("Mapping", total=None)
-        found = mapped(drive, its.lot, finder, every, lambda: progress.advance(task))
+        found = mapped(drive, its.lot, finder, every, lambda: progress.advance(task), localise)
         store.add(found.session)
         log = store.log()
     states = found.states
@@ -250,6 +269,7 @@ def map_drive(
         "seen": int(states.in_view.sum()),
         "taken": int((states.occupied & states.in_view).sum()),
         "cars_located": len(found.session.cars),
+        "corrected_m": round(found.corrected_m, 3),
     }
     save_map(its.lot, predict(log, found.session.time), None, f"{its.name}: {drive.key}", out / "map.png")
     save_summary(out, None, [row])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.envs.search_kernel import act_at, apply_observations_at, finish_step_at
-from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.envs.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import SensingSearchEnv
 from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
@@ -116,6 +116,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     | `captures` | 2 | largest number of captures on an edge |
     | `every` | 1.25 | m, least distance between captures on an edge |
     | `detector` | the scenario's | a `Detector`, or `hog`, `side`, `front`, a file (.npz, .onnx), `MODULE:CLASS` |
+    | `picture_width` | the rig's | px, of the cameras' pictures; smaller ones are drawn and looked at faster |
 
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
     are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).
@@ -149,10 +150,12 @@ class SearchPerceptionEnv(SensingSearchEnv):
         captures: int = 2,
         every: float = 1.25,
         detector: str | Detector | None = None,
+        picture_width: int | None = None,
         **changes: Any,
     ) -> None:
         world = make_scenario(scenario, **changes)
-        self.perception = OnboardPerception(world, rig, weather, captures, every, detector)
+        sensors = make_rig(rig, world, picture_width)
+        self.perception = OnboardPerception(world, sensors, weather, captures, every, detector)
         super().__init__(self.perception.scenario, render_mode)
         self._sampler = self.perception.sampler
 

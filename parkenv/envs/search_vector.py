@@ -105,7 +105,7 @@ def step_full(
         else:
             take_step(search, actions[e])
             refresh_belief(search)
-        _report(search, e, fresh[e], limit, steps, mask)
+        report_step(search, e, fresh[e], limit, steps, mask)
         write_clock(search)
         vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
 
@@ -130,7 +130,7 @@ def step_local(
         search = search_at(address, e)
         if not fresh[e]:
             take_step(search, actions[e])
-        _report(search, e, fresh[e], limit, steps, mask)
+        report_step(search, e, fresh[e], limit, steps, mask)
         observe_surroundings(search, around, local[e])
 
 
@@ -144,7 +144,7 @@ def first_wrong(actions: IntArray) -> int:
 
 
 @kernel
-def _report(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
+def report_step(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
     """Write a search's reward, end of episode, final metrics and action mask."""
     masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     for action in range(N_ACTIONS):

@@ -34,12 +34,25 @@ class Station(NamedTuple):
     movers: Movers | None = None
 
 
-def make_rig(rig: str | SensorRig | None, scenario: Scenario) -> SensorRig:
+def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int | None = None) -> SensorRig:
     """Return a rig by name, as it is, or by default the scenario's.
 
+    Args:
+        rig: the rig or its name.
+        scenario: defines the default.
+        picture_width: px; if given, the pictures are resized to this width.
+
     Raises:
-        InputError: an unknown name, or something else than a rig.
+        InputError: an unknown name, something else than a rig, or a width below 64.
     """
+    if picture_width is not None:
+        if (
+            isinstance(picture_width, bool)
+            or not isinstance(picture_width, (int, np.integer))
+            or picture_width < 64
+        ):
+            raise InputError(f"picture_width is {picture_width!r} px, want a whole number of at least 64")
+        return make_rig(rig, scenario).resized(int(picture_width))
     rig = scenario.rig if rig is None else rig
     if isinstance(rig, SensorRig):
         return rig

@@ -86,6 +86,8 @@ class SearchSensorsEnv(SensingSearchEnv):
     | `scan.<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` for no return |
 
     With `observation="scan"` there are no images, and a step takes a fraction of a millisecond instead of dozens.
+    Batches of such searches are compiled:
+    `gym.make_vec("parkenv/SearchSensors-v2", 256, "vector_entry_point", observation="scan")`.
 
     Beam n points along -3π/4 + n·0.25° from forward, counter-clockwise, in the laser's frame. `env.unwrapped.rig` has
     the poses and models of the sensors. The thesis's rig has `image.right` and `scan.laser`.
@@ -107,6 +109,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
     | `every` | 1.0 | m, least distance between captures on an edge |
+    | `picture_width` | the rig's | px, of the cameras' pictures; smaller ones are drawn faster |
     | `observation` | `full` | `scan`: without images; the cameras of the rig are not drawn |
 
     ```python
@@ -134,12 +137,13 @@ class SearchSensorsEnv(SensingSearchEnv):
         captures: int = 4,
         every: float = 1.0,
         observation: str = "full",
+        picture_width: int | None = None,
         **changes: Any,
     ) -> None:
         if observation not in OBSERVATIONS:
             raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
         super().__init__(make_scenario(scenario, **changes), render_mode)
-        sensors = make_rig(rig, self.scenario)
+        sensors = make_rig(rig, self.scenario, picture_width)
         if observation == "scan":
             if not sensors.lasers:
                 raise InputError('observation is "scan", want a rig with a laser')

@@ -18,6 +18,9 @@ DETECTORS = ("hog", "net", "side", "front")
 DETECTOR_SUFFIXES = (".npz", ".onnx")
 WeatherName = Literal["sunny", "overcast", "low_sun", "dusk", "rain"]
 WEATHERS: tuple[WeatherName, ...] = get_args(WeatherName)
+LocaliserName = Literal["none", "scan-matching"]
+LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
+"""What corrects the pose of a survey's car; see `parkenv.mapping.localisation`."""
 MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 MAP_NAMES: tuple[MapName, ...] = get_args(MapName)

@@ -28,6 +28,7 @@ from parkenv.files.images import decode_image
 from parkenv.files.limited_reading import parse_json
 from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, Lens, StereoSpec
 from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey import Survey, update_grid
 from parkenv.perception.capture import TimedCapture
@@ -84,6 +85,7 @@ class MappedDrive:
     states: SlotStates  # the filter's final estimate
     grid: OccupancyGrid  # the occupancy grid
     frames: int  # captures that were used
+    corrected_m: float  # m, greatest distance between a recorded pose and what it was corrected to
 
 
 class DriveWriter:
@@ -94,7 +96,7 @@ class DriveWriter:
         self._connections: dict[str, Any] = {}
 
     def add(self, captured: TimedCapture, vehicle: FloatArray) -> None:
-        """Append a capture and the estimated pose of the vehicle, (3,)."""
+        """Append a capture and the pose of the vehicle by its odometry, (3,)."""
         stamp = round((_MONDAY_S + captured.time) * 1e9)
         x, y, yaw = (float(v) for v in vehicle)
         self._send(POSE, _POSE_2D, stamp, x=x, y=y, theta=yaw)
@@ -527,6 +529,7 @@ def map_drive(
     detector: str | Detector | None = None,
     every: float = 0.0,
     on_frame: Callable[[], None] = lambda: None,
+    localise: str = "none",
 ) -> MappedDrive:
     """Run the perception pipeline and the mapping on a recorded drive.
 
@@ -536,27 +539,29 @@ def map_drive(
         detector: as in `make_detector`.
         every: m, least distance between captures.
         on_frame: called after every capture.
+        localise: what corrects the recorded poses: `none`, or `scan-matching`, for which they are drifting odometry.
 
     Raises:
-        InputError: see `RecordedDrive` and `make_detector`.
+        InputError: an unknown localiser; see also `RecordedDrive` and `make_detector`.
     """
     pipeline, slots = PerceptionPipeline(drive.rig, lot, detector), SlotFilter(lot)
     low_x, low_y, high_x, high_y = lot.bounds()
     grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
     cars = [np.empty((0, 3))]
-    frames = 0
-    for captured, vehicle in drive.captures(every):
-        result = pipeline.process(captured, slots, vehicle)
+    locate = make_locate(localise, lot)
+    shifts = []
+    for captured, recorded in drive.captures(every):
+        result = pipeline.process(captured, slots, locate(recorded))
+        shifts.append(np.hypot(*(result.vehicle - recorded)[:2]))
         for view in result.views:
-            update_grid(grid, view, vehicle)
+            update_grid(grid, view, result.vehicle)
             cars.append(view.cars.poses)
-        frames += 1
         on_frame()
     states = slots.states()
     p = np.where(states.in_view, states.p_occupied, np.nan)
     rig, weather = (drive.head.rig, drive.head.weather) if drive.head else ("recorded", "unknown")
     session = Session(drive.key, drive.start, rig, weather, p, np.concatenate(cars))
-    return MappedDrive(session, states, grid, frames)
+    return MappedDrive(session, states, grid, len(shifts), float(max(shifts, default=0.0)))
 
 
 def record_drive(survey: Survey, number: int, path: Path) -> None:
@@ -567,7 +572,7 @@ def record_drive(survey: Survey, number: int, path: Path) -> None:
     """
     with recording(path, survey.pipeline.rig) as writer:
         driven = survey.drive(
-            number, on_frame=lambda frame: writer.add(frame.result.captured, frame.result.vehicle)
+            number, on_frame=lambda frame: writer.add(frame.result.captured, frame.odometry)
         )
         its = driven.session
         writer.close(Head(its.key, its.time, its.rig, its.weather))

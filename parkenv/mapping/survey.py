@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
 from parkenv.mapping.store import Session
@@ -38,7 +40,7 @@ class SurveySettings:
     """Settings of a survey.
 
     Raises:
-        InputError: an unknown rig or weather, no window, or a distance that is not positive.
+        InputError: an unknown rig, weather or localiser, no window, or a distance that is not positive.
     """
 
     # `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a camera to
@@ -48,7 +50,8 @@ class SurveySettings:
     weather: str | None = None  # one of `sim_sensors.camera.weather.PRESETS`; None draws one for each session
     # arrival windows of the sessions; the k-th session uses the k-th window, cyclically
     windows: tuple[ArrivalWindow, ...] = (ArrivalWindow(),)
-    pose_noise: PoseNoise = field(default_factory=PoseNoise)  # the vehicle's localisation error
+    pose_noise: PoseNoise = field(default_factory=PoseNoise)  # errors of the vehicle's odometry
+    localise: str = "none"  # what corrects the odometry: `none` or `scan-matching`
     seed: int = 0  # seed of worlds, weather and noise
     # as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`
     detector: str = DEFAULT_DETECTOR
@@ -58,6 +61,8 @@ class SurveySettings:
             raise InputError(f"rig is {self.rig!r}, want one of {', '.join(RIG_NAMES)}")
         if self.weather is not None and self.weather not in PRESETS:
             raise InputError(f"weather is {self.weather!r}, want one of {', '.join(PRESETS)}")
+        if self.localise not in LOCALISERS:
+            raise InputError(f"localise is {self.localise!r}, want one of {', '.join(LOCALISERS)}")
         if not self.windows:
             raise InputError("windows is empty, want at least one")
         if not (np.isfinite(self.every) and self.every > 0.0):
@@ -75,7 +80,11 @@ class SessionResult:
     truth: BoolArray
     parked: int  # number of cars in slots then; `found`: how many of them were detected
     found: int
-    score: SurveyScore  # errors of detection and localisation
+    score: SurveyScore  # errors of detection and of the cars' poses
+    odometry: FloatArray  # (f, 3) x, y, yaw of the vehicle by its odometry, one for each capture
+    poses: FloatArray  # (f, 3) the same as estimated
+    true_poses: FloatArray  # (f, 3) the same in truth
+    car_captures: NDArray[np.int64]  # (n,) the capture in which each of `session.cars` was located
     frame_s: FloatArray  # (f,) s, processing time of each capture
     grid: OccupancyGrid  # the occupancy grid of the session
     shown: tuple[PerceptionResult, ...]  # results of some captures with many cars, for figures
@@ -102,6 +111,7 @@ class SurveyFrame(NamedTuple):
     grid: OccupancyGrid  # the occupancy grid so far
     slots: SlotFilter  # the slot filter so far
     truth: BoolArray  # (n_slots,) bool, true current states; only for figures and scores
+    odometry: FloatArray  # (3,) x, y, yaw of the vehicle by its odometry
 
 
 class Survey:
@@ -124,6 +134,8 @@ class Survey:
         """Return the key of a session in the map file; identical sessions have equal keys."""
         s = self.settings
         noise = f"{s.pose_noise.position:g}m{s.pose_noise.heading:g}rad"
+        noise += f"{s.pose_noise.drift:g}drift" if s.pose_noise.drift else ""
+        noise += "" if s.localise == "none" else f"/{s.localise}"
         detector = "" if s.detector == DEFAULT_DETECTOR else f"{detector_version(s.detector)}/"
         drive = f"{s.rig}/{s.weather or 'any'}/{s.every:g}m/{noise}/{detector}seed{s.seed}"
         return f"{self.scenario.name}/{drive}/{number:05d}"
@@ -149,7 +161,9 @@ class Survey:
         weather = Weather.draw(preset, int(key) % _SEEDS)
 
         poses = poses_along(self.route.path, settings.every)
-        estimated = settings.pose_noise.estimated(poses, rng)
+        odometry = settings.pose_noise.estimated(poses, rng)
+        locate = make_locate(settings.localise, lot)
+        estimated = np.empty_like(odometry)
         times = arrival.time + settings.every / scenario.v_drive * np.arange(len(poses))
         # For each section of the route, the capture with the most cars.
         shown: dict[int, PerceptionResult] = {}
@@ -159,21 +173,24 @@ class Survey:
         low_x, low_y, high_x, high_y = lot.bounds()
         grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
         cars: list[FloatArray] = []
+        at: list[int] = []
         frame_s = []
-        for i, (pose, vehicle, time) in enumerate(zip(poses, estimated, times.tolist(), strict=True)):
+        for i, (pose, measured, time) in enumerate(zip(poses, odometry, times.tolist(), strict=True)):
             scene = scenes.at(time, pose)
             capture = self.pipeline.rig.capture(scene, pose, weather, int(rng.integers(_SEEDS)))
             slots.updated[:] = False
             begun = clock.perf_counter()
-            result = self.pipeline.process(TimedCapture(time, capture), slots, vehicle)
+            result = self.pipeline.process(TimedCapture(time, capture), slots, locate(measured))
+            estimated[i] = vehicle = result.vehicle
             for view in result.views:
                 update_grid(grid, view, vehicle)
                 cars.append(view.cars.poses)
+                at.append(i)
             frame_s.append(clock.perf_counter() - begun)
             observed_at[slots.updated] = time
             if on_frame is not None:
                 taken = world.occupied(np.arange(lot.n_slots), time)
-                on_frame(SurveyFrame(result, grid, slots, taken))
+                on_frame(SurveyFrame(result, grid, slots, taken, measured))
             score.add(scene, result, [localize_as_thesis(view, vehicle) for view in result.views])
             section = i * pictures // len(poses)
             if pictures and (section not in shown or result.n_cars > shown[section].n_cars):
@@ -182,13 +199,15 @@ class Survey:
             [world.occupied([s], t)[0] for s, t in enumerate(observed_at.tolist())], dtype=np.bool_
         )
         states = slots.states()
+        car_captures = np.repeat(np.array(at, dtype=np.int64), [len(c) for c in cars])
         found_cars = np.concatenate(cars) if cars else np.empty((0, 3))
         p = np.where(states.in_view, states.p_occupied, np.nan)
         session = Session(self.key_of(number), arrival.time, settings.rig, preset, p, found_cars)
         return SessionResult(
             session, arrival, states, truth,
-            int(truth.sum()), int((truth & score.found).sum()), score, np.array(frame_s), grid,
-            tuple(shown.values()),
+            int(truth.sum()), int((truth & score.found).sum()), score,
+            odometry, estimated, poses, car_captures,
+            np.array(frame_s), grid, tuple(shown.values()),
         )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -98,19 +98,28 @@ class PerceptionPipeline:
         self.detector = make_detector(detector)
 
     def process(
-        self, captured: TimedCapture, slots: SlotFilter, vehicle: FloatArray | None = None
+        self,
+        captured: TimedCapture,
+        slots: SlotFilter,
+        vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None = None,
     ) -> PerceptionResult:
         """Process one capture, and update the slots from its observations.
 
         Args:
             captured: capture of the pipeline's rig.
             slots: the filter to update.
-            vehicle: (3,) estimated x, y, yaw of the vehicle; None: the true pose.
+            vehicle: (3,) estimated x, y, yaw of the vehicle, or a function that estimates it from the scans in the
+                vehicle's frame; None: the true pose.
         """
         vehicle = captured.capture.pose if vehicle is None else vehicle
         views = []
         disparities = self._disparities(captured.capture)  # eq. 3.1
-        scans = self._range_scans(captured.capture, disparities, vehicle)  # T §3.2.3
+        if callable(vehicle):
+            local = self._range_scans(captured.capture, disparities, np.zeros(3))
+            vehicle = vehicle(tuple(local.values()))
+            scans = {name: scan.placed(vehicle) for name, scan in local.items()}
+        else:
+            scans = self._range_scans(captured.capture, disparities, vehicle)  # T §3.2.3
         for scan in scans.values():
             slots.update_from_scan(scan)  # T §3.3.2, from beams
         for name, camera, mount, image in self._images(captured.capture):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -46,6 +47,11 @@ class RangeScan:
         """Return the end points of beams with a finite range, (k, 2) float64, m, world frame."""
         angle, distance = self.angle[beams], self.distance[beams]
         return np.stack([self.x + distance * np.cos(angle), self.y + distance * np.sin(angle)], axis=1)
+
+    def placed(self, vehicle: FloatArray) -> RangeScan:
+        """Return a scan of the vehicle's frame in the frame of the vehicle's pose, (3,) x, y in m and yaw in rad."""
+        x, y, yaw = Mount(self.x, self.y).in_world(vehicle)
+        return dataclasses.replace(self, x=x, y=y, angle=self.angle + yaw)
 
 
 def scan_from_laser(

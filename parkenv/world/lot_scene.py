@@ -21,7 +21,7 @@ FloatArray = NDArray[np.float64]
 
 WALL_HEIGHT = 1.8  # height, m, of walls given as open lines; closed lines are buildings
 
-_CARS_APART = 1 << 31
+CARS_APART = 1 << 31  # keys of worlds, modulo this, number their first cars
 _KEPT_LOTS = 4
 _SLOT_LOTS: OrderedDict[bytes, SlotLot] = OrderedDict()
 
@@ -94,7 +94,7 @@ class LotScenes:
     def __init__(self, slots: SlotLot, scenario: Scenario, key: np.uint64, world: World) -> None:
         self._slots, self._world = slots, world
         self._everything = np.arange(scenario.lot.n_slots)
-        self._first_car = int(key) % _CARS_APART
+        self._first_car = int(key) % CARS_APART
         self._traffic = LotTraffic(scenario.lot, scenario.goal, scenario.traffic, key, slots)
         self._stretch = np.empty(0, dtype=np.int64)
         self._scene: Scene | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Protocol
 
@@ -155,6 +155,17 @@ class PinholeCamera:
             raise SensorError(f"field of view is {horizontal} rad, want above 0 and below π")
         focal = width / 2.0 / math.tan(horizontal / 2.0)
         return cls(width, height, focal, focal, width / 2.0, height / 2.0)
+
+    def resized(self, width: int) -> PinholeCamera:
+        """Return the camera with pictures of another width, px, and the same field of view and proportions.
+
+        Raises:
+            SensorError: a width below 1.
+        """
+        scale = width / self.width
+        height = max(1, round(self.height * scale))
+        numbers = {name: getattr(self, name) * scale for name in ("fx", "fy", "cx", "cy")}
+        return replace(self, width=width, height=height, **numbers)
 
     @property
     def intrinsics(self) -> tuple[float, float, float, float]:

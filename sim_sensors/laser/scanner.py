@@ -81,7 +81,8 @@ class LaserScanner:
         return np.asarray(self.start + self.step * np.arange(self.n_beams), dtype=np.float64)
 
     @cached_property
-    def _lost_below(self) -> np.float32:
+    def lost_below(self) -> np.float32:
+        """The return of a beam is lost where the noise table is below this."""
         return np.float32(ndtri(self.dropout))
 
     @cached_property
@@ -91,6 +92,11 @@ class LaserScanner:
         angle = (number - middle) * self.step
         u, v, b = (a.astype(np.float32) for a in (np.cos(angle), np.sin(angle), number))
         return BeamTable(u, v, b, int(self.n_beams), middle, 1 / self.step, float(self.max_range))
+
+    @cached_property
+    def beams(self) -> tuple[BeamTable, float]:
+        """The beams for compiled code, and their middle direction, rad, laser frame."""
+        return self._beams, float(self.start + self._beams.middle * self.step)
 
     def scan(
         self,
@@ -190,13 +196,13 @@ class LaserScanner:
             tuple(plane.cells[0]),
             tuple(plane.cells[1]),
             poses,
-            float(self.start + self._beams.middle * self.step),
+            self.beams[1],
             excluded,
             self._beams,
-            _noise_table(),
+            noise_table(),
             offsets,
             np.float32(self.noise_sd),
-            self._lost_below,
+            self.lost_below,
             ranges,
             ids,
         )
@@ -218,7 +224,7 @@ def _poses(value: ArrayLike, name: str, ndim: int) -> NDArray[np.float64]:
 
 
 @lru_cache(maxsize=1)
-def _noise_table() -> Float32Array:
+def noise_table() -> Float32Array:
     """Return quantiles of the standard normal distribution in a fixed random order.
 
     (NOISE_TABLE_SIZE + BEAMS_PER_DRAW,) float32. The table is constant, as in the ziggurat algorithm; scans read it

@@ -14,6 +14,7 @@ from parkenv.files.known_names import (
     SCENARIO_NAMES,
     BackendName,
     KnowledgeName,
+    LocaliserName,
     MapName,
     RigName,
     WeatherName,
@@ -320,6 +321,13 @@ class SurveySpec(Workplace):
     weather: WeatherName | None = Field(None, description="Drawn for each session if absent.")
     every: CaptureDistance = 1.25
     pose_noise: float = Field(0.0, ge=0.0, le=100.0, description="Localisation error of the car, m.")
+    odometry_drift: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.5,
+        description="Error of the car's odometry after 100 m, as a share of the distance.",
+    )
+    localise: LocaliserName = Field("none", description="What corrects the odometry.")
     seed: int = Field(0, ge=0, lt=2**31)
 
 

@@ -46,7 +46,7 @@ SESSION_COLUMNS = (
     "key", "weather", "time_s", "parked", "found", "detections", "right",
     *ERROR_COLUMNS, *(f"thesis_{name}" for name in ERROR_COLUMNS),
     "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
-    "cars_in_frame", "cars_detected",
+    "cars_in_frame", "cars_detected", "odometry_error_m", "pose_error_m", "pose_error_max_m",
 )  # fmt: skip
 
 
@@ -81,7 +81,8 @@ def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
         every=spec.every,
         weather=spec.weather,
         windows=tuple(ArrivalWindow.parse(hours, days) for hours in spec.hours),
-        pose_noise=PoseNoise(spec.pose_noise, 0.02 * spec.pose_noise),
+        pose_noise=PoseNoise(spec.pose_noise, 0.02 * spec.pose_noise, drift=spec.odometry_drift),
+        localise=spec.localise,
         seed=spec.seed,
         detector=spec.detector or spec.scenario.detector,
     )
@@ -101,10 +102,23 @@ def session_row(result: SessionResult) -> Row:
                 result.slot_accuracy, result.slot_accuracy_seen, float(1.0 - result.states.in_view.mean()),
                 float(result.truth.mean()), float(np.median(result.frame_s)),
                 *(" ".join(map(str, counts.tolist())) for counts in score.in_frame.T),
+                *_pose_errors(result),
             ),
             strict=True,
         )
     )  # fmt: skip
+
+
+def _pose_errors(result: SessionResult) -> tuple[float, float, float]:
+    """Return the root mean square error of the odometry's positions, m, that of the estimated ones, and its maximum."""
+    odometry, estimated = (
+        np.hypot(*(poses - result.true_poses)[:, :2].T) for poses in (result.odometry, result.poses)
+    )
+    return (
+        float(np.sqrt((odometry**2).mean())),
+        float(np.sqrt((estimated**2).mean())),
+        float(estimated.max()),
+    )
 
 
 def _error_columns(errors: FloatArray) -> tuple[float, ...]:
@@ -188,6 +202,12 @@ def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_
         "car_pose": {
             name: {c: _mean(run.rows, prefix + c) for c in ERROR_COLUMNS}
             for name, prefix in (("fitted", ""), ("thesis", "thesis_"))
+        },
+        "localise": settings.localise,
+        "pose_error_m": {
+            "odometry": _mean(run.rows, "odometry_error_m"),
+            "estimated": _mean(run.rows, "pose_error_m"),
+            "max": max(r["pose_error_max_m"] for r in run.rows),
         },
         "slot_accuracy": _mean(run.rows, "slot_accuracy"),
         "slot_accuracy_seen": _mean(run.rows, "slot_accuracy_seen"),

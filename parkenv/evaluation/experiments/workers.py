@@ -207,7 +207,14 @@ def _run_by_ray(tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]
         while waiting and len(running) < ahead:
             running.append(remote.remote(*waiting.pop()))
         finished, running = ray.wait(running)
-        yield from ray.get(finished)
+        try:
+            results = ray.get(finished)
+        except ray.exceptions.RayTaskError as error:
+            # Its text is a traceback.
+            if isinstance(error.cause, InputError):
+                raise error.cause from error
+            raise
+        yield from results
 
 
 def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:

@@ -22,6 +22,7 @@ from parkenv.evaluation.figures.lot_picture import BELIEF_MAP, draw_discs, draw_
 from parkenv.evaluation.figures.picture_files import INK, STYLE, save_picture
 from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
 from parkenv.mapping.inference import Prediction
+from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
 from parkenv.world.lot import ParkingLot
@@ -31,6 +32,7 @@ FloatArray = NDArray[np.float64]
 SIDE_COLOR, END_COLOR, UNRANGED_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
 TAKEN, FREE, UNKNOWN = BELIEF_MAP(1.0), BELIEF_MAP(0.0), "#b9bec4"
 WRONG = "#ffd000"
+PATH_COLOR, CAR_COLOR = "#0072b2", "#d55e00"
 WEATHER_COLORS = {
     "sunny": "#e69f00",
     "overcast": "#7f7f7f",
@@ -124,6 +126,38 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         save_picture(
             figure, path, "One survey drive: occupancy grid, detected cars, and the states of the slots"
         )
+
+
+def save_localisation(lot: ParkingLot, result: SessionResult, path: Path) -> None:
+    """Draw the path and the located cars of a session by its odometry, and as corrected."""
+    cars, at = result.session.cars, result.car_captures
+    by_odometry = [
+        moved(result.odometry[i], between(result.poses[i], car)) for i, car in zip(at, cars, strict=True)
+    ]
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, _height(lot, 11.0, 2)), layout="constrained")
+        panels = (
+            ("by odometry", result.odometry, np.array(by_odometry).reshape(-1, 3)),
+            ("corrected", result.poses, cars),
+        )
+        for ax, (name, poses, placed) in zip(figure.subplots(2, 1), panels, strict=True):
+            draw_lot(lot, ax)
+            error = np.hypot(*(poses - result.true_poses)[:, :2].T)
+            ax.quiver(
+                placed[:, 0], placed[:, 1], np.cos(placed[:, 2]), np.sin(placed[:, 2]), pivot="mid", headwidth=1,
+                headlength=0, headaxislength=0, scale=60, width=0.0012, color=CAR_COLOR, zorder=4,
+            )  # fmt: skip
+            ax.plot(*result.true_poses[:, :2].T, color=INK, linewidth=1.0, linestyle="--", zorder=3)
+            ax.plot(*poses[:, :2].T, color=PATH_COLOR, linewidth=1.2, zorder=3)
+            rms = float(np.sqrt((error**2).mean()))
+            ax.set_title(f"{name}: {rms:.2f} m off the true path, at most {error.max():.2f} m")
+        keys = [
+            Line2D([], [], color=INK, linestyle="--", label="true path"),
+            Line2D([], [], color=PATH_COLOR, label="path"),
+            Line2D([], [], color=CAR_COLOR, linewidth=2.0, label="a located car, frame by frame"),
+        ]
+        _draw_key(figure.axes[0], keys)
+        save_picture(figure, path, "A survey drive by drifting odometry, and as corrected by scan matching")
 
 
 def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, path: Path) -> None:
