@@ -12,7 +12,9 @@ from onnx import load as load_onnx
 from onnx import numpy_helper
 
 from parkenv import InputError
+from parkenv.evaluation.experiments.detector_drives import DrivePicture, score_on_drives
 from parkenv.files.onnx_file import read_onnx
+from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
 from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
 from parkenv.perception.onnx_outputs import class_columns, decode_centers, guess_layout
@@ -20,7 +22,7 @@ from parkenv.perception.simulated_scenes import FRAMES, SimulatedScene, simulate
 from parkenv.perception.training_crops import SIZES, ExampleMaker
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import Weather
-from sim_sensors.ground_truth import View, vehicle_boxes
+from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
 from sim_sensors.scene import Fleet, Scene
 from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
@@ -162,6 +164,44 @@ def test_small_pictures_are_enlarged_no_more_than_told(street):
     assert np.allclose(found.boxes, within.boxes - (240, 180, 240, 180), atol=1e-3)
 
 
+def test_detectors_are_compared_at_equal_false_positives():
+    truth = VehicleBoxes(
+        ids=np.array([1, 2, 3], np.int32),
+        box=np.array([[10, 20, 60, 50], [0, 20, 40, 60], [70, 20, 90, 24]], np.int32),
+        visible_box=np.array([[10, 20, 60, 50], [0, 20, 40, 60], [70, 20, 90, 24]], np.int32),
+        visible_fraction=np.array([1.0, 0.5, 0.9]),
+        view=np.array([2, 0, 2], np.int8),
+        distance=np.array([5.0, 10.0, 19.0]),
+    )
+    picture = DrivePicture(np.zeros((80, 100, 3), np.uint8), "rain", truth)
+
+    class Fixed:
+        def __init__(self, boxes, probability):
+            self.found = Detections(np.array(boxes, float), np.array(probability))
+
+        def detect(self, image):
+            return self.found
+
+    detectors = {
+        # The second car reaches beyond the border; the low one need not be found.
+        "good": Fixed(
+            [[10, 20, 60, 50], [-15, 20, 40, 60], [70, 20, 90, 24], [0, 70, 9, 79]], [0.3, 0.2, 0.9, 0.1]
+        ),
+        # A false positive is surer than the first car, and a second box on a car is one, too.
+        "bad": Fixed(
+            [[10, 20, 60, 50], [70, 60, 95, 79], [0, 20, 40, 60], [2, 20, 40, 60]], [0.3, 0.5, 0.9, 0.8]
+        ),
+    }
+    rows = {row["part"]: row for row in score_on_drives(detectors, [picture], 0.0)}
+    assert rows["all"] == {"part": "all", "cars": 2, "good": 1.0, "bad": 0.5}
+    assert rows["rain"] == rows["all"] | {"part": "rain"}
+    assert rows["dusk"] == {"part": "dusk", "cars": 0, "good": None, "bad": None}
+    assert rows["whole and clear"] == {"part": "whole and clear", "cars": 1, "good": 1.0, "bad": 0.0}
+    assert rows["9 to 12 m"]["bad"] == rows["30% to 60% visible"]["bad"] == 1.0
+    more = {row["part"]: row for row in score_on_drives(detectors, [picture], 2.0)}
+    assert more["all"]["bad"] == 1.0
+
+
 def test_what_takes_detectors_takes_net(tmp_path, street):
     cv2.imwrite(str(tmp_path / "photo.png"), street[0][..., ::-1])
     done = parkenv("detect", tmp_path / "photo.png", "--detector", "net", "--out", tmp_path / "out")
@@ -233,7 +273,7 @@ def test_a_training_that_cannot_be_is_refused_in_one_line(tmp_path, words, messa
 
 
 @pytest.mark.slow
-def test_a_short_training_learns_and_repeats(tmp_path):
+def test_a_short_training_repeats_and_its_file_gives_the_same(tmp_path):
     torch = pytest.importorskip("torch")
     from parkenv.perception.center_network import INPUT, CenterNetwork, to_onnx
     from parkenv.perception.center_training import CenterTrainingSettings, as_input, train_centers
@@ -246,12 +286,12 @@ def test_a_short_training_learns_and_repeats(tmp_path):
         for a, b in zip(scenes, read, strict=True)
     )
     told = []
-    settings = CenterTrainingSettings(steps=30, batch=4, averaging=0.8)
+    settings = CenterTrainingSettings(steps=4, batch=2, averaging=0.5, textures=4)
     network = train_centers(scenes, settings, told.append)
     again = train_centers(scenes, settings)
     assert all(torch.equal(a, b) for a, b in zip(network.parameters(), again.parameters(), strict=True))
     # The file gives what the network gives, but for weights of 16 bits.
-    (tmp_path / "net.onnx").write_bytes(to_onnx(network, (0.5, -1.0), {"steps": 30}))
+    (tmp_path / "net.onnx").write_bytes(to_onnx(network, (0.5, -1.0), {"steps": 4}))
     image = cv2.resize(scenes[0].grey, INPUT)
     with torch.no_grad():
         made = network(as_input([image]))[0].numpy()

@@ -52,10 +52,11 @@ class CenterTrainingSettings:
     decay: float = 0.02  # weight decay of the kernels
     averaging: float = 0.998  # of the weights over the steps; the averages are the result
     held_out: int = 400  # examples of other streets on which the scores are calibrated
+    textures: int = 160  # that backgrounds are cut from
     seed: int = 0
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "held_out"):
+        for name in ("steps", "batch", "held_out", "textures"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} is {getattr(self, name)}, want at least 1")
         if self.seed < 0:
@@ -143,7 +144,7 @@ def train_centers(
         on_network: called with the averaged network and the number of steps, now and then.
     """
     torch.manual_seed(settings.seed)
-    maker = ExampleMaker(scenes, np.random.default_rng([settings.seed, 1]))
+    maker = ExampleMaker(scenes, np.random.default_rng([settings.seed, 1]), settings.textures)
     rng = np.random.default_rng([settings.seed, 2])
     network: CenterNetwork = CenterNetwork().to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     averaged: CenterNetwork = copy.deepcopy(network)

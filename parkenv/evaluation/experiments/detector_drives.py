@@ -96,7 +96,7 @@ def score_on_drives(
     for name, detector in detectors.items():
         found, false = [], []
         for picture, cars in zip(pictures, wanted, strict=True):
-            hits, misses = _match(detector.detect(picture.image), picture.truth, cars)
+            hits, misses = _match(_within(detector.detect(picture.image), picture.image), picture.truth, cars)
             found.append(hits)
             false.append(misses)
             on_picture()
@@ -105,6 +105,7 @@ def score_on_drives(
     weather = np.concatenate([[p.weather] * len(w) for p, w in zip(pictures, wanted, strict=True)])
     distance = np.concatenate([p.truth.distance[w] for p, w in zip(pictures, wanted, strict=True)])
     visible = np.concatenate([p.truth.visible_fraction[w] for p, w in zip(pictures, wanted, strict=True)])
+    whole = np.concatenate([_is_whole(p)[w] for p, w in zip(pictures, wanted, strict=True)])
     hit = {name: np.concatenate(m.found) > least[name] for name, m in matched.items()}
 
     def row(part: str, which: NDArray[np.bool_]) -> Row:
@@ -121,12 +122,29 @@ def score_on_drives(
         row(f"{low:.0%} to {high:.0%} visible", (visible >= low) & (visible < high))
         for low, high in itertools.pairwise(VISIBLE)
     ]
-    return rows
+    clear = whole & (visible >= VISIBLE[-2])
+    return [*rows, row("whole and clear", clear), row("cut by the picture's border", ~whole)]
+
+
+def _is_whole(picture: DrivePicture) -> NDArray[np.bool_]:
+    """Return which cars do not reach the picture's border."""
+    height, width = picture.image.shape[:2]
+    box = picture.truth.box
+    inside = (box[:, :2] > 0).all(axis=1) & (box[:, 2] < width) & (box[:, 3] < height)
+    return np.asarray(inside)
 
 
 def _wanted(truth: VehicleBoxes) -> NDArray[np.int64]:
     high = truth.visible_box[:, 3] - truth.visible_box[:, 1] >= _LEAST_HEIGHT
     return np.flatnonzero((truth.visible_fraction >= VISIBLE[0]) & high & (truth.distance < DISTANCES[-1]))
+
+
+def _within(found: Detections, image: NDArray[np.uint8]) -> Detections:
+    """Return the boxes that reach into the image, cut at its border as the true ones are."""
+    height, width = image.shape[:2]
+    boxes = np.clip(found.boxes, 0.0, np.array([width, height, width, height], np.float32))
+    inside = (boxes[:, 2:] > boxes[:, :2]).all(axis=1)
+    return Detections(boxes[inside], found.probability[inside])
 
 
 def _match(
