@@ -114,7 +114,7 @@ def test_detectors_are_made_by_name(tmp_path):
     assert detector_version(str(file)) != before, "another model under the same name is another detector"
     assert detector_version("hog") == "hog"
     for wrong, message in (
-        ("yolo", "unknown detector 'yolo'; want hog, side, front"),
+        ("yolo", "unknown detector 'yolo'; want hog, net, side, front"),
         ("no_such_module:Mine", "detector 'no_such_module:Mine': no module"),
         (f"{__name__}:Nothing", "has no 'Nothing'"),
         (f"{__name__}:Path", r"has no method detect\(image\)"),

@@ -276,4 +276,4 @@ def test_labels_of_few_cars_or_without_names_are_refused(tmp_path):
     done = parkenv("train-detector", "--labels", tmp_path, "--out", tmp_path / "m.npz")
     assert "has neither data.yaml with names nor classes.txt" in " ".join(done.stderr.split())
     done = parkenv("train-detector", "--uiuc", tmp_path, "--labels", tmp_path, "--out", tmp_path / "m.npz")
-    assert "give one of --uiuc FOLDER, --crops FOLDER and --labels" in " ".join(done.stderr.split())
+    assert "--crops FOLDER, --labels FILE|FOLDER and --simulated N" in " ".join(done.stderr.split())
