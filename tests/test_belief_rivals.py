@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, make_scenario
-from parkenv.belief.day_belief import DayBelief, RivalRates
+from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.spec import FleetSpec
@@ -87,14 +87,14 @@ def test_rivals_take_the_best_slots_first_and_all_find_one():
     assert not _take_rates(p_free, np.zeros(n), order, per_s, PASSED).any(), "nothing ever changes"
 
 
-def test_a_slot_taken_soon_after_it_was_free_speaks_for_rivals():
+def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
     n = 40
     belief = SlotBelief.of_forecast(np.full(n, 0.6), np.full(n, 1e-3))
     near = np.linspace(1.0, -1.0, n)
-    rates = np.zeros((2, n))
-    rates[1, :10] = 0.05
+    rates = np.zeros(n)
+    rates[:10] = 0.05
     calm = DayBelief(belief, near)
-    crowd = DayBelief(belief, near, rivals=RivalRates(rates, np.array([0.5, 0.5])))
+    crowd = DayBelief(belief, near, rival_rates=rates)
     for seen_taken in (False, True):
         belief = belief.update([0], [seen_taken])
         for day in (calm, crowd):

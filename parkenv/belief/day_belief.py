@@ -11,7 +11,6 @@ further on are also more likely to be taken.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,13 +50,6 @@ OTHER_LEVELS, OTHER_SLOPES = np.array([-2.0, 0.0, 2.0, 4.0]), np.array([0.0, 2.0
 _LEAST, _MOST = 1e-6, 1.0 - 1e-6
 
 
-class RivalRates(NamedTuple):
-    """Hypotheses about cars that take free slots beside those of the forecast. The first may be that there are none."""
-
-    take_rates: FloatArray  # (k, n_slots) float64, 1/s, rates at which they take each slot while it is free
-    weights: FloatArray  # (k,) float64, probabilities of the hypotheses
-
-
 class DayBelief:
     """Belief about the day and the slots of (a part of) a lot: the exact posterior over hypotheses about the day.
 
@@ -69,7 +61,8 @@ class DayBelief:
         belief: belief about these slots before any observation.
         nearness: (n_slots,) see `parkenv.world.day_error.nearness`; over the whole lot.
         certain: whether the forecast is right on every day, whatever is observed.
-        rivals: cars that take free slots beside those of the forecast.
+        rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
+            None: there are no such cars.
 
     Examples:
         The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
@@ -91,62 +84,30 @@ class DayBelief:
         belief: SlotBelief,
         nearness: FloatArray,
         certain: bool = False,
-        rivals: RivalRates | None = None,
+        rival_rates: FloatArray | None = None,
     ) -> None:
         forecast = np.clip(belief.forecast.astype(np.float64), _LEAST, _MOST)
+        crowded = rival_rates is not None and bool(rival_rates.any())
+        # Rivals make slopes and events of their own: with them, days differ by their level only.
+        self._n_events = 0 if certain or crowded else len(EVENTS)
         if certain:
-            weight, self._p_taken, self._n_events = np.ones(1), forecast[:, None], 0
+            weight, p_taken = np.ones(1), forecast[:, None]
+        elif crowded:
+            weight, p_taken = _hypotheses(forecast, nearness, np.array([belief.day_error[0], 0.0]))
+            weight, p_taken = weight[: -len(EVENTS)], p_taken[:, : -len(EVENTS)]
+            weight = weight / weight.sum()
         else:
-            weight, self._p_taken = _hypotheses(forecast, nearness, belief.day_error)
-            self._n_events = len(EVENTS)
-        if rivals is not None:
-            self._expect(rivals, weight, forecast, nearness, belief)
-        else:
-            self._log_weight = np.log(weight)
+            weight, p_taken = _hypotheses(forecast, nearness, belief.day_error)
+        if rival_rates is not None and crowded:
+            # Free at the rate μ, taken at λ, and by rivals at r: P(free) = μ/(λ+μ+r)
+            leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
+            gone = np.divide(rival_rates, leaving, out=np.zeros(len(leaving)), where=leaving > 0.0)
+            p_taken = 1.0 - 1.0 / (1.0 / (1.0 - p_taken) + gone[:, None])
+        self._log_weight, self._p_taken = np.log(weight), p_taken
         # P(taken) at each slot's last observation under each hypothesis, when that was, and the result
         self._p_then = np.empty_like(self._p_taken)
         self._observed_at = np.full(len(forecast), -1.0)
         self._p_observed = forecast.copy()
-
-    def _expect(
-        self,
-        rivals: RivalRates,
-        weight: FloatArray,
-        forecast: FloatArray,
-        nearness: FloatArray,
-        belief: SlotBelief,
-    ) -> None:
-        """Let each hypothesis about the day be one about rivals, too.
-
-        A slot that becomes free at the rate μ and is taken at the rate λ, and by rivals at the rate r, is free with the
-        probability μ/(λ+μ+r). Rivals make slopes and events of their own: with them, days differ by their level only.
-        """
-        leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
-        level = np.array([belief.day_error[0], 0.0])
-        weights, p_taken = [], []
-        for rates, share in zip(rivals.take_rates, rivals.weights, strict=True):
-            if not rates.any():
-                weights.append(share * weight)
-                p_taken.append(self._p_taken)
-                continue
-            if self._n_events:
-                others, p = _hypotheses(forecast, nearness, level)
-                others, p = others[: -len(EVENTS)], p[:, : -len(EVENTS)]
-                others = others / others.sum()
-            else:
-                others, p = np.ones(1), forecast[:, None]
-            gone = np.divide(rates, leaving, out=np.zeros(len(leaving)), where=leaving > 0.0)
-            weights.append(share * others)
-            p_taken.append(1.0 - 1.0 / (1.0 / (1.0 - p) + gone[:, None]))
-        # Events stay the last hypotheses: without rivals first, if at all
-        if not rivals.take_rates[0].any():
-            usual = len(weights[0]) - self._n_events
-            weights = [weights[0][:usual], *weights[1:], weights[0][usual:]]
-            p_taken = [p_taken[0][:, :usual], *p_taken[1:], p_taken[0][:, usual:]]
-        else:
-            self._n_events = 0
-        self._log_weight = np.log(np.concatenate(weights))
-        self._p_taken = np.concatenate(p_taken, axis=1)
 
     def carry_over(self, other: DayBelief, ours: IntArray, theirs: IntArray) -> None:
         """Take over what is known about the day, and about the slots `theirs` of another part, here `ours`, (k,).

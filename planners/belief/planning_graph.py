@@ -21,7 +21,7 @@ IntArray = NDArray[np.int64]
 Records = NDArray[Any]
 """A structured array. One array of records compiles several times faster than one array per field."""
 
-MOST_HYPOTHESES = 160  # maximum number of hypotheses about the day, and about rivals
+MOST_HYPOTHESES = 64  # maximum number of hypotheses about the day
 MOST_STOPS = 400  # maximum number of vertices of a path
 AGAIN_S = 30.0  # s after which a path typically observes a taken slot again
 

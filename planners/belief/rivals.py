@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv.belief.day_belief import DayBelief, RivalRates
+from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
@@ -83,8 +83,8 @@ class BeliefRivalsAgent(BeliefAgent):
         if self.arrivals_per_hour is not None:
             per_s = self.arrivals_per_hour / 3600.0
         take_rates = _take_rates(1.0 - forecast, leaving, self._order, per_s, PASSED)
-        rivals = RivalRates(take_rates[None, near.slots], np.ones(1))
-        return DayBelief(belief.take(near.slots), self._nearness[near.slots], not self._day, rivals)
+        nearness = self._nearness[near.slots]
+        return DayBelief(belief.take(near.slots), nearness, not self._day, take_rates[near.slots])
 
 
 def usual_arrivals(forecast: FloatArray, leaving: FloatArray) -> float:
