@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from parkenv.errors import InputError
+from parkenv.perception.boxes import overlaps
 from parkenv.perception.center_network import GREY_MEAN, GREY_STD, STRIDE, CenterNetwork, sides, to_onnx
 from parkenv.perception.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
 from parkenv.perception.training_crops import Example, ExampleMaker, draw_size
@@ -330,11 +331,3 @@ def _boxes(made: Tensor) -> Float32Array:
     reach = sides(made[1:5]).numpy()
     y, x = np.mgrid[: reach.shape[1], : reach.shape[2]] * STRIDE + STRIDE / 2
     return np.stack([x - reach[0], y - reach[1], x + reach[2], y + reach[3]]).astype(np.float32)
-
-
-def overlaps(box: Float32Array, others: Float32Array) -> Float32Array:
-    """Return the intersection over union of a box, (4,), with others, (n, 4)."""
-    inner = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
-    common = np.clip(inner, 0.0, None).prod(axis=1)
-    area = (box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1)
-    return np.asarray(common / np.maximum(area - common, 1e-6), dtype=np.float32)

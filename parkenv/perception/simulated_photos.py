@@ -14,7 +14,7 @@ from parkenv.perception.backdrops import with_backdrop
 from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.hog_detector import as_grey
-from parkenv.perception.simulated_streets import Street
+from parkenv.perception.simulated_streets import LongLens, Street
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
@@ -27,8 +27,8 @@ _NEGLIGIBLE = 0.25  # visible fraction below which a car may be missed
 _LEAST_WIDTH = 36  # px
 _WEATHERS = 4
 _FROM_AFAR = 0.6  # fraction of images with a long focal length
-_AFAR_SIZE = (400, 300)  # px
 _TEXTURED = 0.9  # fraction of images with a backdrop
+_ACROSS = LongLens((400, 300), (7.0, 32.0), (0.9, 2.4), (90.0, 230.0), (56.0, 170.0), aside=0.17, roll=0.015)
 _SEEDS = 1 << 20
 
 FRAMES = 20  # number of images per street
@@ -90,14 +90,9 @@ def _weather(rng: np.random.Generator) -> Weather:
 def _photo(
     street: Street, weather: Weather, rng: np.random.Generator, name: str, *, empty: bool
 ) -> SimulatedPhoto:
-    n = len(street.pose)
-    there = np.zeros(n, dtype=np.bool_) if empty else rng.random(n) < rng.uniform(0.4, 1.0)
-    aimed_at = int(rng.integers(street.first))
-    if not empty:
-        there[aimed_at] = True
-    scene = street.scene(there, rng.random(n) < 0.5)
+    scene, aimed_at = street.draw_scene(rng, 0.4, empty=empty)
     if rng.random() < _FROM_AFAR:
-        camera, pose = _from_afar(street, aimed_at, rng)
+        camera, pose = _ACROSS.aim(street, aimed_at, rng)
     else:
         camera, pose = _as_rigs_see(street, rng)
     frame = camera.render(scene, pose, weather, int(rng.integers(_SEEDS)))
@@ -114,24 +109,6 @@ def _photo(
     sides, ends = _crops(grey, boxes, clear, rng)
     labelled = LabelledImage(name, grey, boxes.visible_box[there_at_all].astype(np.float64))
     return SimulatedPhoto(labelled, sides, ends)
-
-
-def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
-    """Place a camera with a long lens across the street, facing one car."""
-    width, height = _AFAR_SIZE
-    away, height_m = rng.uniform(7.0, 32.0), rng.uniform(0.9, 2.4)
-    extent, smallest, largest = (4.6, 90.0, 230.0) if street.kind == "along" else (1.8, 56.0, 170.0)
-    focal = math.exp(rng.uniform(math.log(smallest), math.log(largest))) * away / extent
-    camera = PinholeCamera(width, height, focal, focal, width / 2.0, height / 2.0, coarse_beyond=math.inf)
-    aside = rng.normal(0.0, 0.17) * away
-    # Random pan and tilt: the car is not always in the middle of the image.
-    pan, tilt = rng.normal(0.0, 0.15, 2) * np.array([2.0 * width, height]) / (2.0 * focal)
-    pose = camera_pose(
-        float(street.pose[car, 0]) + aside, street.front - away, height_m,
-        math.pi / 2 + math.atan2(aside, away) + pan, math.atan2(0.7 - height_m, away) + tilt,
-        rng.normal(0.0, 0.015),
-    )  # fmt: skip
-    return camera, pose
 
 
 def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:

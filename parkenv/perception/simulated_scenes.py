@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from parkenv.errors import InputError
 from parkenv.files.archives import read_arrays
 from parkenv.perception.hog_detector import as_grey
-from parkenv.perception.simulated_streets import Street
+from parkenv.perception.simulated_streets import LongLens, Street
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import vehicle_boxes
@@ -34,9 +34,10 @@ DEPTH_STEPS = 32.0
 
 _WEATHERS = 4
 _EMPTY_EVERY = 10
-_AFAR_SIZE, _NEAR_SIZE = (400, 300), (512, 384)  # px
+_NEAR_SIZE = (512, 384)  # px
 _LONG_LENS = 0.55  # fraction of pictures taken from across the street with a long focal length
 _LEAST_PIXELS = 12  # of a car that is seen at all
+_ACROSS = LongLens((400, 300), (6.0, 32.0), (0.7, 2.8), (90.0, 300.0), (56.0, 200.0), aside=0.22, roll=0.02)
 _SEEDS = 1 << 20
 
 
@@ -103,14 +104,9 @@ def _street(number: int, seed: int) -> Iterator[SimulatedScene]:
 
 
 def _picture(street: Street, weather: Weather, rng: np.random.Generator, *, empty: bool) -> SimulatedScene:
-    n = len(street.pose)
-    there = np.zeros(n, dtype=np.bool_) if empty else rng.random(n) < rng.uniform(0.3, 1.0)
-    aimed_at = int(rng.integers(street.first))
-    if not empty:
-        there[aimed_at] = True
-    scene = street.scene(there, rng.random(n) < 0.5)
+    scene, aimed_at = street.draw_scene(rng, 0.3, empty=empty)
     if rng.random() < _LONG_LENS:
-        camera, pose = _from_afar(street, aimed_at, rng)
+        camera, pose = _ACROSS.aim(street, aimed_at, rng)
     else:
         camera, pose = _in_passing(street, rng)
     frame = camera.render(scene, pose, weather, int(rng.integers(_SEEDS)))
@@ -126,23 +122,6 @@ def _picture(street: Street, weather: Weather, rng: np.random.Generator, *, empt
         boxes.visible_fraction[shown].astype(np.float32), boxes.view[shown],
         boxes.distance[shown].astype(np.float32),
     )  # fmt: skip
-
-
-def _from_afar(street: Street, car: int, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
-    """Place a camera with a long lens across the street, facing one car."""
-    width, height = _AFAR_SIZE
-    away, height_m = rng.uniform(6.0, 32.0), rng.uniform(0.7, 2.8)
-    extent, smallest, largest = (4.6, 90.0, 300.0) if street.kind == "along" else (1.8, 56.0, 200.0)
-    focal = math.exp(rng.uniform(math.log(smallest), math.log(largest))) * away / extent
-    camera = PinholeCamera(width, height, focal, focal, width / 2.0, height / 2.0, coarse_beyond=math.inf)
-    aside = rng.normal(0.0, 0.22) * away
-    pan, tilt = rng.normal(0.0, 0.15, 2) * np.array([2.0 * width, height]) / (2.0 * focal)
-    pose = camera_pose(
-        float(street.pose[car, 0]) + aside, street.front - away, height_m,
-        math.pi / 2 + math.atan2(aside, away) + pan, math.atan2(0.7 - height_m, away) + tilt,
-        rng.normal(0.0, 0.02),
-    )  # fmt: skip
-    return camera, pose
 
 
 def _in_passing(street: Street, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.scene import Fleet, Scene
 from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
@@ -59,6 +61,51 @@ class Street:
         pose = self.pose[chosen].copy()
         pose[:, 2] += math.pi * turned[chosen]
         return Scene(pose, chosen, self.fleet)
+
+    def draw_scene(self, rng: np.random.Generator, least: float, *, empty: bool) -> tuple[Scene, int]:
+        """Return the street with a random part of its cars, and a car of the first row that is there unless `empty`.
+
+        Args:
+            rng: random numbers.
+            least: least probability of a car to be there; the most is 1.
+            empty: whether no car is there.
+        """
+        n = len(self.pose)
+        there = np.zeros(n, dtype=np.bool_) if empty else rng.random(n) < rng.uniform(least, 1.0)
+        car = int(rng.integers(self.first))
+        if not empty:
+            there[car] = True
+        return self.scene(there, rng.random(n) < 0.5), car
+
+
+class LongLens(NamedTuple):
+    """How cars are photographed from across the street: limits and standard deviations."""
+
+    size: tuple[int, int]  # px, width and height of the picture
+    away: tuple[float, float]  # m, from the street
+    height: tuple[float, float]  # m, of the camera
+    side: tuple[float, float]  # px, length of the car if its side is seen
+    end: tuple[float, float]  # px, its width if its end is seen
+    aside: float  # as a fraction of the distance
+    roll: float  # rad
+
+    def aim(
+        self, street: Street, car: int, rng: np.random.Generator
+    ) -> tuple[PinholeCamera, NDArray[np.float64]]:
+        """Return a camera that faces one car, and its pose; the car is not always in the middle of the picture."""
+        width, height = self.size
+        away, height_m = rng.uniform(*self.away), rng.uniform(*self.height)
+        extent, (smallest, largest) = (4.6, self.side) if street.kind == "along" else (1.8, self.end)
+        focal = math.exp(rng.uniform(math.log(smallest), math.log(largest))) * away / extent
+        camera = PinholeCamera(width, height, focal, focal, width / 2.0, height / 2.0, coarse_beyond=math.inf)
+        aside = rng.normal(0.0, self.aside) * away
+        pan, tilt = rng.normal(0.0, 0.15, 2) * np.array([2.0 * width, height]) / (2.0 * focal)
+        pose = camera_pose(
+            float(street.pose[car, 0]) + aside, street.front - away, height_m,
+            math.pi / 2 + math.atan2(aside, away) + pan, math.atan2(0.7 - height_m, away) + tilt,
+            rng.normal(0.0, self.roll),
+        )  # fmt: skip
+        return camera, pose
 
 
 def _row(

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.mapping.route import survey_route
+from parkenv.perception.boxes import overlaps
 from parkenv.perception.detector import Detections, Detector
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot_scene import LotScenes, slot_lot
@@ -155,22 +156,14 @@ def _match(
     others = np.setdiff1d(np.arange(len(truth.ids)), wanted)
     for i in np.argsort(-found.probability, kind="stable").tolist():
         box, score = found.boxes[i].astype(np.float64), float(found.probability[i])
-        overlap = np.maximum(_overlaps(box, truth.visible_box[wanted]), _overlaps(box, truth.box[wanted]))
+        overlap = np.maximum(overlaps(box, truth.visible_box[wanted]), overlaps(box, truth.box[wanted]))
         overlap[hits >= 0.0] = 0.0
         best = int(overlap.argmax()) if len(overlap) else -1
         if best >= 0 and overlap[best] >= MATCH:
             hits[best] = score
-        elif not (_overlaps(box, truth.box[others]) > _EITHER).any():
+        elif not (overlaps(box, truth.box[others]) > _EITHER).any():
             misses.append(score)
     return hits, np.array(misses)
-
-
-def _overlaps(box: FloatArray, others: NDArray[np.int32]) -> FloatArray:
-    """Return the intersection over union of a box, (4,), with others, (n, 4)."""
-    inner = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
-    common = np.clip(inner, 0.0, None).prod(axis=1)
-    area = (box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1)
-    return np.asarray(common / np.maximum(area - common, 1e-9), dtype=np.float64)
 
 
 def _threshold(false: FloatArray, most: float) -> float:
