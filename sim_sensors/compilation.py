@@ -25,8 +25,8 @@ from typing import Any, overload
 import numba
 import numpy as np
 from numba.core import event
-from numba.core.cpu import CPUTargetOptions
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, NullCache, _CacheLocator
+from numba.core.cpu import CPUTargetOptions
 from numba.core.options import TargetOptions
 from numba.core.serialize import dumps
 from numba.core.types.misc import unliteral

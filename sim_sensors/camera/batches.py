@@ -8,21 +8,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_sensors.camera.daylight import Light
-from sim_sensors.camera.textures import VECTOR_LOOP
+from sim_sensors.camera.textures import VECTOR_LOOP, Single
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int32]
+
 
 class View(NamedTuple):
     """The camera: rotation (3, 3) camera to world, position (3,), intrinsics in px; all float32."""
 
     rotation: Float32Array
     position: Float32Array
-    fx: np.float32
-    fy: np.float32
-    cx: np.float32
-    cy: np.float32
+    fx: Single
+    fy: Single
+    cx: Single
+    cy: Single
 
 
 class Places(NamedTuple):

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from sim_sensors.camera.light_maps import LightMaps, open_sky
 from sim_sensors.camera.sky import look_up, packed_sky
-from sim_sensors.camera.textures import VECTOR_LEAF
+from sim_sensors.camera.textures import VECTOR_LEAF, Single
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
-Color = tuple[np.float32, np.float32, np.float32]
-Vector = tuple[np.float32, np.float32, np.float32]
+Color = tuple[Single, Single, Single]
+Vector = tuple[Single, Single, Single]
 
 SHADOW_BIAS = np.float32(0.05)  # m, offset towards the sun, against self-shadowing
 
@@ -38,12 +38,12 @@ class Light(NamedTuple):
     sun: Float32Array
     sky: Float32Array
     horizon: Float32Array
-    haze: np.float32
-    wetness: np.float32
-    lit_windows: np.float32
+    haze: Single
+    wetness: Single
+    lit_windows: Single
     background: Float32Array
     mirrored: NDArray[np.uint32]
-    brightest: np.float32
+    brightest: Single
     ground: Float32Array
 
 
@@ -72,12 +72,12 @@ def daylight(weather: Weather, background: Float32Array) -> Light:
 
 @compiled(**VECTOR_LEAF)
 def mirrored(
-    px: np.float32,
-    py: np.float32,
-    pz: np.float32,
-    rx: np.float32,
-    ry: np.float32,
-    rz: np.float32,
+    px: Single,
+    py: Single,
+    pz: Single,
+    rx: Single,
+    ry: Single,
+    rz: Single,
     light: Light,
     maps: LightMaps,
 ) -> Color:

@@ -12,7 +12,7 @@ from sim_sensors.camera.daylight import SHADOW_BIAS, Light
 from sim_sensors.camera.ground_texture import GroundTexture, sample_ground
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.sky import look_up
-from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Tile, hash_unit, sample_tile
+from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, hash_unit, sample_tile
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
@@ -23,7 +23,7 @@ _GRAIN_PER_M = np.float32(1.0 / _GRAIN_M)
 
 def ground_levels(
     rays_down: NDArray[np.float64], height: float, focal: float, texel: float
-) -> tuple[Float32Array, np.float32]:
+) -> tuple[Float32Array, Single]:
     """Return the pyramid level at which a ground texel is about as large as a pixel, for every row.
 
     Args:
@@ -47,8 +47,8 @@ def color_ground(
     n: int,
     places: Places,
     row_level: Float32Array,
-    to_grain: np.float32,
-    wetness: np.float32,
+    to_grain: Single,
+    wetness: Single,
     ground: GroundTexture,
     grain_of_asphalt: Tile,
     batch: Batch,
@@ -107,5 +107,5 @@ def mirror_in_puddles(n: int, light: Light, batch: Batch) -> None:
 
 
 @compiled(**VECTOR_LEAF)
-def _wet(wetness: np.float32, wettable: np.float32) -> np.float32:
+def _wet(wetness: Single, wettable: Single) -> Single:
     return wetness * min(1.0, 0.45 + 1.2 * wettable)

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.textures import VECTOR_LEAF, byte, fractal_noise, mix
+from sim_sensors.camera.textures import VECTOR_LEAF, Single, byte, fractal_noise, mix
 from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Ground
 
@@ -25,7 +25,7 @@ class GroundTexture(NamedTuple):
     """Albedo of the ground as an image pyramid.
 
     Attributes:
-        texels: (total,) uint32, from the lowest byte on: square root of the grey albedo, fraction of grass, and capacity
+        texels: (total,) uint32, from the lowest byte on: square root of the grey albedo, fraction of grass, capacity
             for water, each 255 = 1; level after level, row-major, rows along y.
         start: (n_levels,) int32, first texel of each level.
         shape: (n_levels, 2) int32, rows and columns of each level.
@@ -188,9 +188,7 @@ def _packed(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(**VECTOR_LEAF)
-def sample_ground(
-    texture: GroundTexture, x: np.float32, y: np.float32, level: np.int32
-) -> tuple[np.float32, np.float32, np.float32]:
+def sample_ground(texture: GroundTexture, x: Single, y: Single, level: int) -> tuple[Single, Single, Single]:
     """Sample the ground at (x, y), m: grey albedo, fraction of grass, and how much water can collect there."""
     step = np.uint64(min(max(level, 0), texture.shape.shape[0] - 1))
     columns = texture.shape[step, 1]
@@ -216,7 +214,7 @@ def sample_ground(
 
 
 @compiled(**VECTOR_LEAF)
-def _mirrored(u: np.float32, n: np.float32) -> np.float32:
+def _mirrored(u: Single, n: Single) -> Single:
     """Reflect `u` into [0, n - 1)."""
     span = n - 1.001
     u = abs(u)

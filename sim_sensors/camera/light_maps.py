@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.projection import ScreenTriangles
+from sim_sensors.camera.projection import ScreenTriangles, set_box
 from sim_sensors.camera.rasterizer import rasterize
-from sim_sensors.camera.textures import VECTOR_LEAF, mix, mix_quad, quads
+from sim_sensors.camera.textures import VECTOR_LEAF, Single, mix, mix_quad, quads
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Instances, Material, MeshPool
@@ -149,12 +149,25 @@ def _seen_from_the_sun(
     to_shadow: FloatArray,
     glass: int,
     n: int,
-) -> tuple[Float32Array, FloatArray, Float32Array, NDArray[np.uint8], NDArray[np.uint8], NDArray[np.int32]]:
+) -> tuple[
+    Float32Array,
+    FloatArray,
+    NDArray[np.int16],
+    Float32Array,
+    NDArray[np.bool_],
+    Float32Array,
+    NDArray[np.uint8],
+    NDArray[np.uint8],
+    NDArray[np.int32],
+]:
+    """Return the fields of `ScreenTriangles`, those for shading empty."""
     capacity = 0
     for q in near:
         capacity += triangle_start[mesh[q] + 1] - triangle_start[mesh[q]]
     corners = np.empty((capacity, 6), dtype=np.float32)
     planes = np.empty((capacity, 3))
+    box = np.empty((capacity, 4), dtype=np.int16)
+    nearest = np.empty(capacity, dtype=np.float32)
     count = 0
     p = np.empty((3, 3))
     for q in near:
@@ -174,10 +187,11 @@ def _seen_from_the_sun(
                         to_shadow[i, 0] * x + to_shadow[i, 1] * y + to_shadow[i, 2] * z + to_shadow[i, 3]
                     )
             area = (p[1, 0] - p[0, 0]) * (p[2, 1] - p[0, 1]) - (p[2, 0] - p[0, 0]) * (p[1, 1] - p[0, 1])
-            outside = min(p[0, 0], p[1, 0], p[2, 0]) > n or max(p[0, 0], p[1, 0], p[2, 0]) < 0.0
-            outside |= min(p[0, 1], p[1, 1], p[2, 1]) > n or max(p[0, 1], p[1, 1], p[2, 1]) < 0.0
-            if abs(area) < 1e-6 or outside:
+            left, right = min(p[0, 0], p[1, 0], p[2, 0]), max(p[0, 0], p[1, 0], p[2, 0])
+            top, bottom = min(p[0, 1], p[1, 1], p[2, 1]), max(p[0, 1], p[1, 1], p[2, 1])
+            if abs(area) < 1e-6 or not set_box(left, top, right, bottom, n, n, box[count]):
                 continue
+            nearest[count] = max(p[0, 2], p[1, 2], p[2, 2])
             by_x = (p[1, 2] - p[0, 2]) * (p[2, 1] - p[0, 1]) - (p[2, 2] - p[0, 2]) * (p[1, 1] - p[0, 1])
             by_y = (p[2, 2] - p[0, 2]) * (p[1, 0] - p[0, 0]) - (p[1, 2] - p[0, 2]) * (p[2, 0] - p[0, 0])
             planes[count, 0] = by_x / area
@@ -187,10 +201,14 @@ def _seen_from_the_sun(
                 corners[count, 2 * k] = p[k, 0]
                 corners[count, 2 * k + 1] = p[k, 1]
             count += 1
-    none = np.zeros((count, 9), dtype=np.float32)
     plain = np.zeros(count, dtype=np.uint8)
-    plain_color = np.zeros((count, 3), dtype=np.uint8)
-    return corners[:count], planes[:count], none, plain, plain_color, np.zeros(count, dtype=np.int32)
+    none = (
+        np.zeros((0, 9), dtype=np.float32),
+        plain,
+        np.zeros((0, 3), dtype=np.uint8),
+        np.zeros(0, dtype=np.int32),
+    )
+    return corners[:count], planes[:count], box[:count], nearest[:count], plain == 1, *none
 
 
 def _contact_map(
@@ -229,7 +247,7 @@ def bounding_boxes(pool: MeshPool) -> FloatArray:
 
 
 @compiled(**VECTOR_LEAF)
-def sunlit(maps: LightMaps, x: np.float32, y: np.float32, z: np.float32, bias: np.float32) -> np.float32:
+def sunlit(maps: LightMaps, x: Single, y: Single, z: Single, bias: Single) -> Single:
     """Return the fraction of the sun that reaches a point, 0 to 1; bilinear between four texels."""
     m = maps.to_shadow
     u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] - 0.5
@@ -247,12 +265,12 @@ def sunlit(maps: LightMaps, x: np.float32, y: np.float32, z: np.float32, bias: n
 
 
 @compiled(**VECTOR_LEAF)
-def _open(occluder: np.float32, height: np.float32) -> np.float32:
+def _open(occluder: Single, height: Single) -> Single:
     return np.float32(0.0) if occluder > height else np.float32(1.0)
 
 
 @compiled(**VECTOR_LEAF)
-def open_sky(maps: LightMaps, x: np.float32, y: np.float32) -> np.float32:
+def open_sky(maps: LightMaps, x: Single, y: Single) -> Single:
     """Return the fraction of the sky that is visible from the ground at (x, y) past the vehicles."""
     u = (x - np.float32(maps.x)) * np.float32(maps.texels_per_m) - 0.5
     v = (y - np.float32(maps.y)) * np.float32(maps.texels_per_m) - 0.5
@@ -262,7 +280,7 @@ def open_sky(maps: LightMaps, x: np.float32, y: np.float32) -> np.float32:
 
 
 @compiled(**VECTOR_LEAF)
-def _place(u: np.float32, v: np.float32, n: int) -> tuple[np.uint64, np.uint64, np.float32, np.float32, bool]:
+def _place(u: Single, v: Single, n: int) -> tuple[Single, Single, Single, Single, Single]:
     """Return the texel of a map n wide at or before (u, v), the fractions to the next, and whether there is one."""
     end = np.float32(n - 1)
     covered = (u >= 0.0) & (v >= 0.0) & (u < end) & (v < end)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sim_sensors.camera.batches import Batch, Places, View
 from sim_sensors.camera.daylight import SHADOW_BIAS, Light, mirrored
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
-from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Tile, mix, pixel_level, sample_tile
+from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, mix, pixel_level, sample_tile
 from sim_sensors.compilation import compiled
 from sim_sensors.facades import facade
 from sim_sensors.mesh import Material
@@ -145,7 +145,7 @@ def color_surfaces(
 
 
 @compiled(**VECTOR_LOOP)
-def blotch_surfaces(n: int, cloud: Tile, focal: np.float32, batch: Batch, surfaces: Surfaces) -> None:
+def blotch_surfaces(n: int, cloud: Tile, focal: Single, batch: Batch, surfaces: Surfaces) -> None:
     """Set the blotches of the first n pixels, on a vertical plane through the normal: dirt, plaster, leaves."""
     for i in range(n):
         x, y, z = batch.x[i], batch.y[i], batch.z[i]
@@ -158,7 +158,7 @@ def blotch_surfaces(n: int, cloud: Tile, focal: np.float32, batch: Batch, surfac
 
 @compiled(**VECTOR_LOOP)
 def detail_walls_and_leaves(
-    n: int, focal: np.float32, light: Light, grain: Tile, batch: Batch, surfaces: Surfaces
+    n: int, focal: Single, light: Light, grain: Tile, batch: Batch, surfaces: Surfaces
 ) -> None:
     """Add windows to those of the first n pixels that are of walls, and leaves to those of foliage."""
     detailed = np.int32(0)
@@ -294,7 +294,7 @@ def cover_with_glass(
 
 
 @compiled(**VECTOR_LEAF)
-def fifth_power(x: np.float32) -> np.float32:
+def fifth_power(x: Single) -> Single:
     """Return x⁵, of which reflections at grazing angles grow."""
     square = x * x
     return square * square * x

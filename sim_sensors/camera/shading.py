@@ -1,12 +1,10 @@
 """Deferred shading: the radiance of every pixel, from sky, ground or a surface, through haze and glass.
 
-The rasterizer has found the visible surfaces, so each pixel is shaded once, and once more for a pane of glass. Pixels of
-a kind are collected and shaded together.
+The rasterizer has found the visible surfaces, so each pixel is shaded once, and once more for a pane of glass. Pixels
+of a kind are collected and shaded together.
 """
 
 from __future__ import annotations
-
-from typing import NamedTuple
 
 import numpy as np
 from numba import prange
@@ -43,7 +41,7 @@ from sim_sensors.camera.materials import (
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.rasterizer import BAND, Visibility, interleaved
 from sim_sensors.camera.sky import sky_of_view
-from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Tile, cloud_tile, grain_tile
+from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single, Tile, cloud_tile, grain_tile
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
@@ -108,7 +106,7 @@ def _shade(
     view: View,
     light: Light,
     ground_level: Float32Array,
-    to_grain: np.float32,
+    to_grain: Single,
     ground: GroundTexture,
     maps: LightMaps,
     grain: Tile,
@@ -151,9 +149,7 @@ def _shade(
                     others, on_surface, triangles, visibility, view, light, maps, materials, batch, surfaces, image
                 )  # fmt: skip
             if panes > 0:
-                _shade_panes(
-                    panes, on_pane, triangles, visibility, view, light, maps, batch, surfaces, image
-                )
+                _shade_panes(panes, on_pane, triangles, visibility, view, light, maps, batch, surfaces, image)
             grounds = others = panes = 0
 
 
@@ -166,7 +162,9 @@ def _new_places(n: int) -> Places:
 @compiled
 def _new_batch(n: int) -> Batch:
     f = np.empty((BATCH_FIELDS, n), dtype=np.float32)
-    return Batch(f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12], f[13], f[14])
+    return Batch(
+        f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12], f[13], f[14]
+    )
 
 
 @compiled
@@ -189,12 +187,17 @@ def _draw_sky(inverse_depth: Float32Array, background: Float32Array, image: Floa
         for x in range(width):
             for channel in range(3):
                 image[x, channel] = background[x, channel]
-    return covered > 0
+    return bool(covered > 0)
 
 
 @compiled(**VECTOR_LOOP)
 def _split(
-    inverse_depth: Float32Array, triangle: IntArray, on_ground: IntArray, grounds: int, on_surface: IntArray, others: int
+    inverse_depth: Float32Array,
+    triangle: IntArray,
+    on_ground: IntArray,
+    grounds: int,
+    on_surface: IntArray,
+    others: int,
 ) -> tuple[int, int]:
     """Append the columns of a row that show the ground or a surface to two lists, and return the new lengths.
 
@@ -207,7 +210,7 @@ def _split(
         on_surface[s] = x
         g += np.uint64((inverse_depth[x] > 0.0) & (not surface))
         s += np.uint64(surface)
-    return np.int64(g), np.int64(s)
+    return int(g), int(s)
 
 
 @compiled(**VECTOR_LOOP)
@@ -222,7 +225,7 @@ def _find_panes(pane: IntArray, on_pane: IntArray, panes: int) -> int:
     for x in range(pane.shape[0]):
         on_pane[p] = x
         p += np.uint64(pane[x] >= 0)
-    return np.int64(p)
+    return int(p)
 
 
 @compiled(**VECTOR_LOOP)
@@ -241,7 +244,7 @@ def _shade_ground(
     view: View,
     light: Light,
     ground_level: Float32Array,
-    to_grain: np.float32,
+    to_grain: Single,
     ground: GroundTexture,
     maps: LightMaps,
     grain: Tile,

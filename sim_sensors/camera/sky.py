@@ -14,7 +14,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from sim_sensors.camera.textures import FAST, LEAF, VECTOR_LEAF, cloud_noise, fractal_noise, mix
+from sim_sensors.camera.textures import FAST, LEAF, VECTOR_LEAF, Single, cloud_noise, fractal_noise, mix
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
@@ -240,11 +240,11 @@ def _fill_view(
 @compiled(**VECTOR_LEAF)
 def look_up(
     dome: NDArray[np.uint32], brightest: np.float32, x: np.float32, y: np.float32, z: np.float32
-) -> tuple[np.float32, np.float32, np.float32]:
+) -> tuple[Single, Single, Single]:
     """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0, in a map of `packed_sky`."""
     n = dome.shape[0]
     scale = 0.5 / (1.0 + z)
-    last = np.float32(n - 1.001)
+    last: Single = np.float32(n - 1.001)
     u = min(max((x * scale + 0.5) * np.float32(n) - 0.5, 0.0), last)
     v = min(max((y * scale + 0.5) * np.float32(n) - 0.5, 0.0), last)
     left = np.int32(u)
@@ -252,7 +252,12 @@ def look_up(
     a = u - np.float32(left)
     b = v - np.float32(top)
     row, column, one = np.uint64(top), np.uint64(left), np.uint64(1)
-    corners = dome[row, column], dome[row, column + one], dome[row + one, column], dome[row + one, column + one]
+    corners = (
+        dome[row, column],
+        dome[row, column + one],
+        dome[row + one, column],
+        dome[row + one, column + one],
+    )
     red = _between(corners, 21, _MOST_11, a, b)
     green = _between(corners, 10, _MOST_11, a, b)
     blue = _between(corners, 0, _MOST_10, a, b)
@@ -261,8 +266,12 @@ def look_up(
 
 @compiled(**VECTOR_LEAF)
 def _between(
-    corners: tuple[np.uint32, np.uint32, np.uint32, np.uint32], shift: int, most: int, a: np.float32, b: np.float32
-) -> np.float32:
+    corners: tuple[Single, Single, Single, Single],
+    shift: int,
+    most: int,
+    a: Single,
+    b: Single,
+) -> Single:
     """Interpolate one colour between four texels; its greatest code `most` is 1."""
     c00, c01, c10, c11 = corners
     above = mix(_code(c00, shift, most), _code(c01, shift, most), a)
@@ -271,5 +280,5 @@ def _between(
 
 
 @compiled(**VECTOR_LEAF)
-def _code(texel: np.uint32, shift: int, most: int) -> np.float32:
+def _code(texel: Single, shift: int, most: int) -> Single:
     return np.float32(np.int32((texel >> np.uint32(shift)) & np.uint32(most)))

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_sensors.compilation import compiled
+
+Single = Any  # a scalar in compiled code, float32 mostly: numba knows its type
 
 # All fastmath flags except the one that excludes infinities: the depth of the sky is infinite.
 FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
@@ -25,7 +27,7 @@ VECTOR_LEAF = {**LEAF, "error_model": "numpy", "single": True}
 class Tile(NamedTuple):
     """A square, tileable grey texture with its image pyramid."""
 
-    # (total,) uint32, `quads` of the texels, 255 = 1; level after level, each row-major and half as wide as the previous
+    # (total,) uint32, `quads` of the texels, 255 = 1; level after level, each row-major, half as wide as the previous
     levels: NDArray[np.uint32]
     start: NDArray[np.int32]  # (n_levels,) int32, start of each level
     size: int  # texels along a side of the finest level, a power of two
@@ -72,7 +74,7 @@ def quads(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
 
 
 @compiled(forceinline=True)
-def _quad(here: np.uint8, right: np.uint8, below: np.uint8, across: np.uint8) -> np.uint32:
+def _quad(here: Single, right: Single, below: Single, across: Single) -> Single:
     return np.uint32(here) | np.uint32(right) << 8 | np.uint32(below) << 16 | np.uint32(across) << 24
 
 
@@ -97,7 +99,7 @@ def cloud_tile() -> Tile:
 
 
 @compiled(**VECTOR_LEAF)
-def sample_tile(tile: Tile, u: np.float32, v: np.float32, level: np.int32) -> np.float32:
+def sample_tile(tile: Tile, u: Single, v: Single, level: int) -> Single:
     """Return the bilinear value at (u, v), in periods of the tile, at one level of its pyramid."""
     level = min(max(level, 0), tile.start.shape[0] - 1)
     n = tile.size >> level
@@ -111,7 +113,7 @@ def sample_tile(tile: Tile, u: np.float32, v: np.float32, level: np.int32) -> np
 
 
 @compiled(**VECTOR_LEAF)
-def mix_quad(quad: np.uint32, a: np.float32, b: np.float32) -> np.float32:
+def mix_quad(quad: Single, a: Single, b: Single) -> Single:
     """Interpolate between the four texels of `quads`, from 0 to 1; a is the fraction along the row."""
     above = mix(byte(quad, 0), byte(quad, 8), a)
     below = mix(byte(quad, 16), byte(quad, 24), a)
@@ -119,19 +121,19 @@ def mix_quad(quad: np.uint32, a: np.float32, b: np.float32) -> np.float32:
 
 
 @compiled(**VECTOR_LEAF)
-def byte(packed: np.uint32, shift: int) -> np.float32:
+def byte(packed: Single, shift: int) -> Single:
     """Return the eight bits from `shift` on."""
     return np.float32(np.int32((packed >> np.uint32(shift)) & np.uint32(255)))
 
 
 @compiled(**VECTOR_LEAF)
-def mix(a: np.float32, b: np.float32, fraction: np.float32) -> np.float32:
+def mix(a: Single, b: Single, fraction: Single) -> Single:
     """Interpolate from a to b."""
     return a + (b - a) * fraction
 
 
 @compiled(**VECTOR_LEAF)
-def hash_unit(x: int, y: int) -> np.float32:
+def hash_unit(x: int, y: int) -> Single:
     """Hash two integers to a number from 0 to 1."""
     h = (np.int64(x) * 374761393 + np.int64(y) * 668265263) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
@@ -139,7 +141,7 @@ def hash_unit(x: int, y: int) -> np.float32:
 
 
 @compiled(**VECTOR_LEAF)
-def pixel_level(texels: np.float32) -> np.int32:
+def pixel_level(texels: Single) -> Single:
     """Return the level of a 512-texel tile at which a texel is as large as a pixel that spans `texels` periods."""
     level = 0
     limit = 1.4 / 512.0
