@@ -25,7 +25,7 @@ _DOME = 160  # texels across the hemisphere
 _SAMPLES = 3  # along each side of a texel
 _BEARINGS = 1024  # steps of the skyline
 _BELOW = -0.1  # z of a ray; nothing lower is sky, from any height below 100 m
-_KEPT_VIEWS = 4
+_KEPT_VIEWS = 8
 _NOISE = 256
 
 
@@ -151,7 +151,7 @@ def mirrored_sky(weather: Weather) -> Float32Array:
     return np.asarray(cv2.resize(dome, (_DOME, _DOME), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _fill_dome(sky: Sky, dome: Float32Array) -> None:
     n = dome.shape[0]
     for row in prange(n):
@@ -186,7 +186,8 @@ def sky_of_view(
     Returns:
         (h, w, 3) float32, linear RGB radiance; the horizon's far below it. It must not be changed.
     """
-    return _sky_of_view(weather, tuple(rotation.ravel().tolist()), intrinsics, size)
+    # Headings that differ by rounding alone share a sky.
+    return _sky_of_view(weather, tuple(rotation.ravel().round(6).tolist()), intrinsics, size)
 
 
 @lru_cache(maxsize=_KEPT_VIEWS)
@@ -201,7 +202,7 @@ def _sky_of_view(
     return view
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _fill_view(
     sky: Sky, rotation: FloatArray, fx: float, fy: float, cx: float, cy: float, view: Float32Array
 ) -> None:
