@@ -33,6 +33,7 @@ def detect(
     """Find cars in photographs and videos.
 
     With --out, pictures and films with the boxes drawn in are written, and all boxes with frame and time as a table.
+    View and visible fraction are those of the detector: HOG knows sides and ends alone, `net` all three views.
 
     Examples:
         parkenv detect photo.png --out results/cars
@@ -90,15 +91,16 @@ def detect(
             else:
                 boxes += detect_in_image(file, finder, threshold, drawn)
                 progress.advance(task)
-    headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
+    headings = ["file", "left", "top", "right", "bottom", "probability", "view", "visible_fraction"]
     cells = [
-        (b["file"], *(f"{b[side]:.0f}" for side in headings[1:5]), f"{b['probability']:.2f}", b["view"])
+        (b["file"], *(f"{b[side]:.0f}" for side in headings[1:5]), f"{b['probability']:.2f}", b["view"],
+         "" if b["visible_fraction"] is None else f"{b['visible_fraction']:.2f}")
         for b in boxes
         if b["frame"] is None
-    ]
+    ]  # fmt: skip
     n_images = len(chosen) - len(videos)
     if n_images:
-        console.print(make_table(None, headings, cells))
+        console.print(make_table(None, [h.removesuffix("_fraction") for h in headings], cells))
         console.print(f"{plural(len(cells), 'car')} in {plural(n_images, 'image')}")
     for video in videos:
         console.print(

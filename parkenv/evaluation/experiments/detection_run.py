@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -15,11 +16,15 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.videos import VIDEO_SUFFIXES, Video, film
 from parkenv.perception.detector import Detections, Detector
+from sim_sensors.ground_truth import View
 
 Row = dict[str, Any]
 
-BOX_COLUMNS = ("file", "frame", "time_s", "left", "top", "right", "bottom", "probability", "view")
-"""Columns of `boxes.csv`; frame (from 0) and time_s are empty for images."""
+BOX_COLUMNS = (
+    "file", "frame", "time_s", "left", "top", "right", "bottom", "probability", "view", "visible_fraction",
+)  # fmt: skip
+"""Columns of `boxes.csv`; frame (from 0) and time_s are empty for images, visible_fraction where the detector does not
+know it."""
 
 
 class VideoCars(NamedTuple):
@@ -99,21 +104,10 @@ def _likely(found: Detections, threshold: float) -> Detections:
 
 
 def _rows(file: Path, found: Detections, frame: int | None = None, time: float | None = None) -> list[Row]:
-    values = zip(found.boxes.tolist(), found.probability.tolist(), found.end_on.tolist(), strict=True)
+    taken = None if time is None else round(time, 4)
+    views = [View(view).name.lower() for view in found.view]
+    visible = [None if math.isnan(v) else round(v, 4) for v in found.visible_fraction.tolist()]
+    cars = zip(found.boxes.tolist(), found.probability.tolist(), views, visible, strict=True)
     return [
-        dict(
-            zip(
-                BOX_COLUMNS,
-                (
-                    str(file),
-                    frame,
-                    None if time is None else round(time, 4),
-                    *box,
-                    p,
-                    "end" if end else "side",
-                ),
-                strict=True,
-            )
-        )
-        for box, p, end in values
+        dict(zip(BOX_COLUMNS, (str(file), frame, taken, *box, *of_car), strict=True)) for box, *of_car in cars
     ]
