@@ -186,7 +186,7 @@ def _shadow_boxes(pool: MeshPool, rows: FloatArray, to_shadow: FloatArray) -> ND
     world = np.stack([x, y, rows[:, 3, None] + local[..., 2], np.ones_like(x)], axis=-1)
     column, row = (world @ to_shadow[i] for i in (0, 1))
     ends = [row.min(axis=1) - 1, row.max(axis=1) + 2, column.min(axis=1) - 1, column.max(axis=1) + 2]
-    return np.floor(np.column_stack(ends)).astype(np.int64)
+    return np.asarray(np.floor(np.column_stack(ends)), dtype=np.int64)
 
 
 def _drawn_mesh(pool: MeshPool, rows: FloatArray) -> IntArray:
@@ -314,7 +314,7 @@ def _footprint_boxes(pool: MeshPool, vehicles: FloatArray, maps: LightMaps) -> N
     reach = pool.radius[vehicles[:, 0].astype(np.int64)] * _CONTACT_SCALE + 2.0
     column, row = (vehicles[:, 1] - maps.x) * _CONTACT_SCALE, (vehicles[:, 2] - maps.y) * _CONTACT_SCALE
     ends = np.column_stack([row - reach, row + reach, column - reach, column + reach])
-    return np.floor(ends).astype(np.int64)
+    return np.asarray(np.floor(ends), dtype=np.int64)
 
 
 def _print_footprints(
