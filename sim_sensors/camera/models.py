@@ -8,14 +8,17 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
-from sim_sensors.camera.ground_texture import ground_texture
+from sim_sensors.camera.ground_texture import GroundTexture, ground_texture
 from sim_sensors.camera.image_sensor import ImageSensor
-from sim_sensors.camera.light_maps import bounding_boxes, light_maps
+from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
 from sim_sensors.camera.projection import ScreenTriangles, project
 from sim_sensors.camera.rasterizer import FAR, Visibility, rasterize
 from sim_sensors.camera.shading import shade
+from sim_sensors.camera.shadows import light_maps
+from sim_sensors.camera.sky import packed_sky, sky_of_view
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
@@ -218,9 +221,7 @@ class PinholeCamera:
     ) -> tuple[Float32Array, ScreenTriangles, Visibility]:
         """Return the radiance, and what is seen at the pixels' centres."""
         seen = self.visibility(scene, pose)
-        texture = ground_texture(scene.ground)
-        x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
-        maps = light_maps(scene.pool, scene.instances, weather, float(x), float(y))
+        texture, maps = _surroundings(scene, scene.instances, pose, weather)
         if self.supersampling == 1:
             return shade(*seen, pose, self.intrinsics, weather, texture, maps), *seen
         fine = PinholeCamera(
@@ -229,6 +230,24 @@ class PinholeCamera:
         )  # fmt: skip
         radiance = shade(*fine.visibility(scene, pose), pose, fine.intrinsics, weather, texture, maps)
         return _halved(radiance), *seen
+
+    def prepare(self, scene: Drawable, pose: FloatArray, weather: Weather | None = None) -> None:
+        """Draw and keep what pictures from nearby poses share: texture of the ground, shadows and sky.
+
+        Args:
+            scene: as in `render`.
+            pose: as in `render`.
+            weather: as in `render`.
+        """
+        weather = Weather() if weather is None else weather
+        pose = checked_pose(scene, pose)
+        # The shadows of what moves are drawn with each picture.
+        still = scene.instances if scene.instances.still is None else scene.instances.still
+        _surroundings(scene, still, pose, weather)
+        n = self.supersampling
+        fx, fy, cx, cy = (n * value for value in self.intrinsics)
+        sky_of_view(weather, pose[:3, :3], (fx, fy, cx, cy), (n * self.width, n * self.height))
+        packed_sky(weather)
 
     def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
         """Return the visible triangle of each pixel: geometry without light."""
@@ -296,6 +315,15 @@ class StereoCamera:
         return StereoFrame(*frames)
 
 
+def _surroundings(
+    scene: Drawable, instances: Instances, pose: FloatArray, weather: Weather
+) -> tuple[GroundTexture, LightMaps]:
+    """Return the texture of the ground, and the shadows of instances around a camera."""
+    x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
+    maps = light_maps(scene.pool, instances, weather, float(x), float(y))
+    return ground_texture(scene.ground), maps
+
+
 def camera_pose(
     x: float, y: float, z: float, yaw: float, pitch: float = 0.0, roll: float = 0.0
 ) -> FloatArray:
@@ -343,10 +371,24 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
         raise SensorError(f"camera pose has axes {rotation.tolist()}, want a rotation")
     if pose[2, 3] <= 0.0:
         raise SensorError(f"camera height is {pose[2, 3]} m, want above the ground, z = 0")
-    instances = scene.instances
-    box = bounding_boxes(scene.pool)[instances.mesh]
-    offset = pose[:3, 3] - instances.pose[:, :3]
-    cosine, sine = np.cos(instances.pose[:, 3]), np.sin(instances.pose[:, 3])
+    vehicle = _vehicle_around(scene, pose[:3, 3])
+    if vehicle > 0:
+        raise SensorError(
+            f"camera position {pose[:3, 3].tolist()} is inside vehicle {vehicle}, want it outside"
+        )
+    return pose
+
+
+def _vehicle_around(scene: Drawable, point: FloatArray) -> int:
+    """Return the number of the vehicle in whose bounding box a point is, 0 for none."""
+    instances, pool = scene.instances, scene.pool
+    away = np.abs(instances.pose[:, :2] - point[:2]).max(axis=1)
+    near = np.flatnonzero((away < pool.radius[instances.mesh]) & (instances.ids > 0))
+    if len(near) == 0:
+        return 0
+    box = bounding_boxes(pool)[instances.mesh[near]]
+    offset = point - instances.pose[near, :3]
+    cosine, sine = np.cos(instances.pose[near, 3]), np.sin(instances.pose[near, 3])
     local = np.stack(
         [
             cosine * offset[:, 0] + sine * offset[:, 1],
@@ -355,16 +397,11 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
         ],
         axis=1,
     )
-    inside = ((local > box[:, :3]) & (local < box[:, 3:])).all(axis=1) & (instances.ids > 0)
-    if inside.any():
-        vehicle = int(instances.ids[np.argmax(inside)])
-        raise SensorError(
-            f"camera position {pose[:3, 3].tolist()} is inside vehicle {vehicle}, want it outside"
-        )
-    return pose
+    inside = ((local > box[:, :3]) & (local < box[:, 3:])).all(axis=1)
+    return int(instances.ids[near[np.argmax(inside)]]) if inside.any() else 0
 
 
-@compiled
+@compiled(parallel=True, nogil=True)
 def _geometry(
     visibility: Visibility, instance: NDArray[np.int32], ids: NDArray[np.int32]
 ) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
@@ -374,7 +411,7 @@ def _geometry(
     seen = np.empty((height, width), dtype=np.int32)
     infinite = np.float32(np.inf)
     one = np.float32(1.0)
-    for y in range(height):
+    for y in prange(height):
         for x in range(width):
             inverse = visibility.inverse_depth[y, x]
             depth[y, x] = one / inverse if inverse > 0 else infinite
@@ -385,7 +422,7 @@ def _geometry(
     return depth, glass, seen
 
 
-@compiled
+@compiled(nogil=True)
 def _halved(image: Float32Array) -> Float32Array:
     """Average every 2×2 pixels of an (h, w, 3) image."""
     height, width, _ = image.shape

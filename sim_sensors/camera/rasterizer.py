@@ -51,8 +51,6 @@ def rasterize(
     size: tuple[int, int],
     floor: FloatArray,
     minimum: float = 1.0 / FAR,
-    *,
-    panes: bool = True,
 ) -> Visibility:
     """Find the nearest opaque surface of every pixel, and the glass in front of it.
 
@@ -61,19 +59,18 @@ def rasterize(
         size: width, height, px.
         floor: (3,) inverse depth of the ground, a·x + b·y + c at (x, y) px.
         minimum: 1/m; ground with a smaller inverse depth is sky.
-        panes: whether to draw glass; if not, its three arrays are (0, 0).
     """
     width, height = size
-    glazed = (height, width) if panes else (0, 0)
+    shape = (height, width)
     out = Visibility(
-        np.empty((height, width), dtype=np.float32),
-        np.empty((height, width), dtype=np.int32),
-        np.empty(glazed, dtype=np.float32),
-        np.empty(glazed, dtype=np.int32),
-        np.empty(glazed, dtype=np.uint8),
+        np.empty(shape, dtype=np.float32),
+        np.empty(shape, dtype=np.int32),
+        np.empty(shape, dtype=np.float32),
+        np.empty(shape, dtype=np.int32),
+        np.empty(shape, dtype=np.uint8),
     )
     bands = (height + BAND - 1) // BAND
-    start, members = _sort_into_bands(triangles.box, triangles.is_back, triangles.material, bands, panes)
+    start, members = _sort_into_bands(triangles.box, triangles.is_back, triangles.material, bands)
     _rasterize(
         triangles.corners,
         triangles.inverse_depth,
@@ -104,11 +101,11 @@ def interleaved(n: int) -> NDArray[np.int64]:
     return np.arange(n, dtype=np.int64) * step % n
 
 
-@compiled
+@compiled(nogil=True)
 def _sort_into_bands(
-    box: NDArray[np.int16], is_back: NDArray[np.bool_], material: NDArray[np.uint8], n_bands: int, panes: bool
+    box: IntArray, is_back: NDArray[np.bool_], material: NDArray[np.uint8], n_bands: int
 ) -> tuple[NDArray[np.int64], IntArray]:
-    """Return the triangles of each band in their order, by kind; without `panes` there is no glass.
+    """Return the triangles of each band in their order, by kind.
 
     Those of kind k in band b are `members[start[3·b + k]:start[3·b + k + 1]]`.
     """
@@ -120,16 +117,12 @@ def _sort_into_bands(
         kinds[t] = kind
         for band in range(box[t, 1] // BAND, (box[t, 3] - 1) // BAND + 1):
             start[_KINDS * band + kind + 1] += 1
-    if not panes:
-        start[_PANE + 1 :: _KINDS] = 0
     for place in range(_KINDS * n_bands):
         start[place + 1] += start[place]
     members = np.empty(start[_KINDS * n_bands], dtype=np.int32)
     fill = start[:-1].copy()
     for t in range(n):
         kind = kinds[t]
-        if kind == _PANE and not panes:
-            continue
         for band in range(box[t, 1] // BAND, (box[t, 3] - 1) // BAND + 1):
             place = _KINDS * band + kind
             members[fill[place]] = t
@@ -162,11 +155,11 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
     return ax, ay, bx, by, cx, cy
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,
-    box: NDArray[np.int16],
+    box: IntArray,
     nearest: Float32Array,
     start: NDArray[np.int64],
     members: IntArray,
@@ -186,14 +179,13 @@ def _rasterize(
         bottom = min(height, top + BAND)
         for y in range(top, bottom):
             _clear(y, floor, minimum, depth[y], triangle[y])
-            if pane.shape[0] > 0:
-                pane_depth[y] = 0.0
-                pane[y] = -1
-                n_panes[y] = 0
+            pane_depth[y] = 0.0
+            pane[y] = -1
+            n_panes[y] = 0
         hiding = np.zeros((BAND // _STRIP, width), dtype=np.float32)
         _refresh(depth[top:bottom], 0, width, hiding)
         # Draw glass last, since it is drawn only in front of opaque surfaces.
-        for kind in range(_KINDS if pane.shape[0] > 0 else _PANE):
+        for kind in range(_KINDS):
             drawn, first, end = 0, width, 0
             for member in range(start[_KINDS * band + kind], start[_KINDS * band + kind + 1]):
                 t = members[member]
@@ -238,7 +230,7 @@ def _refresh(depth: Float32Array, first: int, end: int, hiding: Float32Array) ->
 
 
 @compiled(**LEAF)
-def _is_hidden(box: NDArray[np.int16], nearest: float, top: int, bottom: int, hiding: Float32Array) -> bool:
+def _is_hidden(box: IntArray, nearest: float, top: int, bottom: int, hiding: Float32Array) -> bool:
     """Return whether a triangle is behind what is drawn in its columns of the strips that it is in."""
     limit = np.float32(nearest * _MARGIN)
     for strip in range((max(box[1], top) - top) // _STRIP, (min(box[3], bottom) - 1 - top) // _STRIP + 1):

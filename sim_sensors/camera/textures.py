@@ -53,23 +53,25 @@ def make_tile(image: NDArray[np.float64]) -> Tile:
         level = level.reshape(half, 2, half, 2).mean(axis=(1, 3))
         levels.append(level)
     start = np.cumsum([0] + [part.size for part in levels[:-1]]).astype(np.int32)
-    packed = [quads(np.round(255.0 * part).astype(np.uint8)).ravel() for part in levels]
+    packed = [quads(np.round(255.0 * part).astype(np.uint8), True).ravel() for part in levels]
     return Tile(np.concatenate(packed), start, image.shape[0])
 
 
-@compiled
-def quads(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
+@compiled(nogil=True)
+def quads(image: NDArray[np.uint8], tiled: bool) -> NDArray[np.uint32]:
     """Pack each texel with the next in its row (second byte), column (third) and both (fourth).
 
-    One load then fetches all four texels of a bilinear sample. After the last texel comes the first.
+    One load then fetches all four texels of a bilinear sample. After the last texel comes the first in an image that is
+    `tiled`, else the last once more.
     """
     rows, columns = image.shape
     packed = np.empty((rows, columns), dtype=np.uint32)
+    after = 0 if tiled else columns - 1
     for row in range(rows):
-        here, below = image[row], image[(row + 1) % rows]
+        here, below = image[row], image[row + 1 if row + 1 < rows else (0 if tiled else row)]
         for column in range(columns - 1):
             packed[row, column] = _quad(here[column], here[column + 1], below[column], below[column + 1])
-        packed[row, columns - 1] = _quad(here[columns - 1], here[0], below[columns - 1], below[0])
+        packed[row, columns - 1] = _quad(here[columns - 1], here[after], below[columns - 1], below[after])
     return packed
 
 
