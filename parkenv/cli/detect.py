@@ -314,12 +314,12 @@ def evaluate_detector(
     false_positives: float = 0.1,
     seed: int = 0,
     sessions: int = 0,
-    rig: str = "laser",
+    rig: str | None = None,
     every: float = 2.5,
     misses: int = 0,
     machines: args.Machines,
 ) -> None:
-    """Measure recall and precision of a detector on UIUC's test sets, or compare detectors on simulated drives.
+    r"""Measure recall and precision of a detector on UIUC's test sets, or compare detectors on simulated drives.
 
     On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars. Any other
     detector looks as it does in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the sets
@@ -334,7 +334,8 @@ def evaluate_detector(
         parkenv evaluate-detector --uiuc CarData --model side
         parkenv evaluate-detector --uiuc CarData --detector net
         parkenv evaluate-detector --drives campus --detector hog,net
-        parkenv evaluate-detector --drives campus --sessions 21 --rig laser,stereo --detector hog,net --misses 8
+        parkenv evaluate-detector --drives campus --detector hog,net \
+            --sessions 21 --rig laser,stereo --misses 8
 
     Options:
         uiuc (DIR): UIUC's folder as published (CarData).
@@ -344,26 +345,38 @@ def evaluate_detector(
             --drives several, separated by commas.  [default: none]
         out, -o (DIR): Folder for summary.json, tables and figures.
 
-    On pictures of drives:
-        drives (SCENARIO): Instead of --uiuc: pictures along the survey's route of a scenario.
+    On drives:
+        drives (SCENARIO): Instead of --uiuc: pictures along the survey's route of a scenario, or whole drives.
         pictures (N >= 1): Pictures in each of the five weathers.
         false_positives (X >= 0): Boxes without a car in a picture, on average.
         seed (N >= 0): Seed of cars, light and noise.
 
     On whole drives:
-        sessions (N >= 0): Survey drives for each rig; 0: pictures only.
-        rig (NAME[,...]): laser, stereo, both_sides.
+        sessions (N >= 0): Survey drives for each rig; 0: only pictures.
+        rig (NAME[,...]): laser, stereo, both_sides.  [default: laser]
         every (M >= 0.1): Metres between captures.
         misses (N >= 0): Missed cars of each kind on a contact sheet for each rig and detector; 0: none.
     """
     if (uiuc is None) == (drives is None):
         raise InputError("give one of --uiuc FOLDER and --drives SCENARIO")
+    if not sessions and (rig is not None or misses):
+        raise InputError("--rig and --misses go with --sessions")
+    if sessions and uiuc is not None:
+        raise InputError("--sessions goes with --drives")
     if drives is not None:
         names = words("--detector", detector or model)
         if sessions:
             with writing_into(out, "the same command"):
                 compare_on_drives(
-                    drives, words("--rig", rig), names, sessions, every, seed, misses, out, machines
+                    drives,
+                    words("--rig", rig or "laser"),
+                    names,
+                    sessions,
+                    every,
+                    seed,
+                    misses,
+                    out,
+                    machines,
                 )
             return
         _evaluate_on_drives(drives, names, pictures, false_positives, seed, out)

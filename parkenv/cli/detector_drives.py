@@ -62,8 +62,8 @@ def compare_on_drives(
         table += compared.comparison_table(its, survey, of_survey)
         reach += compared.reach_table(survey, of_survey)
     write_csv(out / "table.csv", compared.TABLE_COLUMNS, table)
-    title = f"{its.name}, {plural(sessions, 'drive')}: whole cars of which 60 % are visible"
-    save_reach(reach, title, out / file_name(f"reach_{its.name}", ".png"))
+    ylabel = f"cars found in a picture, {its.name}, {plural(sessions, 'drive')}"
+    save_reach(reach, ylabel, out / file_name(f"reach_{its.name}", ".png"))
     save_summary(out, seed, table, reach=reach, causes=compared.CAUSES)
     for printed in _tables(table, rigs, detectors):
         console.print(printed)

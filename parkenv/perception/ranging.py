@@ -107,10 +107,14 @@ class CarBeams(NamedTuple):
     # whether the car extends beyond the first and beyond the last of them, where it is occluded or outside the
     # sensor's field of view
     cut: tuple[bool, bool]
+    fit: float = 0.0
 
 
 def car_beams(
-    scan: RangeScan, beams: NDArray[np.int64], clipped: tuple[bool, bool] = (False, False)
+    scan: RangeScan,
+    beams: NDArray[np.int64],
+    clipped: tuple[bool, bool] = (False, False),
+    free: NDArray[np.bool_] | None = None,
 ) -> CarBeams:
     """Select the beams of a box that end on its car: the run of end points that best fills the middle of the box.
 
@@ -124,7 +128,7 @@ def car_beams(
             sees the car where the camera does not, and the run continues beyond the box.
     """
     met = np.flatnonzero(np.isfinite(scan.distance))
-    inside = np.flatnonzero(np.isin(met, beams))
+    inside = np.flatnonzero(np.isin(met, beams if free is None else beams[free[beams]]))
     if len(inside) < _LEAST_BEAMS:
         return CarBeams(met[:0], (False, False))
     step = np.diff(scan.points(met), axis=0)
@@ -144,7 +148,10 @@ def car_beams(
         goes_on[0] and _hidden(scan.distance[: met[first] + 1][::-1]),
         goes_on[1] and _hidden(scan.distance[met[last] :]),
     )
-    return CarBeams(met[first : last + 1], cut)
+    low = inside[0] if clipped[0] else min(ends[0], inside[0])
+    high = inside[-1] if clipped[1] else max(ends[-1], inside[-1])
+    both = min(ends[-1], inside[-1]) - max(ends[0], inside[0]) + 1
+    return CarBeams(met[first : last + 1], cut, both / (high - low + 1))
 
 
 def median_depth(disparity_px: Float32Array, box: Float32Array, stereo: StereoCamera) -> float:
@@ -174,14 +181,17 @@ def localize_cars(
     """
     _require_same_axis(scan, mount, vehicle)
     rows, cars, distances = [], [], []
-    for i, (left, right) in enumerate(bearings(camera, mount, vehicle, detections.boxes)):
+    margins = bearings(camera, mount, vehicle, detections.boxes)
+    free = np.ones(len(scan.angle), dtype=np.bool_)  # beams that end on no car yet
+    for i in np.argsort(-detections.boxes[:, 3], kind="stable").tolist():
+        left, right = margins[i]
         # Counter-clockwise, the box's right margin comes first.
         clipped = (
             bool(detections.boxes[i, 2] >= (1.0 - _MARGIN) * camera.width),
             bool(detections.boxes[i, 0] <= _MARGIN * camera.width),
         )
-        beams, cut = car_beams(scan, beams_between(scan, left, right), clipped)
-        if not len(beams):
+        beams, cut, _ = car_beams(scan, beams_between(scan, left, right), clipped)
+        if free[beams].sum() <= 0.5 * len(beams):
             continue
         if not _is_on_ground(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount):
             continue
@@ -190,6 +200,7 @@ def localize_cars(
         )
         if car.seen_length < LONG_SIDE and (car.seen_width < WHOLE_END or (any(clipped) and any(cut))):
             continue
+        free[beams] = False
         rows.append(i)
         cars.append(car)
         distances.append(float(np.median(scan.distance[beams])))

@@ -27,12 +27,12 @@ _CROP = (4, 3)  # width and height of a crop, in proportion
 _LEAST_CROP = 176  # px, its width
 
 
-def save_reach(rows: Sequence[Row], title: str, path: Path) -> None:
+def save_reach(rows: Sequence[Row], ylabel: str, path: Path) -> None:
     """Draw how often cars are found in a picture, by distance: a panel for each weather, a line for each survey.
 
     Args:
         rows: rows of `reach_table`.
-        title: title of the figure.
+        ylabel: what is found where.
         path: the PNG to write.
     """
     panels = list(dict.fromkeys(row["weather"] for row in rows))
@@ -64,10 +64,9 @@ def save_reach(rows: Sequence[Row], title: str, path: Path) -> None:
         for ax in axes[len(panels) :]:
             ax.remove()
         figure.supxlabel("distance from the camera to the middle of the car, m", size=9.0)
-        figure.supylabel("cars found in a picture", size=9.0)
-        figure.suptitle(title, x=0.01, ha="left", weight="bold")
+        figure.supylabel(ylabel, size=9.0)
         handles, labels = axes[0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=max(2, len(labels)))
+        figure.legend(handles, labels, loc="outside upper left", ncols=len(labels), handlelength=2.6)
         save_picture(figure, path, "How often a car in a picture is found, by weather, distance and detector")
 
 
