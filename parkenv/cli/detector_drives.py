@@ -79,9 +79,11 @@ def compare_on_drives(
                 wanted = {miss.picture for _, cars in sheets for miss in cars}
                 pictures = compared.pictures_of(its, sheets[0][0].settings, wanted)
                 for survey, cars in sheets:
-                    name = (survey.settings.rig, survey.settings.detector)
-                    rows = [r for r in table if (r["rig"], r["detector"]) == name and r["group"] == "cause"]
-                    title = f"Cars that `{name[1]}` missed in pictures of {its.name}, rig {name[0]}"
+                    rig, detector = survey.settings.rig, survey.settings.detector
+                    rows = [
+                        r for r in table if (r["rig"], r["detector"], r["group"]) == (rig, detector, "cause")
+                    ]
+                    title = f"Cars that {detector} missed in pictures of {its.name}, rig {rig}"
                     save_misses(cars, pictures, rows, title, out / f"misses_{survey.folder.name}.png")
     console.print(f"Written: {out / 'table.csv'}, summary.json, figures, and a map for each rig and detector")
 

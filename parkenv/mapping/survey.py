@@ -144,7 +144,7 @@ class Survey:
     def draw(self, number: int) -> SurveyDrive:
         """Draw what determines the captures of a session: its cars, light, way and noise.
 
-        Surveys that differ in their detectors alone draw the same.
+        Surveys that differ in their detectors, or in rigs with the same route, draw the same.
 
         Args:
             number: 0 or more; determines the session.
@@ -161,7 +161,7 @@ class Survey:
         return SurveyDrive(
             self.pipeline.rig, LotScenes(self._slots, scenario, key, world), world, arrival, preset,
             Weather.draw(preset, int(key) % _SEEDS), poses, odometry,
-            arrival.time + settings.every / scenario.v_drive * np.arange(len(poses)),
+            arrival.time + settings.every / scenario.v_drive * np.arange(len(poses), dtype=np.float64),
             [int(rng.integers(_SEEDS)) for _ in poses],
         )  # fmt: skip
 
@@ -206,31 +206,41 @@ def drive_together(
     pictures: int = 0,
     on_frame: Callable[[SurveyFrame], None] | None = None,
 ) -> list[SessionResult]:
-    """Drive a session of several surveys at once: every capture is drawn once, and all detectors look at it.
+    """Drive a session of several surveys at once: every picture is drawn once, and all detectors look at it.
+
+    With rigs that differ, the laser rig gets the left picture of the stereo camera: as good a picture as in a survey
+    of its own, with other noise.
 
     Args:
-        surveys: surveys of one scenario that differ in their detectors alone.
+        surveys: surveys of one scenario that differ in their detectors alone, or in rigs with the same route, too.
         number: 0 or more; determines the session.
         pictures: number of results to keep for figures.
         on_frame: called after every capture and survey.
 
     Raises:
-        InputError: the surveys differ in more than their detectors.
+        InputError: the surveys differ in more than that.
     """
     first = surveys[0]
     if any(
-        s.scenario is not first.scenario
-        or replace(s.settings, detector="") != replace(first.settings, detector="")
-        for s in surveys
+        survey.scenario is not first.scenario
+        or replace(survey.settings, rig=first.settings.rig, detector="")
+        != replace(first.settings, detector="")
+        or not np.array_equal(survey.route.path, first.route.path)
+        for survey in surveys
     ):
-        raise InputError("surveys that drive together must differ in their detectors alone")
+        raise InputError(
+            "surveys that drive together must differ in detectors, or rigs of the same route, alone"
+        )
     drive = first.draw(number)
+    for survey in surveys[1:]:
+        drive = replace(drive, rig=drive.rig.joined(survey.pipeline.rig))
     sessions = [_OpenSession(survey, drive, number, pictures) for survey in surveys]
     for i in range(len(drive.poses)):
         scene, capture = drive.capture(i)
         true = true_boxes(drive.rig, scene, capture)
-        for session in sessions:
-            frame = session.add(i, scene, capture, true)
+        parts = {survey.settings.rig: survey.pipeline.rig.part_of(capture) for survey in surveys}
+        for survey, session in zip(surveys, sessions, strict=True):
+            frame = session.add(i, scene, parts[survey.settings.rig], true)
             if on_frame is not None:
                 on_frame(frame)
     return [session.result() for session in sessions]

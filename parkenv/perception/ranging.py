@@ -34,6 +34,7 @@ OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or be
 CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
 _MARGIN = 0.02  # of an image's width; boxes that come this close to its border count as clipped by it
+_EXPLAINED = 0.5  # fraction of a box's beams from which they belong to the nearer car of another box
 _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
 
@@ -107,14 +108,10 @@ class CarBeams(NamedTuple):
     # whether the car extends beyond the first and beyond the last of them, where it is occluded or outside the
     # sensor's field of view
     cut: tuple[bool, bool]
-    fit: float = 0.0
 
 
 def car_beams(
-    scan: RangeScan,
-    beams: NDArray[np.int64],
-    clipped: tuple[bool, bool] = (False, False),
-    free: NDArray[np.bool_] | None = None,
+    scan: RangeScan, beams: NDArray[np.int64], clipped: tuple[bool, bool] = (False, False)
 ) -> CarBeams:
     """Select the beams of a box that end on its car: the run of end points that best fills the middle of the box.
 
@@ -128,7 +125,7 @@ def car_beams(
             sees the car where the camera does not, and the run continues beyond the box.
     """
     met = np.flatnonzero(np.isfinite(scan.distance))
-    inside = np.flatnonzero(np.isin(met, beams if free is None else beams[free[beams]]))
+    inside = np.flatnonzero(np.isin(met, beams))
     if len(inside) < _LEAST_BEAMS:
         return CarBeams(met[:0], (False, False))
     step = np.diff(scan.points(met), axis=0)
@@ -148,10 +145,7 @@ def car_beams(
         goes_on[0] and _hidden(scan.distance[: met[first] + 1][::-1]),
         goes_on[1] and _hidden(scan.distance[met[last] :]),
     )
-    low = inside[0] if clipped[0] else min(ends[0], inside[0])
-    high = inside[-1] if clipped[1] else max(ends[-1], inside[-1])
-    both = min(ends[-1], inside[-1]) - max(ends[0], inside[0]) + 1
-    return CarBeams(met[first : last + 1], cut, both / (high - low + 1))
+    return CarBeams(met[first : last + 1], cut)
 
 
 def median_depth(disparity_px: Float32Array, box: Float32Array, stereo: StereoCamera) -> float:
@@ -166,8 +160,9 @@ def localize_cars(
     """Locate the detected cars: fit a car's rectangle to the `car_beams` of each box.
 
     The following detections are dropped: those without an obstacle at bumper height; those that, at its distance, would
-    not be on the ground or have a car's height; and cars too hidden to estimate their orientation, with neither a side
-    nor an end visible, or only a part of one at the image border. Later captures show them better.
+    not be on the ground or have a car's height; those whose beams end on the nearer car of another box, which hides
+    them, or is the same; and cars too hidden to estimate their orientation, with neither a side nor an end visible, or
+    only a part of one at the image border. Later captures show them better.
 
     Args:
         detections: detections in the camera's image.
@@ -182,7 +177,8 @@ def localize_cars(
     _require_same_axis(scan, mount, vehicle)
     rows, cars, distances = [], [], []
     margins = bearings(camera, mount, vehicle, detections.boxes)
-    free = np.ones(len(scan.angle), dtype=np.bool_)  # beams that end on no car yet
+    explained = np.zeros(len(scan.angle), dtype=np.bool_)  # beams that end on the car of another box
+    # On the ground, nearer cars reach further down in the image.
     for i in np.argsort(-detections.boxes[:, 3], kind="stable").tolist():
         left, right = margins[i]
         # Counter-clockwise, the box's right margin comes first.
@@ -190,8 +186,8 @@ def localize_cars(
             bool(detections.boxes[i, 2] >= (1.0 - _MARGIN) * camera.width),
             bool(detections.boxes[i, 0] <= _MARGIN * camera.width),
         )
-        beams, cut, _ = car_beams(scan, beams_between(scan, left, right), clipped)
-        if free[beams].sum() <= 0.5 * len(beams):
+        beams, cut = car_beams(scan, beams_between(scan, left, right), clipped)
+        if not len(beams) or explained[beams].mean() >= _EXPLAINED:
             continue
         if not _is_on_ground(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount):
             continue
@@ -200,7 +196,7 @@ def localize_cars(
         )
         if car.seen_length < LONG_SIDE and (car.seen_width < WHOLE_END or (any(clipped) and any(cut))):
             continue
-        free[beams] = False
+        explained[beams] = True
         rows.append(i)
         cars.append(car)
         distances.append(float(np.median(scan.distance[beams])))

@@ -99,7 +99,7 @@ def run_detector_surveys(
     workers: Workers = HERE,
     on_drive: Callable[[int], None] = lambda _: None,
 ) -> list[list[SurveyedDrive]]:
-    """Drive the sessions that the folders do not hold yet; all detectors look at the same drives.
+    """Drive the sessions that the folders do not hold yet; all detectors look at the same drives and pictures.
 
     Args:
         scenario: the scenario.
@@ -123,20 +123,22 @@ def run_detector_surveys(
             stores.append(opened.enter_context(MapStore(its.folder / MAP_FILE, scenario.lot)))
             rows.append(stored_sessions(stores[-1], its.folder / "sessions.csv"))
         tasks, of = [], []
-        for _, group in itertools.groupby(range(len(surveys)), lambda i: surveys[i].settings.rig):
-            its_surveys = list(group)
+        # Rigs with the same route share their pictures.
+        for _, same_route in itertools.groupby(range(len(surveys)), lambda i: made[i].route.path.tobytes()):
+            group = list(same_route)
+            settings = [surveys[i].settings for i in group]
             for k in range(sessions):
-                missing = [i for i in its_surveys if keys[i][k] not in rows[i]]
-                on_drive(len(its_surveys) - len(missing))
-                if missing:
-                    settings = [surveys[i].settings for i in missing]
+                if all(keys[i][k] in rows[i] for i in group):
+                    on_drive(len(group))
+                else:
                     tasks.append(partial(_drive_together, scenario, settings, k))
-                    of.append((k, missing))
-        for (k, missing), results in zip(of, _in_order(workers, tasks), strict=True):
-            for i, result in zip(missing, results, strict=True):
-                _write_sightings(_sightings_file(surveys[i], k), result.score.sightings)
-                store_session(result, rows[i], stores[i], surveys[i].folder / "sessions.csv")
-            on_drive(len(missing))
+                    of.append((k, group))
+        for (k, group), results in zip(of, _in_order(workers, tasks), strict=True):
+            for i, result in zip(group, results, strict=True):
+                if keys[i][k] not in rows[i]:
+                    _write_sightings(_sightings_file(surveys[i], k), result.score.sightings)
+                    store_session(result, rows[i], stores[i], surveys[i].folder / "sessions.csv")
+            on_drive(len(group))
     return [
         [
             SurveyedDrive(k, rows[i][key], _read_sightings(_sightings_file(its, k)))
@@ -251,7 +253,8 @@ def is_wanted(sightings: Sightings) -> BoolArray:
     """Return which sightings are parked cars that should be found, as in `score_on_drives`."""
     s = sightings
     high = s["bottom"] - s["top"] >= LEAST_HEIGHT
-    return (s["slot"] >= 0) & (s["visible"] >= VISIBLE[0]) & high & (s["distance"] < DISTANCES[-1])
+    wanted = (s["slot"] >= 0) & (s["visible"] >= VISIBLE[0]) & high & (s["distance"] < DISTANCES[-1])
+    return np.asarray(wanted)
 
 
 def causes_of(sightings: Sightings, weather: str, width: int, height: int) -> NDArray[np.int64]:
@@ -267,7 +270,7 @@ def causes_of(sightings: Sightings, weather: str, width: int, height: int) -> ND
         s["view"] == View.OBLIQUE,
         np.ones(len(s), dtype=np.bool_),
     ]
-    return np.argmax(holds, axis=0)
+    return np.asarray(np.argmax(holds, axis=0), dtype=np.int64)
 
 
 def never_found(drive: SurveyedDrive, wanted: BoolArray, causes: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -323,7 +326,7 @@ def pictures_of(
         pictures: session, capture and camera of each.
     """
     survey = Survey(scenario, settings)
-    drawn = {}
+    drawn: dict[tuple[int, int, int], NDArray[np.uint8]] = {}
     for session, of_session in itertools.groupby(sorted(pictures), lambda picture: picture[0]):
         drive = survey.draw(session)
         for i, of_capture in itertools.groupby(of_session, lambda picture: picture[1]):
