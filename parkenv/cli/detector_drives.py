@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
-from parkenv.errors import InputError
 from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 
@@ -42,8 +41,6 @@ def compare_on_drives(
     from parkenv.files.csv_writing import write_csv
     from parkenv.perception.detector_registry import make_detector
 
-    if misses < 0:
-        raise InputError(f"--misses is {misses}, want at least 0")
     spec = SurveySpec().changed(scenario=drives, sessions=sessions, every=every, seed=seed, **machines.given)
     for name in detectors:
         make_detector(name)
