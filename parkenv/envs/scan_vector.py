@@ -389,6 +389,9 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
         )
         self._laser = _laser_of(laser, (float(mount.x), float(mount.y), float(mount.yaw)))
         self._cursors = np.zeros(n * lot.n_slots, CURSOR)
+        # Each thread has a share of the searches.
+        ends: list[int] = np.linspace(0, n, min(get_num_threads(), n) + 1).astype(int).tolist()
+        self._shares = list(pairwise(ends))
 
     @property
     def bytes_each(self) -> float:
@@ -417,7 +420,6 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
             address, self._lanes, actions, fresh, idle, self._limit, self._steps, self._stops,
             seen["vertex"], seen["time"], seen["action_mask"],
         )  # fmt: skip
-        share = np.linspace(0, self.num_envs, min(get_num_threads(), self.num_envs) + 1).astype(int).tolist()
         cursors = address_of(self._cursors, CURSOR)
 
         def scan_part(part: tuple[int, int]) -> None:
@@ -426,7 +428,7 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
                 self._stops, seen["pose"], seen["captured_at"], self._scan,
             )  # fmt: skip
 
-        in_threads(scan_part, list(pairwise(share)))
+        in_threads(scan_part, self._shares)
 
 
 class StackedScanVectorEnv(ScanSearchVectorEnv):
