@@ -1,5 +1,6 @@
 """The packaged network `net`: the shipped file, how it is read, its training pictures, and a training of seconds."""
 
+import csv
 import json
 import pickle
 import zipfile
@@ -35,15 +36,20 @@ def net():
     return make_detector("net")
 
 
-@pytest.fixture(scope="module")
-def street():
-    """A picture of three parked cars, one of them end-on, with their true boxes."""
+def drawn(poses):
+    """Return a picture of three parked cars, with their true boxes."""
     models = tuple(VehicleModel.from_seed(body, 3) for body in ("hatchback", "estate", "sedan"))
-    fleet = Fleet(models, Surroundings(paved=[[[-12, -2], [12, -2], [12, 12], [-12, 12]]]))
-    scene = Scene(np.array([[-5.0, 8.0, 0.0], [0.6, 8.0, 0.0], [5.5, 8.5, np.pi / 2]]), np.arange(3), fleet)
+    fleet = Fleet(models, Surroundings(paved=[[[-12, -2], [12, -2], [12, 16], [-12, 16]]]))
+    scene = Scene(np.array(poses), np.arange(3), fleet)
     camera, pose = PinholeCamera(), camera_pose(0.0, 0.0, 1.4, np.pi / 2, -0.05)
     frame = camera.render(scene, pose, Weather.draw("overcast", 1), 1)
     return frame.image, vehicle_boxes(camera, scene, pose, frame)
+
+
+@pytest.fixture(scope="module")
+def street():
+    """Two cars along the street and one across."""
+    return drawn([[-5.0, 8.0, 0.0], [0.6, 8.0, 0.0], [5.5, 8.5, np.pi / 2]])
 
 
 def overlap(a, b):
@@ -91,7 +97,17 @@ def test_it_finds_the_cars_of_a_picture(net, street):
         best = max(range(3), key=lambda i: overlap(sure.boxes[i], box))
         assert overlap(sure.boxes[best], box) > 0.7
         if view != View.OBLIQUE:
+            assert sure.view[best] == view
             assert sure.end_on[best] == (view == View.END)
+
+
+def test_a_hidden_car_is_less_visible_than_the_one_before_it(net):
+    image, truth = drawn([[-1.5, 7.0, 0.0], [-0.2, 12.0, 0.0], [5.5, 8.5, np.pi / 2]])
+    found = net.detect(image)
+    best = [max(range(len(found)), key=lambda i: overlap(found.boxes[i], b)) for b in truth.visible_box]
+    hidden, front = np.argmin(truth.visible_fraction), np.argmin(truth.distance)
+    assert truth.visible_fraction[hidden] < 0.6
+    assert found.visible_fraction[best[hidden]] < found.visible_fraction[best[front]] - 0.05
 
 
 def test_equal_pictures_give_equal_boxes(net, street):
@@ -140,15 +156,17 @@ def test_centers_are_decoded_cell_by_cell():
             s = cells[0, 0, row, column]
             around = [score[row + dy, column + dx] for dy in range(3) for dx in range(3)]
             if s >= 0.2 and all(s > v for v in around[:4]) and all(s >= v for v in around[5:]):
-                left, top, right, bottom, end, _, side, visible = cells[0, 1:, row, column]
+                left, top, right, bottom, *views, visible = cells[0, 1:, row, column]
                 x, y = 8 * column + 4, 8 * row + 4
-                wanted.append([x - left, y - top, x + right, y + bottom, s, end > side, visible])
+                view, is_end = np.argmax(views), views[View.END] > views[View.SIDE]
+                wanted.append([x - left, y - top, x + right, y + bottom, s, view, is_end, visible])
     wanted = np.array(wanted)
     assert len(wanted) > 5
     assert np.allclose(found.boxes, wanted[:, :4], atol=1e-4)
     assert np.array_equal(found.score, wanted[:, 4].astype(np.float32))
-    assert np.array_equal(found.end_on, wanted[:, 5] == 1.0)
-    assert np.allclose(found.visible, wanted[:, 6])
+    assert np.array_equal(found.view, wanted[:, 5])
+    assert np.array_equal(found.end_on, wanted[:, 6] == 1.0)
+    assert np.allclose(found.visible, wanted[:, 7])
     assert guess_layout([(1, 9, 60, 80)], (640, 480)) == "centers"
     with pytest.raises(InputError, match=r"want one output \(1, 9, rows, columns\)"):
         class_columns("centers", [(1, 8, 60, 80)], False)
@@ -207,6 +225,10 @@ def test_what_takes_detectors_takes_net(tmp_path, street):
     done = parkenv("detect", tmp_path / "photo.png", "--detector", "net", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     assert "3 cars in 1 image" in done.stdout
+    with (tmp_path / "out" / "boxes.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["view"] for row in rows} == {"side", "oblique"}
+    assert all(float(row["visible_fraction"]) > 0.8 for row in rows)
     assert (tmp_path / "out" / "photo_cars.png").is_file()
 
 

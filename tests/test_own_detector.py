@@ -13,6 +13,7 @@ from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import detector_version, make_detector
 from parkenv.perception.hog_detector import HogDetector
+from sim_sensors.ground_truth import View
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 OWN = "ground_detector:GroundDetector"
@@ -132,9 +133,20 @@ def test_detectors_are_made_by_name(tmp_path):
         ({"probability": [0.5, 1.5]}, "want 0 to 1"),
         ({"probability": [0.5, np.nan]}, "finite"),
         ({"end_on": [True]}, r"end_on has shape \(1,\), want \(2,\)"),
+        ({"view": [2, 3]}, r"view is \[2, 3\], want 2 of END 0, OBLIQUE 1, SIDE 2"),
+        ({"visible_fraction": [0.5, 1.5]}, r"visible_fraction is \[0.5, 1.5\], want 2 of 0 to 1 or NaN"),
     ],
 )
 def test_detections_are_checked(wrong, message):
     good = {"boxes": [[0, 0, 1, 1], [2, 2, 4, 4]], "probability": [0.5, 0.6]}
     with pytest.raises(InputError, match=message):
         Detections(**{**good, **wrong})
+
+
+def test_what_a_detector_does_not_know_is_side_or_end_and_nan():
+    found = Detections([[0, 0, 1, 1], [2, 2, 4, 4]], [0.5, 0.6], [False, True])
+    assert found.view.tolist() == [View.SIDE, View.END]
+    assert np.isnan(found.visible_fraction).all()
+    known = Detections(found.boxes, found.probability, view=[1, 2], visible_fraction=[0.3, np.nan])
+    one = known.select(np.array([True, False]))
+    assert (one.view.tolist(), one.visible_fraction.tolist()) == ([View.OBLIQUE], [pytest.approx(0.3)])

@@ -62,6 +62,7 @@ def test_a_folder_of_pictures_and_videos_becomes_boxes_and_films(folder, tmp_pat
     assert [float(r["left"]) for r in frames] == pytest.approx([10, 20, 30, 40, 50], abs=3)
     (picture,) = [r for r in rows if not r["frame"]]
     assert (picture["left"], picture["view"], picture["time_s"]) == ("20.0", "side", "")
+    assert picture["visible_fraction"] == ""  # this detector does not know
     summary = json.loads((out / "summary.json").read_text())
     assert [row["file"] for row in summary["rows"]] == [str(folder / "photo.png")]
     (video,) = summary["videos"]

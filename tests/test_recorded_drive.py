@@ -8,6 +8,8 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError, make_scenario
+from parkenv.files.recordings import footage_in
+from parkenv.files.videos import Video
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.recorded_drive import Head, RecordedDrive, map_drive, recording
 from parkenv.mapping.store import MapStore
@@ -195,6 +197,26 @@ def test_rosbags_of_ros_1_and_ros_2_hold_the_same_drive(tmp_path):
                 one.capture.images["right"].image, other.capture.images["right"].image
             )
             np.testing.assert_array_equal(one.capture.scans["front"], other.capture.scans["front"])
+
+
+def test_cars_are_searched_in_the_pictures_of_a_recording(tmp_path):
+    (tmp_path / "drives").mkdir()
+    bag(tmp_path / "drives/bag")
+    for path in ("drives/bag/bag.mcap", "drives/bag", "drives"):
+        done = parkenv("detect", tmp_path / path, "--step", 2, "--out", tmp_path / "found")
+        assert done.returncode == 0, done.stderr
+        assert ":/camera: 3 frames of 1.0 s, 0 boxes" in done.stdout
+    (film,) = (tmp_path / "found").glob("*_camera_cars.mp4")
+    video = Video.of(film)
+    assert (video.width, video.height, video.frames, video.fps) == (WIDTH, HEIGHT, 3, pytest.approx(2.5))
+    (footage,) = footage_in(tmp_path / "drives/bag")
+    frames = list(footage.read())
+    assert [frame.time for frame in frames] == pytest.approx([0.0, 0.2, 0.4, 0.6, 0.8])
+    for k, frame in enumerate(frames):
+        np.testing.assert_array_equal(frame.image, image(k))
+    blind = bag(tmp_path / "blind", pictures=0)
+    with pytest.raises(InputError, match=r"blind.*: has no pictures, want sensor_msgs/msg/Image or .*/scan"):
+        footage_in(blind)
 
 
 def test_a_drive_is_mapped(tmp_path):

@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import gymnasium as gym
+import numba
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
@@ -46,6 +47,20 @@ def test_the_same_seed_shows_the_same_pictures_to_everyone():
     for a, b in zip(drive(one, 3, (3, 3, 3)), drive(two, 3, (3, 3, 3)), strict=True):
         assert data_equivalence(a, b, exact=True)
     assert not np.array_equal(drive(one, 3, (3,))[1]["image.right"], drive(one, 4, (3,))[1]["image.right"])
+
+
+def test_captures_drawn_side_by_side_are_those_drawn_one_by_one():
+    options = {"scenario": "campus", "traffic": BUSY, "captures": 4}
+    together = drive(make(**options), 3, (0, 3, 1))
+    cores = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        alone = drive(make(**options), 3, (0, 3, 1))
+    finally:
+        numba.set_num_threads(cores)
+    assert max(int(observation["count"]) for observation in alone) > 1
+    for a, b in zip(together, alone, strict=True):
+        assert data_equivalence(a, b, exact=True)
 
 
 def test_the_search_is_that_of_the_search_environment():

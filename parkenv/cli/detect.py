@@ -30,17 +30,19 @@ def detect(
     step: int = 1,
     out: Path | None = None,
 ) -> None:
-    """Find cars in photographs and videos.
+    """Find cars in photographs, videos and recorded drives.
 
     With --out, pictures and films with the boxes drawn in are written, and all boxes with frame and time as a table.
+    View and visible fraction are those of the detector: HOG knows sides and ends alone, `net` all three views.
 
     Examples:
         parkenv detect photo.png --out results/cars
         parkenv detect photos --model side --threshold 0.8
         parkenv detect drive.mp4 --detector yolo.onnx --step 5 --out results/cars
+        parkenv detect drive.mcap --detector net --out results/cars
 
     Options:
-        images (FILE|DIR): Images, videos, or folders of them.
+        images (FILE|DIR): Images, videos, recorded drives (MCAP, rosbags; extra bags), or folders of them.
         model (NAME|FILE): side, front, or an .npz of `parkenv train-detector`; repeatable.  [default: side and front]
         detector (NAME|FILE|MODULE:CLASS): Instead of models: net, the packaged network, another (.onnx), or a class
             of your own.  [default: none]
@@ -57,16 +59,16 @@ def detect(
     )
     from parkenv.evaluation.experiments.results import make_folder
     from parkenv.files.csv_writing import write_csv
-    from parkenv.files.videos import Video
 
     finder = _finder(model, detector, threshold, least_height)
     chosen = require_readable(images)  # a damaged one is refused before any work
+    names = distinct_names([one if isinstance(one, Path) else one.file for one in chosen])
     drawings = [
-        file_name(f"{name}_cars", ".mp4" if isinstance(one, Video) else ".png")
-        for one, name in zip(chosen.values(), distinct_names(list(chosen)), strict=True)
+        file_name(f"{name}_cars", ".png" if isinstance(one, Path) else ".mp4")
+        for one, name in zip(chosen, names, strict=True)
     ]
     if out is not None:
-        originals = {file.resolve() for file in chosen}
+        originals = {(one if isinstance(one, Path) else one.path).resolve() for one in chosen}
         for drawing in drawings:
             if (out / drawing).resolve() in originals:
                 kind = "a video" if drawing.endswith(".mp4") else "an image"
@@ -76,29 +78,30 @@ def detect(
     boxes: list[dict[str, Any]] = []
     videos: list[dict[str, Any]] = []
     total: int | None = 0
-    for one in chosen.values():
-        frames = -(-one.frames // step) if isinstance(one, Video) and one.frames else 1
-        total = None if total is None or (isinstance(one, Video) and not one.frames) else total + frames
+    for one in chosen:
+        frames = 1 if isinstance(one, Path) else one.frames and -(-one.frames // step)
+        total = None if total is None or frames is None else total + frames
     with progress_bar(console, "frames") as progress:
         task = progress.add_task("Detecting", total=total)
-        for (file, one), drawing in zip(chosen.items(), drawings, strict=True):
+        for one, drawing in zip(chosen, drawings, strict=True):
             drawn = None if out is None else out / drawing
-            if isinstance(one, Video):
+            if not isinstance(one, Path):
                 found = detect_in_video(one, finder, threshold, step, drawn, lambda: progress.advance(task))
                 videos.append(found.row)
                 boxes += found.boxes
             else:
-                boxes += detect_in_image(file, finder, threshold, drawn)
+                boxes += detect_in_image(one, finder, threshold, drawn)
                 progress.advance(task)
-    headings = ["file", "left", "top", "right", "bottom", "probability", "view"]
+    headings = ["file", "left", "top", "right", "bottom", "probability", "view", "visible_fraction"]
     cells = [
-        (b["file"], *(f"{b[side]:.0f}" for side in headings[1:5]), f"{b['probability']:.2f}", b["view"])
+        (b["file"], *(f"{b[side]:.0f}" for side in headings[1:5]), f"{b['probability']:.2f}", b["view"],
+         "" if b["visible_fraction"] is None else f"{b['visible_fraction']:.2f}")
         for b in boxes
         if b["frame"] is None
-    ]
+    ]  # fmt: skip
     n_images = len(chosen) - len(videos)
     if n_images:
-        console.print(make_table(None, headings, cells))
+        console.print(make_table(None, [h.removesuffix("_fraction") for h in headings], cells))
         console.print(f"{plural(len(cells), 'car')} in {plural(n_images, 'image')}")
     for video in videos:
         console.print(

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
+from parkenv.perception.threads import in_threads
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
@@ -124,15 +125,18 @@ class SensorSampler:
             One capture for each station.
         """
         scenes, weather = self._world(state)
-        captures = []
+        jobs = []
         for time, pose, movers in stations:
             # Keyed by the millisecond: the same capture has the same noise.
             noise = np.random.SeedSequence([int(state.key), int(time * 1000.0)]).generate_state(1)
             scene = scenes.at(time, pose)
             if movers is not None:
                 scene = scene.with_movers(movers)
-            captures.append(TimedCapture(time, self.rig.capture(scene, pose, weather, int(noise[0]))))
-        return captures
+            self.rig.prepare(scene, pose, weather)
+            jobs.append((time, scene, pose, int(noise[0])))
+        return in_threads(
+            lambda job: TimedCapture(job[0], self.rig.capture(job[1], job[2], weather, job[3])), jobs
+        )
 
     def select_stations(self, driven: FloatArray) -> NDArray[np.int64]:
         """Select evenly spaced points of a driven path, including the last.

@@ -24,7 +24,7 @@ Image = NDArray[np.uint8]
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 # FFmpeg reads it when it is first used; else it would write of damaged files to standard error.
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-_USUAL_FPS = 25.0
+USUAL_FPS = 25.0
 _MOST_FPS = 1_000.0
 
 
@@ -53,6 +53,16 @@ class Video:
     fps: float
     frames: int | None
 
+    @property
+    def name(self) -> str:
+        """The file."""
+        return str(self.path)
+
+    @property
+    def file(self) -> Path:
+        """The file, after which films of it are named."""
+        return self.path
+
     @classmethod
     def of(cls, path: Path) -> Video:
         """Open a video file, and read its first frame.
@@ -72,7 +82,7 @@ class Video:
                 path,
                 width,
                 height,
-                fps if math.isfinite(fps) and 0.0 < fps <= _MOST_FPS else _USUAL_FPS,
+                fps if math.isfinite(fps) and 0.0 < fps <= _MOST_FPS else USUAL_FPS,
                 int(count) if math.isfinite(count) and 0 < count < 1e9 else None,
             )
 

@@ -24,8 +24,15 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write, check_writable
-from parkenv.files.images import decode_image
 from parkenv.files.limited_reading import parse_json
+from parkenv.files.recordings import (
+    COMPRESSED_IMAGE,
+    IMAGE,
+    open_recording,
+    picture_in,
+    require_rosbags,
+    stamp_of,
+)
 from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, Lens, StereoSpec
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.localisation import make_locate
@@ -50,10 +57,8 @@ PAIR_S = 0.1
 GAP_S = 2.0
 """Longest time between two poses that a pose is interpolated between, s."""
 HEAD, POSE = "/parkenv/drive", "/pose"
-SUFFIXES = (".mcap", ".db3", ".bag")
 _MONDAY_S = 4 * DAY_S  # 1970-01-05, the first Monday of Unix time
 _STRING, _POSE_2D = "std_msgs/msg/String", "geometry_msgs/msg/Pose2D"
-_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _SCAN = "sensor_msgs/msg/LaserScan"
 _POSES = (
     _POSE_2D, "geometry_msgs/msg/PoseStamped", "geometry_msgs/msg/PoseWithCovarianceStamped", "nav_msgs/msg/Odometry",
@@ -120,7 +125,7 @@ class DriveWriter:
 
     def _send_image(self, topic: str, stamp: int, image: NDArray[np.uint8]) -> None:
         data = cv2.imencode(".png", image[..., ::-1], [cv2.IMWRITE_PNG_COMPRESSION, 1])[1].ravel()
-        self._send(topic, _COMPRESSED, stamp, header=self._header(stamp, topic), format="png", data=data)
+        self._send(topic, COMPRESSED_IMAGE, stamp, header=self._header(stamp, topic), format="png", data=data)
 
     def _send(self, topic: str, kind: str, stamp: int, **parts: Any) -> None:
         if topic not in self._connections:
@@ -169,18 +174,6 @@ def require_recordable(path: Path) -> None:
     check_writable(path)
 
 
-def require_rosbags() -> None:
-    """Check that the library rosbags is installed.
-
-    Raises:
-        InputError: it is not; the message says how to install it.
-    """
-    try:
-        import rosbags.rosbag2  # noqa: F401
-    except ImportError as error:
-        raise InputError("recorded drives need the extra bags: pip install 'parkenv[bags]'") from error
-
-
 @dataclass(eq=False)
 class RecordedDrive:
     """A recorded drive: an MCAP file, a rosbag of ROS 2 (folder, .mcap or .db3) or of ROS 1 (.bag).
@@ -202,14 +195,13 @@ class RecordedDrive:
     pose_s: FloatArray = field(init=False)  # (n,) s, Unix time relative to `_start`
 
     def __post_init__(self) -> None:
-        require_rosbags()
         self._streams: dict[str, _Stream] = {}
         self._lenses: dict[str, Lens] = {}
         self._stamps: dict[str, list[int]] = {}
         self._scans: dict[str, list[NDArray[np.float32]]] = {}
         self._scanners: dict[str, LaserScanner] = {}
         poses: list[tuple[float, float, float]] = []
-        with self._messages_open() as (topics, messages):
+        with open_recording(self.path) as (topics, messages):
             self._plan(topics)
             wanted = {stream.topic: key for key, stream in self._streams.items()}
             self._stamps = {key: [] for key in self._streams}
@@ -218,7 +210,7 @@ class RecordedDrive:
                     self._take_head(message.data)
                     continue
                 key = wanted[topic]
-                self._add_stamp(key, _stamp_of(message, stamp))
+                self._add_stamp(key, stamp_of(message, stamp))
                 if key == "pose":
                     poses.append(_pose_of(message))
                 elif key.startswith("scan:"):
@@ -257,7 +249,7 @@ class RecordedDrive:
         count = dict.fromkeys(self._streams, -1)
         cameras = {s.topic: key for key, s in self._streams.items() if key.startswith("image:")}
         done = 0
-        with self._messages_open() as (_, messages):
+        with open_recording(self.path) as (_, messages):
             for topic, _, message in messages(set(cameras)):
                 key = cameras[topic]
                 count[key] += 1
@@ -270,7 +262,7 @@ class RecordedDrive:
 
     def _plan(self, topics: dict[str, str]) -> None:
         """Set the streams: from the calibration, or those of `recording`."""
-        image, pose = (_COMPRESSED, _IMAGE), self.calibration.pose if self.calibration else POSE
+        image, pose = (COMPRESSED_IMAGE, IMAGE), self.calibration.pose if self.calibration else POSE
         self._streams = {"pose": _Stream(pose, _POSES)}
         sensors: Sequence[CameraSpec | StereoSpec | LaserSpec]
         if self.calibration is None:
@@ -282,7 +274,7 @@ class RecordedDrive:
                 name, _, what = topic[1:].partition("/")
                 if kind == _SCAN:
                     self._streams[f"scan:{name}"] = _Stream(topic, (_SCAN,))
-                elif kind == _COMPRESSED:
+                elif kind == COMPRESSED_IMAGE:
                     side = what.partition("/")[0] if what.startswith(("left", "right")) else "mono"
                     self._streams[f"image:{name}:{side}"] = _Stream(topic, image)
         else:
@@ -454,9 +446,7 @@ class RecordedDrive:
     def _decoded(self, key: str, message: Any, index: int) -> NDArray[np.uint8]:
         """Return an image, (h, w, 3) RGB, without distortion."""
         where = f"{self.path}: {self._streams[key].topic}: image {index + 1}"
-        image = (
-            decode_image(bytes(message.data), where) if hasattr(message, "format") else _raw(message, where)
-        )
+        image = picture_in(message, where)
         image = image if image.ndim == 3 else np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
         name = key.split(":")[1]
         camera = next(
@@ -472,55 +462,6 @@ class RecordedDrive:
         if lens is not None and lens.distortion:
             image = np.asarray(cv2.undistort(image, camera.matrix, np.array(lens.distortion)))
         return image
-
-    @contextmanager
-    def _messages_open(
-        self,
-    ) -> Iterator[tuple[dict[str, str], Callable[[set[str]], Iterator[tuple[str, int, Any]]]]]:
-        """Open the recording: yield the type of each topic, and a function that reads the messages of some."""
-        from rosbags.rosbag1 import Reader as Reader1
-        from rosbags.rosbag2 import Reader as Reader2
-        from rosbags.typesys import Stores, get_typestore
-
-        if not self.path.exists():
-            raise InputError(f"{self.path}: No such file or directory")
-        is_ros1 = self.path.suffix == ".bag"
-        # Types are those of ROS, not what the file says they are.
-        store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
-        deserialize = store.deserialize_ros1 if is_ros1 else store.deserialize_cdr
-
-        with self._in_words():
-            reader: Any = (Reader1 if is_ros1 else Reader2)(self.path)
-            reader.open()
-        try:
-
-            def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
-                chosen = [c for c in reader.connections if c.topic in topics]
-                found = reader.messages(connections=chosen) if chosen else iter(())
-                while True:
-                    with self._in_words():
-                        one = next(found, None)
-                        message = None if one is None else deserialize(one[2], one[0].msgtype)
-                    if one is None:
-                        return
-                    yield one[0].topic, one[1], message
-
-            yield {c.topic: c.msgtype for c in reader.connections}, messages
-        finally:
-            reader.close()
-
-    @contextmanager
-    def _in_words(self) -> Iterator[None]:
-        """Turn errors of the library, which are of many kinds for damaged files, into one."""
-        try:
-            yield
-        except InputError:
-            raise
-        except Exception as error:
-            reason = " ".join(str(error).split()) or type(error).__name__
-            raise InputError(
-                f"{self.path}: is no whole recording ({reason:.200}); want {', '.join(SUFFIXES)} or a rosbag's folder"
-            ) from error
 
 
 def map_drive(
@@ -578,12 +519,6 @@ def record_drive(survey: Survey, number: int, path: Path) -> None:
         writer.close(Head(its.key, its.time, its.rig, its.weather))
 
 
-def _stamp_of(message: Any, recorded: int) -> int:
-    """Return the time of a message, ns."""
-    header = getattr(message, "header", None)
-    return recorded if header is None else int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
-
-
 def _pose_of(message: Any) -> tuple[float, float, float]:
     if hasattr(message, "theta"):
         return float(message.x), float(message.y), float(message.theta)
@@ -599,20 +534,3 @@ def _nearest(stamps: IntArray, stamp: int) -> int:
     if after == len(stamps) or (after and stamp - stamps[after - 1] <= stamps[after] - stamp):
         return after - 1
     return after
-
-
-def _raw(message: Any, where: str) -> NDArray[np.uint8]:
-    """Return an uncompressed image."""
-    channels = {"rgb8": 3, "bgr8": 3, "mono8": 1, "8UC1": 1, "8UC3": 3}.get(message.encoding)
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    if channels is None:
-        raise InputError(f"{where}: encoding is {message.encoding!r:.40}, want rgb8, bgr8 or mono8")
-    data = np.frombuffer(bytes(message.data), np.uint8)
-    if step < width * channels or height * step > len(data) or not height * width:
-        raise InputError(f"{where}: has {len(data):,} bytes for {width}×{height} px of {message.encoding}")
-    image = (
-        data[: height * step].reshape(height, step)[:, : width * channels].reshape(height, width, channels)
-    )
-    if channels == 1:
-        return image[..., 0]
-    return np.ascontiguousarray(image[..., ::-1] if message.encoding in ("bgr8", "8UC3") else image)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
+from sim_sensors.ground_truth import View
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
@@ -20,6 +21,8 @@ measurements in it fit a car on the ground."""
 class Detections:
     """Cars found in one image, in any order.
 
+    What a detector does not know: `view` is then END or SIDE as `end_on` says, and `visible_fraction` NaN.
+
     Args:
         boxes: (n, 4) float32, px: left, top, right, bottom of each car in image coordinates (x right, y down, origin at
             the upper left corner). Boxes may reach beyond the image.
@@ -29,10 +32,13 @@ class Detections:
         score: (n,) float32, the detector's own scale, greater is better; None: the probabilities.
         regions: (n, 4) float32, px, the classified image region, with some background around the car, for data sets
             with such labels (UIUC). None: the boxes.
+        view: (n,) int, a `sim_sensors.ground_truth.View` of each car: END, OBLIQUE or SIDE. None: not known.
+        visible_fraction: (n,) float32, the fraction of each car that nothing hides, in [0, 1]; NaN where it is not
+            known. None: not known of any car.
 
     Raises:
-        InputError: an array of another shape, a number that is not finite, a box without area, or a probability
-            outside [0, 1].
+        InputError: an array of another shape, a number that is not finite, a box without area, or a probability or
+            fraction outside [0, 1].
     """
 
     def __init__(
@@ -42,6 +48,8 @@ class Detections:
         end_on: NDArray[np.bool_] | None = None,
         score: NDArray[np.floating] | None = None,
         regions: NDArray[np.floating] | None = None,
+        view: NDArray[np.integer] | None = None,
+        visible_fraction: NDArray[np.floating] | None = None,
     ) -> None:
         n = len(probability)
         self.boxes = _checked("boxes", boxes, (n, 4))
@@ -58,6 +66,20 @@ class Detections:
             raise InputError(
                 f"detections: boxes[{bad}] is {self.boxes[bad].tolist()}, want left < right and top < bottom"
             )
+        self.view = np.where(self.end_on, View.END, View.SIDE).astype(np.int8)
+        if view is not None:
+            self.view = np.asarray(view, dtype=np.int8)
+            if self.view.shape != (n,) or not np.isin(self.view, list(View)).all():
+                views = ", ".join(f"{v.name} {v:d}" for v in View)
+                raise InputError(f"detections: view is {self.view.tolist()}, want {n} of {views}")
+        self.visible_fraction = np.full(n, np.nan, dtype=np.float32)
+        if visible_fraction is not None:
+            self.visible_fraction = np.asarray(visible_fraction, dtype=np.float32)
+            known = self.visible_fraction[~np.isnan(self.visible_fraction)]
+            if self.visible_fraction.shape != (n,) or not ((known >= 0.0) & (known <= 1.0)).all():
+                raise InputError(
+                    f"detections: visible_fraction is {self.visible_fraction.tolist()}, want {n} of 0 to 1 or NaN"
+                )
 
     def __len__(self) -> int:
         return len(self.probability)
@@ -65,8 +87,9 @@ class Detections:
     def select(self, rows: NDArray[np.int64] | NDArray[np.bool_]) -> Detections:
         """Return some of the detections, by index or by mask."""
         return Detections(
-            self.boxes[rows], self.probability[rows], self.end_on[rows], self.score[rows], self.regions[rows]
-        )
+            self.boxes[rows], self.probability[rows], self.end_on[rows], self.score[rows], self.regions[rows],
+            self.view[rows], self.visible_fraction[rows],
+        )  # fmt: skip
 
 
 class Detector(Protocol):
@@ -120,7 +143,10 @@ class GroundBand(NamedTuple):
 
 @runtime_checkable
 class BandDetector(Protocol):
-    """A detector that is faster if it knows where in the image the cars can be."""
+    """A detector that is faster if it knows where in the image the cars can be.
+
+    It is called in several threads at once.
+    """
 
     def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
         """Find the cars in one image as `Detector.detect` does, only those whose boxes lie in the band."""

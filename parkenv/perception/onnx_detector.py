@@ -202,9 +202,10 @@ class OnnxDetector:
         plan, name = self._plan, self._file.name
         fed, scale, offset = _fed(image, plan)
         outputs = self._run(fed, plan.outputs)
-        end_on = None
+        centers = None
         if plan.layout == "centers":
-            boxes, score, end_on, _ = decode_centers(outputs[0], plan.size, 0.5 * self.settings.threshold)
+            centers = decode_centers(outputs[0], plan.size, self.settings.threshold)
+            boxes, score = centers.boxes, centers.score
         else:
             boxes, score = decode(outputs, plan.layout, plan.cars, plan.scores, grid=plan.grid)
         if not (np.isfinite(boxes).all() and np.isfinite(score).all()):
@@ -214,9 +215,8 @@ class OnnxDetector:
                 f"{name}: has scores from {score.min():.4g} to {score.max():.4g}, want 0 to 1; for others write "
                 f'scores = "logits" in {_beside(name)}'
             )
-        likely = score >= self.settings.threshold
-        boxes, score = boxes[likely].astype(np.float64), np.clip(score[likely], 0.0, 1.0)
-        end_on = None if end_on is None else end_on[likely]
+        rows = np.flatnonzero(score >= self.settings.threshold)
+        boxes, score = boxes[rows].astype(np.float64), np.clip(score[rows], 0.0, 1.0)
         if not plan.corners:
             half = 0.5 * boxes[:, 2:]
             boxes = np.hstack([boxes[:, :2] - half, boxes[:, :2] + half])
@@ -227,11 +227,15 @@ class OnnxDetector:
         drawn = np.isfinite(boxes).all(axis=1) & (size > 0.0).all(axis=1)
         boxes, score, size = boxes[drawn], score[drawn], size[drawn]
         kept = best_boxes(boxes, score, plan.overlap)
-        if end_on is None:
-            end_on = size[:, 0] < self.settings.end_on_below * size[:, 1]
-            return Detections(boxes[kept], score[kept], end_on[kept])
-        end_on = end_on[drawn][kept]
-        return Detections(boxes[kept], score[kept], end_on, regions=_regions(boxes[kept], end_on))
+        boxes, score, size = boxes[kept], score[kept], size[kept]
+        if centers is None:
+            return Detections(boxes, score, size[:, 0] < self.settings.end_on_below * size[:, 1])
+        rows = rows[drawn][kept]
+        end_on, visible = centers.end_on[rows], np.clip(centers.visible[rows], 0.0, 1.0)
+        regions = _regions(boxes, end_on)
+        return Detections(
+            boxes, score, end_on, regions=regions, view=centers.view[rows], visible_fraction=visible
+        )
 
     def _run(self, fed: Float32Array, outputs: Sequence[str]) -> list[Float32Array]:
         """Return the named outputs for an input, (1, channels, height, width)."""

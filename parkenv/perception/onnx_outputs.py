@@ -126,6 +126,7 @@ class Centers(NamedTuple):
     boxes: Float32Array  # (n, 4) px of the input: left, top, right, bottom
     score: Float32Array  # (n,) P(car)
     end_on: NDArray[np.bool_]  # (n,) whether a front or rear is more likely than a side
+    view: NDArray[np.int8]  # (n,) the most likely `sim_sensors.ground_truth.View`
     visible: Float32Array  # (n,) visible fraction
 
 
@@ -146,11 +147,12 @@ def decode_centers(output: Float32Array, size: tuple[int, int], threshold: float
     score = np.ascontiguousarray(cells[0])
     top = (score > _highest(score, before)) & (score >= _highest(score, after))
     row, column = np.nonzero(top & (score >= threshold))
-    left, above, right, below, end, _, side, visible = cells[1:, row, column]
+    left, above, right, below, end, oblique, side, visible = cells[1:, row, column]
     x = (column + np.float32(0.5)) * np.float32(size[0] / score.shape[1])
     y = (row + np.float32(0.5)) * np.float32(size[1] / score.shape[0])
     boxes = np.stack([x - left, y - above, x + right, y + below], axis=1).astype(np.float32)
-    return Centers(boxes, score[row, column], end > side, visible)
+    view = np.argmax([end, oblique, side], axis=0).astype(np.int8)
+    return Centers(boxes, score[row, column], end > side, view, visible)
 
 
 def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array:

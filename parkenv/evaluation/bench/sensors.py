@@ -20,10 +20,10 @@ from parkenv.envs.scan_vector import ScanSearchVectorEnv
 from parkenv.evaluation.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot import PARK
 from sim_sensors.camera.ground_texture import ground_texture
-from sim_sensors.camera.light_maps import light_maps
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
 from sim_sensors.camera.projection import ScreenTriangles, project
 from sim_sensors.camera.shading import shade
+from sim_sensors.camera.shadows import light_maps
 from sim_sensors.camera.textures import FAST
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled

@@ -26,10 +26,14 @@ from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
 from parkenv.world.lot import ParkingLot
+from sim_sensors.ground_truth import View
 
 FloatArray = NDArray[np.float64]
 
-SIDE_COLOR, END_COLOR, UNRANGED_COLOR = (255, 208, 0), (86, 180, 233), (200, 200, 200)
+SIDE_COLOR, OBLIQUE_COLOR, END_COLOR = (255, 208, 0), (120, 200, 80), (86, 180, 233)
+UNRANGED_COLOR = (200, 200, 200)
+HIDDEN = 0.8
+"""Visible fraction below which it is written beside the probability."""
 TAKEN, FREE, UNKNOWN = BELIEF_MAP(1.0), BELIEF_MAP(0.0), "#b9bec4"
 WRONG = "#ffd000"
 PATH_COLOR, CAR_COLOR = "#0072b2", "#d55e00"
@@ -45,7 +49,7 @@ WEATHER_COLORS = {
 def draw_detections(
     image: NDArray[np.uint8], found: Detections, placed: NDArray[np.int64] | None = None
 ) -> NDArray[np.uint8]:
-    """Return a copy of an image, (h, w, 3) RGB, with its detections.
+    """Return a copy of an image, (h, w, 3) RGB, with its detections: probability, and what is visible of a hidden car.
 
     Args:
         image: the image.
@@ -53,14 +57,16 @@ def draw_detections(
         placed: indices of the ranged detections, others are drawn thin and grey; all if None.
     """
     drawn = image.copy()
-    for i, (box, p, end) in enumerate(zip(found.boxes, found.probability, found.end_on, strict=True)):
+    colors = {View.SIDE: SIDE_COLOR, View.OBLIQUE: OBLIQUE_COLOR, View.END: END_COLOR}
+    for i, (box, p) in enumerate(zip(found.boxes, found.probability, strict=True)):
         left, top, right, bottom = (round(float(v)) for v in box)
         if placed is not None and i not in placed:
             cv2.rectangle(drawn, (left, top), (right, bottom), UNRANGED_COLOR, 1, cv2.LINE_AA)
             continue
-        color = END_COLOR if end else SIDE_COLOR
+        color, visible = colors[View(found.view[i])], found.visible_fraction[i]
+        hidden = f", {visible:.0%} visible" if visible < HIDDEN else ""
         cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
-        write_tag(drawn, f"{p:.2f}", (left, max(top, 0)), color)
+        write_tag(drawn, f"{p:.2f}{hidden}", (left, max(top, 0)), color)
     return drawn
 
 
@@ -77,7 +83,8 @@ def save_detections(result: SessionResult, path: Path) -> None:
             ax.imshow(draw_detections(view.image, view.detections, view.cars.detection))
             ax.set_axis_off()
         kinds = (
-            ("a car's side", SIDE_COLOR, 2.0), ("front or rear", END_COLOR, 2.0), ("no distance", UNRANGED_COLOR, 1.0),
+            ("a car's side", SIDE_COLOR, 2.0), ("oblique", OBLIQUE_COLOR, 2.0), ("front or rear", END_COLOR, 2.0),
+            ("no distance", UNRANGED_COLOR, 1.0),
         )  # fmt: skip
         handles = [
             Patch(fill=False, edgecolor="#{:02x}{:02x}{:02x}".format(*color), linewidth=width, label=name)
@@ -86,7 +93,7 @@ def save_detections(result: SessionResult, path: Path) -> None:
         note = Line2D(
             [], [], linestyle="none", marker="$0.97$", markersize=18, color=INK, label="probability"
         )
-        figure.legend(handles=[*handles, note], loc="lower left", ncols=4)
+        figure.legend(handles=[*handles, note], loc="lower left", ncols=5)
         figure.subplots_adjust(0.01, 0.08, 0.99, 0.91, wspace=0.02)
         save_picture(figure, path, "Camera frames of a survey drive, with the cars that were detected")
 
