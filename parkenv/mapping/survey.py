@@ -40,8 +40,8 @@ class SurveySettings:
     """Settings of a survey.
 
     Raises:
-        InputError: an unknown rig, weather or localiser, no window, a distance that is not positive, or pictures narrower
-            than 64 px.
+        InputError: an unknown rig, weather or localiser, no window, a distance that is not positive, or pictures
+            narrower than 64 px.
     """
 
     # `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a camera to
