@@ -328,6 +328,9 @@ class SurveySpec(Workplace):
         description="Error of the car's odometry after 100 m, as a share of the distance.",
     )
     localise: LocaliserName = Field("none", description="What corrects the odometry.")
+    picture_width: int | None = Field(
+        None, ge=64, le=4_096, description="Width of the cameras' pictures, px; 640 if absent."
+    )
     seed: int = Field(0, ge=0, lt=2**31)
 
 
