@@ -14,7 +14,9 @@ from onnx import numpy_helper
 
 from parkenv import InputError
 from parkenv.evaluation.experiments.detector_drives import DrivePicture, score_on_drives
+from parkenv.evaluation.experiments.detector_scores import score_on
 from parkenv.files.onnx_file import read_onnx
+from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
 from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
@@ -139,6 +141,7 @@ def test_windows_of_labelled_crops_surround_the_cars(net, street):
     found = net.detect(street[0])
     side = ~found.end_on
     size = found.regions[:, 2:] - found.regions[:, :2]
+    side |= found.boxes[:, 2] - found.boxes[:, 0] > 2.0 * (found.boxes[:, 3] - found.boxes[:, 1])
     assert size[side, 0] == pytest.approx(2.5 * size[side, 1], rel=1e-4)
     assert size[~side, 0] == pytest.approx(size[~side, 1], rel=1e-4)
     assert (found.regions[:, 0] <= found.boxes[:, 0]).all()
@@ -180,6 +183,33 @@ def test_small_pictures_are_enlarged_no_more_than_told(street):
     found = OnnxDetector(file, settings.changed(enlarge=1.0)).detect(image)
     within = OnnxDetector(file, settings).detect(framed)
     assert np.allclose(found.boxes, within.boxes - (240, 180, 240, 180), atol=1e-3)
+
+
+def test_small_pictures_are_looked_at_mirrored_too(net, street):
+    small = np.ascontiguousarray(cv2.resize(street[0], (288, 216), interpolation=cv2.INTER_AREA)[:200])
+    found, other = net.detect(small), net.detect(np.ascontiguousarray(small[:, ::-1]))
+    turned = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (288, 0, 288, 0)
+    sure = np.flatnonzero(found.probability > 0.3)
+    assert len(sure) >= 3
+    for i in sure:
+        j = np.abs(turned - found.boxes[i]).max(axis=1).argmin()
+        assert turned[j] == pytest.approx(found.boxes[i], abs=0.01)
+        assert other.probability[j] == pytest.approx(found.probability[i], abs=1e-4)
+        assert (other.view[j], other.end_on[j]) == (found.view[i], found.end_on[i])
+    once = OnnxDetector(read_onnx(str(FILE)), net.settings.changed(mirror=False))
+    assert not np.array_equal(once.detect(small).probability, found.probability)
+    assert np.array_equal(once.detect(street[0]).boxes, net.detect(street[0]).boxes)  # this one fills the input
+
+
+def test_a_wide_box_is_no_front_where_photographs_of_sides_are_judged():
+    class Fixed:
+        def detect(self, image):
+            boxes = np.array([[10, 10, 94, 40], [110, 5, 194, 80]], float)  # wide; as high as a front
+            return Detections(boxes, np.array([0.9, 0.8]), end_on=np.array([True, True]))
+
+    photo = LabelledImage("photo", np.zeros((90, 210), np.uint8), np.array([[8.0, 5.0, 98.0, 45.0]]))
+    score = score_on(Fixed(), [photo], "single")
+    assert (score.row["recall"], score.row["precision"]) == (1.0, 1.0)
 
 
 def test_detectors_are_compared_at_equal_false_positives():

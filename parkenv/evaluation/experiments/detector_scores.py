@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from parkenv.evaluation.figures.picture_files import STYLE, save_picture
 from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, LabelledImage, read_uiuc_test
 from parkenv.perception.car_model import CarModel
+from parkenv.perception.car_regions import END_WIDEST
 from parkenv.perception.detection_scores import RecallPrecision, recall_precision
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.hog_detector import HogDetector
@@ -22,8 +23,6 @@ _SMALLEST = {"single": 0.85, "multi": 0.8}
 _LARGEST = {"single": 1.2, "multi": 2.6}
 """Range of searched sizes relative to UIUC's 100×40 box; all cars of the single-scale set have the same size, those of
 the multi-scale set are 0.89 to 2.12 times as large."""
-
-
 _TOLERANCE = 1.25  # of these sizes, for detectors
 
 
@@ -62,7 +61,8 @@ def score_on(
     """Measure recall and precision on labelled images, by UIUC's matching rule.
 
     A model's windows are searched at the sizes of the set's cars. A detector looks as it does anywhere; its boxes of
-    other sizes, and of fronts and rears, are left out, as the sets label neither.
+    other sizes, and of fronts and rears, are left out, as the sets label neither. A box more than twice as wide as high
+    is a side.
     """
     detector = _searching(model, test_set) if isinstance(model, CarModel) else model
     found, begun = [], time.perf_counter()
@@ -94,7 +94,9 @@ def score_on(
 def _of_the_set(found: Detections, test_set: str) -> Detections:
     width = (found.regions[:, 2] - found.regions[:, 0]) / UIUC_SIZE[0]
     least, most = _SMALLEST[test_set] / _TOLERANCE, _LARGEST[test_set] * _TOLERANCE
-    return found.select(~found.end_on & (width >= least) & (width <= most))
+    size = found.boxes[:, 2:] - found.boxes[:, :2]
+    side = ~found.end_on | (size[:, 0] > END_WIDEST * size[:, 1])
+    return found.select(side & (width >= least) & (width <= most))
 
 
 def _searching(model: CarModel, test_set: str) -> HogDetector:
