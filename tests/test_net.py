@@ -14,9 +14,9 @@ from onnx import numpy_helper
 
 from parkenv import InputError
 from parkenv.evaluation.experiments.detector_drives import DrivePicture, score_on_drives
-from parkenv.evaluation.experiments.detector_scores import score_on
+from parkenv.evaluation.experiments.detector_scores import recall_on_crops, score_on
 from parkenv.files.onnx_file import read_onnx
-from parkenv.perception.car_datasets import LabelledImage
+from parkenv.perception.car_datasets import Crops, LabelledImage
 from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
 from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
@@ -198,7 +198,9 @@ def test_small_pictures_are_looked_at_mirrored_too(net, street):
         assert (other.view[j], other.end_on[j]) == (found.view[i], found.end_on[i])
     once = OnnxDetector(read_onnx(str(FILE)), net.settings.changed(mirror=False))
     assert not np.array_equal(once.detect(small).probability, found.probability)
-    assert np.array_equal(once.detect(street[0]).boxes, net.detect(street[0]).boxes)  # this one fills the input
+    assert np.array_equal(
+        once.detect(street[0]).boxes, net.detect(street[0]).boxes
+    )  # this one fills the input
 
 
 def test_a_wide_box_is_no_front_where_photographs_of_sides_are_judged():
@@ -210,6 +212,36 @@ def test_a_wide_box_is_no_front_where_photographs_of_sides_are_judged():
     photo = LabelledImage("photo", np.zeros((90, 210), np.uint8), np.array([[8.0, 5.0, 98.0, 45.0]]))
     score = score_on(Fixed(), [photo], "single")
     assert (score.row["recall"], score.row["precision"]) == (1.0, 1.0)
+
+
+def test_crops_are_judged_by_a_box_in_their_middle(tmp_path):
+    """Grey levels say what the toy detector finds in a crop: nothing, a car, a small one, or one aside."""
+    places = {10: [4, 4, 60, 50], 20: [25, 25, 45, 45], 30: [-40, 0, 24, 60]}
+
+    class Toy:
+        def detect(self, image):
+            box = places.get(int(image[0, 0]))
+            if box is None:
+                return Detections(np.zeros((0, 4)), np.zeros(0))
+            return Detections(np.array([box], float), np.array([0.9]))
+
+    def crops(*levels):
+        return [np.full((64, 64), level, np.uint8) for level in levels]
+
+    cars, others = crops(*[10] * 30, *[20] * 15, *[30] * 15), crops(*[0] * 19, 10)
+    low, high = recall_on_crops(Toy(), Crops(cars, others))
+    assert (low["false_positives"], low["recall"], low["cars"], low["others"]) == (0.01, 0.0, 60, 20)
+    assert (high["recall"], high["interval"]) == (0.5, pytest.approx(1.96 * np.sqrt(7.5 / 29 / 30)))
+    with pytest.raises(InputError, match="20 crops of cars, want at least 30"):
+        recall_on_crops(Toy(), Crops(others, cars))
+    for name, images in (("positives", cars[:30]), ("negatives", others)):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image)
+    done = parkenv("evaluate-detector", "--crops", tmp_path, "--model", "front", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "summary.json").read_text())["rows"]
+    assert [row["cars"] for row in rows] == [30, 30]
 
 
 def test_detectors_are_compared_at_equal_false_positives():
