@@ -214,6 +214,23 @@ class SensorRig:
             scans[name] = laser.scan(scene.scan_plane, mount.in_world(vehicle), rng)
         return Capture(vehicle, images, pairs, scans)
 
+    def prepare(self, scene: Sensed, pose: FloatArray, weather: Weather | None = None) -> None:
+        """Draw what captures near a pose share: sky, shadows, scan plane. Captures in several threads then read it.
+
+        Args:
+            scene: as in `capture`.
+            pose: as in `capture`.
+            weather: as in `capture`.
+        """
+        for _, camera, mount in self.cameras:
+            camera.prepare(scene, mount.camera_pose(pose), weather)
+        for _, stereo, mount in self.stereo_cameras:
+            eye = mount.camera_pose(pose)
+            for side in (eye, stereo.right_pose(eye)):
+                stereo.camera.prepare(scene, side, weather)
+        if self.lasers:
+            _ = scene.scan_plane
+
     def drive(
         self, scene: Sensed, path: ArrayLike, every: float, weather: Weather | None = None, seed: int = 0
     ) -> Iterator[Capture]:

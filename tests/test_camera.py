@@ -2,6 +2,7 @@
 
 import math
 import pickle
+from copy import copy
 from dataclasses import replace
 
 import cv2
@@ -13,13 +14,15 @@ from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
 from parkenv.perception.range_scan import disparity
 from sim_sensors.camera.image_sensor import ImageSensor
-from sim_sensors.camera.light_maps import light_maps, open_sky, sunlit
+from sim_sensors.camera.light_maps import open_sky, sunlit
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.camera.shadows import light_maps
 from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.errors import SensorError
 from sim_sensors.ground_truth import View, vehicle_boxes
 from sim_sensors.mesh import Instances, Material
+from sim_sensors.slot_scenes import SlotLot
 
 CAMERA = PinholeCamera.from_field_of_view(320, 240)
 POSE = camera_pose(0.0, 0.0, 1.4, 0.4, -0.05)
@@ -150,6 +153,26 @@ def test_shadows_follow_new_instances(row):
     emptied = CAMERA.render(ToyScene(row.pool, gone, row.ground), pose, weather)
     assert not (emptied.ids == 3).any()
     assert not np.array_equal(full.image, emptied.image)
+
+
+@pytest.mark.parametrize("preset", ["low_sun", "rain"])
+def test_shadows_changed_in_place_are_those_drawn_anew(preset):
+    lot = SlotLot([[2.5 * i, 6.0 * j] for i in range(12) for j in range(2)], 0.5 * math.pi, 5.0, 2.5)
+    weather, rng = Weather.draw(preset, 4), np.random.default_rng(0)
+    scene = lot.scene(rng.random(24) < 0.6)
+    first = light_maps(scene.pool, scene.instances, weather, 0.0, 0.0)
+    shown = first.shadow.copy(), first.contact.copy()
+    for slot in rng.integers(0, 24, 5).tolist():
+        there = slot in scene.present
+        scene = scene.without_vehicle(slot) if there else lot.filled(scene, slot, int(rng.integers(9)))
+        changed = light_maps(scene.pool, scene.instances, weather, 0.0, 0.0)
+        anew = light_maps(copy(scene.pool), scene.instances, weather, 0.0, 0.0)
+        np.testing.assert_array_equal(changed.shadow, anew.shadow)
+        np.testing.assert_array_equal(changed.contact, anew.contact)
+    assert not np.array_equal(shown[1], changed.contact)
+    # Scenes of before keep their maps.
+    np.testing.assert_array_equal(shown[0], first.shadow)
+    np.testing.assert_array_equal(shown[1], first.contact)
 
 
 def test_boxes_of_vehicles(row):

@@ -7,13 +7,14 @@ import sys
 from pathlib import Path
 
 import gymnasium as gym
+import numba
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import data_equivalence
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
-from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.envs.sensor_sampler import PICTURE_WIDTH, SensorSampler
 from parkenv.lots import grid_lot
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic, _Loops
@@ -46,6 +47,20 @@ def test_the_same_seed_shows_the_same_pictures_to_everyone():
     for a, b in zip(drive(one, 3, (3, 3, 3)), drive(two, 3, (3, 3, 3)), strict=True):
         assert data_equivalence(a, b, exact=True)
     assert not np.array_equal(drive(one, 3, (3,))[1]["image.right"], drive(one, 4, (3,))[1]["image.right"])
+
+
+def test_captures_drawn_side_by_side_are_those_drawn_one_by_one():
+    options = {"scenario": "campus", "traffic": BUSY, "captures": 4}
+    together = drive(make(**options), 3, (0, 3, 1))
+    cores = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        alone = drive(make(**options), 3, (0, 3, 1))
+    finally:
+        numba.set_num_threads(cores)
+    assert max(int(observation["count"]) for observation in alone) > 1
+    for a, b in zip(together, alone, strict=True):
+        assert data_equivalence(a, b, exact=True)
 
 
 def test_the_search_is_that_of_the_search_environment():
@@ -113,8 +128,11 @@ def test_scans_alone_are_those_beside_the_pictures():
 def test_pictures_of_another_width():
     env = make(picture_width=160)
     assert env.reset(seed=1)[0]["image.right"].shape[1:] == (120, 160, 3)
-    seen = gym.make("parkenv/SearchPerception-v2", scenario="mini", picture_width=320).unwrapped
-    assert seen.rig.cameras[0][1].width == 320
+    assert make().unwrapped.rig is SMALL_RIG
+    for given, width in ((None, PICTURE_WIDTH), (640, 640)):
+        for name in ("SearchSensors", "SearchPerception"):
+            seen = gym.make(f"parkenv/{name}-v2", scenario="mini", picture_width=given).unwrapped
+            assert seen.rig.cameras[0][1].width == width
     for wrong in (True, 12, 3.5):
         with pytest.raises(InputError, match="picture_width is"):
             make(picture_width=wrong)

@@ -53,6 +53,12 @@ def test_equal_sessions_are_equal():
     assert one.session.key == two.session.key
 
 
+def test_smaller_pictures_are_another_session():
+    surveys = [Survey(make_scenario("mini"), SurveySettings(picture_width=w)) for w in (None, 320)]
+    assert [survey.pipeline.rig.cameras[0][1].width for survey in surveys] == [640, 320]
+    assert len({survey.key_of(0) for survey in surveys}) == 2
+
+
 def test_a_survey_goes_on_where_it_was(tmp_path):
     scenario, _ = halves()
     settings = SurveySettings(weather="sunny", every=4.0)
@@ -171,6 +177,7 @@ def test_a_rig_that_cannot_see_or_range_is_refused():
         ({"weather": "hail"}, "weather is 'hail'"),
         ({"windows": ()}, "windows is empty"),
         ({"every": 0.0}, "every is 0"),
+        ({"picture_width": 12}, "picture_width is 12 px"),
     ],
 )
 def test_bad_settings_are_named(wrong, message):

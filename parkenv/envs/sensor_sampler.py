@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from parkenv.envs.search_state import SearchState
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
+from parkenv.perception.threads import in_threads
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
@@ -21,6 +22,9 @@ if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
 FloatArray = NDArray[np.float64]
+
+PICTURE_WIDTH = 400
+"""px; width of the pictures of a searching car's cameras. Those of a survey are 640 px wide."""
 
 _SEEDS = 1 << 31
 
@@ -40,27 +44,25 @@ def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int
     Args:
         rig: the rig or its name.
         scenario: defines the default.
-        picture_width: px; if given, the pictures are resized to this width.
+        picture_width: px, width of the pictures; None: `PICTURE_WIDTH` for a rig by name, a `SensorRig`'s own.
 
     Raises:
         InputError: an unknown name, something else than a rig, or a width below 64.
     """
-    if picture_width is not None:
-        if (
-            isinstance(picture_width, bool)
-            or not isinstance(picture_width, (int, np.integer))
-            or picture_width < 64
-        ):
-            raise InputError(f"picture_width is {picture_width!r} px, want a whole number of at least 64")
-        return make_rig(rig, scenario).resized(int(picture_width))
     rig = scenario.rig if rig is None else rig
     if isinstance(rig, SensorRig):
-        return rig
-    if not isinstance(rig, str):
+        made, width = rig, picture_width
+    elif not isinstance(rig, str):
         raise InputError(f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-    if rig not in RIG_NAMES:
+    elif rig not in RIG_NAMES:
         raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-    return SensorRig.named(rig)
+    else:
+        made, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
+    if width is None:
+        return made
+    if isinstance(width, bool) or not isinstance(width, (int, np.integer)) or width < 64:
+        raise InputError(f"picture_width is {width!r} px, want a whole number of at least 64")
+    return made.resized(int(width))
 
 
 class SensorSampler:
@@ -124,15 +126,18 @@ class SensorSampler:
             One capture for each station.
         """
         scenes, weather = self._world(state)
-        captures = []
+        jobs = []
         for time, pose, movers in stations:
             # Keyed by the millisecond: the same capture has the same noise.
             noise = np.random.SeedSequence([int(state.key), int(time * 1000.0)]).generate_state(1)
             scene = scenes.at(time, pose)
             if movers is not None:
                 scene = scene.with_movers(movers)
-            captures.append(TimedCapture(time, self.rig.capture(scene, pose, weather, int(noise[0]))))
-        return captures
+            self.rig.prepare(scene, pose, weather)
+            jobs.append((time, scene, pose, int(noise[0])))
+        return in_threads(
+            lambda job: TimedCapture(job[0], self.rig.capture(job[1], job[2], weather, job[3])), jobs
+        )
 
     def select_stations(self, driven: FloatArray) -> NDArray[np.int64]:
         """Select evenly spaced points of a driven path, including the last.

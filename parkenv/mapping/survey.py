@@ -40,7 +40,8 @@ class SurveySettings:
     """Settings of a survey.
 
     Raises:
-        InputError: an unknown rig, weather or localiser, no window, or a distance that is not positive.
+        InputError: an unknown rig, weather or localiser, no window, a distance that is not positive, or pictures
+            narrower than 64 px.
     """
 
     # `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a camera to
@@ -55,6 +56,7 @@ class SurveySettings:
     seed: int = 0  # seed of worlds, weather and noise
     # as `make_detector` takes it: `hog`, `side`, `front`, a model file or `MODULE:CLASS`
     detector: str = DEFAULT_DETECTOR
+    picture_width: int | None = None  # px, of the cameras' pictures; None: the rig's own
 
     def __post_init__(self) -> None:
         if self.rig not in RIG_NAMES:
@@ -65,6 +67,8 @@ class SurveySettings:
             raise InputError(f"localise is {self.localise!r}, want one of {', '.join(LOCALISERS)}")
         if not self.windows:
             raise InputError("windows is empty, want at least one")
+        if self.picture_width is not None and self.picture_width < 64:
+            raise InputError(f"picture_width is {self.picture_width} px, want at least 64")
         if not (np.isfinite(self.every) and self.every > 0.0):
             raise InputError(f"every is {self.every} m, want a finite distance above 0")
 
@@ -126,6 +130,8 @@ class Survey:
         self.scenario = scenario
         self.settings = settings or SurveySettings()
         rig = SensorRig.named(self.settings.rig)
+        if self.settings.picture_width is not None:
+            rig = rig.resized(self.settings.picture_width)
         self.pipeline = PerceptionPipeline(rig, scenario.lot, self.settings.detector)
         self.route: SurveyRoute = survey_route(scenario.lot, both_sides=self.settings.rig == "both_sides")
         self._slots = slot_lot(scenario.lot)
@@ -137,6 +143,7 @@ class Survey:
         noise += f"{s.pose_noise.drift:g}drift" if s.pose_noise.drift else ""
         noise += "" if s.localise == "none" else f"/{s.localise}"
         detector = "" if s.detector == DEFAULT_DETECTOR else f"{detector_version(s.detector)}/"
+        detector += "" if s.picture_width is None else f"{s.picture_width}px/"
         drive = f"{s.rig}/{s.weather or 'any'}/{s.every:g}m/{noise}/{detector}seed{s.seed}"
         return f"{self.scenario.name}/{drive}/{number:05d}"
 

@@ -1,4 +1,4 @@
-"""One pool of threads for the parts of perception that run beside each other."""
+"""One pool of threads for sensors and perception: pictures are drawn beside each other, and then looked at."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import lru_cache
 from typing import TypeVar
 
-from numba import get_num_threads
+from numba import get_num_threads, set_num_threads
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -17,8 +17,10 @@ Result = TypeVar("Result")
 def in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
     """Return the result of each item, in their order; on as many cores as numba uses.
 
+    Within `work`, compiled loops and this function itself use one core: the items share the cores among them.
+
     Args:
-        work: a function that mostly runs compiled code without the interpreter lock, and does not call this function.
+        work: a function that mostly runs compiled code without the interpreter lock.
         items: its arguments.
     """
     n = get_num_threads()
@@ -26,13 +28,17 @@ def in_threads(work: Callable[[Item], Result], items: Sequence[Item]) -> list[Re
         return [work(item) for item in items]
     waiting = [_pool(n).submit(work, item) for item in items[1:]]
     # The calling thread takes a part, too.
-    first = work(items[0])
+    set_num_threads(1)
+    try:
+        first = work(items[0])
+    finally:
+        set_num_threads(n)
     return [first, *(one.result() for one in waiting)]
 
 
 @lru_cache(maxsize=1)
 def _pool(n: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max_workers=n, thread_name_prefix="perception")
+    return ThreadPoolExecutor(n, "perception", set_num_threads, (1,))
 
 
 # A forked process has none of the threads.

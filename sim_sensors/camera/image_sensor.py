@@ -137,7 +137,7 @@ def _draw_rain(radiance: Float32Array, rain: float, generator: np.random.Generat
     _streaks(radiance, column, row, length, lean, strength)
 
 
-@compiled
+@compiled(nogil=True)
 def _streaks(
     radiance: Float32Array,
     column: NDArray[np.float64],
@@ -155,7 +155,7 @@ def _streaks(
                     radiance[y, x, channel] += strength[i]
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _expose(
     radiance: Float32Array,
     noise: Float32Array,

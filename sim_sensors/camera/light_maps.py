@@ -2,30 +2,18 @@
 
 from __future__ import annotations
 
-from collections import OrderedDict
 from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.projection import ScreenTriangles
-from sim_sensors.camera.rasterizer import rasterize
 from sim_sensors.camera.textures import LEAF
-from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
-from sim_sensors.mesh import Instances, Material, MeshPool
+from sim_sensors.mesh import MeshPool
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
-
-_WINDOW = 72.0  # m, side of the square that the maps cover
-_STEP = 16.0  # m; the window moves in steps of this size, so a moving camera can reuse it
-_SHADOW_TEXELS = 2048
-_CONTACT_TEXELS = 1024
-_CONTACT_CLEARANCE = 0.93  # scale of the footprints: bumpers are off the ground
-_KEPT = 4  # windows kept per scene
 
 
 class LightMaps(NamedTuple):
@@ -45,173 +33,6 @@ class LightMaps(NamedTuple):
     x: float
     y: float
     texels_per_m: float
-
-
-_Key = tuple[Weather, int, int]
-_CACHE: WeakKeyDictionary[Instances, OrderedDict[_Key, LightMaps]] = WeakKeyDictionary()
-
-
-def light_maps(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: float) -> LightMaps:
-    """Return the maps around (x, y), m. Maps of static instances are cached as long as the instances exist."""
-    still = instances if instances.still is None else instances.still
-    column, row = round(x / _STEP), round(y / _STEP)
-    x, y = column * _STEP, row * _STEP
-    kept = _CACHE.setdefault(still, OrderedDict())
-    key = (weather, column, row)
-    if key not in kept:
-        kept[key] = _draw(pool, still, weather, x, y)
-        if len(kept) > _KEPT:
-            kept.popitem(last=False)
-    kept.move_to_end(key)
-    moving = _near(pool, instances, x, y)
-    moving = moving[moving >= len(still.mesh)]
-    return _with_moving(kept[key], pool, instances, moving, x, y) if len(moving) else kept[key]
-
-
-def _near(pool: MeshPool, instances: Instances, x: float, y: float) -> NDArray[np.int32]:
-    """Return the instances that may cast a shadow into the window around (x, y)."""
-    away = np.hypot(instances.pose[:, 0] - x, instances.pose[:, 1] - y)
-    return np.flatnonzero(away < 0.75 * _WINDOW + pool.radius[instances.mesh]).astype(np.int32)
-
-
-def _draw(pool: MeshPool, instances: Instances, weather: Weather, x: float, y: float) -> LightMaps:
-    near = _near(pool, instances, x, y)
-    to_shadow = _toward_the_sun(weather, x, y)
-    if max(weather.sun) > 0.0:
-        shadow = _shadow_map(pool, instances, near, to_shadow)
-    else:
-        shadow = np.zeros((2, 2), dtype=np.float32)
-    contact, corner = _contact_map(pool, instances, near, x, y), (x - _WINDOW / 2, y - _WINDOW / 2)
-    return LightMaps(shadow, to_shadow, contact, *corner, _CONTACT_TEXELS / _WINDOW)
-
-
-def _with_moving(
-    maps: LightMaps, pool: MeshPool, instances: Instances, moving: NDArray[np.int32], x: float, y: float
-) -> LightMaps:
-    """Add the moving instances to the maps of the static ones."""
-    shadow = maps.shadow
-    if len(shadow) == _SHADOW_TEXELS:
-        shadow = np.maximum(shadow, _shadow_map(pool, instances, moving, maps.to_shadow))
-    contact = np.maximum(maps.contact, _contact_map(pool, instances, moving, x, y))
-    return maps._replace(shadow=shadow, contact=contact)
-
-
-def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
-    """Return the matrix from a world point (x, y, z, 1) to column, row of the shadow map and height towards the sun."""
-    sun = np.array(weather.sun_direction)
-    across = np.cross([0.0, 0.0, 1.0], sun)
-    across /= np.linalg.norm(across)
-    up = np.cross(sun, across)
-    n = _SHADOW_TEXELS
-    to_shadow = np.zeros((3, 4))
-    to_shadow[0, :3] = across * (n / _WINDOW)
-    # Seen from a low sun the window is foreshortened: its texels can be finer in that direction.
-    to_shadow[1, :3] = up * (n / _WINDOW) / max(0.3, sun[2])
-    to_shadow[2, :3] = sun
-    center = np.array([x, y, 0.0])
-    to_shadow[:, 3] = [n / 2, n / 2, 500.0] - to_shadow[:, :3] @ center
-    return to_shadow
-
-
-def _shadow_map(
-    pool: MeshPool, instances: Instances, drawn: NDArray[np.int32], to_shadow: FloatArray
-) -> Float32Array:
-    """Rasterize the scene from the sun, with height towards the sun instead of inverse depth."""
-    n = _SHADOW_TEXELS
-    triangles = _seen_from_the_sun(
-        pool.vertices,
-        pool.triangles,
-        pool.material,
-        pool.vertex_start,
-        pool.triangle_start,
-        drawn,
-        instances.mesh if pool.coarse is None else pool.coarse[instances.mesh],
-        instances.pose,
-        to_shadow,
-        int(Material.GLASS),
-        n,
-    )
-    seen = rasterize(ScreenTriangles(*triangles), (n, n), np.zeros(3), 0.0, panes=False)
-    return seen.inverse_depth
-
-
-@compiled
-def _seen_from_the_sun(
-    vertices: Float32Array,
-    triangles: NDArray[np.int32],
-    material: NDArray[np.uint8],
-    vertex_start: NDArray[np.int64],
-    triangle_start: NDArray[np.int64],
-    near: NDArray[np.int32],
-    mesh: NDArray[np.int32],
-    poses: FloatArray,
-    to_shadow: FloatArray,
-    glass: int,
-    n: int,
-) -> tuple[Float32Array, FloatArray, Float32Array, NDArray[np.uint8], NDArray[np.uint8], NDArray[np.int32]]:
-    capacity = 0
-    for q in near:
-        capacity += triangle_start[mesh[q] + 1] - triangle_start[mesh[q]]
-    corners = np.empty((capacity, 6), dtype=np.float32)
-    planes = np.empty((capacity, 3))
-    count = 0
-    p = np.empty((3, 3))
-    for q in near:
-        first = vertex_start[mesh[q]]
-        cosine = np.cos(poses[q, 3])
-        sine = np.sin(poses[q, 3])
-        for t in range(triangle_start[mesh[q]], triangle_start[mesh[q] + 1]):
-            if material[t] == glass:
-                continue
-            for k in range(3):
-                v = vertices[first + triangles[t, k]]
-                x = poses[q, 0] + cosine * v[0] - sine * v[1]
-                y = poses[q, 1] + sine * v[0] + cosine * v[1]
-                z = poses[q, 2] + v[2]
-                for i in range(3):
-                    p[k, i] = (
-                        to_shadow[i, 0] * x + to_shadow[i, 1] * y + to_shadow[i, 2] * z + to_shadow[i, 3]
-                    )
-            area = (p[1, 0] - p[0, 0]) * (p[2, 1] - p[0, 1]) - (p[2, 0] - p[0, 0]) * (p[1, 1] - p[0, 1])
-            outside = min(p[0, 0], p[1, 0], p[2, 0]) > n or max(p[0, 0], p[1, 0], p[2, 0]) < 0.0
-            outside |= min(p[0, 1], p[1, 1], p[2, 1]) > n or max(p[0, 1], p[1, 1], p[2, 1]) < 0.0
-            if abs(area) < 1e-6 or outside:
-                continue
-            by_x = (p[1, 2] - p[0, 2]) * (p[2, 1] - p[0, 1]) - (p[2, 2] - p[0, 2]) * (p[1, 1] - p[0, 1])
-            by_y = (p[2, 2] - p[0, 2]) * (p[1, 0] - p[0, 0]) - (p[1, 2] - p[0, 2]) * (p[2, 0] - p[0, 0])
-            planes[count, 0] = by_x / area
-            planes[count, 1] = by_y / area
-            planes[count, 2] = p[0, 2] - planes[count, 0] * p[0, 0] - planes[count, 1] * p[0, 1]
-            for k in range(3):
-                corners[count, 2 * k] = p[k, 0]
-                corners[count, 2 * k + 1] = p[k, 1]
-            count += 1
-    none = np.zeros((count, 9), dtype=np.float32)
-    plain = np.zeros(count, dtype=np.uint8)
-    plain_color = np.zeros((count, 3), dtype=np.uint8)
-    return corners[:count], planes[:count], none, plain, plain_color, np.zeros(count, dtype=np.int32)
-
-
-def _contact_map(
-    pool: MeshPool, instances: Instances, near: NDArray[np.int32], x: float, y: float
-) -> NDArray[np.uint8]:
-    """Blur the footprints of the vehicles twice: for the dark area between the wheels and for its soft border."""
-    image = np.zeros((_CONTACT_TEXELS, _CONTACT_TEXELS), dtype=np.uint8)
-    boxes = bounding_boxes(pool)
-    scale = _CONTACT_TEXELS / _WINDOW
-    corner = np.array([x, y]) - _WINDOW / 2
-    for q in near:
-        if instances.ids[q] == 0:
-            continue
-        low_x, low_y, _, high_x, high_y, _ = boxes[instances.mesh[q]] * _CONTACT_CLEARANCE
-        px, py, _, yaw = instances.pose[q]
-        rotation = np.array([[np.cos(yaw), np.sin(yaw)], [-np.sin(yaw), np.cos(yaw)]])
-        outline = np.array([[low_x, low_y], [high_x, low_y], [high_x, high_y], [low_x, high_y]])
-        texels = (outline @ rotation + (px, py) - corner) * scale - 0.5
-        cv2.fillConvexPoly(image, np.round(texels * 16).astype(np.int32), 255, cv2.LINE_AA, 4)
-    wide = cv2.GaussianBlur(image, (0, 0), 0.34 * scale)
-    tight = cv2.GaussianBlur(image, (0, 0), 0.1 * scale)
-    return np.asarray(cv2.addWeighted(wide, 0.5, tight, 0.46, 0.0), dtype=np.uint8)
 
 
 _BOXES: WeakKeyDictionary[MeshPool, FloatArray] = WeakKeyDictionary()

@@ -10,12 +10,14 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.ground_texture import ground_texture
+from sim_sensors.camera.ground_texture import GroundTexture, ground_texture
 from sim_sensors.camera.image_sensor import ImageSensor
-from sim_sensors.camera.light_maps import bounding_boxes, light_maps
+from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
 from sim_sensors.camera.projection import ScreenTriangles, project
 from sim_sensors.camera.rasterizer import FAR, Visibility, rasterize
 from sim_sensors.camera.shading import shade
+from sim_sensors.camera.shadows import light_maps
+from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
@@ -218,9 +220,7 @@ class PinholeCamera:
     ) -> tuple[Float32Array, ScreenTriangles, Visibility]:
         """Return the radiance, and what is seen at the pixels' centres."""
         seen = self.visibility(scene, pose)
-        texture = ground_texture(scene.ground)
-        x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
-        maps = light_maps(scene.pool, scene.instances, weather, float(x), float(y))
+        texture, maps = _surroundings(scene, scene.instances, pose, weather)
         if self.supersampling == 1:
             return shade(*seen, pose, self.intrinsics, weather, texture, maps), *seen
         fine = PinholeCamera(
@@ -229,6 +229,24 @@ class PinholeCamera:
         )  # fmt: skip
         radiance = shade(*fine.visibility(scene, pose), pose, fine.intrinsics, weather, texture, maps)
         return _halved(radiance), *seen
+
+    def prepare(self, scene: Drawable, pose: FloatArray, weather: Weather | None = None) -> None:
+        """Draw and keep what pictures from nearby poses share: texture of the ground, shadows and sky.
+
+        Args:
+            scene: as in `render`.
+            pose: as in `render`.
+            weather: as in `render`.
+        """
+        weather = Weather() if weather is None else weather
+        pose = checked_pose(scene, pose)
+        # The shadows of what moves are drawn with each picture.
+        still = scene.instances if scene.instances.still is None else scene.instances.still
+        _surroundings(scene, still, pose, weather)
+        n = self.supersampling
+        fx, fy, cx, cy = (n * value for value in self.intrinsics)
+        sky_of_view(weather, pose[:3, :3], (fx, fy, cx, cy), (n * self.width, n * self.height))
+        mirrored_sky(weather)
 
     def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
         """Return the visible triangle of each pixel: geometry without light."""
@@ -294,6 +312,15 @@ class StereoCamera:
             image = sensor.expose(radiance, 2 * seed + side, gain, rain=weather.rain)
             frames.append(_RenderedFrame(image, seen, triangles.instance, scene.instances.ids))
         return StereoFrame(*frames)
+
+
+def _surroundings(
+    scene: Drawable, instances: Instances, pose: FloatArray, weather: Weather
+) -> tuple[GroundTexture, LightMaps]:
+    """Return the texture of the ground, and the shadows of instances around a camera."""
+    x, y = pose[:2, 3] + _AHEAD * pose[:2, 2]
+    maps = light_maps(scene.pool, instances, weather, float(x), float(y))
+    return ground_texture(scene.ground), maps
 
 
 def camera_pose(
@@ -364,7 +391,7 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
     return pose
 
 
-@compiled
+@compiled(nogil=True)
 def _geometry(
     visibility: Visibility, instance: NDArray[np.int32], ids: NDArray[np.int32]
 ) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
@@ -385,7 +412,7 @@ def _geometry(
     return depth, glass, seen
 
 
-@compiled
+@compiled(nogil=True)
 def _halved(image: Float32Array) -> Float32Array:
     """Average every 2×2 pixels of an (h, w, 3) image."""
     height, width, _ = image.shape

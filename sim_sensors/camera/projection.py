@@ -140,7 +140,7 @@ def _visible_instances(
     return np.flatnonzero(seen).astype(np.int32)
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _project_parts(
     vertices: Float32Array,
     normals: Float32Array,

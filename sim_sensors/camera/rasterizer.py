@@ -97,7 +97,7 @@ def interleaved(n: int) -> NDArray[np.int64]:
     return np.arange(n, dtype=np.int64) * step % n
 
 
-@compiled
+@compiled(nogil=True)
 def _sort_into_bands(
     corners: Float32Array, material: NDArray[np.uint8], n_bands: int, height: int, panes: bool
 ) -> tuple[NDArray[np.int64], IntArray]:
@@ -156,7 +156,7 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
     return ax, ay, bx, by, cx, cy
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,

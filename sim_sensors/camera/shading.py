@@ -72,7 +72,7 @@ def shade(
     return image
 
 
-@compiled(parallel=True, fastmath=FAST)
+@compiled(parallel=True, fastmath=FAST, nogil=True)
 def _shade(
     triangles: ScreenTriangles,
     visibility: Visibility,

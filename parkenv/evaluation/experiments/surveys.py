@@ -85,6 +85,7 @@ def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
         localise=spec.localise,
         seed=spec.seed,
         detector=spec.detector or spec.scenario.detector,
+        picture_width=spec.picture_width,
     )
     return build(described), settings
 
