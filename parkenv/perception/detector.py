@@ -143,7 +143,10 @@ class GroundBand(NamedTuple):
 
 @runtime_checkable
 class BandDetector(Protocol):
-    """A detector that is faster if it knows where in the image the cars can be."""
+    """A detector that is faster if it knows where in the image the cars can be.
+
+    It is called in several threads at once.
+    """
 
     def detect_on_ground(self, image: Image, band: GroundBand) -> Detections:
         """Find the cars in one image as `Detector.detect` does, only those whose boxes lie in the band."""

@@ -6,6 +6,8 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +26,7 @@ from parkenv.perception.ranging import (
     localize_median,
 )
 from parkenv.perception.slot_filter import SlotFilter, SlotObservation
+from parkenv.perception.threads import in_threads
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Capture, Mount, SensorRig
@@ -57,6 +60,13 @@ class CameraView:
     stereo: tuple[StereoCamera, NDArray[np.float32]] | None
     cars: LocatedCars
     slots: NDArray[np.int64]
+
+
+class _Seen(NamedTuple):
+    """What the images of a capture show, before any range is known."""
+
+    detections: dict[str, Detections]  # by camera
+    disparities: dict[str, tuple[StereoCamera, NDArray[np.float32]]]  # by stereo camera, eq. 3.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,6 +106,8 @@ class PerceptionPipeline:
         self.rig = rig
         self.lot = lot
         self.detector = make_detector(detector)
+        # Only these promise that they may be called in several threads.
+        self._concurrent = isinstance(self.detector, BandDetector)
 
     def process(
         self,
@@ -111,9 +123,18 @@ class PerceptionPipeline:
             vehicle: (3,) estimated x, y, yaw of the vehicle, or a function that estimates it from the scans in the
                 vehicle's frame; None: the true pose.
         """
+        return self._process(captured, self._look(captured), slots, vehicle)
+
+    def _process(
+        self,
+        captured: TimedCapture,
+        seen: _Seen,
+        slots: SlotFilter,
+        vehicle: FloatArray | Callable[[Sequence[RangeScan]], FloatArray] | None = None,
+    ) -> PerceptionResult:
         vehicle = captured.capture.pose if vehicle is None else vehicle
         views = []
-        disparities = self._disparities(captured.capture)  # eq. 3.1
+        disparities = seen.disparities
         if callable(vehicle):
             local = self._range_scans(captured.capture, disparities, np.zeros(3))
             vehicle = vehicle(tuple(local.values()))
@@ -124,7 +145,7 @@ class PerceptionPipeline:
             slots.update_from_scan(scan)  # T §3.3.2, from beams
         for name, camera, mount, image in self._images(captured.capture):
             scan = scans[self._ranging_sensor(name)]
-            found = self._detect(image, camera, mount)  # T §3.2.1, §3.2.2
+            found = seen.detections[name]
             cars = localize_cars(found, scan, camera, mount, vehicle)  # eq. 3.2
             found, cars = _confirmed(found, cars)
             placed = slots.update_from_cars(cars)  # T §3.3.2, from detections
@@ -141,8 +162,28 @@ class PerceptionPipeline:
             The result of each capture, and the observed slots with their states.
         """
         slots = SlotFilter(self.lot)
-        results = tuple(self.process(captured, slots) for captured in captures)
+        seen = in_threads(self._look, captures) if self._concurrent else [self._look(c) for c in captures]
+        results = tuple(
+            self._process(captured, one, slots) for captured, one in zip(captures, seen, strict=True)
+        )
         return results, slots.observation()
+
+    def _look(self, captured: TimedCapture) -> _Seen:
+        """Find the cars in the images of a capture, and match its stereo pairs."""
+        capture = captured.capture
+        if self._concurrent and self.rig.stereo_cameras:
+            jobs: list[Callable[[], Any]] = [
+                partial(self._detections, capture),
+                partial(self._disparities, capture),
+            ]
+            return _Seen(*in_threads(_call, jobs))
+        return _Seen(self._detections(capture), self._disparities(capture))
+
+    def _detections(self, capture: Capture) -> dict[str, Detections]:
+        return {
+            name: self._detect(image, camera, mount)  # T §3.2.1, §3.2.2
+            for name, camera, mount, image in self._images(capture)
+        }
 
     def _detect(self, image: NDArray[np.uint8], camera: PinholeCamera, mount: Mount) -> Detections:
         """Find the cars; a detector that can do so looks only where a car on the ground can be."""
@@ -204,6 +245,10 @@ def localize_as_thesis(view: CameraView, vehicle: FloatArray) -> LocatedCars:
         stereo, disparity_px = view.stereo
         return localize_disparity(view.detections, disparity_px, stereo, view.mount, vehicle)
     return localize_median(view.detections, view.scan, view.camera, view.mount, vehicle)
+
+
+def _call(job: Callable[[], Any]) -> Any:
+    return job()
 
 
 def _confirmed(found: Detections, cars: LocatedCars) -> tuple[Detections, LocatedCars]:

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
+from scipy.fft import irfft, rfft2
 
 from sim_sensors.camera.textures import FAST, LEAF, cloud_tile, fractal_noise
 from sim_sensors.camera.weather import Weather
@@ -64,7 +65,7 @@ def sky_of(weather: Weather) -> Sky:
     """Draw clouds and skyline of a weather: distant trees and roofs, up to about 8° high, in haze."""
     rng = np.random.default_rng([weather.seed, 7])
     noise = (0.5 + 0.2 * fractal_noise(_NOISE, rng, 1.5)).astype(np.float32)
-    crowns = 0.05 + 0.022 * fractal_noise(_BEARINGS, rng, 0.9)[0]
+    crowns = 0.05 + 0.022 * _first_row_of_noise(_BEARINGS, rng, 0.9)
     roofs = np.repeat(rng.uniform(0.02, 0.13, 64), _BEARINGS // 64)
     built = np.repeat(rng.random(64) < 0.3, _BEARINGS // 64)
     sky, sun, tile = np.array(weather.sky), np.array(weather.sun), cloud_tile()
@@ -82,6 +83,25 @@ def sky_of(weather: Weather) -> Sky:
         min(0.85, 0.12 + weather.haze * 120.0),
         tile.levels[: tile.size**2].reshape(tile.size, tile.size),
     )
+
+
+def _first_row_of_noise(size: int, generator: np.random.Generator, slope: float) -> FloatArray:
+    """Return the first row of `fractal_noise`, up to rounding, without computing the others: a third of the time."""
+    spectrum = rfft2(generator.standard_normal((size, size)))
+    spectrum *= _falloff(size, slope)
+    # Columns from 1 to size/2 - 1 stand for their mirror images, too.
+    power = 2.0 * (spectrum.real**2 + spectrum.imag**2).sum(axis=0)
+    power[[0, -1]] *= 0.5
+    mean = spectrum[0, 0].real / size**2
+    std = math.sqrt(power.sum() / size**4 - mean**2)
+    return np.asarray((irfft(spectrum.mean(axis=0), size) - mean) / std)
+
+
+@lru_cache(maxsize=1)
+def _falloff(size: int, slope: float) -> FloatArray:
+    radius = np.hypot(np.fft.fftfreq(size)[:, None], np.fft.rfftfreq(size))
+    radius[0, 0] = 1.0
+    return np.asarray(radius**-slope)
 
 
 @compiled(**LEAF)
