@@ -367,6 +367,7 @@ class _Curves:
             return 0.5 * float(off @ off) - solution.evidence, off / _SPREAD - gradient
 
         bounds = list(zip(_MEDIAN - 3 * _SPREAD, _MEDIAN + 3 * _SPREAD, strict=True))
-        options = {"maxiter": _TUNING_STEPS}
-        found = minimize(loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        found = minimize(
+            loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": _TUNING_STEPS}
+        )
         return np.asarray(found.x, float)
