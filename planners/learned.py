@@ -11,11 +11,16 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
-from planners.model_file import OBSERVATION, load_model
+from planners.model_file import SEARCH_OBSERVATIONS, load_model
+
+_WRAPPERS = {
+    "local": "parkenv.envs.local_observation.LocalObservation",
+    "scan": "parkenv.envs.scan_observation.ScanObservation",
+}
 
 
 class LearnedAgent:
-    """A trained model as an agent for any lot, on observations of `parkenv.envs.local_observation`.
+    """A trained model as an agent: on `parkenv.envs.local_observation`, or on `parkenv.envs.scan_observation`.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -28,14 +33,17 @@ class LearnedAgent:
     Attributes:
         card: metadata of the file.
         model: the policy.
-        local_k: number of slots in the observation.
+        local_k: number of slots in the observation; None for a model that observes scans.
+        scans_k: number of scans in the observation; None for a model that observes `local`.
     """
 
     def __init__(self, problem: SearchProblem, algorithm: str, path: str | os.PathLike[str]) -> None:
         self.name = f"{algorithm}:{path}"
         self.problem = problem.public()
-        self.card, self.model = load_model(algorithm, path, "search", OBSERVATION)
-        self.local_k = self.card.k
+        self.card, self.model = load_model(algorithm, path, "search", *SEARCH_OBSERVATIONS)
+        self._key = SEARCH_OBSERVATIONS[self.card.observation][0]
+        self.local_k = self.card.k if self._key == "local" else None
+        self.scans_k = self.card.k if self._key == "scan" else None
 
     def predict(
         self,
@@ -44,20 +52,20 @@ class LearnedAgent:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """Choose an action for an observation of `LocalObservation` (stable-baselines3's interface).
+        """Choose an action for an observation of `LocalObservation` or `ScanObservation`, as stable-baselines3 does.
 
         Raises:
             InputError: the observation has another layout, or its mask allows no action.
         """
-        if "local" not in observation:
+        key = self._key
+        if key not in observation:
             raise InputError(
-                f"{self.name} wants observations of parkenv.envs.local_observation.LocalObservation, got "
-                f"{', '.join(observation)}"
+                f"{self.name} wants observations of {_WRAPPERS[key]}, got {', '.join(observation)}"
             )
-        given, wanted = observation["local"].shape[-1:], self.model.observation_space["local"].shape
+        given, wanted = observation[key].shape[-1:], self.model.observation_space[key].shape
         if given != wanted:
             raise InputError(
-                f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.local_k}"
+                f"{self.name} observes {wanted[0]} numbers, got {given[0]} for its k = {self.card.k}"
             )
         if not np.any(observation["action_mask"], axis=-1).all():
             raise InputError("action_mask allows nothing; a search that goes on allows at least one action")

@@ -32,6 +32,15 @@ OBSERVATION = "local-1"
 """Version of the layout of `parkenv.envs.local_observation`, which search models observe."""
 FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
 """Size of that observation: for k slots, 46 + 8k numbers."""
+SCANS_OBSERVATION = "scan-1"
+"""Version of the layout of `parkenv.envs.scan_observation`, which search models observe instead of `local`."""
+FIXED_OF_SCANS, NUMBERS_PER_SCAN = 30, 77
+"""Size of that observation: for k scans, 30 + 77k numbers."""
+SEARCH_OBSERVATIONS = {
+    OBSERVATION: ("local", FIXED_NUMBERS, NUMBERS_PER_SLOT),
+    SCANS_OBSERVATION: ("scan", FIXED_OF_SCANS, NUMBERS_PER_SCAN),
+}
+"""What a search model may observe: key of the vector, its fixed numbers, and those for each of k slots or scans."""
 COMMANDS = {"search": "parkenv compare", "drive": "parkenv park"}
 """Commands that run the models of each task."""
 _MAX_BYTES = 500_000_000
@@ -112,7 +121,7 @@ class ModelCard(Spec):
     algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo", "sac", "tqc"]
     task: Literal["search", "drive"]
     observation: str = Field(description="Version of the observation's layout.")
-    k: int = Field(ge=0, le=1_000, description="Slots in the observation; 0 for driving.")
+    k: int = Field(ge=0, le=1_000, description="Slots, or scans, in the observation; 0 for driving.")
     policy: Literal["MultiInputPolicy", "MultiInputLstmPolicy"]
     policy_options: PolicyOptions
     observation_space: Annotated[dict[str, BoxSpace], Field(max_length=16)]
@@ -181,8 +190,8 @@ def save_model(
     """Write a model of stable-baselines3 or sb3-contrib to a model file, atomically.
 
     Args:
-        model: trained on `parkenv.envs.search_sb3.SearchVecEnv`, or another environment of the `local` observation; or
-            on the driving observation of `planners.driving.policy_interface`.
+        model: trained on `parkenv.envs.search_sb3.SearchVecEnv`, or another environment of the `local` or the `scan`
+            observation; or on the driving observation of `planners.driving.policy_interface`.
         path: file to write; its name should end in `.safetensors`.
         scenarios: names of the training scenarios; for driving, of the lots.
         held_out: names of the places that it was evaluated in, and never trained on.
@@ -200,7 +209,7 @@ def save_model(
     algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
     if algorithm is None:
         raise InputError(f"the model is a {name}, want one of {', '.join(ALGORITHMS)}")
-    task, observation, k = _observation_of(model.observation_space)
+    task, observation, k = observation_of(model.observation_space)
     aliases = {kind: alias for alias, kind in type(model).policy_aliases.items()}
     options = {
         key: value.__name__ if isinstance(value, type) else value
@@ -227,17 +236,24 @@ def save_model(
         beside.write_bytes(save(weights, {CARD_KEY: card.model_dump_json()}))
 
 
-def _observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
-    """Return task, observation version and k of a model's observation space."""
-    if isinstance(space, spaces.Dict) and "local" in space.spaces and space["local"].shape:
-        return "search", OBSERVATION, (space["local"].shape[0] - FIXED_NUMBERS) // NUMBERS_PER_SLOT
+def observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
+    """Return task, observation version and k of a model's observation space.
+
+    Raises:
+        InputError: it is of no task.
+    """
+    for version, (key, fixed, each) in SEARCH_OBSERVATIONS.items():
+        if isinstance(space, spaces.Dict) and key in space.spaces and (shape := space[key].shape):
+            return "search", version, (shape[0] - fixed) // each
     if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
         return "drive", import_module("planners.driving.policy_interface").INTERFACE, 0
-    raise InputError("the model observes neither `local` (to search) nor `achieved_goal` (to drive)")
+    raise InputError(
+        "the model observes neither `local` or `scan` (to search) nor `achieved_goal` (to drive)"
+    )
 
 
 def load_model(
-    algorithm: str, path: str | os.PathLike[str], task: str, observation: str
+    algorithm: str, path: str | os.PathLike[str], task: str, *observations: str
 ) -> tuple[ModelCard, Any]:
     """Load a model's card and policy; no code from the file is run.
 
@@ -245,7 +261,7 @@ def load_model(
         algorithm: algorithm that it was trained with.
         path: the model file.
         task: `search` or `drive`.
-        observation: version of the environment's observation layout.
+        observations: versions of the layouts that the environment can give.
 
     Raises:
         InputError: the file is not a model, or is one of another algorithm, task or observation.
@@ -258,9 +274,10 @@ def load_model(
         raise InputError(
             f"{path}: was trained to {card.task}, not to {task}; `{COMMANDS[card.task]}` runs it"
         )
-    if card.observation != observation:
+    if card.observation not in observations:
         raise InputError(
-            f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
+            f"{path}: observes {card.observation!r}, this version of parkenv gives "
+            f"{' or '.join(map(repr, observations))}; "
             f"it was trained with parkenv {card.parkenv}"
         )
     _require_spaces(card, path)
@@ -283,7 +300,8 @@ def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
     observed = {name: space.shape for name, space in card.observation_space.items()}
     acted = card.action_space if isinstance(card.action_space, int) else card.action_space.shape
     if card.task == "search":
-        wanted = {"local": (FIXED_NUMBERS + NUMBERS_PER_SLOT * card.k,), "action_mask": (len(ACTIONS),)}
+        key, fixed, each = SEARCH_OBSERVATIONS[card.observation]
+        wanted = {key: (fixed + each * card.k,), "action_mask": (len(ACTIONS),)}
         act: int | tuple[int, ...] = len(ACTIONS)
     else:
         size = import_module("planners.driving.policy_interface").OBSERVATION_SIZE

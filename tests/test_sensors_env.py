@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
-from parkenv.envs.sensor_sampler import SensorSampler
+from parkenv.envs.sensor_sampler import PICTURE_WIDTH, SensorSampler
 from parkenv.lots import grid_lot
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic, _Loops
@@ -128,8 +128,11 @@ def test_scans_alone_are_those_beside_the_pictures():
 def test_pictures_of_another_width():
     env = make(picture_width=160)
     assert env.reset(seed=1)[0]["image.right"].shape[1:] == (120, 160, 3)
-    seen = gym.make("parkenv/SearchPerception-v2", scenario="mini", picture_width=320).unwrapped
-    assert seen.rig.cameras[0][1].width == 320
+    assert make().unwrapped.rig is SMALL_RIG
+    for given, width in ((None, PICTURE_WIDTH), (640, 640)):
+        for name in ("SearchSensors", "SearchPerception"):
+            seen = gym.make(f"parkenv/{name}-v2", scenario="mini", picture_width=given).unwrapped
+            assert seen.rig.cameras[0][1].width == width
     for wrong in (True, 12, 3.5):
         with pytest.raises(InputError, match="picture_width is"):
             make(picture_width=wrong)

@@ -133,7 +133,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     assert best < 60.0 < curve[0]["total_s"], "it parks now, and did not when it began"
     name = f"maskable-ppo:{trained / 'model.safetensors'}"
     agent = make_agent(name, SCENARIO)
-    times, _ = episode_times(agent.model, SCENARIO, EVALUATED, 5)
+    times, _ = episode_times(agent.model, SCENARIO, EVALUATED)
     assert times.mean() == pytest.approx(best)
     rows, _ = Case(SCENARIO, name).run(EVALUATED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
@@ -225,9 +225,9 @@ def test_cloning_begins_near_the_planner():
     assert (shown.times > 0.0).all()
     venv = SearchVecEnv(4, campus, reward_scale=0.01, max_episode_steps=MAX_STEPS)
     model = MaskablePPO("MultiInputPolicy", venv, seed=0, policy_kwargs={"net_arch": [64, 64]})
-    fresh, _ = episode_times(model, campus, EVALUATED, 5)
+    fresh, _ = episode_times(model, campus, EVALUATED)
     clone(model, shown, 0, updates=2000)
-    cloned, _ = episode_times(model, campus, EVALUATED, 5)
+    cloned, _ = episode_times(model, campus, EVALUATED)
     planner = [row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]]
     # The mean would be of those few searches in which a clone drives in circles; on empty days any agent parks soon.
     cloned_s, planner_s, fresh_s = (np.quantile(times, 0.75) for times in (cloned, planner, fresh))

@@ -6,7 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
+from parkenv.cli import arguments as args
 from parkenv.cli.arguments import words
+from parkenv.cli.detector_drives import compare_on_drives
+from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.evaluation.plurals import plural
@@ -313,18 +316,29 @@ def evaluate_detector(
     pictures: int = 40,
     false_positives: float = 0.1,
     seed: int = 0,
+    sessions: int = 0,
+    rig: str | None = None,
+    every: float = 2.5,
+    misses: int = 0,
+    machines: args.Machines,
 ) -> None:
-    """Measure recall and precision of a detector on UIUC's test sets, or compare detectors on simulated drives.
+    r"""Measure recall and precision of a detector on UIUC's test sets, or compare detectors on simulated drives.
 
     On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars. Any other
     detector looks as it does in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the sets
-    label neither. On drives, every detector reports so many boxes that it has equally many false positives; a car
-    counts if it is within 20 m, 16 px high, and 30 % of it are visible.
+    label neither. On pictures of drives, every detector reports so many boxes that it has equally many false positives;
+    a car counts if it is within 20 m, 16 px high, and 30 % of it are visible.
+
+    With --sessions, whole survey drives are compared, as `parkenv survey` makes them: cars found, slots right, error of
+    the map, by weather, distance, and what makes a car hard to find. All detectors look at the same pictures. Each rig
+    and detector has a folder with its map. The same command goes on after an interruption.
 
     Examples:
         parkenv evaluate-detector --uiuc CarData --model side
         parkenv evaluate-detector --uiuc CarData --detector net
         parkenv evaluate-detector --drives campus --detector hog,net
+        parkenv evaluate-detector --drives campus --detector hog,net \
+            --sessions 21 --rig laser,stereo --misses 8
 
     Options:
         uiuc (DIR): UIUC's folder as published (CarData).
@@ -332,18 +346,42 @@ def evaluate_detector(
             --detector.
         detector (NAME|FILE|MODULE:CLASS): Instead of a model: hog, net, a network (.onnx), or a class of your own; with
             --drives several, separated by commas.  [default: none]
-        out, -o (DIR): Folder for summary.json and the curves.
+        out, -o (DIR): Folder for summary.json, tables and figures.
 
     On drives:
-        drives (SCENARIO): Instead of --uiuc: pictures along the survey's route of a scenario.
+        drives (SCENARIO): Instead of --uiuc: pictures along the survey's route of a scenario, or whole drives.
         pictures (N >= 1): Pictures in each of the five weathers.
         false_positives (X >= 0): Boxes without a car in a picture, on average.
         seed (N >= 0): Seed of cars, light and noise.
+
+    On whole drives:
+        sessions (N >= 0): Survey drives for each rig; 0: only pictures.
+        rig (NAME[,...]): laser, stereo, both_sides.  [default: laser]
+        every (M >= 0.1): Metres between captures.
+        misses (N >= 0): Missed cars of each kind on a contact sheet for each rig and detector; 0: none.
     """
     if (uiuc is None) == (drives is None):
         raise InputError("give one of --uiuc FOLDER and --drives SCENARIO")
+    if not sessions and (rig is not None or misses):
+        raise InputError("--rig and --misses go with --sessions")
+    if sessions and uiuc is not None:
+        raise InputError("--sessions goes with --drives")
     if drives is not None:
         names = words("--detector", detector or model)
+        if sessions:
+            with writing_into(out, "the same command"):
+                compare_on_drives(
+                    drives,
+                    words("--rig", rig or "laser"),
+                    names,
+                    sessions,
+                    every,
+                    seed,
+                    misses,
+                    out,
+                    machines,
+                )
+            return
         _evaluate_on_drives(drives, names, pictures, false_positives, seed, out)
     elif uiuc is not None:
         _evaluate_on_uiuc(uiuc, model, detector, out)

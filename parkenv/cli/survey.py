@@ -37,6 +37,7 @@ def survey(
     pose_noise: float = 0.0,
     odometry_drift: float = 0.0,
     localise: LocaliserName = "none",
+    picture_width: int | None = None,
     rerun: Path | None = None,
     record: Path | None = None,
     folder: args.ReportedRun,
@@ -70,6 +71,7 @@ def survey(
         pose_noise (M >= 0): Localisation error of the car, m.
         odometry_drift (0 <= P <= 0.5): Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.
         localise (none|scan-matching): scan-matching: correct the odometry by parked cars, walls and slots.
+        picture_width (64 <= PX <= 4096): Width of the cameras' pictures; searches have 400.  [default: 640]
 
     Results:
         record (FILE.mcap): Also record images, scans and poses of the first session (extra bags), for `parkenv
@@ -81,7 +83,7 @@ def survey(
     spec = SurveySpec().changed(
         scenario=traffic.on(world.spec(scenario), BUSY), sessions=sessions, rig=rig, detector=detector,
         weather=weather, every=every, pose_noise=pose_noise, odometry_drift=odometry_drift, localise=localise,
-        seed=seed, **windows, **machines.given,
+        picture_width=picture_width, seed=seed, **windows, **machines.given,
     )  # fmt: skip
     with writing_into(out, "the same command"):
         run_survey_of(spec, out, folder, rerun, record)

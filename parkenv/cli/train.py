@@ -38,6 +38,7 @@ def train(
     clone: str | None = None,
     demonstrations: int | None = None,
     k: int | None = None,
+    observation: Literal["local", "scan"] | None = None,
     evaluate_every: int | None = None,
     evaluation_episodes: int | None = None,
     held_out: float | None = None,
@@ -55,6 +56,7 @@ def train(
     agents: str | None = None,
     beside: str | None = None,
     lot: str | None = None,
+    day_error: str | None = None,
     tensorboard: bool = False,
     folder: args.ReportedRun,
     machines: args.Machines,
@@ -62,10 +64,10 @@ def train(
     """Train agents by reinforcement learning with several seeds, and draw their learning curves beside the planners.
 
     The reward of search agents is minus the time in seconds. They observe the surroundings of the car, so they run on
-    any lot. In a fleet, one network drives all cars, or a share of them. Driving agents park the car in a slot, with
-    hindsight experience replay (sac, tqc) or the dense reward (ppo); their curriculum starts just outside the slot. All
-    are evaluated in held-out worlds; each seed's best model is kept, and tested at the end. Hyperparameters are in
-    parkenv/evaluation/training/configs.py.
+    any lot; or raw laser scans, on one lot. In a fleet, one network drives all cars, or a share of them. Driving agents
+    park the car in a slot, with hindsight experience replay (sac, tqc) or the dense reward (ppo); their curriculum
+    starts just outside the slot. All are evaluated in held-out worlds; each seed's best model is kept, and tested at
+    the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
 
     Examples:
         parkenv train maskable-ppo --scenario campus
@@ -74,6 +76,7 @@ def train(
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train network --scenario my-lots --evaluate-on other-lots
         parkenv train ppo --beside results/maskable-ppo,results/dqn
+        parkenv train maskable-ppo --scenario mini --observation scan --trainings 3
         parkenv train --env fleet --arrivals-per-hour 120 --trainings 3
         parkenv train sac --env drive --scenario campus,street --trainings 3
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
@@ -90,13 +93,15 @@ def train(
             fleet, 500000; for network, 10000; to drive, the training config's]
         trainings (N >= 1): How many, with one seed each from --seed on.
         seed (N >= 0): First seed of the trainings.
-        out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/drive-ALGORITHM,
-            results/fleet-ALGORITHM]
+        out, -o (DIR): Folder for models, curves and figures.  [default: results/ALGORITHM, results/scan-ALGORITHM,
+            results/drive-ALGORITHM, results/fleet-ALGORITHM]
 
     Learning:
         clone (AGENT): Start with behaviour cloning of this planner (search; ppo, maskable-ppo).
         demonstrations (N >= 1): Episodes of the planner to clone.  [default: 2000]
-        k (N >= 1): Slots in an observation (search, fleet).  [default: 5]
+        k (N >= 1): Slots in an observation (search, fleet).  [default: 5; with --observation scan, 4 scans]
+        observation (local|scan): What is observed (search; ppo, maskable-ppo). local: what is near the car, from belief
+            and forecast; scan: the last laser scans and poses alone, in one scenario.  [default: local]
         curriculum (size): Begin with the smallest tenth of the places, and add larger ones evenly until half of --steps
             (search).  [default: all places from the start]
         without (PART[,...]): Parts of network to leave out: lookahead, tokens, day, memory.  [default: none]
@@ -124,6 +129,8 @@ def train(
         agents (NAME[,...]|none): Agents that are drawn for comparison.  [default: belief, mdp-tuned, mdp, first-free,
             greedy-drive, greedy-goal; with held-out places, belief, mdp, first-free, greedy-drive; in a fleet,
             greedy-drive, first-free; to drive, planner]
+        day_error (X[,Y]): How far whole days differ from the forecast, in all of these scenarios: standard deviations,
+            logits, of their level and of their slope to the goal; 0 for days as forecast.  [default: the scenario's]
         beside (DIR[,...]): Folders of other trainings with the same evaluations, to draw in the same figure.
 
     Results:
@@ -132,10 +139,13 @@ def train(
     """
     from parkenv.evaluation.experiments.spec import TrainingSpec
 
+    if day_error and not (scenario or lot):
+        raise InputError("--day-error goes with --scenario or --lot")
+    world, days = args.World(lot=lot, day_error=day_error), args.World(day_error=day_error)
     given = {
-        "scenarios": tuple(args.World(lot=lot).specs(scenario)) if scenario or lot else None,
-        "evaluate_on": tuple(args.scenario_specs(evaluate_on)) if evaluate_on else None,
-        "test_on": tuple(args.scenario_specs(test_on)) if test_on else None,
+        "scenarios": tuple(world.specs(scenario)) if scenario or lot else None,
+        "evaluate_on": tuple(days.specs(evaluate_on)) if evaluate_on else None,
+        "test_on": tuple(days.specs(test_on)) if test_on else None,
         "without": args.words("--without", without) if without else None,
         "agents": _agents(agents),
         "test_among": _agents(test_among),
@@ -143,10 +153,10 @@ def train(
     }
     spec = TrainingSpec().changed(
         env=env, algorithm=algorithm, steps=steps, trainings=trainings, seed=seed, clone=clone,
-        demonstrations=demonstrations, k=k, held_out=held_out, curriculum=curriculum, evaluate_every=evaluate_every,
-        evaluation_episodes=evaluation_episodes, arrivals_per_hour=arrivals_per_hour, stay_s=_seconds(stay_min),
-        patience_s=_seconds(patience_min), knows=knows, learners=learners, tensorboard=tensorboard, **given,
-        **machines.given,
+        demonstrations=demonstrations, k=k, observation=observation, held_out=held_out, curriculum=curriculum,
+        evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes, arrivals_per_hour=arrivals_per_hour,
+        stay_s=_seconds(stay_min), patience_s=_seconds(patience_min), knows=knows, learners=learners,
+        tensorboard=tensorboard, **given, **machines.given,
     )  # fmt: skip
     out = out or Path("results") / _task_of(spec).folder
     with writing_into(out, "the same command with --resume"):

@@ -116,7 +116,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     | `captures` | 2 | largest number of captures on an edge |
     | `every` | 1.25 | m, least distance between captures on an edge |
     | `detector` | the scenario's | a `Detector`, or `hog`, `side`, `front`, a file (.npz, .onnx), `MODULE:CLASS` |
-    | `picture_width` | the rig's | px, of the cameras' pictures; smaller ones are drawn and looked at faster |
+    | `picture_width` | 400; a `SensorRig`'s own | px, width of the cameras' pictures; those of a survey have 640 |
 
     The scenario's `sensor_model` gives the error rates that the belief update assumes, and its range: farther slots
     are not updated. If it is perfect, the fitted model of the rig replaces it (`SensorModel.named`).
@@ -136,7 +136,8 @@ class SearchPerceptionEnv(SensingSearchEnv):
     ```
 
     ## Version history
-    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast.
+    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast; pictures are
+      400 px wide unless told otherwise.
     - v1: observations gain `belief`.
     - v0: first version.
     """

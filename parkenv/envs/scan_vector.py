@@ -14,6 +14,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from parkenv.envs.car_footprints import CarLibrary, Scratch, draw_car, put_car, remove_car
+from parkenv.envs.scan_observation import SCANS, ScanHistory, goal_of, observe_scans, scans_space
 from parkenv.envs.search import LATEST
 from parkenv.envs.search_kernel import take_step
 from parkenv.envs.search_records import PROCESS_KIND, search_at
@@ -198,11 +199,7 @@ def scan_searches(
         search = search_at(address, e)
         corners, x, y, radius = planes.corners[e], planes.x[e], planes.y[e], planes.radius[e]
         if fresh[e]:
-            for slot in range(n_slots):
-                cursor = cursor_at(cursors, e * n_slots + slot)
-                cursor.sojourn, cursor.valid_until = 0, 0.0
-                planes.shown[e, slot] = 0
-                remove_car(library, slot, x, y)
+            _forget_cars(cursors, library, planes, e)
         count, done = stops.count[e], 0
         scan[e, count:] = np.float32(0.0)
         pose[e, count:] = np.float32(0.0)
@@ -240,6 +237,24 @@ def scan_searches(
             captured_at[e, capture] = time - search.arrival
         if done < count:
             _scan(planes.quads, others, sensor, nobody, offsets, no_ids, laser, done, count, scan[e])
+
+
+@kernel
+def forget_all_cars(cursors: int, library: CarLibrary, planes: Planes) -> None:
+    """Remove the cars of all searches; the next scan draws those near again."""
+    for e in range(planes.shown.shape[0]):
+        _forget_cars(cursors, library, planes, e)
+
+
+@kernel
+def _forget_cars(cursors: int, library: CarLibrary, planes: Planes, e: int) -> None:
+    """Remove the cars of a search."""
+    n_slots = planes.shown.shape[1]
+    for slot in range(n_slots):
+        cursor = cursor_at(cursors, e * n_slots + slot)
+        cursor.sojourn, cursor.valid_until = 0, 0.0
+        planes.shown[e, slot] = 0
+        remove_car(library, slot, planes.x[e], planes.y[e])
 
 
 @compiled(error_model="numpy")
@@ -352,10 +367,12 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
             }
         )
         self.observation_space = batch_space(self.single_observation_space, n)
-        self._seen = create_empty_array(self.single_observation_space, n)  # type: ignore[assignment]
+        empty: Any = create_empty_array(self.single_observation_space, n)
+        self._measured: dict[str, NDArray[Any]] = empty
+        self._seen = self._measured
         self._surroundings = None
-        self._scan = self._seen[f"scan.{name}"]
-        self._stops = Stops(self._seen["count"], np.zeros((n, k, 3)), np.zeros((n, k)))
+        self._scan = self._measured[f"scan.{name}"]
+        self._stops = Stops(self._measured["count"], np.zeros((n, k, 3)), np.zeros((n, k)))
         self._library, quads, others = CarLibrary.of(slot_lot(lot))
         self._lanes = _lanes_of(world.lot, k, float(every), laser.max_range)
         self._planes = Planes(
@@ -372,6 +389,9 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
         )
         self._laser = _laser_of(laser, (float(mount.x), float(mount.y), float(mount.yaw)))
         self._cursors = np.zeros(n * lot.n_slots, CURSOR)
+        # Each thread has a share of the searches.
+        ends: list[int] = np.linspace(0, n, min(get_num_threads(), n) + 1).astype(int).tolist()
+        self._shares = list(pairwise(ends))
 
     @property
     def bytes_each(self) -> float:
@@ -388,29 +408,18 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
         )
         return super().bytes_each + sum(array.nbytes for array in arrays) / self.num_envs
 
-    def get_state(self) -> tuple[NDArray[Any], ...]:
-        """Not supported.
-
-        Raises:
-            InputError: always.
-        """
-        raise InputError("a batch of scans has no get_state, want parkenv/Search-v2 or a single environment")
-
-    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:  # noqa: ARG002 - the base's interface
-        """Not supported.
-
-        Raises:
-            InputError: always.
-        """
-        raise InputError("a batch of scans has no set_state, want parkenv/Search-v2 or a single environment")
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """Continue from a state that `get_state` returned for the same scenario; no search in it may be over."""
+        super().set_state(state)
+        # Cars follow from the worlds, so they are drawn again rather than kept.
+        forget_all_cars(address_of(self._cursors, CURSOR), self._library, self._planes)
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        seen, address = self._seen, self._searches.address
+        seen, address = self._measured, self._searches.address
         drive_all(
             address, self._lanes, actions, fresh, idle, self._limit, self._steps, self._stops,
             seen["vertex"], seen["time"], seen["action_mask"],
         )  # fmt: skip
-        share = np.linspace(0, self.num_envs, min(get_num_threads(), self.num_envs) + 1).astype(int).tolist()
         cursors = address_of(self._cursors, CURSOR)
 
         def scan_part(part: tuple[int, int]) -> None:
@@ -419,7 +428,70 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
                 self._stops, seen["pose"], seen["captured_at"], self._scan,
             )  # fmt: skip
 
-        in_threads(scan_part, list(pairwise(share)))
+        in_threads(scan_part, self._shares)
+
+
+class StackedScanVectorEnv(ScanSearchVectorEnv):
+    """A batch of searches that observe their last k scans, as `parkenv.envs.scan_observation.ScanObservation` does.
+
+    There is one scan for each decision. `parkenv.envs.search_sb3.SearchVecEnv` makes it.
+
+    Args:
+        num_envs, scenario, max_episode_steps, autoreset_mode: as in `ScanSearchVectorEnv`.
+        k: number of scans.
+
+    Raises:
+        InputError: an argument out of its range; the message names it.
+
+    Examples:
+        >>> envs = StackedScanVectorEnv(3, "mini", k=4)
+        >>> observations, infos = envs.reset(seed=0)
+        >>> observations["scan"].shape
+        (3, 338)
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: ScenarioSource = "campus",
+        k: int = SCANS,
+        max_episode_steps: int | None = 2000,
+        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+    ) -> None:
+        super().__init__(
+            num_envs, scenario, captures=1, max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode
+        )
+        self._history, self._goal = ScanHistory.of(self.num_envs, k), goal_of(self.scenarios[0])
+        self.single_observation_space = scans_space(k)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        empty: Any = create_empty_array(self.single_observation_space, self.num_envs)
+        self._seen = empty | {"action_mask": self._measured["action_mask"]}
+
+    @property
+    def bytes_each(self) -> float:
+        """Memory of one search, bytes."""
+        arrays = (*self._measured.values(), *self._history)
+        return super().bytes_each + sum(array.nbytes for array in arrays) / self.num_envs
+
+    def get_state(self) -> tuple[NDArray[Any], ...]:
+        """Return a copy of the state of all searches, for `set_state`."""
+        return (*super().get_state(), *(array.copy() for array in self._history))
+
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """Continue from a state that `get_state` returned for the same scenario; no search in it may be over."""
+        searches, history = state[: -len(self._history)], state[-len(self._history) :]
+        super().set_state(searches)
+        own: tuple[NDArray[Any], ...] = self._history
+        for mine, saved in zip(own, history, strict=True):
+            mine[...] = saved
+
+    def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
+        super()._step(actions, fresh, idle)
+        seen = self._measured
+        observe_scans(
+            self._scan, seen["pose"], seen["count"], seen["time"], self._goal, fresh, idle, self._history,
+            self._seen["scan"],
+        )  # fmt: skip
 
 
 def _laser_of(laser: LaserScanner, mount: tuple[float, float, float]) -> Laser:

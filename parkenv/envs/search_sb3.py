@@ -10,15 +10,46 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from parkenv.envs.scan_observation import SCANS
+from parkenv.envs.scan_vector import StackedScanVectorEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
-from parkenv.scenarios.build import ScenarioSources
+from parkenv.scenarios.build import ScenarioSources, make_scenarios
 
 METRICS = (
     "drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m", "failed_parks",
     "slots_passed", "parked", "place",
 )  # fmt: skip
+
+_DEFAULT_K = {"scan": SCANS}
+
+
+def search_batch(
+    num_envs: int,
+    scenario: ScenarioSources,
+    observation: str,
+    k: int | None,
+    max_episode_steps: int = 2000,
+    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
+) -> ParkSearchVectorEnv:
+    """Return a compiled batch of searches that observe `local`, `full` or `scan`; see `SearchVecEnv`."""
+    k = _DEFAULT_K.get(observation, 5) if k is None else k
+    if observation != "scan":
+        return ParkSearchVectorEnv(
+            num_envs,
+            scenario,
+            observation=observation,
+            max_episode_steps=max_episode_steps,
+            autoreset_mode=autoreset_mode,
+            k=k,
+        )
+    places = make_scenarios(scenario)
+    if len(places) != 1:
+        raise InputError(f"there are {len(places)} scenarios, want one for searches that observe scans")
+    return StackedScanVectorEnv(
+        num_envs, places[0], max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode, k=k
+    )
 
 
 class SearchVecEnv(SharedVecEnv):
@@ -32,8 +63,9 @@ class SearchVecEnv(SharedVecEnv):
         scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
             drawn for each episode, and `info["place"]` names it at the end.
         reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
-        k: number of slots in the `local` observation.
-        observation: `local`, or for a single lot `full`.
+        k: number of slots in the `local` observation, 5 if None; or of scans in `scan`, 4 if None.
+        observation: `local`; for a single lot also `full`, or `scan`, as from
+            `parkenv.envs.scan_observation.ScanObservation`.
         max_episode_steps: steps after which a search is truncated.
 
     Raises:
@@ -52,19 +84,14 @@ class SearchVecEnv(SharedVecEnv):
         num_envs: int,
         scenario: ScenarioSources = "campus",
         reward_scale: float = 1.0,
-        k: int = 5,
+        k: int | None = None,
         observation: str = "local",
         max_episode_steps: int = 2000,
     ) -> None:
         if not (np.isfinite(reward_scale) and reward_scale > 0.0):
             raise InputError(f"reward_scale is {reward_scale}, want a number above 0")
-        self.batch = ParkSearchVectorEnv(
-            num_envs,
-            scenario,
-            observation=observation,
-            k=k,
-            max_episode_steps=max_episode_steps,
-            autoreset_mode=AutoresetMode.SAME_STEP,
+        self.batch = search_batch(
+            num_envs, scenario, observation, k, max_episode_steps, AutoresetMode.SAME_STEP
         )
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)
         self.reward_scale = reward_scale

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
 
 FloatArray = NDArray[np.float64]
 
+PICTURE_WIDTH = 400
+"""px; width of the pictures of a searching car's cameras. Those of a survey are 640 px wide."""
+
 _SEEDS = 1 << 31
 
 
@@ -41,27 +44,25 @@ def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int
     Args:
         rig: the rig or its name.
         scenario: defines the default.
-        picture_width: px; if given, the pictures are resized to this width.
+        picture_width: px, width of the pictures; None: `PICTURE_WIDTH` for a rig by name, a `SensorRig`'s own.
 
     Raises:
         InputError: an unknown name, something else than a rig, or a width below 64.
     """
-    if picture_width is not None:
-        if (
-            isinstance(picture_width, bool)
-            or not isinstance(picture_width, (int, np.integer))
-            or picture_width < 64
-        ):
-            raise InputError(f"picture_width is {picture_width!r} px, want a whole number of at least 64")
-        return make_rig(rig, scenario).resized(int(picture_width))
     rig = scenario.rig if rig is None else rig
     if isinstance(rig, SensorRig):
-        return rig
-    if not isinstance(rig, str):
+        made, width = rig, picture_width
+    elif not isinstance(rig, str):
         raise InputError(f"rig is a {type(rig).__name__}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-    if rig not in RIG_NAMES:
+    elif rig not in RIG_NAMES:
         raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
-    return SensorRig.named(rig)
+    else:
+        made, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
+    if width is None:
+        return made
+    if isinstance(width, bool) or not isinstance(width, (int, np.integer)) or width < 64:
+        raise InputError(f"picture_width is {width!r} px, want a whole number of at least 64")
+    return made.resized(int(width))
 
 
 class SensorSampler:

@@ -109,7 +109,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
     | `every` | 1.0 | m, least distance between captures on an edge |
-    | `picture_width` | the rig's | px, of the cameras' pictures; smaller ones are drawn faster |
+    | `picture_width` | 400; a `SensorRig`'s own | px, width of the cameras' pictures; those of a survey have 640 |
     | `observation` | `full` | `scan`: without images; the cameras of the rig are not drawn |
 
     ```python
@@ -118,12 +118,13 @@ class SearchSensorsEnv(SensingSearchEnv):
     >>> env = gym.make("parkenv/SearchSensors-v2", scenario="mini", captures=2)
     >>> observation, info = env.reset(seed=0)
     >>> observation["image.right"].shape, observation["scan.laser"].shape, int(observation["count"])
-    ((2, 480, 640, 3), (2, 1081), 1)
+    ((2, 300, 400, 3), (2, 1081), 1)
 
     ```
 
     ## Version history
-    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast.
+    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast; pictures are
+      400 px wide unless told otherwise.
     - v1: same version number as `parkenv/Search-v2`.
     - v0: first version.
     """

@@ -18,13 +18,13 @@ from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.compare import rows_of
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.picture_files import save_film
-from parkenv.evaluation.simulate import Observer, Step, adapt_to_agent, simulate
+from parkenv.evaluation.simulate import Observer, Step, make_search, simulate
 from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.files.atomic_write import atomic_write
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.driving.parking_agents import PLANNER, make_parking_agent
-from planners.model_file import ModelCard
+from planners.model_file import SCANS_OBSERVATION, ModelCard
 
 MODEL, FILM, CARD = "model.safetensors", "replay.gif", "README.md"
 BESIDE = ("mdp", "belief", "first-free")
@@ -95,11 +95,9 @@ class Publication:
         seeds, frames = range(self.seed, self.seed + _FILMED), _Frames()
         if self.card.task == "search":
             agent = make_agent(self._source, scenario)
-            env = gym.make(
-                "parkenv/Search-v2", scenario=scenario, render_mode="rgb_array", max_episode_steps=_LONGEST
-            )
+            env = make_search(scenario, agent, render_mode="rgb_array", max_episode_steps=_LONGEST)
             for seed in seeds:
-                simulate(adapt_to_agent(env, agent), agent, seed, (frames,))
+                simulate(env, agent, seed, (frames,))
             save_film(frames.shown, path, fps=4.0, colors=128)
         else:
             parker, drive = (
@@ -273,13 +271,17 @@ def _usage(card: ModelCard, scenario: str) -> str:
         return f"""from planners.driving.parking_agents import make_parking_agent
 
 agent = make_parking_agent("{card.algorithm}:{MODEL}")  # for parkenv/Drive-v1 with obstacle_map=True"""
+    wrapper, env = "local_observation import LocalObservation", '"parkenv/Search-v2", scenario=scenario'
+    if card.observation == SCANS_OBSERVATION:
+        wrapper = "scan_observation import ScanObservation"
+        env = '"parkenv/SearchSensors-v2", scenario=scenario, observation="scan", captures=1'
     return f"""import gymnasium as gym
 import parkenv
-from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.{wrapper}
 from planners import make_agent
 
 scenario = parkenv.make_scenario("{scenario}")
-env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario), k={card.k})
+env = {wrapper.rpartition(" ")[2]}(gym.make({env}), k={card.k})
 agent = make_agent("{card.algorithm}:{MODEL}", scenario)
 observation, info = env.reset(seed=0)
 action, state = agent.predict(observation)"""

@@ -10,6 +10,10 @@ from typing import Any, NamedTuple
 import gymnasium as gym
 
 from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.scan_observation import ScanObservation
+from parkenv.envs.sensors import SearchSensorsEnv
+from parkenv.errors import InputError
+from parkenv.world.scenario import Scenario
 from planners.agent import Agent, ClairvoyantAgent
 from sim_sensors.compilation import seconds_spent
 
@@ -115,8 +119,43 @@ def charge_truncation(metrics: MutableMapping[str, Any], give_up_s: Any, truncat
     metrics["total_s"] = metrics["total_s"] + penalty
 
 
+def make_search(
+    scenario: Scenario, agent: Agent, rig: str | None = None, **options: Any
+) -> gym.Env[Any, Any]:
+    """Make the environment that gives an agent what it observes.
+
+    A model that observes scans searches in `parkenv/SearchSensors-v2`, any other agent in `parkenv/Search-v2`, or with
+    a rig in `parkenv/SearchPerception-v2`. Equal seeds give equal worlds in all three.
+
+    Args:
+        scenario: the scenario.
+        agent: the agent.
+        rig: sensor rig of the car, by name.
+        options: further arguments of `gymnasium.make`.
+    """
+    name = "parkenv/Search-v2" if rig is None else "parkenv/SearchPerception-v2"
+    if getattr(agent, "scans_k", None) is not None:
+        name = "parkenv/SearchSensors-v2"
+        options |= {"observation": "scan", "captures": 1}
+    if rig is not None:
+        options["rig"] = rig
+    # The environments are checked by their tests; checking each again takes as long as some searches.
+    env = gym.make(name, disable_env_checker=True, scenario=scenario, **options)
+    return adapt_to_agent(env, agent)
+
+
 def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
-    """Give the environment the agent's observation: trained models (with `local_k`) use `LocalObservation`."""
+    """Give the environment the agent's observation: trained models use `LocalObservation` or `ScanObservation`.
+
+    Raises:
+        InputError: the agent observes scans, and the environment has none.
+    """
+    if (k := getattr(agent, "scans_k", None)) is not None:
+        if not isinstance(env.unwrapped, SearchSensorsEnv):
+            raise InputError(
+                f"{getattr(agent, 'name', 'the agent')} observes laser scans, and there are none here"
+            )
+        return ScanObservation(env, k)
     k = getattr(agent, "local_k", None)
     return env if k is None else LocalObservation(env, k)
 

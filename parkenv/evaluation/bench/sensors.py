@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
 from parkenv.envs.scan_vector import ScanSearchVectorEnv
+from parkenv.envs.sensor_sampler import PICTURE_WIDTH
 from parkenv.evaluation.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot import PARK
 from sim_sensors.camera.ground_texture import ground_texture
@@ -30,6 +31,7 @@ from sim_sensors.compilation import compiled
 from sim_sensors.ground_truth import vehicle_boxes
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
+from sim_sensors.rig import WIDE
 from sim_sensors.scene import Scene
 from sim_sensors.slot_scenes import scene_of_slots
 
@@ -163,12 +165,15 @@ def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     """Measure the steps per second of random drives on `campus` through sensors, resets included."""
     few = 10.0 * seconds  # an episode begins with a new world, weather and sky
     rows: list[BenchRow] = []
-    no_pictures: dict[str, Any] = {"observation": "scan"}
-    drives: tuple[tuple[str, dict[str, Any], str], ...] = (
-        ("SearchSensors", {}, "pictures and scans, up to 4 a step"),
-        ("SearchPerception", {}, "seen by the pipeline, up to 2 a step"),
-        ("SearchSensors", no_pictures, "scans alone, up to 4 a step"),
-    )
+    drives: list[tuple[str, dict[str, Any], str]] = [
+        ("SearchSensors", {"observation": "scan"}, "scans alone, up to 4 a step")
+    ]
+    for width in (PICTURE_WIDTH, WIDE.width):
+        size, wide = f"pictures {width} px wide", {"picture_width": width}
+        drives += [
+            ("SearchSensors", wide, f"scans and {size}, up to 4 a step"),
+            ("SearchPerception", wide, f"{size}, seen by the pipeline, up to 2 a step"),
+        ]
     for name, options, case in drives:
         env: gym.Env[Any, Any] = gym.make(f"parkenv/{name}-v2", scenario="campus", **options)
         rows += rate(

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.search_state import SearchState
-from parkenv.evaluation.simulate import Observer, Step, adapt_to_agent, simulate
+from parkenv.evaluation.simulate import Observer, Step, make_search, simulate
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
 from planners.bounds.oracle import best_slot
@@ -69,7 +69,7 @@ class EpisodeRunner:
         scenario: the scenario, with the costs and speeds of the setting.
         name: name of the agent, for the trace.
         agent: the agent.
-        rig: sensor rig for `parkenv/SearchPerception-v2`; None for `parkenv/Search-v2`.
+        rig: sensor rig of the car; None for the scenario's sensor model; see `make_search`.
         detector, every: detector and distance between captures, m, for `parkenv/SearchPerception-v2`; None for its own.
     """
 
@@ -86,12 +86,9 @@ class EpisodeRunner:
         self.name = name
         self.agent = agent
         options: dict[str, Any] = {}
-        if rig is not None:
-            options = {"rig": rig, "detector": detector} | ({} if every is None else {"every": every})
-        name_of_env = "parkenv/Search-v2" if rig is None else "parkenv/SearchPerception-v2"
-        # The environments are checked by their tests; checking each again takes as long as some searches.
-        env = gym.make(name_of_env, disable_env_checker=True, scenario=scenario, **options)
-        self.env = adapt_to_agent(env, agent)
+        if rig is not None and getattr(agent, "scans_k", None) is None:
+            options = {"detector": detector} | ({} if every is None else {"every": every})
+        self.env = make_search(scenario, agent, rig, **options)
         self._routes = DriveRoutes(scenario)
 
     def bound_s(self, seed: int) -> float:

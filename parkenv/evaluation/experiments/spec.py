@@ -328,6 +328,9 @@ class SurveySpec(Workplace):
         description="Error of the car's odometry after 100 m, as a share of the distance.",
     )
     localise: LocaliserName = Field("none", description="What corrects the odometry.")
+    picture_width: int | None = Field(
+        None, ge=64, le=4_096, description="Width of the cameras' pictures, px; 640 if absent."
+    )
     seed: int = Field(0, ge=0, lt=2**31)
 
 
@@ -402,7 +405,17 @@ class TrainingSpec(Workplace):
     demonstrations: int | None = Field(
         None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone."
     )
-    k: int | None = Field(None, ge=1, le=1_000, description="Slots in an observation (search, fleet).")
+    k: int | None = Field(
+        None,
+        ge=1,
+        le=1_000,
+        description="Slots in an observation (search, fleet); scans with observation scan.",
+    )
+    observation: Literal["local", "scan"] | None = Field(
+        None,
+        description="local: what is near the car, from belief and forecast; scan: raw laser scans and poses, in one "
+        "scenario; local if absent (search).",
+    )
     evaluate_every: int | None = Field(None, ge=1, le=10**12, description="Decisions between evaluations.")
     evaluation_episodes: int | None = Field(
         None,
@@ -419,7 +432,7 @@ class TrainingSpec(Workplace):
     @model_validator(mode="after")
     def _of_env(self) -> Self:
         if self.env != "search":
-            alone = ("clone", "demonstrations", "held_out", "evaluate_on", "curriculum")
+            alone = ("clone", "demonstrations", "held_out", "evaluate_on", "curriculum", "observation")
             self._require_unset("search", *alone)
         if self.env == "drive":
             self._require_unset("search", "k")
@@ -427,6 +440,12 @@ class TrainingSpec(Workplace):
             self._require_unset("search or drive", "test_on")
         else:
             self._require_unset("fleet", *FLEET_FIELDS)
+        if self.observation == "scan":
+            for name in ("clone", "held_out", "evaluate_on", "curriculum"):
+                if getattr(self, name) is not None:
+                    raise PydanticCustomError(
+                        "whole", "{name} does not go with observation scan", {"name": name}
+                    )
         if self.learners is not None and self.among is None:
             raise PydanticCustomError("whole", "learners goes with among")
         if self.without is not None and self.algorithm != "network":

@@ -10,6 +10,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from parkenv.evaluation.experiments.statistics import mean_interval
@@ -21,6 +22,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#55
 OFF_SCALE = 2.0
 """Times above this multiple of the lowest are cut off."""
 _APART = 0.045  # least distance of two labels, fraction of the axis
+_MARGIN_IN = 0.12  # beside the labels, inches
 
 Curves = Sequence[Sequence[Mapping[str, Any]]]
 
@@ -67,7 +69,8 @@ def save_learning_curves(
         path: the PNG file to write.
     """
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.2, 4.2 if len(curves) == 1 else 4.8), layout="constrained")
+        layout = ConstrainedLayoutEngine(w_pad=_MARGIN_IN)
+        figure = Figure(figsize=(7.2, 4.2 if len(curves) == 1 else 4.8), layout=layout)
         axes = figure.subplots()
         highest = 0.0
         for (name, its), color in zip(curves.items(), COLORS, strict=False):

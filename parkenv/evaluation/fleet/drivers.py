@@ -44,11 +44,16 @@ def driver_of(
     agent = make_agent(spec.name, scenario, **told | spec.options)
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
-    if isinstance(agent, LearnedAgent) and agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
-        from parkenv.envs.fleet_sb3 import network_rule
+    if isinstance(agent, LearnedAgent):
+        if agent.local_k is None:
+            raise InputError(
+                f"agent {spec.label!r} observes laser scans, which the cars of a fleet do not have"
+            )
+        if agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
+            from parkenv.envs.fleet_sb3 import network_rule
 
-        sampled = agent.card.algorithm != "dqn"
-        return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
+            sampled = agent.card.algorithm != "dqn"
+            return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     return None, agent
 
 

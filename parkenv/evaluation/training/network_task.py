@@ -26,6 +26,7 @@ FIXED = {
     "clone": "clones belief in any case",
     "demonstrations": "labels as many decisions of belief as --steps says",
     "k": "observes the same number of slots in every lot",
+    "observation": "has one of its own",
     "curriculum": "trains in all places from the beginning",
     "evaluate_every": "is evaluated after each of its stages",
 }

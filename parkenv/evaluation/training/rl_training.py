@@ -209,7 +209,10 @@ class Trained:
 def train_one(training: AnyTraining, seed: int, folder: Path, tensorboard: bool = False) -> Trained:
     """Train with one seed on a single thread, so that one training per core can run in parallel."""
     import torch
+    from numba import get_num_threads
 
+    # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
+    get_num_threads()
     torch.set_num_threads(1)
     curve = training.train(seed, folder, tensorboard=tensorboard)
     return Trained(curve, (folder / MODEL).read_bytes())

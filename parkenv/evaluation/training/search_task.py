@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from functools import cached_property
 from pathlib import Path
 from typing import ClassVar
@@ -9,6 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.envs.scan_observation import SCANS
+from parkenv.envs.search_sb3 import search_batch
 from parkenv.errors import InputError
 from parkenv.evaluation.experiments.agent_spec import AgentSpec
 from parkenv.evaluation.experiments.benchmark import suite_lots
@@ -17,9 +20,13 @@ from parkenv.evaluation.experiments.spec import TrainingSpec
 from parkenv.evaluation.experiments.workers import Workers
 from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.evaluation.training.cloning import Demonstrations, require_cloneable
-from parkenv.evaluation.training.configs import SEARCH_CONFIGS, config_of
 from parkenv.evaluation.training.rl_training import AnyTraining
-from parkenv.evaluation.training.search_training import SearchTraining, episode_times, times_row
+from parkenv.evaluation.training.search_training import (
+    SearchTraining,
+    episode_times,
+    search_config,
+    times_row,
+)
 from parkenv.evaluation.training.training_task import (
     Row,
     Status,
@@ -58,11 +65,17 @@ class SearchTask(TrainingTask):
         super().__init__(spec)
         self.steps = spec.steps or 2_000_000
         self.evaluate_every = spec.evaluate_every or 100_000
-        self.k = spec.k or 5
+        self.observation = spec.observation or "local"
+        self.k = spec.k or (SCANS if self.observation == "scan" else 5)
         self.demonstrations = spec.demonstrations or 2000
         self._holds_out = spec.held_out is not None or spec.evaluate_on is not None
         usual = PLANNERS_OF_PLACES if self._holds_out else PLANNERS
         self.compared = usual if spec.agents is None else spec.agents
+
+    @property
+    def folder(self) -> str:
+        """See `TrainingTask`."""
+        return f"scan-{self.algorithm}" if self.observation == "scan" else super().folder
 
     @cached_property
     def _sides(self) -> tuple[list[Scenario], list[Scenario]]:
@@ -119,8 +132,12 @@ class SearchTask(TrainingTask):
 
     def check(self) -> None:
         """See `TrainingTask`."""
-        config_of(self.algorithm, SEARCH_CONFIGS, "search")
+        search_config(self.algorithm, self.observation)
         super().check()
+        if self.observation == "scan":
+            # What gives no scans in a batch is refused before training, not at the tests in the end.
+            for place in (*self.worlds, *itertools.chain(*self.tests.values())):
+                search_batch(1, self.worlds if place in self.worlds else place, "scan", self.k)
         if self.spec.clone is not None:
             require_cloneable(self.algorithm, self.spec.clone, self.worlds[0])
         for world in (self.worlds[0], *(places[0] for places in self.tests.values())):
@@ -133,7 +150,7 @@ class SearchTask(TrainingTask):
             **super().settings(), "scenario": [w.name for w in self.worlds], "steps": self.steps, "k": self.k,
             "clone": self.spec.clone, "demonstrations": self.demonstrations if self.spec.clone else None,
             "evaluate_every": self.evaluate_every, "held_out": [w.name for w in self.held_out],
-            "curriculum": self.spec.curriculum,
+            "curriculum": self.spec.curriculum, "observation": self.observation,
         }  # fmt: skip
 
     def evaluation_settings(self, settings: Row) -> Row:
@@ -162,6 +179,7 @@ class SearchTask(TrainingTask):
             demonstrations,
             tuple(self.held_out),
             self.spec.curriculum,
+            self.observation,
         )
 
     def score_text(self, row: Row) -> str:
@@ -212,7 +230,7 @@ class SearchTask(TrainingTask):
     def times_of(self, model: Path, places: list[Scenario]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Test a model: return the times of the test's episodes, s, and whether the car parked."""
         agent = LearnedAgent(self.worlds[0], self.algorithm, model)
-        return episode_times(agent.model, places, self.test_seeds, agent.local_k)
+        return episode_times(agent.model, places, self.test_seeds)
 
     def _curves(self, name: str, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
         """Return the curves to draw: in places trained on, and in those held out."""

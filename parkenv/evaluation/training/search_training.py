@@ -11,14 +11,14 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv.envs.search_sb3 import SearchVecEnv
-from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.envs.search_sb3 import SearchVecEnv, search_batch
 from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.evaluation.simulate import charge_truncation
 from parkenv.evaluation.training.cloning import Demonstrations, clone, require_cloneable
 from parkenv.evaluation.training.configs import (
     MAX_STEPS,
     REWARD_SCALE,
+    SCAN_CONFIGS,
     SEARCH_CONFIGS,
     TrainingConfig,
     config_of,
@@ -28,6 +28,7 @@ from parkenv.evaluation.training.rl_training import Training
 from parkenv.scenarios.places import by_size, open_places
 from parkenv.world.scenario import Scenario
 from planners.learned import LearnedAgent
+from planners.model_file import SEARCH_OBSERVATIONS, observation_of
 
 METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
 HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
@@ -43,10 +44,11 @@ class SearchTraining(Training):
         evaluate_every: decisions between evaluations.
         scenarios: scenarios to train on; each search is in one of them, drawn from its seed.
         evaluation_seeds: seeds of the held-out worlds; each draws one of the scenarios.
-        k: number of slots in the observation.
+        k: number of slots in the observation, or of scans; None for the default.
         demonstrations: demonstrations to clone before training; None for no cloning.
         held_out: further places to evaluate in. They do not decide which model is kept.
         curriculum: `size`: begin in the smallest lots; see `parkenv.scenarios.places.open_places`.
+        observation: `local` or, in one scenario, `scan`.
 
     Raises:
         InputError: an unknown algorithm, one that does not support behaviour cloning, or a number out of range.
@@ -54,10 +56,11 @@ class SearchTraining(Training):
 
     scenarios: tuple[Scenario, ...]
     evaluation_seeds: range
-    k: int = 5
+    k: int | None = None
     demonstrations: Demonstrations | None = None
     held_out: tuple[Scenario, ...] = ()
     curriculum: str | None = None
+    observation: str = "local"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,7 +70,7 @@ class SearchTraining(Training):
     @property
     def config(self) -> TrainingConfig:
         """Training config of the algorithm."""
-        return config_of(self.algorithm, SEARCH_CONFIGS, "search")
+        return search_config(self.algorithm, self.observation)
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -77,7 +80,7 @@ class SearchTraining(Training):
     def make_env(self) -> SearchVecEnv:
         """Make a batch of search environments over all scenarios."""
         places = self.scenarios if self.curriculum is None else by_size(self.scenarios)
-        env = SearchVecEnv(self.config.n_envs, places, REWARD_SCALE, self.k, max_episode_steps=MAX_STEPS)
+        env = SearchVecEnv(self.config.n_envs, places, REWARD_SCALE, self.k, self.observation, MAX_STEPS)
         self._open_places(env, 0.0)
         return env
 
@@ -94,7 +97,7 @@ class SearchTraining(Training):
         del env
         found: list[float] = []
         for places in (self.scenarios, self.held_out) if self.held_out else (self.scenarios,):
-            times, parked = episode_times(policy, places, self.evaluation_seeds, self.k)
+            times, parked = episode_times(policy, places, self.evaluation_seeds)
             found += [*mean_interval(times), float(parked.mean())]
         return dict(zip(self.metrics, found, strict=True))
 
@@ -117,9 +120,20 @@ class SearchTraining(Training):
         return {"scenarios": names, "held_out": [one.name for one in self.held_out], "settings": settings}
 
 
+def search_config(algorithm: str, observation: str) -> TrainingConfig:
+    """Return the training config of an algorithm for searches with an observation.
+
+    Raises:
+        InputError: there is none.
+    """
+    if observation == "scan":
+        return config_of(algorithm, SCAN_CONFIGS, "searches on scans")
+    return config_of(algorithm, SEARCH_CONFIGS, "search")
+
+
 def search_times(agent: LearnedAgent, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Row:
     """Run a model, and return its total times as columns of `parkenv compare`."""
-    return times_row(*episode_times(agent.model, places, seeds, agent.local_k))
+    return times_row(*episode_times(agent.model, places, seeds))
 
 
 def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
@@ -134,38 +148,30 @@ def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
 
 
 def episode_times(
-    model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int], k: int
+    model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
 
     An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
 
     Args:
-        model: a stable-baselines3 or sb3-contrib model of the `local` observation.
+        model: a stable-baselines3 or sb3-contrib model of the `local` or the `scan` observation.
         places: scenario to search in; or several, of which each seed draws one.
         seeds: one episode each.
-        k: number of slots in the observation.
     """
     n = len(seeds)
-    batch = ParkSearchVectorEnv(
-        n,
-        places,
-        observation="local",
-        k=k,
-        max_episode_steps=MAX_STEPS,
-        autoreset_mode=AutoresetMode.NEXT_STEP,
-    )
-    observation, _ = batch.reset(seed=list(seeds))
+    _, version, k = observation_of(model.observation_space)
+    observation = SEARCH_OBSERVATIONS[version][0]
+    batch = search_batch(n, places, observation, k, MAX_STEPS, AutoresetMode.NEXT_STEP)
+    seen, _ = batch.reset(seed=list(seeds))
     give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
     times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
     state, start = None, np.ones(n, dtype=np.bool_)
     masked = "action_masks" in model.predict.__code__.co_varnames
     while np.isnan(times).any():
-        masks = {"action_masks": observation["action_mask"]} if masked else {}
-        actions, state = model.predict(
-            observation, state=state, episode_start=start, deterministic=True, **masks
-        )
-        observation, _, terminated, truncated, info = batch.step(actions)
+        masks = {"action_masks": seen["action_mask"]} if masked else {}
+        actions, state = model.predict(seen, state=state, episode_start=start, deterministic=True, **masks)
+        seen, _, terminated, truncated, info = batch.step(actions)
         start = terminated | truncated
         first = start & np.isnan(times)
         if first.any():

@@ -1,0 +1,219 @@
+"""Learning from raw scans: what is observed, trainings, and models in comparisons."""
+
+import dataclasses
+import json
+import math
+from itertools import pairwise
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from command_line import parkenv
+from sb3_contrib import MaskablePPO
+
+from parkenv import InputError, make_scenario
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.scan_observation import FIXED, PER_SCAN, SCANS, WAVELENGTHS_M, ScanObservation, scans_space
+from parkenv.envs.scan_vector import StackedScanVectorEnv
+from parkenv.envs.search_sb3 import SearchVecEnv
+from parkenv.evaluation.experiments.agent_spec import AgentSpec
+from parkenv.evaluation.experiments.compare import Case
+from parkenv.evaluation.fleet.drivers import driver_of
+from parkenv.evaluation.simulate import make_search, simulate
+from parkenv.evaluation.training.checkpoint import save_checkpoint
+from parkenv.evaluation.training.configs import SCAN_CONFIGS
+from parkenv.evaluation.training.rl_training import train_one
+from parkenv.evaluation.training.search_training import SearchTraining, episode_times
+from parkenv.evaluation.trips.driven_search import DrivenSearch
+from planners.agent import make_agent
+from planners.learned import LearnedAgent
+from planners.model_file import FIXED_OF_SCANS, NUMBERS_PER_SCAN, ModelCard, save_model
+
+MINI = make_scenario("mini")
+SEEDS = range(2_000_000, 2_000_006)
+
+
+def scan_env(scenario="mini"):
+    return gym.make("parkenv/SearchSensors-v2", scenario=scenario, observation="scan", captures=1)
+
+
+def expected(measured, goal):
+    """The vector as the module describes it, of the observations so far, the newest last."""
+    seen = [one for one in measured if one["count"]]
+    x, y, yaw = seen[-1]["pose"][0].astype(float)
+    away = np.array(goal) - (x, y)
+    bearing = math.atan2(away[1], away[0]) - yaw
+    elapsed = float(measured[-1]["time"][1])
+    numbers = [
+        elapsed / (elapsed + 60.0),
+        math.cos(bearing),
+        math.sin(bearing),
+        1 / (1 + math.hypot(*away) / 5),
+    ]
+    numbers += [math.cos(yaw), math.sin(yaw)]
+    for wavelength in WAVELENGTHS_M:
+        for metres in (x, y):
+            numbers += [
+                math.sin(2 * math.pi * metres / wavelength),
+                math.cos(2 * math.pi * metres / wavelength),
+            ]
+    for one in seen[: -SCANS - 1 : -1]:
+        then = one["pose"][0].astype(float)
+        turn, (dx, dy) = then[2] - yaw, then[:2] - (x, y)
+        ahead, left = math.cos(yaw) * dx + math.sin(yaw) * dy, math.cos(yaw) * dy - math.sin(yaw) * dx
+        numbers += [1.0, *np.clip([ahead / 30, left / 30], -1, 1), math.cos(turn), math.sin(turn)]
+        edges = np.arange(73) * 1081 // 72
+        nearest = [one["scan.laser"][0, a:b].min() for a, b in pairwise(edges)]
+        numbers += [1.0 / (1.0 + metres / 5.0) for metres in nearest]
+    return np.array(numbers + [0.0] * (FIXED + PER_SCAN * SCANS - len(numbers)))
+
+
+def test_the_vector_is_as_described_and_forgets_with_each_search():
+    raw, env = scan_env(), ScanObservation(scan_env())
+    rng, over, goal = np.random.default_rng(0), True, MINI.lot.goals[MINI.goal]
+    measured, ends = [], 0
+    for _ in range(60):
+        if over:
+            measured = [raw.reset(seed=3 + ends)[0]]
+            observation, _ = env.reset(seed=3 + ends)
+        assert observation in env.observation_space
+        np.testing.assert_allclose(observation["scan"], expected(measured, goal), atol=2e-5)
+        action = rng.choice(np.flatnonzero(observation["action_mask"]))
+        measured.append(raw.step(action)[0])
+        observation, _, terminated, truncated, _ = env.step(action)
+        over = terminated or truncated
+        ends += over
+    assert ends
+
+
+def test_a_batch_observes_what_single_searches_observe_and_continues_from_a_state():
+    batch, env = StackedScanVectorEnv(3, "campus"), ScanObservation(scan_env("campus"))
+    observed, one = batch.reset(seed=5)[0], env.reset(seed=7)[0]
+    rng, done, seen = np.random.default_rng(0), [], []
+    for step in range(12):
+        np.testing.assert_allclose(observed["scan"][2], one["scan"], atol=1e-5)
+        if step == 6:
+            state = batch.get_state()
+        done.append(np.array([rng.choice(np.flatnonzero(mask[:4])) for mask in observed["action_mask"]]))
+        observed, one = batch.step(done[-1])[0], env.step(done[-1][2])[0]
+        seen.append(observed["scan"])
+    other = StackedScanVectorEnv(3, "campus")
+    other.set_state(state)
+    for actions, wanted in zip(done[6:], seen[6:], strict=True):
+        np.testing.assert_array_equal(other.step(actions)[0]["scan"], wanted)
+
+
+def test_sizes_are_those_of_model_files():
+    assert (FIXED_OF_SCANS, NUMBERS_PER_SCAN) == (FIXED, PER_SCAN)
+    assert SearchVecEnv(2, "mini", observation="scan").observation_space == scans_space(SCANS)
+
+
+@pytest.fixture
+def small(monkeypatch):
+    """Small batches and rollouts, and short searches."""
+    config = SCAN_CONFIGS["maskable-ppo"]
+    sizes = {"batch_size": 128, "n_steps": 16, "policy_kwargs": {"net_arch": [32]}}
+    changed = dataclasses.replace(config, n_envs=8, settings={**config.settings, **sizes})
+    monkeypatch.setitem(SCAN_CONFIGS, "maskable-ppo", changed)
+    monkeypatch.setattr("parkenv.evaluation.training.search_training.MAX_STEPS", 60)
+
+
+def training_of(steps):
+    return SearchTraining("maskable-ppo", steps, 128, (MINI,), SEEDS, observation="scan")
+
+
+def test_a_resumed_training_equals_an_unbroken_one_and_its_model_searches_in_the_same_worlds(
+    small, tmp_path, monkeypatch
+):
+    saves = []
+
+    def killed(*arguments):
+        if len(saves) == 2:
+            raise KeyboardInterrupt
+        saves.append(arguments[0])
+        save_checkpoint(*arguments)
+
+    training = training_of(384)
+    with monkeypatch.context() as patch:
+        patch.setattr("parkenv.evaluation.training.rl_training.save_checkpoint", killed)
+        with pytest.raises(KeyboardInterrupt):
+            train_one(training, 0, tmp_path / "resumed")
+    resumed, whole = (train_one(training, 0, tmp_path / name).curve for name in ("resumed", "whole"))
+    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
+    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    card = ModelCard.of_file(files[0])
+    assert (card.observation, card.k, card.scenarios) == ("scan-1", SCANS, ("mini",))
+
+    agent = LearnedAgent(MINI, "maskable-ppo", files[0])
+    times, _ = episode_times(agent.model, MINI, SEEDS[:2])
+    env = make_search(MINI, agent, max_episode_steps=60)
+    planned = make_search(MINI, make_agent("mdp", MINI))
+    for seed, total_s in zip(SEEDS[:2], times, strict=True):
+        assert simulate(env, agent, seed).info["total_s"] == pytest.approx(total_s)
+        planned.reset(seed=seed)
+        assert env.unwrapped.state.key == planned.unwrapped.state.key
+
+
+def model_of_scans(path):
+    model = MaskablePPO("MultiInputPolicy", SearchVecEnv(2, "mini", observation="scan"), n_steps=8, seed=0)
+    save_model(model, path, scenarios=["mini"])
+    return f"maskable-ppo:{path}"
+
+
+def test_a_model_needs_scans(tmp_path):
+    name = model_of_scans(tmp_path / "model.safetensors")
+    agent = make_agent(name, MINI)
+    observation, _ = LocalObservation(gym.make("parkenv/Search-v2", scenario=MINI)).reset(seed=0)
+    with pytest.raises(
+        InputError, match=r"wants observations of .*\.ScanObservation, got local, action_mask"
+    ):
+        agent.predict(observation)
+    with pytest.raises(InputError, match="observes 338 numbers, got 184 for its k = 4"):
+        agent.predict(ScanObservation(scan_env(), k=2).reset(seed=0)[0])
+    with pytest.raises(InputError, match="observes laser scans, which the cars of a fleet do not have"):
+        driver_of(AgentSpec(name=name), MINI)
+    with pytest.raises(InputError, match="observes laser scans, and there are none here"):
+        DrivenSearch(MINI, name)
+    with pytest.raises(InputError, match='observation is "scan", want a rig with a laser'):
+        Case(MINI, name, rig="stereo").run([0])
+    with pytest.raises(TypeError, match=r"wraps parkenv/SearchSensors-v2, not ParkSearchEnv|not SearchEnv"):
+        ScanObservation(gym.make("parkenv/Search-v2", scenario="mini"))
+    action, _ = agent.predict(ScanObservation(scan_env()).reset(seed=0)[0])
+    assert 0 <= int(action) < 5
+
+
+@pytest.mark.parametrize(
+    ("arguments", "wanted"),
+    [
+        (["dqn"], "ALGORITHM is 'dqn', want one of ppo, maskable-ppo for searches on scans"),
+        (["network"], "observation does not go with network, which has one of its own"),
+        (["--env", "fleet"], "observation goes with env search"),
+        (["--clone", "mdp"], "clone does not go with observation scan"),
+        (["--held-out", "0.5"], "held_out does not go with observation scan"),
+        (["--scenario", "mini,campus"], "there are 2 scenarios, want one for searches that observe scans"),
+        (["--k", "101"], "k is 101, want a whole number of scans from 1 to 100"),
+        (["--observation", "smell"], "'smell' is not one of"),
+        (["--day-error", "0.5"], "--day-error goes with --scenario or --lot"),
+        (["--scenario", "mini", "--day-error", "x"], "--day-error"),
+    ],
+)
+def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
+    algorithm = arguments.pop(0) if not arguments[0].startswith("-") else "maskable-ppo"
+    done = parkenv("train", algorithm, "--observation", "scan", *arguments, "--out", tmp_path / "out")
+    assert done.returncode == 2
+    assert wanted in " ".join(done.stderr.split())
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_size_of_the_day_error_is_that_of_all_scenarios(small, tmp_path):
+    done = parkenv(
+        "train", "maskable-ppo", "--scenario", "mini", "--observation", "scan", "--day-error", "0",
+        "--steps", 128, "--trainings", 1, "--evaluation-episodes", 2, "--agents", "none", "--test-on", "mini",
+        "--jobs", 1, "--out", tmp_path / "out",
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    spec = json.loads((tmp_path / "out" / "experiment.json").read_text())
+    assert spec["observation"] == "scan"
+    for name in ("scenarios", "test_on"):
+        assert spec[name][0]["occupancy"]["day_error"] == {"level": 0.0, "slope": 0.0}
