@@ -133,6 +133,16 @@ def test_what_does_not_stand_on_the_ground_as_cars_do_is_none(top, bottom, stand
     assert len(found) == stands
 
 
+def test_beams_end_on_the_nearest_car_of_their_boxes():
+    """The car behind would stand where the one in front does: its box is not located; of a car alone it is."""
+    near, far = (0.0, -5.0, 0.0, 4.0, 2.0), (0.0, -10.0, 0.0, 4.0, 2.0)
+    in_front, behind = [160, 200, 480, 345], [245, 215, 395, 290]
+    both = localize_cars(boxes_of(behind, in_front, ends=False), swept(near, far), CAMERA, EYE, ORIGIN)
+    assert both.detection.tolist() == [1]
+    alone = localize_cars(boxes_of(behind, ends=False), swept(far), CAMERA, EYE, ORIGIN)
+    np.testing.assert_allclose(alone.xy, [[0.0, -10.0]], atol=0.2)
+
+
 def test_no_detection_is_no_car():
     scan = swept((0.0, -5.0, 0.0, 4.0, 2.0))
     for way in (localize_cars, localize_median):

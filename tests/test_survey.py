@@ -11,7 +11,7 @@ from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import Survey, SurveySettings
+from parkenv.mapping.survey import Survey, SurveySettings, drive_together
 from parkenv.mapping.survey_score import METHODS
 from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.world.occupancy import ArrivalWindow
@@ -71,6 +71,38 @@ def test_a_survey_goes_on_where_it_was(tmp_path):
         assert [s.key for s in store.sessions()] == sorted(r["key"] for r in both.rows)
     with pytest.raises(InputError, match="sessions is 0"):
         run_survey(scenario, settings, 0, tmp_path / "m.sqlite")
+
+
+def test_detectors_that_drive_together_find_what_each_finds_alone():
+    scenario, _ = halves()
+    surveys = [
+        Survey(scenario, SurveySettings(weather="rain", every=10.0, detector=name)) for name in ("hog", "net")
+    ]
+    together = drive_together(surveys, 1)
+    for survey, result in zip(surveys, together, strict=True):
+        alone = survey.drive(1)
+        np.testing.assert_array_equal(result.session.p_occupied, alone.session.p_occupied)
+        assert repr(result.score.sightings.tolist()) == repr(alone.score.sightings.tolist())
+        assert result.session.key == alone.session.key
+    seen = together[0].score.sightings
+    parked = seen["slot"] >= 0
+    assert result.truth[seen["slot"][parked]].all()
+    assert (seen["visible"][parked] > 0).all()
+    other = Survey(scenario, SurveySettings(weather="sunny", every=10.0))
+    with pytest.raises(InputError, match="must differ in detectors, or rigs of the same route, alone"):
+        drive_together([surveys[0], other], 1)
+
+
+def test_rigs_that_drive_together_see_the_same_cars():
+    scenario, _ = halves()
+    surveys = [
+        Survey(scenario, SurveySettings(weather="sunny", every=8.0, rig=rig)) for rig in ("laser", "stereo")
+    ]
+    laser, stereo = (result.score.sightings for result in drive_together(surveys, 1))
+    for name in ("capture", "slot", "visible"):
+        np.testing.assert_array_equal(
+            laser[name][laser["visible"] > 0], stereo[name][stereo["visible"] > 0], name
+        )
 
 
 def test_the_maps_error_is_zero_where_it_is_right():

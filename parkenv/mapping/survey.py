@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -17,17 +17,18 @@ from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
 from parkenv.mapping.store import Session
-from parkenv.mapping.survey_score import SurveyScore
+from parkenv.mapping.survey_score import SurveyScore, TrueBoxes, true_boxes
 from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.keyed_random import world_key
 from parkenv.world.lot_scene import LotScenes, slot_lot
-from parkenv.world.occupancy import Arrival, ArrivalWindow
+from parkenv.world.occupancy import Arrival, ArrivalWindow, World
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.rig import RIG_NAMES, SensorRig, poses_along
+from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, poses_along
+from sim_sensors.scene import Scene
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -147,6 +148,30 @@ class Survey:
         drive = f"{s.rig}/{s.weather or 'any'}/{s.every:g}m/{noise}/{detector}seed{s.seed}"
         return f"{self.scenario.name}/{drive}/{number:05d}"
 
+    def draw(self, number: int) -> SurveyDrive:
+        """Draw what determines the captures of a session: its cars, light, way and noise.
+
+        Surveys that differ in their detectors, or in rigs with the same route, draw the same.
+
+        Args:
+            number: 0 or more; determines the session.
+        """
+        scenario, settings = self.scenario, self.settings
+        key = world_key(settings.seed, number)
+        window = settings.windows[number % len(settings.windows)]
+        arrival = scenario.occupancy.draw_arrival(window, key)
+        world = scenario.occupancy.world(key, arrival)
+        rng = np.random.default_rng([int(key), 1])
+        preset = settings.weather or str(rng.choice(PRESETS))
+        poses = poses_along(self.route.path, settings.every)
+        odometry = settings.pose_noise.estimated(poses, rng)
+        return SurveyDrive(
+            self.pipeline.rig, LotScenes(self._slots, scenario, key, world), world, arrival, preset,
+            Weather.draw(preset, int(key) % _SEEDS), poses, odometry,
+            arrival.time + settings.every / scenario.v_drive * np.arange(len(poses), dtype=np.float64),
+            [int(rng.integers(_SEEDS)) for _ in poses],
+        )  # fmt: skip
+
     def drive(
         self, number: int, *, pictures: int = 0, on_frame: Callable[[SurveyFrame], None] | None = None
     ) -> SessionResult:
@@ -157,64 +182,133 @@ class Survey:
             pictures: number of results to keep for figures.
             on_frame: called after every capture.
         """
-        scenario, settings, lot = self.scenario, self.settings, self.scenario.lot
-        key = world_key(settings.seed, number)
-        window = settings.windows[number % len(settings.windows)]
-        arrival = scenario.occupancy.draw_arrival(window, key)
-        world = scenario.occupancy.world(key, arrival)
-        scenes = LotScenes(self._slots, scenario, key, world)
-        rng = np.random.default_rng([int(key), 1])
-        preset = settings.weather or str(rng.choice(PRESETS))
-        weather = Weather.draw(preset, int(key) % _SEEDS)
+        return drive_together([self], number, pictures=pictures, on_frame=on_frame)[0]
 
-        poses = poses_along(self.route.path, settings.every)
-        odometry = settings.pose_noise.estimated(poses, rng)
-        locate = make_locate(settings.localise, lot)
-        estimated = np.empty_like(odometry)
-        times = arrival.time + settings.every / scenario.v_drive * np.arange(len(poses))
-        # For each section of the route, the capture with the most cars.
-        shown: dict[int, PerceptionResult] = {}
 
-        slots, score = SlotFilter(lot), SurveyScore(lot.n_slots)
-        observed_at = np.full(lot.n_slots, arrival.time)
-        low_x, low_y, high_x, high_y = lot.bounds()
-        grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
-        cars: list[FloatArray] = []
-        at: list[int] = []
-        frame_s = []
-        for i, (pose, measured, time) in enumerate(zip(poses, odometry, times.tolist(), strict=True)):
-            scene = scenes.at(time, pose)
-            capture = self.pipeline.rig.capture(scene, pose, weather, int(rng.integers(_SEEDS)))
-            slots.updated[:] = False
-            begun = clock.perf_counter()
-            result = self.pipeline.process(TimedCapture(time, capture), slots, locate(measured))
-            estimated[i] = vehicle = result.vehicle
-            for view in result.views:
-                update_grid(grid, view, vehicle)
-                cars.append(view.cars.poses)
-                at.append(i)
-            frame_s.append(clock.perf_counter() - begun)
-            observed_at[slots.updated] = time
-            if on_frame is not None:
-                taken = world.occupied(np.arange(lot.n_slots), time)
-                on_frame(SurveyFrame(result, grid, slots, taken, measured))
-            score.add(scene, result, [localize_as_thesis(view, vehicle) for view in result.views])
-            section = i * pictures // len(poses)
-            if pictures and (section not in shown or result.n_cars > shown[section].n_cars):
-                shown[section] = result
-        truth = np.array(
-            [world.occupied([s], t)[0] for s, t in enumerate(observed_at.tolist())], dtype=np.bool_
+@dataclass(frozen=True, eq=False)
+class SurveyDrive:
+    """The drive of a session, before anything is perceived."""
+
+    rig: SensorRig
+    scenes: LotScenes
+    world: World  # the true occupancy
+    arrival: Arrival  # start of the session
+    preset: str  # one of `sim_sensors.camera.weather.PRESETS`
+    weather: Weather
+    poses: FloatArray  # (f, 3) x, y, yaw of the vehicle, one for each capture
+    odometry: FloatArray  # (f, 3) the same by its odometry
+    times: FloatArray  # (f,) s
+    seeds: list[int]  # of the noise of each capture
+
+    def capture(self, i: int) -> tuple[Scene, Capture]:
+        """Return the true scene at capture i, and the measurements; captures may be skipped, not repeated."""
+        scene = self.scenes.at(float(self.times[i]), self.poses[i])
+        return scene, self.rig.capture(scene, self.poses[i], self.weather, self.seeds[i])
+
+
+def drive_together(
+    surveys: Sequence[Survey],
+    number: int,
+    *,
+    pictures: int = 0,
+    on_frame: Callable[[SurveyFrame], None] | None = None,
+) -> list[SessionResult]:
+    """Drive a session of several surveys at once: every picture is drawn once, and all detectors look at it.
+
+    With rigs that differ, the laser rig gets the left picture of the stereo camera: as good a picture as in a survey
+    of its own, with other noise.
+
+    Args:
+        surveys: surveys of one scenario that differ in their detectors alone, or in rigs with the same route, too.
+        number: 0 or more; determines the session.
+        pictures: number of results to keep for figures.
+        on_frame: called after every capture and survey.
+
+    Raises:
+        InputError: the surveys differ in more than that.
+    """
+    first = surveys[0]
+    if any(
+        survey.scenario is not first.scenario
+        or replace(survey.settings, rig=first.settings.rig, detector="")
+        != replace(first.settings, detector="")
+        or not np.array_equal(survey.route.path, first.route.path)
+        for survey in surveys
+    ):
+        raise InputError(
+            "surveys that drive together must differ in detectors, or rigs of the same route, alone"
         )
-        states = slots.states()
-        car_captures = np.repeat(np.array(at, dtype=np.int64), [len(c) for c in cars])
-        found_cars = np.concatenate(cars) if cars else np.empty((0, 3))
+    drive = first.draw(number)
+    for survey in surveys[1:]:
+        drive = replace(drive, rig=drive.rig.joined(survey.pipeline.rig))
+    sessions = [_OpenSession(survey, drive, number, pictures) for survey in surveys]
+    for i in range(len(drive.poses)):
+        scene, capture = drive.capture(i)
+        true = true_boxes(drive.rig, scene, capture)
+        parts = {survey.settings.rig: survey.pipeline.rig.part_of(capture) for survey in surveys}
+        for survey, session in zip(surveys, sessions, strict=True):
+            frame = session.add(i, scene, parts[survey.settings.rig], true)
+            if on_frame is not None:
+                on_frame(frame)
+    return [session.result() for session in sessions]
+
+
+class _OpenSession:
+    """A session of one survey while it drives."""
+
+    def __init__(self, survey: Survey, drive: SurveyDrive, number: int, pictures: int) -> None:
+        lot = survey.scenario.lot
+        self._survey, self._drive, self._key, self._pictures = survey, drive, survey.key_of(number), pictures
+        self._locate = make_locate(survey.settings.localise, lot)
+        self._estimated = np.empty_like(drive.odometry)
+        self._slots, self._score = SlotFilter(lot), SurveyScore(lot.n_slots)
+        self._observed_at = np.full(lot.n_slots, drive.arrival.time)
+        low_x, low_y, high_x, high_y = lot.bounds()
+        self._grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
+        self._cars: list[FloatArray] = []
+        self._at: list[int] = []
+        self._frame_s: list[float] = []
+        # For each section of the route, the capture with the most cars.
+        self._shown: dict[int, PerceptionResult] = {}
+
+    def add(self, i: int, scene: Scene, capture: Capture, true: TrueBoxes) -> SurveyFrame:
+        """Process capture i; the true scene is only for figures and scores."""
+        drive, slots, time = self._drive, self._slots, float(self._drive.times[i])
+        slots.updated[:] = False
+        begun = clock.perf_counter()
+        captured = TimedCapture(time, capture)
+        result = self._survey.pipeline.process(captured, slots, self._locate(drive.odometry[i]))
+        self._estimated[i] = vehicle = result.vehicle
+        for view in result.views:
+            update_grid(self._grid, view, vehicle)
+            self._cars.append(view.cars.poses)
+            self._at.append(i)
+        self._frame_s.append(clock.perf_counter() - begun)
+        self._observed_at[slots.updated] = time
+        self._score.add(i, scene, result, [localize_as_thesis(view, vehicle) for view in result.views], true)
+        section = i * self._pictures // len(drive.poses)
+        if self._pictures and (section not in self._shown or result.n_cars > self._shown[section].n_cars):
+            self._shown[section] = result
+        taken = drive.world.occupied(np.arange(len(self._observed_at)), time)
+        return SurveyFrame(result, self._grid, slots, taken, drive.odometry[i])
+
+    def result(self) -> SessionResult:
+        """Return the session after its last capture."""
+        drive, score, states = self._drive, self._score, self._slots.states()
+        truth = np.array(
+            [drive.world.occupied([s], t)[0] for s, t in enumerate(self._observed_at.tolist())],
+            dtype=np.bool_,
+        )
+        car_captures = np.repeat(np.array(self._at, dtype=np.int64), [len(c) for c in self._cars])
+        found_cars = np.concatenate(self._cars) if self._cars else np.empty((0, 3))
         p = np.where(states.in_view, states.p_occupied, np.nan)
-        session = Session(self.key_of(number), arrival.time, settings.rig, preset, p, found_cars)
+        rig = self._survey.settings.rig
         return SessionResult(
-            session, arrival, states, truth,
+            Session(self._key, drive.arrival.time, rig, drive.preset, p, found_cars),
+            drive.arrival, states, truth,
             int(truth.sum()), int((truth & score.found).sum()), score,
-            odometry, estimated, poses, car_captures,
-            np.array(frame_s), grid, tuple(shown.values()),
+            drive.odometry, self._estimated, drive.poses, car_captures,
+            np.array(self._frame_s), self._grid, tuple(self._shown.values()),
         )  # fmt: skip
 
 

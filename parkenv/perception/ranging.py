@@ -34,6 +34,7 @@ OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or be
 CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
 _MARGIN = 0.02  # of an image's width; boxes that come this close to its border count as clipped by it
+_EXPLAINED = 0.5  # fraction of a box's beams from which they belong to the nearer car of another box
 _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
 
@@ -159,8 +160,9 @@ def localize_cars(
     """Locate the detected cars: fit a car's rectangle to the `car_beams` of each box.
 
     The following detections are dropped: those without an obstacle at bumper height; those that, at its distance, would
-    not be on the ground or have a car's height; and cars too hidden to estimate their orientation, with neither a side
-    nor an end visible, or only a part of one at the image border. Later captures show them better.
+    not be on the ground or have a car's height; those whose beams end on the nearer car of another box, which hides
+    them, or is the same; and cars too hidden to estimate their orientation, with neither a side nor an end visible, or
+    only a part of one at the image border. Later captures show them better.
 
     Args:
         detections: detections in the camera's image.
@@ -174,14 +176,18 @@ def localize_cars(
     """
     _require_same_axis(scan, mount, vehicle)
     rows, cars, distances = [], [], []
-    for i, (left, right) in enumerate(bearings(camera, mount, vehicle, detections.boxes)):
+    margins = bearings(camera, mount, vehicle, detections.boxes)
+    explained = np.zeros(len(scan.angle), dtype=np.bool_)  # beams that end on the car of another box
+    # On the ground, nearer cars reach further down in the image.
+    for i in np.argsort(-detections.boxes[:, 3], kind="stable").tolist():
+        left, right = margins[i]
         # Counter-clockwise, the box's right margin comes first.
         clipped = (
             bool(detections.boxes[i, 2] >= (1.0 - _MARGIN) * camera.width),
             bool(detections.boxes[i, 0] <= _MARGIN * camera.width),
         )
         beams, cut = car_beams(scan, beams_between(scan, left, right), clipped)
-        if not len(beams):
+        if not len(beams) or explained[beams].mean() >= _EXPLAINED:
             continue
         if not _is_on_ground(detections.boxes[i], float(np.median(scan.distance[beams])), camera, mount):
             continue
@@ -190,6 +196,7 @@ def localize_cars(
         )
         if car.seen_length < LONG_SIDE and (car.seen_width < WHOLE_END or (any(clipped) and any(cut))):
             continue
+        explained[beams] = True
         rows.append(i)
         cars.append(car)
         distances.append(float(np.median(scan.distance[beams])))

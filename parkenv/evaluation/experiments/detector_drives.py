@@ -28,7 +28,7 @@ VISIBLE = (0.3, 0.6, 0.9, 1.0001)  # limits of the bins of the visible fraction
 MATCH = 0.5
 """Least intersection over union of a found box with the whole or the visible box of a car."""
 
-_LEAST_HEIGHT = 16  # px, of the cars that should be found
+LEAST_HEIGHT = 16  # px, of the cars that should be found
 _EITHER = 0.3  # overlap with a car that need not be found, from which a box does not count
 _SEEDS = 1 << 20
 
@@ -136,7 +136,7 @@ def _is_whole(picture: DrivePicture) -> NDArray[np.bool_]:
 
 
 def _wanted(truth: VehicleBoxes) -> NDArray[np.int64]:
-    high = truth.visible_box[:, 3] - truth.visible_box[:, 1] >= _LEAST_HEIGHT
+    high = truth.visible_box[:, 3] - truth.visible_box[:, 1] >= LEAST_HEIGHT
     return np.flatnonzero((truth.visible_fraction >= VISIBLE[0]) & high & (truth.distance < DISTANCES[-1]))
 
 

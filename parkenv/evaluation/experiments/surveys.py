@@ -160,23 +160,36 @@ def run_survey(
     survey = Survey(scenario, settings)
     table = map_file.with_name("sessions.csv")
     with MapStore(map_file, scenario.lot) as store:
-        # A row is written before its session: a row without a session is from an interrupted drive, which is repeated.
-        rows = {r["key"]: r for r in read_sessions(table) if store.has(r["key"])}
+        rows = stored_sessions(store, table)
         wanted = [survey.key_of(k) for k in range(sessions)]
-        missing = [k for k, key in enumerate(wanted) if not store.has(key) or key not in rows]
+        missing = [k for k, key in enumerate(wanted) if key not in rows]
         shown = recorded = None
         for number, (result, recording) in zip(
             missing, _driven(survey, missing, workers, record), strict=True
         ):
-            row = session_row(result)
-            rows[row["key"]] = row
-            write_csv(table, SESSION_COLUMNS, list(rows.values()))
-            if not store.has(row["key"]):
-                store.add(result.session)
+            row = store_session(result, rows, store, table)
             if number == 0:
                 shown, recorded = result, recording
             on_session(row)
     return SurveyRun([rows[key] for key in wanted], shown, recorded)
+
+
+def stored_sessions(store: MapStore, table: Path) -> dict[str, Row]:
+    """Return the rows of the sessions that a map file and its `sessions.csv` hold, by their keys.
+
+    A row is written before its session: a row without a session is from an interrupted drive, which is repeated.
+    """
+    return {row["key"]: row for row in read_sessions(table) if store.has(row["key"])}
+
+
+def store_session(result: SessionResult, rows: dict[str, Row], store: MapStore, table: Path) -> Row:
+    """Add a session to `stored_sessions`, to the table and to the map; return its row."""
+    row = session_row(result)
+    rows[row["key"]] = row
+    write_csv(table, SESSION_COLUMNS, list(rows.values()))
+    if not store.has(row["key"]):
+        store.add(result.session)
+    return row
 
 
 def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
