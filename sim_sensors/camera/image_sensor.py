@@ -71,8 +71,10 @@ class ImageSensor:
         It measures the green channel of every eighth pixel, clipped at white, so a low sun does not turn the street
         black.
         """
-        sample = radiance[::8, ::8, 1].astype(np.float64)
-        mean = float(np.minimum(sample, 3.0 * np.median(sample)).mean())
+        sample = radiance[::8, ::8, 1].ravel().astype(np.float64)
+        middle = len(sample) // 2
+        median = np.partition(sample, middle)[middle]
+        mean = float(np.minimum(sample, 3.0 * median).mean())
         return min(max(self.mid_grey / max(mean, 1e-6), self.least_gain), self.greatest_gain)
 
     def expose(
