@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from sim_sensors.camera.textures import LEAF, Tile, hash_unit, pixel_level, sample_tile
+from sim_sensors.camera.textures import VECTOR_LEAF, Tile, hash_unit, pixel_level, sample_tile
 from sim_sensors.compilation import compiled
 
 
-@compiled(**LEAF)
+@compiled(**VECTOR_LEAF)
 def facade(
     along: float, z: float, nz: float, footprint: float, lit_windows: float, grain: Tile
 ) -> tuple[float, float, float]:

@@ -1,5 +1,6 @@
 """How tests are run: by which process, with how many threads, and with which examples."""
 
+import gc
 import os
 
 import hypothesis
@@ -18,6 +19,16 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
 )
 hypothesis.settings.load_profile("parkenv")
+
+
+def pytest_collection_finish():
+    """Modules and tests live to the end: let the garbage collector pass over them, and look less often.
+
+    Compiling makes many objects that reference counting frees.
+    """
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(20_000, 20, 20)
 
 
 @pytest.hookimpl(optionalhook=True)

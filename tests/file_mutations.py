@@ -1,10 +1,8 @@
-"""Damaged and hostile variants of good files, drawn by hypothesis."""
+"""Damaged and hostile variants of good files; `rng` is a `random.Random`."""
 
 import copy
 import json
 import re
-
-from hypothesis import strategies as st
 
 ODD_VALUES = [
     None,
@@ -91,34 +89,30 @@ ODD_WORDS = [
 ]
 
 
-@st.composite
-def mutated_bytes(draw, good):
-    """Bytes with slices cut, repeated or overwritten; perhaps cut off, or in another encoding."""
+def mutated_bytes(good, rng):
+    """Bytes with slices cut, repeated or overwritten; perhaps cut off."""
     data = bytes(good)
-    for _ in range(draw(st.integers(1, 3))):
-        start = draw(st.integers(0, len(data)))
-        end = min(len(data), start + draw(st.sampled_from([0, 1, 2, 4, 16, 200])))
-        new = draw(
-            st.sampled_from([b"", data[start:end] * 2, b"\xff", b"\0", b"\xff\xff\xff\x7f"])
-            | st.binary(min_size=1, max_size=8)
-        )
-        data = draw(st.sampled_from([data[:start] + new + data[end:], data[:start], data[start:]]))
+    for _ in range(rng.randint(1, 3)):
+        start = rng.randint(0, len(data))
+        end = min(len(data), start + rng.choice([0, 1, 2, 4, 16, 200]))
+        odd = [b"", data[start:end] * 2, b"\xff", b"\0", b"\xff\xff\xff\x7f"]
+        new = rng.choice(odd) if rng.random() < 0.5 else rng.randbytes(rng.randint(1, 8))
+        data = rng.choice([data[:start] + new + data[end:], data[:start], data[start:]])
     return data
 
 
-@st.composite
-def mutated_text(draw, good):
-    """A text with words and numbers replaced by odd ones, or with lines left out or repeated."""
+def mutated_text(good, rng):
+    """A text with words and numbers replaced by odd ones, or with lines left out or repeated; any encoding."""
     text = good
-    for _ in range(draw(st.integers(1, 3))):
+    for _ in range(rng.randint(1, 3)):
         parts = [m.span() for m in re.finditer(r"[\w.+-]+", text)] or [(0, 0)]
-        start, end = draw(st.sampled_from(parts))
-        text = text[:start] + draw(st.sampled_from(ODD_WORDS)) + text[end:]
+        start, end = rng.choice(parts)
+        text = text[:start] + rng.choice(ODD_WORDS) + text[end:]
         lines = text.split("\n")
-        if draw(st.booleans()):
-            i, n = draw(st.integers(0, len(lines) - 1)), draw(st.integers(0, 3))
+        if rng.random() < 0.5:
+            i, n = rng.randrange(len(lines)), rng.randint(0, 3)
             text = "\n".join(lines[:i] + lines[i : i + 1] * n + lines[i + 1 :])
-    return text.encode(draw(st.sampled_from(["utf-8"] * 6 + ["utf-16", "latin-1"])), "replace")
+    return text.encode(rng.choice(["utf-8"] * 6 + ["utf-16", "latin-1"]), "replace")
 
 
 def _places(value, place=()):
@@ -131,16 +125,15 @@ def _places(value, place=()):
             yield from _places(part, (*place, i))
 
 
-@st.composite
-def mutated_value(draw, good):
+def mutated_value(good, rng):
     """JSON values with parts replaced by odd ones, left out, repeated or nested."""
     holder = [copy.deepcopy(good)]
-    for _ in range(draw(st.integers(1, 3))):
-        *way, last = draw(st.sampled_from([p for p in _places(holder) if p]))
+    for _ in range(rng.randint(1, 3)):
+        *way, last = rng.choice([p for p in _places(holder) if p])
         at = holder
         for step in way:
             at = at[step]
-        match draw(st.sampled_from(["replace", "replace", "replace", "leave out", "repeat", "nest"])):
+        match rng.choice(["replace", "replace", "replace", "leave out", "repeat", "nest"]):
             case "leave out" if at is not holder:
                 del at[last]
             case "repeat" if isinstance(at, list):
@@ -148,10 +141,12 @@ def mutated_value(draw, good):
             case "nest":
                 at[last] = [at[last]]
             case _:
-                at[last] = copy.deepcopy(draw(st.sampled_from(ODD_VALUES)))
+                at[last] = copy.deepcopy(rng.choice(ODD_VALUES))
     return holder[0]
 
 
-def mutated_json(good):
+def mutated_json(good, rng):
     """A JSON text, damaged as a value or as a text."""
-    return mutated_value(good).map(lambda value: json.dumps(value).encode()) | mutated_text(json.dumps(good))
+    if rng.random() < 0.5:
+        return json.dumps(mutated_value(good, rng)).encode()
+    return mutated_text(json.dumps(good), rng)

@@ -4,7 +4,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.textures import cloud_tile, fractal_noise
+from sim_sensors.camera.textures import cloud_noise, fractal_noise
 from sim_sensors.camera.weather import Weather
 
 Float32Array = NDArray[np.float32]
@@ -82,9 +82,8 @@ def _with_skyline(
     top = np.where(is_roof, roofs, np.clip(crowns, 0.012, 0.16))
     height = top[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
     built = is_roof[np.minimum((azimuth * bins).astype(np.int64), bins - 1)]
-    tile = cloud_tile()
-    noise = tile.levels[: tile.size**2].reshape(tile.size, tile.size)
-    speckle = noise[(z * 2200).astype(np.int64) % tile.size, (azimuth * 6000).astype(np.int64) % tile.size]
+    noise = cloud_noise()
+    speckle = noise[(z * 2200).astype(np.int64) % len(noise), (azimuth * 6000).astype(np.int64) % len(noise)]
     light = np.array(weather.sky) + 0.35 * np.array(weather.sun)
     leaf = np.array([0.05, 0.075, 0.03]) * (0.3 + 1.4 * speckle[..., None])
     wall = np.array([0.3, 0.27, 0.24]) * (0.8 + 0.4 * speckle[..., None])

@@ -10,12 +10,15 @@ import numba
 import numpy as np
 import plain_sky
 import pytest
+from plain_shading import plain_radiance
 from toy_scene import ToyScene, box_mesh, parked_cars, random_boxes, toy_scene
 
 from parkenv.perception.range_scan import disparity
+from sim_sensors.camera.ground_texture import ground_texture
 from sim_sensors.camera.image_sensor import ImageSensor
 from sim_sensors.camera.light_maps import open_sky, sunlit
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
+from sim_sensors.camera.shading import shade
 from sim_sensors.camera.shadows import light_maps
 from sim_sensors.camera.sky import mirrored_sky, sky_of_view
 from sim_sensors.camera.weather import PRESETS, Weather
@@ -76,6 +79,32 @@ def test_the_sky_is_that_of_plain_numpy(preset):
     plain = cv2.remap(sharp, *np.moveaxis(place.astype(np.float32), -1, 0), cv2.INTER_LINEAR)
     assert up.mean() > 0.6
     assert np.abs(view - plain)[up].mean() < 0.02 * plain[up].mean()
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_shading_is_that_of_plain_python(preset):
+    paint, wall = box_mesh(4.3, 1.8, 1.4), box_mesh(3.0, 0.3, 6.0, Material.FACADE)
+    bush, pane = box_mesh(1.5, 1.0, 1.2, Material.FOLIAGE), box_mesh(1.5, 0.1, 1.1, Material.GLASS)
+    placed = [(0, 5.0, 1.0, 0.0, 0.4), (0, 11.0, -3.0, 0.0, 1.2), (1, 14.0, 3.0, 0.0, 1.5)]
+    placed += [(2, 5.0, -1.6, 0.0, 0.3), (3, 2.6, -0.4, 0.6, 1.7)]
+    scene = toy_scene([paint, wall, bush, pane], placed, [1, 2, 0, 0, 3])
+    camera, pose = PinholeCamera.from_field_of_view(64, 48), camera_pose(-1.0, 0.2, 1.5, 0.1, -0.1, 0.02)
+    weather = Weather.draw(preset, 4)
+    maps = light_maps(scene.pool, scene.instances, weather, 8.0, 0.0)
+    seen = (
+        *camera.visibility(scene, pose),
+        pose,
+        camera.intrinsics,
+        weather,
+        ground_texture(scene.ground),
+        maps,
+    )
+    assert set(seen[0].material[np.unique(seen[1].triangle[seen[1].triangle >= 0])]) == {0, 9, 10}
+    assert (seen[1].pane >= 0).mean() > 0.01
+    ours, plain = shade(*seen), plain_radiance(*seen)
+    off = np.abs(ours - plain) / (plain + 0.1 * plain.mean())
+    assert off.mean() < 0.001
+    assert np.quantile(off, 0.99) < 0.02
 
 
 def test_truth_is_computed_when_asked_for_and_travels(scene):

@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import random
 import shutil
 import tempfile
 import tomllib
@@ -14,8 +15,6 @@ import cv2
 import numpy as np
 import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from test_import_osm import car_park
 from test_typed_csv import SESSION
 from tiny_networks import Tiny
@@ -52,7 +51,7 @@ class Format:
 
     name: str
     good: Any
-    mutated: Callable[[Any], st.SearchStrategy[bytes]]
+    mutated: Callable[[Any, random.Random], bytes]
     read: Callable[[Path], object]
 
     def __str__(self):
@@ -401,23 +400,24 @@ def test_the_good_file_is_read(tmp_path, kind):
     kind.read(tmp_path / kind.name)
 
 
-def fuzz(kind, **options):
+def read_damaged(kind, count):
+    """Read `count` variants, the same ones in every run, from a folder that keeps none of their files."""
     with tempfile.TemporaryDirectory() as folder:
-
-        @settings(deadline=None, suppress_health_check=list(HealthCheck), database=None, **options)
-        @given(kind.mutated(kind.good))
-        def run(content):
+        for number in range(count):
+            content = kind.mutated(kind.good, random.Random(f"{kind} {number}"))
             for path in Path(folder).iterdir():
                 if path.is_file():
                     path.unlink()
-            read(kind, content, Path(folder))
-
-        run()
+            try:
+                read(kind, content, Path(folder))
+            except Exception as error:
+                error.add_note(f"{kind}, variant {number}: {content[:2000]!r}")
+                raise
 
 
 @pytest.mark.parametrize("kind", FORMATS, ids=str)
 def test_damaged_files_are_read_or_refused(kind):
-    fuzz(kind, max_examples=15, derandomize=True)
+    read_damaged(kind, 15)
 
 
 FOUND = [
@@ -453,7 +453,6 @@ def test_a_map_whose_schema_is_no_text_is_refused(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:Generating overly large repr")
 @pytest.mark.parametrize("kind", FORMATS, ids=str)
 def test_many_damaged_files_are_read_or_refused(kind):
-    fuzz(kind, max_examples=1000)
+    read_damaged(kind, 1000)

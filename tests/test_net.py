@@ -14,7 +14,9 @@ from onnx import numpy_helper
 
 from parkenv import InputError
 from parkenv.evaluation.experiments.detector_drives import DrivePicture, score_on_drives
+from parkenv.evaluation.experiments.detector_scores import recall_on_crops, score_on
 from parkenv.files.onnx_file import read_onnx
+from parkenv.perception.car_datasets import Crops, LabelledImage
 from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
 from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
@@ -139,6 +141,7 @@ def test_windows_of_labelled_crops_surround_the_cars(net, street):
     found = net.detect(street[0])
     side = ~found.end_on
     size = found.regions[:, 2:] - found.regions[:, :2]
+    side |= found.boxes[:, 2] - found.boxes[:, 0] > 2.0 * (found.boxes[:, 3] - found.boxes[:, 1])
     assert size[side, 0] == pytest.approx(2.5 * size[side, 1], rel=1e-4)
     assert size[~side, 0] == pytest.approx(size[~side, 1], rel=1e-4)
     assert (found.regions[:, 0] <= found.boxes[:, 0]).all()
@@ -180,6 +183,65 @@ def test_small_pictures_are_enlarged_no_more_than_told(street):
     found = OnnxDetector(file, settings.changed(enlarge=1.0)).detect(image)
     within = OnnxDetector(file, settings).detect(framed)
     assert np.allclose(found.boxes, within.boxes - (240, 180, 240, 180), atol=1e-3)
+
+
+def test_small_pictures_are_looked_at_mirrored_too(net, street):
+    small = np.ascontiguousarray(cv2.resize(street[0], (288, 216), interpolation=cv2.INTER_AREA)[:200])
+    found, other = net.detect(small), net.detect(np.ascontiguousarray(small[:, ::-1]))
+    turned = other.boxes[:, [2, 1, 0, 3]] * (-1, 1, -1, 1) + (288, 0, 288, 0)
+    sure = np.flatnonzero(found.probability > 0.3)
+    assert len(sure) >= 3
+    for i in sure:
+        j = np.abs(turned - found.boxes[i]).max(axis=1).argmin()
+        assert turned[j] == pytest.approx(found.boxes[i], abs=0.01)
+        assert other.probability[j] == pytest.approx(found.probability[i], abs=1e-4)
+        assert (other.view[j], other.end_on[j]) == (found.view[i], found.end_on[i])
+    once = OnnxDetector(read_onnx(str(FILE)), net.settings.changed(mirror=False))
+    assert not np.array_equal(once.detect(small).probability, found.probability)
+    assert np.array_equal(
+        once.detect(street[0]).boxes, net.detect(street[0]).boxes
+    )  # this one fills the input
+
+
+def test_a_wide_box_is_no_front_where_photographs_of_sides_are_judged():
+    class Fixed:
+        def detect(self, image):
+            boxes = np.array([[10, 10, 94, 40], [110, 5, 194, 80]], float)  # wide; as high as a front
+            return Detections(boxes, np.array([0.9, 0.8]), end_on=np.array([True, True]))
+
+    photo = LabelledImage("photo", np.zeros((90, 210), np.uint8), np.array([[8.0, 5.0, 98.0, 45.0]]))
+    score = score_on(Fixed(), [photo], "single")
+    assert (score.row["recall"], score.row["precision"]) == (1.0, 1.0)
+
+
+def test_crops_are_judged_by_a_box_in_their_middle(tmp_path):
+    """Grey levels say what the toy detector finds in a crop: nothing, a car, a small one, or one aside."""
+    places = {10: [4, 4, 60, 50], 20: [25, 25, 45, 45], 30: [-40, 0, 24, 60]}
+
+    class Toy:
+        def detect(self, image):
+            box = places.get(int(image[0, 0]))
+            if box is None:
+                return Detections(np.zeros((0, 4)), np.zeros(0))
+            return Detections(np.array([box], float), np.array([0.9]))
+
+    def crops(*levels):
+        return [np.full((64, 64), level, np.uint8) for level in levels]
+
+    cars, others = crops(*[10] * 30, *[20] * 15, *[30] * 15), crops(*[0] * 19, 10)
+    low, high = recall_on_crops(Toy(), Crops(cars, others))
+    assert (low["false_positives"], low["recall"], low["cars"], low["others"]) == (0.01, 0.0, 60, 20)
+    assert (high["recall"], high["interval"]) == (0.5, pytest.approx(1.96 * np.sqrt(7.5 / 29 / 30)))
+    with pytest.raises(InputError, match="20 crops of cars, want at least 30"):
+        recall_on_crops(Toy(), Crops(others, cars))
+    for name, images in (("positives", cars[:30]), ("negatives", others)):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image)
+    done = parkenv("evaluate-detector", "--crops", tmp_path, "--model", "front", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "summary.json").read_text())["rows"]
+    assert [row["cars"] for row in rows] == [30, 30]
 
 
 def test_detectors_are_compared_at_equal_false_positives():

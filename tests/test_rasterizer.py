@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from toy_scene import box_mesh, random_boxes, ray_depth, toy_scene
+from toy_scene import box_mesh, parked_cars, random_boxes, ray_depth, toy_scene
 
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.projection import NEAR, project
-from sim_sensors.camera.rasterizer import FAR, interleaved
+from sim_sensors.camera.rasterizer import FAR, interleaved, rasterize
 from sim_sensors.mesh import Material
 
 
@@ -145,6 +145,19 @@ def test_same_result_on_any_number_of_threads():
         numba.set_num_threads(before)
     for one, other in zip(results[0], results[-1], strict=True):
         assert np.array_equal(one, other)
+
+
+def test_skipping_what_is_hidden_changes_nothing():
+    scene, camera = parked_cars(), PinholeCamera.from_field_of_view()
+    for yaw in (-math.pi / 2, 0.3):
+        pose = camera_pose(-6.0, 0.3, 1.35, yaw, -0.04)
+        triangles, seen = camera.visibility(scene, pose)
+        never_hidden = triangles._replace(nearest=np.full_like(triangles.nearest, np.inf))
+        down = -pose[2, :3] / pose[2, 3] / (camera.fx, camera.fy, 1.0)
+        floor = np.array([down[0], down[1], down[2] - down[0] * camera.cx - down[1] * camera.cy])
+        all_drawn = rasterize(never_hidden, (camera.width, camera.height), floor)
+        for one, other in zip(seen, all_drawn, strict=True):
+            assert np.array_equal(one, other)
 
 
 def test_far_instances_are_drawn_coarse():

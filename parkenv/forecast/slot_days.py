@@ -21,10 +21,11 @@ median of 99 car parks with published counts of two years, by 0.5 to 1.07 in the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
@@ -245,6 +246,28 @@ class _Curves:
     parts: FloatArray  # (t, k) basis of the weekdays' deviations
     numbers: IntArray  # different days, ascending: those of the drift
 
+    @cached_property
+    def _own_design(self) -> FloatArray:
+        """The design of the fitted days."""
+        return self.design(self.days)
+
+    @cached_property
+    def _lag(self) -> FloatArray:
+        """Hours between periods, (t, t)."""
+        return np.asarray(np.subtract.outer(self.hours, self.hours))
+
+    @cached_property
+    def _days_apart(self) -> FloatArray:
+        return np.abs(np.subtract.outer(self.numbers, self.numbers)).astype(float)
+
+    @cached_property
+    def _profile(self) -> tuple[FloatArray, float]:
+        """Inverse and log-determinant of the covariance of the profile, which no hyperparameter changes."""
+        lag = np.sqrt(3.0) * np.abs(self._lag) / _PROFILE_LENGTH
+        covariance = _PROFILE_SD**2 + _PROFILE_CURVE_SD**2 * (1 + lag) * np.exp(-lag)
+        covariance += _JITTER * np.eye(len(lag))
+        return np.linalg.inv(covariance), _log_determinant(covariance)
+
     @classmethod
     def of(cls, periods: tuple[int, int, int], days: Days, forecast: Days | None = None) -> _Curves:
         first, last, n = periods
@@ -262,54 +285,89 @@ class _Curves:
 
     def day_covariance(self, hyper: FloatArray) -> FloatArray:
         """Return the covariance of a day's level over its periods, (t, t)."""
-        constant_sd, curve_sd, length = np.exp(hyper[:3])
-        lag = np.subtract.outer(self.hours, self.hours)
-        curve = np.exp(-0.5 * (lag / length) ** 2) + _JITTER * np.eye(len(lag))
-        return np.asarray(constant_sd**2 + curve_sd**2 * curve)
+        constant_sd, curve_sd, _ = np.exp(hyper[:3])
+        return np.asarray(constant_sd**2 + curve_sd**2 * self._day_curve(hyper))
 
-    def _priors(self, hyper: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariances of the profile, of the weekdays (diagonal) and of the drift."""
-        weekday_sd, drift_sd, drift_days = np.exp(hyper[3:])
-        lag = np.sqrt(3.0) * np.abs(np.subtract.outer(self.hours, self.hours)) / _PROFILE_LENGTH
-        profile = _PROFILE_SD**2 + _PROFILE_CURVE_SD**2 * (1 + lag) * np.exp(-lag)
-        drift = drift_sd**2 * np.exp(-np.abs(np.subtract.outer(self.numbers, self.numbers)) / drift_days)
-        weekdays = np.full(_WEEKDAYS * self.parts.shape[1], weekday_sd**2)
-        return (
-            profile + _JITTER * np.eye(len(profile)),
-            np.diag(weekdays),
-            drift + _JITTER * np.eye(len(drift)),
-        )
+    def _day_curve(self, hyper: FloatArray) -> FloatArray:
+        """Return the correlation of a day's level, without its constant part, over its periods, (t, t)."""
+        curve = np.exp(-0.5 * (self._lag / np.exp(hyper[2])) ** 2)
+        return np.asarray(curve + _JITTER * np.eye(len(curve)))
+
+    def _drift_correlation(self, hyper: FloatArray) -> FloatArray:
+        return np.asarray(np.exp(-self._days_apart / np.exp(hyper[5])))
 
     def solve(self, hyper: FloatArray, response: FloatArray, information: FloatArray) -> _Solution:
         """Solve for the coefficients with the days' own levels integrated out (Henderson's equations)."""
-        t = len(self.hours)
+        return self._solve(hyper, response, information)[0]
+
+    def _solve(
+        self, hyper: FloatArray, response: FloatArray, information: FloatArray
+    ) -> tuple[_Solution, FloatArray]:
+        """Return also the gradient of the evidence by the hyperparameters, (6,)."""
+        t, (_, k), n = len(self.hours), self.parts.shape, len(self.numbers)
         day, root = self.day_covariance(hyper), np.sqrt(information)
         inner = np.eye(t) + root[:, :, None] * day * root[:, None]
         weight = root[:, :, None] * np.linalg.inv(inner) * root[:, None]  # (d, t, t)
-        design = self.design(self.days)
+        design = self._own_design
         weighted = weight @ design
-        precision = np.tensordot(design, weighted, ((0, 1), (0, 1)))
-        priors, at, log_prior = self._priors(hyper), 0, 0.0
-        for prior in priors:
-            block = slice(at, at := at + len(prior))
-            precision[block, block] += np.linalg.inv(prior)
-            log_prior += _log_determinant(prior)
-        right = np.tensordot(weighted, response, ((0, 1), (0, 1)))
-        mean = np.linalg.solve(precision, right)
+        flat, size = weighted.reshape(-1, design.shape[2]), design.shape[2]
+        precision = design.reshape(-1, size).T @ flat
+        # Priors of the profile, of the weekdays and of the drift.
+        weekday_sd, drift_sd, drift_days = np.exp(hyper[3:])
+        correlation = self._drift_correlation(hyper)
+        drift = drift_sd**2 * correlation + _JITTER * np.eye(n)
+        inverse = np.zeros((size, size))
+        inverse[:t, :t], log_prior = self._profile
+        weekdays = slice(t, size - n)
+        inverse[weekdays, weekdays] = np.eye(_WEEKDAYS * k) / weekday_sd**2
+        inverse[-n:, -n:] = np.linalg.inv(drift)
+        log_prior += 2.0 * _WEEKDAYS * k * float(hyper[3]) + _log_determinant(drift)
+        precision += inverse
+        right = response.ravel() @ flat
+        covariance = np.linalg.inv(precision)
+        mean = covariance @ right
         fit = design @ mean
-        explained = np.einsum("dt,dts,ds->", response, weight, response, optimize=True) - right @ mean
+        # Of the residuals, weighted: response - fit, less what the days' own levels explain.
+        score = (weight @ (response - fit)[:, :, None])[:, :, 0]
+        explained = float((response * score).sum())
         evidence = -0.5 * (explained + _log_determinant(inner) + _log_determinant(precision) + log_prior)
-        own = np.einsum("ts,dsr,dr->dt", day, weight, response - fit, optimize=True)
-        return _Solution(float(evidence), mean, precision, fit + own)
+        solution = _Solution(evidence, mean, precision, fit + score @ day)
+
+        # With V the covariance of the responses: d evidence = (s dV s - tr(V⁻¹ dV)) / 2, where s is the score.
+        surplus = (
+            score.T @ score
+            - weight.sum(axis=0)
+            + (flat @ covariance).reshape(weighted.shape).transpose(1, 0, 2).reshape(t, -1)
+            @ weighted.transpose(1, 0, 2).reshape(t, -1).T
+        )
+        constant_sd, curve_sd, length = np.exp(hyper[:3])
+        curve = self._day_curve(hyper)
+        of_length = curve_sd**2 * curve * (self._lag / length) ** 2
+        pull = inverse @ mean
+        prior = np.outer(pull, pull) - inverse + inverse @ covariance @ inverse
+        of_drift = prior[-n:, -n:] * drift_sd**2 * correlation
+        gradient = np.array(
+            [
+                constant_sd**2 * surplus.sum(),
+                curve_sd**2 * (surplus * curve).sum(),
+                0.5 * (surplus * of_length).sum(),
+                weekday_sd**2 * np.trace(prior[weekdays, weekdays]),
+                of_drift.sum(),
+                0.5 * (of_drift * self._days_apart).sum() / drift_days,
+            ]
+        )
+        return solution, gradient
 
     def tune(self, start: FloatArray, response: FloatArray, information: FloatArray) -> FloatArray:
         """Return the hyperparameters of the largest marginal posterior."""
 
-        def loss(hyper: ArrayLike) -> float:
-            hyper = np.asarray(hyper, float)
+        def loss(hyper: FloatArray) -> tuple[float, FloatArray]:
             off = (hyper - _MEDIAN) / _SPREAD
-            return 0.5 * float(off @ off) - self.solve(hyper, response, information).evidence
+            solution, gradient = self._solve(hyper, response, information)
+            return 0.5 * float(off @ off) - solution.evidence, off / _SPREAD - gradient
 
         bounds = list(zip(_MEDIAN - 3 * _SPREAD, _MEDIAN + 3 * _SPREAD, strict=True))
-        found = minimize(loss, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": _TUNING_STEPS})
+        found = minimize(
+            loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": _TUNING_STEPS}
+        )
         return np.asarray(found.x, float)

@@ -12,6 +12,8 @@ SIDE_CAR = (0.08, 0.22, 0.92, 0.885)
 SIDE_ASPECT = 2.5
 END_CAR = (0.08, 0.12, 0.92, 0.92)  # the same for a front or rear view
 END_ASPECT = 1.0
+END_WIDEST = 2.0
+"""Width over height of a box above which no long lens shows a car's whole front or rear in it."""
 
 
 def region_of(box: FloatArray, car: tuple[float, float, float, float], aspect: float) -> FloatArray:

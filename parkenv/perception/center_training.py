@@ -38,6 +38,7 @@ channels = "grey"
 mean = [{mean:.1f}]
 std = [{std:.1f}]
 enlarge = 2.0  # small pictures, at most
+mirror = true
 overlap = 0.45
 """
 

@@ -48,13 +48,7 @@ def score_on_crops(model: CarModel, crops: Crops, seed: int = 0) -> CropScore:
     """Score a model on crops, each resized to its window, and on photographs made of them with this seed."""
     from sklearn.metrics import roc_auc_score
 
-    window = (model.descriptor.width, model.descriptor.height)
-    scores = [
-        model.scores(
-            np.stack([cv2.resize(i, window, interpolation=cv2.INTER_LINEAR) for i in images])
-        ).astype(np.float64)
-        for images in (crops.positives, crops.negatives)
-    ]
+    scores = [scores_of(model, images) for images in (crops.positives, crops.negatives)]
     labels = np.repeat([1, 0], [len(s) for s in scores])
     return CropScore(
         float(roc_auc_score(labels, np.concatenate(scores))),
@@ -63,6 +57,13 @@ def score_on_crops(model: CarModel, crops: Crops, seed: int = 0) -> CropScore:
         len(scores[1]),
         score_on_made_photos(model, crops, MADE_PHOTOS, seed).equal_error,
     )
+
+
+def scores_of(model: CarModel, images: Sequence[_Image]) -> NDArray[np.float64]:
+    """Return a model's score of each crop, resized to its window, (n,)."""
+    window = (model.descriptor.width, model.descriptor.height)
+    resized = np.stack([cv2.resize(i, window, interpolation=cv2.INTER_LINEAR) for i in images])
+    return model.scores(resized).astype(np.float64)
 
 
 def score_on_made_photos(model: CarModel, crops: Crops, n: int, seed: int = 0) -> RecallPrecision:

@@ -16,7 +16,7 @@ from pydantic import Field
 from parkenv.errors import InputError
 from parkenv.files.onnx_file import OnnxFile, OnnxValue, read_onnx
 from parkenv.files.spec_file import Several, Spec
-from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
+from parkenv.perception.car_regions import END_ASPECT, END_CAR, END_WIDEST, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.detector import LEAST_PROBABILITY, Detections
 from parkenv.perception.hog_detector import as_grey, best_boxes
 from parkenv.perception.onnx_outputs import (
@@ -26,6 +26,7 @@ from parkenv.perception.onnx_outputs import (
     decode,
     decode_centers,
     guess_layout,
+    mirrored_centers,
 )
 from parkenv.perception.onnx_trial import require_runs
 
@@ -73,6 +74,11 @@ class OnnxSettings(Spec):
     )
     enlarge: float = Field(
         1_000.0, gt=0.0, le=1_000.0, description="Largest magnification of a small image in a letterbox."
+    )
+    mirror: bool = Field(
+        False,
+        description="Whether an image that even the largest magnification makes smaller than the input is looked at "
+        "mirrored, too, and the two averaged; of centers only.",
     )
     pad: int = Field(114, ge=0, le=255, description="Grey level of the borders of a letterbox.")
     channels: Literal["rgb", "bgr", "grey"] | None = Field(
@@ -136,6 +142,7 @@ class _Plan:
     size: tuple[int, int]
     letterbox: bool
     enlarge: float
+    mirror: bool
     pad: int
     channels: str
     mean: Float32Array
@@ -204,6 +211,9 @@ class OnnxDetector:
         outputs = self._run(fed, plan.outputs)
         centers = None
         if plan.layout == "centers":
+            if plan.mirror and min(offset) > 0.0:
+                mirrored = self._run(np.ascontiguousarray(fed[..., ::-1]), plan.outputs)
+                outputs = [0.5 * (outputs[0] + mirrored_centers(mirrored[0]))]
             centers = decode_centers(outputs[0], plan.size, self.settings.threshold)
             boxes, score = centers.boxes, centers.score
         else:
@@ -317,6 +327,7 @@ def _planned(file: OnnxFile, settings: OnnxSettings, run: Any, *, is_known: bool
         size=size,
         letterbox=(s.resize or ("stretch" if many else "letterbox")) == "letterbox",
         enlarge=s.enlarge,
+        mirror=s.mirror,
         pad=s.pad,
         channels=channels,
         mean=_per_channel("mean", s.mean or mean, count, beside),
@@ -432,9 +443,11 @@ def _fed(image: Image, plan: _Plan) -> tuple[Float32Array, tuple[float, float], 
 
 def _regions(boxes: Float32Array, end_on: NDArray[np.bool_]) -> Float32Array:
     """Return the windows around cars that labelled crops have, as those of the HOG models."""
+    size = boxes[:, 2:] - boxes[:, :2]
+    square = end_on & (size[:, 0] <= END_WIDEST * size[:, 1])
     regions = [
         region_of(box, END_CAR, END_ASPECT) if end else region_of(box, SIDE_CAR, SIDE_ASPECT)
-        for box, end in zip(boxes.astype(np.float64), end_on, strict=True)
+        for box, end in zip(boxes.astype(np.float64), square, strict=True)
     ]
     return np.array(regions, dtype=np.float32).reshape(-1, 4)
 

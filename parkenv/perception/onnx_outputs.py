@@ -155,6 +155,11 @@ def decode_centers(output: Float32Array, size: tuple[int, int], threshold: float
     return Centers(boxes, score[row, column], end > side, view, visible)
 
 
+def mirrored_centers(output: Float32Array) -> Float32Array:
+    """Return what a network of the layout `centers` would put out for the mirrored input: left and right exchanged."""
+    return output[:, [0, 3, 2, 1, *range(4, _CENTER_NUMBERS)], :, ::-1]
+
+
 def _highest(score: Float32Array, neighbours: NDArray[np.uint8]) -> Float32Array:
     highest = cv2.dilate(score, neighbours, borderType=cv2.BORDER_CONSTANT, borderValue=-1.0)
     return np.asarray(highest, dtype=np.float32)

@@ -151,6 +151,7 @@ def _centred_logits(p: FloatArray, deviation: FloatArray) -> FloatArray:
     centres, factors = np.empty_like(p), np.ones(_NODES.size)
     for i in range(p.size):
         if i == 0 or deviation[i] != deviation[i - 1]:
-            factors[:] = np.exp(deviation[i] * _NODES)
+            for k in range(_NODES.size):
+                factors[k] = math.exp(deviation[i] * _NODES[k])
         centres[i] = _centred_logit(p[i], deviation[i], factors)
     return centres

@@ -7,6 +7,7 @@ dozen arrays, and is cheap to call from Python. Code that writes an address into
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any
 
 import numba
@@ -17,6 +18,8 @@ from numba.core import cgutils
 from numba.extending import intrinsic
 from numba.np import arrayobj
 from numpy.typing import NDArray
+
+from sim_sensors.compilation import compiled
 
 _LINE = 64  # bytes of a cache line
 _SMALL = 4096  # bytes
@@ -132,12 +135,19 @@ def call_at(_: Any, address: Any, one: Any, other: Any) -> Any:  # noqa: ARG001 
 def call_address(function: Any) -> int:
     """Return the address of a compiled function of two int64 that returns an int64, for `call_at`.
 
-    The function must stay referenced; an exception in it is printed, and it then returns 0.
+    An exception in the function is printed, and it then returns 0.
     """
     signature = types.int64(types.int64, types.int64)
-    function.compile(signature)
-    compiled = function.overloads[signature.args]
-    return int(compiled.library.get_pointer_to_function(compiled.fndesc.llvm_cfunc_wrapper_name))
+    from_c = _callable_from_c(function)
+    from_c.compile(signature)
+    code = from_c.overloads[signature.args]
+    return int(code.library.get_pointer_to_function(code.fndesc.llvm_cfunc_wrapper_name))
+
+
+@cache
+def _callable_from_c(function: Any) -> Any:
+    options = {name: value for name, value in function.targetoptions.items() if name != "nopython"}
+    return compiled(**options | {"no_cfunc_wrapper": False})(function.py_func)
 
 
 def record_at(dtype: Any) -> Any:

@@ -8,17 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sim_sensors.camera.light_maps import LightMaps, open_sky
-from sim_sensors.camera.sky import look_up, mirrored_sky
-from sim_sensors.camera.textures import LEAF
+from sim_sensors.camera.sky import look_up, packed_sky
+from sim_sensors.camera.textures import VECTOR_LEAF, Single
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
-Color = tuple[float, float, float]
-Vector = tuple[float, float, float]
+Color = tuple[Single, Single, Single]
+Vector = tuple[Single, Single, Single]
 
-SHADOW_BIAS = 0.05  # m, offset towards the sun, against self-shadowing
+SHADOW_BIAS = np.float32(0.05)  # m, offset towards the sun, against self-shadowing
 
 _GROUND_TONE = 0.12  # albedo of the ground in reflections and for bounced light
 
@@ -27,24 +26,25 @@ class Light(NamedTuple):
     """The light of a weather for compiled code; colours are relative linear RGB radiance (see `Weather`).
 
     Attributes:
-        sun_direction: (3,) float64, unit vector to the sun, world frame.
-        sun, sky, horizon: (3,) float64, as in `Weather`.
+        sun_direction: (3,) float32, unit vector to the sun, world frame.
+        sun, sky, horizon: (3,) float32, as in `Weather`.
         haze, wetness, lit_windows: as in `Weather`.
         background: (h, w, 3) float32, the sky behind every pixel.
-        mirrored: (n, n, 3) float32, the blurred sky, for `look_up`.
-        ground: (3,) float64, radiance of open ground in reflections and as bounced light.
+        mirrored, brightest: the blurred sky, for `look_up`.
+        ground: (3,) float32, radiance of open ground in reflections and as bounced light.
     """
 
-    sun_direction: FloatArray
-    sun: FloatArray
-    sky: FloatArray
-    horizon: FloatArray
-    haze: float
-    wetness: float
-    lit_windows: float
+    sun_direction: Float32Array
+    sun: Float32Array
+    sky: Float32Array
+    horizon: Float32Array
+    haze: Single
+    wetness: Single
+    lit_windows: Single
     background: Float32Array
-    mirrored: Float32Array
-    ground: FloatArray
+    mirrored: NDArray[np.uint32]
+    brightest: Single
+    ground: Float32Array
 
 
 def daylight(weather: Weather, background: Float32Array) -> Light:
@@ -56,22 +56,41 @@ def daylight(weather: Weather, background: Float32Array) -> Light:
     """
     sun, sky = np.array(weather.sun), np.array(weather.sky)
     ground = _GROUND_TONE * (1.0 - 0.5 * weather.wetness) * (sun * weather.sun_direction[2] + sky)
-    strengths = weather.haze, weather.wetness, weather.lit_windows
-    direction, horizon = np.array(weather.sun_direction), np.array(weather.horizon)
-    return Light(direction, sun, sky, horizon, *strengths, background, mirrored_sky(weather), ground)
+    return Light(
+        np.array(weather.sun_direction, dtype=np.float32),
+        sun.astype(np.float32),
+        sky.astype(np.float32),
+        np.array(weather.horizon, dtype=np.float32),
+        np.float32(weather.haze),
+        np.float32(weather.wetness),
+        np.float32(weather.lit_windows),
+        background,
+        *packed_sky(weather),
+        ground.astype(np.float32),
+    )
 
 
-@compiled(**LEAF)
+@compiled(**VECTOR_LEAF)
 def mirrored(
-    px: float, py: float, pz: float, rx: float, ry: float, rz: float, light: Light, maps: LightMaps
+    px: Single,
+    py: Single,
+    pz: Single,
+    rx: Single,
+    ry: Single,
+    rz: Single,
+    light: Light,
+    maps: LightMaps,
 ) -> Color:
     """Return the radiance seen from a point in direction (rx, ry, rz): the sky, or the ground with its shadows."""
-    if rz >= 0.0:
-        red, green, blue = look_up(light.mirrored, rx, ry, rz)
-        return red, green, blue
+    red, green, blue = look_up(light.mirrored, light.brightest, rx, ry, max(rz, 0.0))
     reach = max(pz, 0.05) / max(-rz, 0.02)
     hidden = open_sky(maps, px + rx * reach, py + ry * reach)
     # Other cars, kerbs and hedges towards the horizon are darker than the open ground.
     far = min(1.0, reach * 0.12)
     tone = (0.25 + 0.75 * hidden) * (1.0 - 0.45 * far)
-    return light.ground[0] * tone, light.ground[1] * tone, light.ground[2] * tone
+    up = rz >= 0.0
+    return (
+        red if up else light.ground[0] * tone,
+        green if up else light.ground[1] * tone,
+        blue if up else light.ground[2] * tone,
+    )

@@ -4,72 +4,108 @@ from __future__ import annotations
 
 import math
 
-from sim_sensors.camera.daylight import SHADOW_BIAS, Color, Light, Vector
-from sim_sensors.camera.ground_texture import GroundTexture, sample_ground, sample_water
+import numpy as np
+from numpy.typing import NDArray
+
+from sim_sensors.camera.batches import Batch, Places
+from sim_sensors.camera.daylight import SHADOW_BIAS, Light
+from sim_sensors.camera.ground_texture import GroundTexture, sample_ground
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.sky import look_up
-from sim_sensors.camera.textures import LEAF, Tile, sample_tile
+from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, hash_unit, sample_tile
 from sim_sensors.compilation import compiled
 
+Float32Array = NDArray[np.float32]
 
-@compiled(**LEAF)
-def ground_level(row_z: float, height: float, focal: float, texel: float) -> float:
-    """Return the pyramid level at which a ground texel is about as large as a pixel, in the middle of a row.
+_GRAIN_M = 3.0  # m, period of the asphalt's grain
+_GRAIN_PER_M = np.float32(1.0 / _GRAIN_M)
+
+
+def ground_levels(
+    rays_down: NDArray[np.float64], height: float, focal: float, texel: float
+) -> tuple[Float32Array, Single]:
+    """Return the pyramid level at which a ground texel is about as large as a pixel, for every row.
 
     Args:
-        row_z: world z of the row's ray at unit depth.
+        rays_down: (h,) world z of the ray at unit depth in the middle of each row.
         height: m, camera height above the ground.
-        focal: px, focal length along the row.
+        focal: px, focal length along the rows.
         texel: m, side of a texel of the finest level.
+
+    Returns:
+        (h,) float32 levels of the ground, and the number to add for those of the asphalt's grain.
     """
-    depth = -height / min(row_z, -1e-3)
+    depth = -height / np.minimum(rays_down, -1e-3)
     # A pixel covers depth/f across and depth²/(f·h) along the ground: their geometric mean keeps edges sharp.
-    footprint = depth / focal * math.sqrt(max(depth / height, 1.0))
-    return max(math.log2(footprint / texel) - 0.4, 0.0)
+    footprint = depth / focal * np.sqrt(np.maximum(depth / height, 1.0))
+    level = np.maximum(np.log2(footprint / texel) - 0.4, 0.0)
+    return level.astype(np.float32), np.float32(math.log2(texel / (_GRAIN_M / 512)))
 
 
-@compiled(**LEAF)
-def ground_radiance(
-    px: float,
-    py: float,
-    ray: Vector,
-    level: int,
-    grain_level: int,
-    light: Light,
+@compiled(**VECTOR_LOOP)
+def color_ground(
+    n: int,
+    places: Places,
+    row_level: Float32Array,
+    to_grain: Single,
+    wetness: Single,
     ground: GroundTexture,
-    maps: LightMaps,
     grain_of_asphalt: Tile,
-) -> Color:
-    """Return the radiance, linear RGB, of the ground at (px, py), m, seen along the unit vector `ray`.
+    batch: Batch,
+) -> None:
+    """Set the albedo of the first n pixels, all of the ground, and how wet they are; levels are of `ground_levels`."""
+    level = batch.depth  # which the ground no longer needs
+    for i in range(n):
+        # Rows change from one level to the next in a random pattern instead of a line.
+        dither = hash_unit(places.column[i], places.row[i])
+        level[i] = row_level[np.uint64(places.row[i])] + dither
+    for i in range(n):
+        albedo, grass, wettable = sample_ground(ground, batch.x[i], batch.y[i], np.int32(level[i]))
+        # Asphalt is a warm grey, grass a yellowish green.
+        batch.red[i] = albedo * (1.03 - 0.08 * grass)
+        batch.green[i] = albedo * (1.0 + 0.25 * grass)
+        batch.blue[i] = albedo * (0.95 - 0.45 * grass)
+        batch.wettable[i] = wettable
+    for i in range(n):
+        x, y = batch.x[i] * _GRAIN_PER_M, batch.y[i] * _GRAIN_PER_M
+        grain = 0.55 + 0.9 * sample_tile(grain_of_asphalt, x, y, np.int32(level[i] + to_grain))
+        grain *= 1.0 - 0.45 * _wet(wetness, batch.wettable[i])
+        batch.grain[i] = grain
+        batch.red[i] *= grain
+        batch.green[i] *= grain
+        batch.blue[i] *= grain
 
-    `level` and `grain_level` are the levels of the pyramids of the ground and of the asphalt's grain.
-    """
-    albedo, grass, texel, below = sample_ground(ground, px, py, level)
-    grain = 0.55 + 0.9 * sample_tile(grain_of_asphalt, px / 3.0, py / 3.0, grain_level)
-    sky = open_sky(maps, px, py)
-    sun = 0.0
-    if light.sun[0] > 0.0:
-        sun = light.sun_direction[2] * sunlit(maps, px, py, 0.0, SHADOW_BIAS)
-    wet = 0.0
-    if light.wetness > 0.0:
-        wettable = sample_water(ground, texel, below)
-        wet = light.wetness * min(1.0, 0.45 + 1.2 * wettable)
-        grain *= 1.0 - 0.45 * wet
-    albedo *= grain
-    # Asphalt is a warm grey, grass a yellowish green.
-    red = albedo * (1.03 - 0.08 * grass) * (light.sun[0] * sun + light.sky[0] * sky)
-    green = albedo * (1.0 + 0.25 * grass) * (light.sun[1] * sun + light.sky[1] * sky)
-    blue = albedo * (0.95 - 0.45 * grass) * (light.sun[2] * sun + light.sky[2] * sky)
-    if wet > 0.0:
-        # Water reflects the sky, or a dark car where the sky is occluded.
-        dx, dy, dz = ray
-        mirror = 1.0 + dz
-        mirror = (0.025 + 0.975 * mirror * mirror * mirror * mirror * mirror) * wet
-        mirror *= min(1.0, 0.3 + 1.1 * wettable)
-        ripple = 0.05 * (grain - 1.0)
-        m_red, m_green, m_blue = look_up(light.mirrored, dx + ripple, dy + ripple, max(-dz, 0.0))
-        mirror *= sky * sky
-        red += (m_red - red) * mirror
-        green += (m_green - green) * mirror
-        blue += (m_blue - blue) * mirror
-    return red, green, blue
+
+@compiled(**VECTOR_LOOP)
+def light_ground(n: int, light: Light, maps: LightMaps, batch: Batch) -> None:
+    """Turn the albedo of the first n pixels into their radiance."""
+    for i in range(n):
+        batch.sun[i] = sunlit(maps, batch.x[i], batch.y[i], 0.0, SHADOW_BIAS)
+    for i in range(n):
+        sun = light.sun_direction[2] * batch.sun[i]
+        sky = open_sky(maps, batch.x[i], batch.y[i])
+        batch.red[i] *= light.sun[0] * sun + light.sky[0] * sky
+        batch.green[i] *= light.sun[1] * sun + light.sky[1] * sky
+        batch.blue[i] *= light.sun[2] * sun + light.sky[2] * sky
+        batch.sky[i] = sky
+
+
+@compiled(**VECTOR_LOOP)
+def mirror_in_puddles(n: int, light: Light, batch: Batch) -> None:
+    """Add what water on the first n pixels reflects: the sky, or a dark car where the sky is occluded."""
+    for i in range(n):
+        steep = 1.0 + batch.ray_z[i]
+        mirror = 0.025 + 0.975 * steep * steep * steep * steep * steep
+        mirror *= _wet(light.wetness, batch.wettable[i]) * min(1.0, 0.3 + 1.1 * batch.wettable[i])
+        mirror *= batch.sky[i] * batch.sky[i]
+        ripple = 0.05 * (batch.grain[i] - 1.0)
+        x, y = batch.ray_x[i] + ripple, batch.ray_y[i] + ripple
+        red, green, blue = look_up(light.mirrored, light.brightest, x, y, max(-batch.ray_z[i], 0.0))
+        batch.red[i] += (red - batch.red[i]) * mirror
+        batch.green[i] += (green - batch.green[i]) * mirror
+        batch.blue[i] += (blue - batch.blue[i]) * mirror
+
+
+@compiled(**VECTOR_LEAF)
+def _wet(wetness: Single, wettable: Single) -> Single:
+    return wetness * min(1.0, 0.45 + 1.2 * wettable)

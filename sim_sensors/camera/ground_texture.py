@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.textures import LEAF, fractal_noise
+from sim_sensors.camera.textures import VECTOR_LEAF, Single, byte, fractal_noise, mix
 from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Ground
 
@@ -25,19 +25,19 @@ class GroundTexture(NamedTuple):
     """Albedo of the ground as an image pyramid.
 
     Attributes:
-        texels: (total, 3) uint8: square root of the grey albedo, fraction of grass, and capacity for water, each 255 =
-            1; level after level, row-major, rows along y.
-        start: (n_levels,) int64, first texel of each level.
-        shape: (n_levels, 2) int64, rows and columns of each level.
-        per_m: (n_levels, 2) float64, texels per metre along y and x.
+        texels: (total,) uint32, from the lowest byte on: square root of the grey albedo, fraction of grass, capacity
+            for water, each 255 = 1; level after level, row-major, rows along y.
+        start: (n_levels,) int32, first texel of each level.
+        shape: (n_levels, 2) int32, rows and columns of each level.
+        per_m: (n_levels, 2) float32, texels per metre along y and x.
         x, y: m, corner of the image.
         texel: m, side of a texel of the finest level.
     """
 
-    texels: NDArray[np.uint8]
-    start: NDArray[np.int64]
-    shape: NDArray[np.int64]
-    per_m: NDArray[np.float64]
+    texels: NDArray[np.uint32]
+    start: NDArray[np.int32]
+    shape: NDArray[np.int32]
+    per_m: NDArray[np.float32]
     x: float
     y: float
     texel: float
@@ -172,53 +172,51 @@ def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -
         half = (max(1, image.shape[1] // 2), max(1, image.shape[0] // 2))
         image = np.asarray(cv2.resize(image, half, interpolation=cv2.INTER_AREA), dtype=np.uint8)
         levels.append(image)
-    shape = np.array([level.shape[:2] for level in levels], dtype=np.int64)
-    start = np.concatenate([[0], np.cumsum(shape.prod(axis=1))[:-1]]).astype(np.int64)
-    texels = np.concatenate([level.reshape(-1, 3) for level in levels])
+    shape = np.array([level.shape[:2] for level in levels], dtype=np.int32)
+    start = np.concatenate([[0], np.cumsum(shape.prod(axis=1))[:-1]]).astype(np.int32)
+    texels = np.concatenate([_packed(level).ravel() for level in levels])
     # Levels are not exact halves where a side is odd.
-    per_m = shape / (shape[0] * texel)
+    per_m = (shape / (shape[0] * texel)).astype(np.float32)
     return GroundTexture(texels, start, shape, per_m, float(low[0]), float(low[1]), texel)
 
 
-@compiled(**LEAF)
-def sample_ground(
-    texture: GroundTexture, x: float, y: float, level: int
-) -> tuple[float, float, np.uint64, np.uint64]:
-    """Sample the ground at (x, y), m: grey albedo and fraction of grass, bilinear; and the texel and the one below."""
-    level = min(max(level, 0), texture.shape.shape[0] - 1)
-    columns = texture.shape[level, 1]
+def _packed(image: NDArray[np.uint8]) -> NDArray[np.uint32]:
+    """Pack an (h, w, 3) image into (h, w): one load then fetches a whole texel."""
+    wide = np.zeros((*image.shape[:2], 4), dtype=np.uint8)
+    wide[..., :3] = image
+    return wide.view("<u4")[..., 0].astype(np.uint32)
+
+
+@compiled(**VECTOR_LEAF)
+def sample_ground(texture: GroundTexture, x: Single, y: Single, level: int) -> tuple[Single, Single, Single]:
+    """Sample the ground at (x, y), m: grey albedo, fraction of grass, and how much water can collect there."""
+    step = np.uint64(min(max(level, 0), texture.shape.shape[0] - 1))
+    columns = texture.shape[step, 1]
     # Beyond the drawn part the texture repeats, mirrored, so no streaks run to the horizon.
-    u = _mirrored((x - texture.x) * texture.per_m[level, 1] - 0.5, columns)
-    v = _mirrored((y - texture.y) * texture.per_m[level, 0] - 0.5, texture.shape[level, 0])
-    column = int(u)
-    row = int(v)
-    a = u - column
-    b = v - row
-    i = np.uint64(texture.start[level] + row * columns + column)
+    u = _mirrored((x - np.float32(texture.x)) * texture.per_m[step, 1] - 0.5, np.float32(columns))
+    v = _mirrored(
+        (y - np.float32(texture.y)) * texture.per_m[step, 0] - 0.5, np.float32(texture.shape[step, 0])
+    )
+    column = np.int32(u)
+    row = np.int32(v)
+    a = u - np.float32(column)
+    b = v - np.float32(row)
+    i = np.uint64(texture.start[step] + row * columns + column)
     j = i + np.uint64(columns)
     one = np.uint64(1)
     t = texture.texels
-    above = t[i, 0] + a * (float(t[i + one, 0]) - t[i, 0])
-    below = t[j, 0] + a * (float(t[j + one, 0]) - t[j, 0])
-    root = (above + b * (below - above)) / 255.0
-    return root * root, t[i, 1] / 255.0, i, j
+    t00, t01, t10, t11 = t[i], t[i + one], t[j], t[j + one]
+    above = mix(byte(t00, 0), byte(t01, 0), a)
+    below = mix(byte(t10, 0), byte(t11, 0), a)
+    root = mix(above, below, b) * (1.0 / 255.0)
+    water = byte(t00, 16) + byte(t01, 16) + byte(t10, 16) + byte(t11, 16)
+    return root * root, byte(t00, 8) * (1.0 / 255.0), water * (1.0 / 1020.0)
 
 
-@compiled(**LEAF)
-def sample_water(texture: GroundTexture, i: np.uint64, j: np.uint64) -> float:
-    """Return how much water can collect between the texels i and j of `sample_ground`."""
-    t, one = texture.texels, np.uint64(1)
-    return float(float(t[i, 2]) + t[i + one, 2] + t[j, 2] + t[j + one, 2]) / 1020.0
-
-
-@compiled(**LEAF)
-def _mirrored(u: float, n: int) -> float:
+@compiled(**VECTOR_LEAF)
+def _mirrored(u: Single, n: Single) -> Single:
     """Reflect `u` into [0, n - 1)."""
     span = n - 1.001
-    if u < 0.0:
-        u = -u
-    if u > span:
-        u -= 2.0 * span * np.floor(u / (2.0 * span))
-        if u > span:
-            u = 2.0 * span - u
-    return float(u)
+    u = abs(u)
+    u -= 2.0 * span * np.floor(u / (2.0 * span))
+    return max(min(u, 2.0 * span - u), 0.0)

@@ -5,20 +5,24 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
 from sim_sensors.camera.rasterizer import BAND, interleaved
-from sim_sensors.camera.textures import FAST
+from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single
 from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
 
 Float32Array = NDArray[np.float32]
 
 _CURVE_STEPS = 4096
-_BRIGHTEST = 4.0  # greatest input of the tone curve; a plain sRGB curve would clip at 1
+_BRIGHTEST = np.float32(4.0)  # greatest input of the tone curve; a plain sRGB curve would clip at 1
+_STEPS_PER_ROOT = np.float32(
+    (_CURVE_STEPS - 1) / math.sqrt(4.0)
+)  # steps of the tone curve per square root of light
 _KNEE = 0.7  # highlights above this are compressed, as in a camera's own curve
 _NOISE = 1 << 20  # numbers in the noise table
 
@@ -67,8 +71,10 @@ class ImageSensor:
         It measures the green channel of every eighth pixel, clipped at white, so a low sun does not turn the street
         black.
         """
-        sample = radiance[::8, ::8, 1].astype(np.float64)
-        mean = float(np.minimum(sample, 3.0 * np.median(sample)).mean())
+        sample = radiance[::8, ::8, 1].ravel().astype(np.float64)
+        middle = len(sample) // 2
+        median = np.partition(sample, middle)[middle]
+        mean = float(np.minimum(sample, 3.0 * median).mean())
         return min(max(self.mid_grey / max(mean, 1e-6), self.least_gain), self.greatest_gain)
 
     def expose(
@@ -91,8 +97,7 @@ class ImageSensor:
         if rain > 0.0:
             radiance = radiance.copy()
             _draw_rain(radiance, rain, generator)
-        # A kernel of three taps with the given variance.
-        side = self.blur**2 / 2.0
+        variances = np.float32(self.shot_noise**2 * gain), np.float32((self.read_noise * gain) ** 2)
         image = np.empty((height, width, 3), dtype=np.uint8)
         _expose(
             radiance,
@@ -100,14 +105,29 @@ class ImageSensor:
             offsets,
             _tone_curve(),
             interleaved((height + BAND - 1) // BAND),
-            np.float32(side),
+            _lens(self.blur, self.vignetting, (width, height)),
             np.float32(gain),
-            np.float32(self.vignetting),
-            np.float32(self.shot_noise**2 * gain),
-            np.float32((self.read_noise * gain) ** 2),
+            variances,
             image,
         )
         return image
+
+
+class _Lens(NamedTuple):
+    """What the lens does to an image."""
+
+    side: np.float32  # weight of each neighbour in a blur of three pixels
+    dark_rows: Float32Array  # (h,) and (3 w,) float32: their sum is the light lost at a channel of a pixel
+    dark_columns: Float32Array
+
+
+@lru_cache(maxsize=4)
+def _lens(blur: float, vignetting: float, size: tuple[int, int]) -> _Lens:
+    width, height = size
+    per_corner = vignetting / (0.25 * (width**2 + height**2))
+    columns, rows = (per_corner * (np.arange(n) + 0.5 - 0.5 * n) ** 2 for n in size)
+    # A kernel of three taps with the given variance.
+    return _Lens(np.float32(blur**2 / 2.0), rows.astype(np.float32), np.repeat(columns, 3).astype(np.float32))
 
 
 @lru_cache(maxsize=1)
@@ -116,13 +136,13 @@ def _noise_table() -> Float32Array:
 
 
 @lru_cache(maxsize=1)
-def _tone_curve() -> NDArray[np.uint8]:
+def _tone_curve() -> NDArray[np.int32]:
     """Return 8-bit codes over the square root of the light: dark tones get most of the steps."""
     light = np.linspace(0.0, 1.0, _CURVE_STEPS) ** 2 * _BRIGHTEST
     over = np.maximum(light - _KNEE, 0.0)
     light = np.minimum(light, _KNEE) + (1.0 - _KNEE) * (1.0 - np.exp(-over / (1.0 - _KNEE)))
     code = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1.0 / 2.4) - 0.055)
-    return np.round(255.0 * np.clip(code, 0.0, 1.0)).astype(np.uint8)
+    return np.round(255.0 * np.clip(code, 0.0, 1.0)).astype(np.int32)
 
 
 def _draw_rain(radiance: Float32Array, rain: float, generator: np.random.Generator) -> None:
@@ -160,47 +180,58 @@ def _expose(
     radiance: Float32Array,
     noise: Float32Array,
     offsets: NDArray[np.int64],
-    curve: NDArray[np.uint8],
+    curve: NDArray[np.int32],
     order: NDArray[np.int64],
-    side: np.float32,
+    lens: _Lens,
     gain: np.float32,
-    vignetting: np.float32,
-    shot_variance: np.float32,
-    read_variance: np.float32,
+    variances: tuple[np.float32, np.float32],
     image: NDArray[np.uint8],
 ) -> None:
     height, width, _ = radiance.shape
     n = 3 * width
     flat = radiance.reshape(height, n)
     codes = image.reshape(height, n)
-    middle = np.float32(1.0) - np.float32(2.0) * side
-    steps = np.float32(_CURVE_STEPS - 1) / np.sqrt(np.float32(_BRIGHTEST))
-    brightest = np.float32(_BRIGHTEST)
-    zero = np.float32(0.0)
-    per_corner = vignetting / np.float32(0.25 * (width * width + height * height))
     for task in prange(order.shape[0]):
-        column = np.empty(n, dtype=np.float32)
-        step = np.empty(n, dtype=np.int32)
+        # The row, blurred from top to bottom, with a pixel more at both ends.
+        padded = np.empty(n + 6, dtype=np.float32)
         for y in range(order[task] * BAND, min(height, order[task] * BAND + BAND)):
-            here = flat[y]
-            above = flat[max(y - 1, 0)]
-            below = flat[min(y + 1, height - 1)]
-            for i in range(n):
-                column[i] = middle * here[i] + side * (above[i] + below[i])
-            across = np.float32(y + 0.5 - 0.5 * height)
-            drawn = noise[offsets[y] : offsets[y] + n]
-            for i in range(n):
-                left = column[i - 3] if i >= 3 else column[i]
-                right = column[i + 3] if i < n - 3 else column[i]
-                along = (
-                    np.float32(np.int32(i) // np.int32(3))
-                    + np.float32(0.5)
-                    - np.float32(0.5) * np.float32(width)
-                )
-                light = middle * column[i] + side * (left + right)
-                light *= gain * (np.float32(1.0) - per_corner * (along * along + across * across))
-                light += drawn[i] * np.sqrt(shot_variance * max(light, zero) + read_variance)
-                step[i] = np.int32(steps * np.sqrt(min(max(light, zero), brightest)) + np.float32(0.5))
-            row = codes[y]
-            for i in range(n):
-                row[i] = curve[step[i]]
+            _blur(flat[max(y - 1, 0)], flat[y], flat[min(y + 1, height - 1)], lens.side, padded)
+            bright = gain * (np.float32(1.0) - lens.dark_rows[y])
+            _encode(
+                padded, lens, bright, gain, noise[offsets[y] : offsets[y] + n], variances, curve, codes[y]
+            )
+
+
+@compiled(**VECTOR_LOOP)
+def _blur(
+    above: Float32Array, here: Float32Array, below: Float32Array, side: Single, padded: Float32Array
+) -> None:
+    n = here.shape[0]
+    middle = 1.0 - 2.0 * side
+    for i in range(n):
+        padded[i + 3] = middle * here[i] + side * (above[i] + below[i])
+    for channel in range(3):
+        padded[channel] = padded[channel + 3]
+        padded[n + 3 + channel] = padded[n + channel]
+
+
+@compiled(**VECTOR_LOOP)
+def _encode(
+    padded: Float32Array,
+    lens: _Lens,
+    bright: Single,
+    gain: Single,
+    drawn: Float32Array,
+    variances: tuple[np.float32, np.float32],
+    curve: NDArray[np.int32],
+    codes: NDArray[np.uint8],
+) -> None:
+    """Blur a row from left to right, darken its ends, add the noise drawn for it, and apply the tone curve."""
+    shot_variance, read_variance = variances
+    middle = 1.0 - 2.0 * lens.side
+    for i in range(codes.shape[0]):
+        light = middle * padded[i + 3] + lens.side * (padded[i] + padded[i + 6])
+        light *= bright - gain * lens.dark_columns[i]
+        light += drawn[i] * np.sqrt(shot_variance * max(light, 0.0) + read_variance)
+        step = np.int32(_STEPS_PER_ROOT * np.sqrt(min(max(light, 0.0), _BRIGHTEST)) + 0.5)
+        codes[i] = curve[np.uint64(step)]

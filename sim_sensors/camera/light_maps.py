@@ -8,7 +8,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.camera.textures import LEAF
+from sim_sensors.camera.textures import VECTOR_LEAF, Single, mix, mix_quad
 from sim_sensors.compilation import compiled
 from sim_sensors.mesh import MeshPool
 
@@ -22,14 +22,14 @@ class LightMaps(NamedTuple):
     Attributes:
         shadow: (n, n) float32, m, height towards the sun of the nearest occluder; 0 if there is none.
         to_shadow: (3, 4) float64, maps a world point (x, y, z, 1) to column, row (texels) and that height.
-        contact: (m, m) uint8, fraction of the sky that vehicles hide from the ground, 255 = all.
+        contact: (m, m) uint32, `quads` of the fraction of the sky that vehicles hide from the ground, 255 = all.
         x, y: m, corner of the contact map.
         texels_per_m: resolution of the contact map.
     """
 
     shadow: Float32Array
     to_shadow: FloatArray
-    contact: NDArray[np.uint8]
+    contact: NDArray[np.uint32]
     x: float
     y: float
     texels_per_m: float
@@ -48,43 +48,46 @@ def bounding_boxes(pool: MeshPool) -> FloatArray:
     return _BOXES[pool]
 
 
-@compiled(**LEAF)
-def sunlit(maps: LightMaps, x: float, y: float, z: float, bias: float) -> float:
+@compiled(**VECTOR_LEAF)
+def sunlit(maps: LightMaps, x: Single, y: Single, z: Single, bias: Single) -> Single:
     """Return the fraction of the sun that reaches a point, 0 to 1; bilinear between four texels."""
     m = maps.to_shadow
     u = m[0, 0] * x + m[0, 1] * y + m[0, 2] * z + m[0, 3] - 0.5
     v = m[1, 0] * x + m[1, 1] * y + m[1, 2] * z + m[1, 3] - 0.5
-    n = maps.shadow.shape[0]
-    if u < 0.0 or v < 0.0 or u >= n - 1 or v >= n - 1:
-        return 1.0
     height = m[2, 0] * x + m[2, 1] * y + m[2, 2] * z + m[2, 3] + bias
-    left, right = np.uint64(int(u)), np.uint64(int(u) + 1)
-    top, bottom = np.uint64(int(v)), np.uint64(int(v) + 1)
-    a = u - int(u)
-    b = v - int(v)
+    left, top, a, b, covered = _place(u, v, maps.shadow.shape[0])
+    one = np.uint64(1)
     s = maps.shadow
-    s00 = 0.0 if s[top, left] > height else 1.0
-    s01 = 0.0 if s[top, right] > height else 1.0
-    s10 = 0.0 if s[bottom, left] > height else 1.0
-    s11 = 0.0 if s[bottom, right] > height else 1.0
-    above = s00 * (1 - a) + s01 * a
-    below = s10 * (1 - a) + s11 * a
-    return float(above + b * (below - above))
+    s00 = _open(s[top, left], height)
+    s01 = _open(s[top, left + one], height)
+    s10 = _open(s[top + one, left], height)
+    s11 = _open(s[top + one, left + one], height)
+    lit = mix(mix(s00, s01, a), mix(s10, s11, a), b)
+    return lit if covered else np.float32(1.0)
 
 
-@compiled(**LEAF)
-def open_sky(maps: LightMaps, x: float, y: float) -> float:
+@compiled(**VECTOR_LEAF)
+def _open(occluder: Single, height: Single) -> Single:
+    return np.float32(0.0) if occluder > height else np.float32(1.0)
+
+
+@compiled(**VECTOR_LEAF)
+def open_sky(maps: LightMaps, x: Single, y: Single) -> Single:
     """Return the fraction of the sky that is visible from the ground at (x, y) past the vehicles."""
-    u = (x - maps.x) * maps.texels_per_m - 0.5
-    v = (y - maps.y) * maps.texels_per_m - 0.5
-    n = maps.contact.shape[0]
-    if u < 0.0 or v < 0.0 or u >= n - 1 or v >= n - 1:
-        return 1.0
-    left, right = np.uint64(int(u)), np.uint64(int(u) + 1)
-    top, bottom = np.uint64(int(v)), np.uint64(int(v) + 1)
-    a = u - int(u)
-    b = v - int(v)
-    c = maps.contact
-    above = c[top, left] * (1 - a) + c[top, right] * a
-    below = c[bottom, left] * (1 - a) + c[bottom, right] * a
-    return float(1.0 - (above * (1 - b) + below * b) / 255.0)
+    u = (x - np.float32(maps.x)) * np.float32(maps.texels_per_m) - 0.5
+    v = (y - np.float32(maps.y)) * np.float32(maps.texels_per_m) - 0.5
+    left, top, a, b, covered = _place(u, v, maps.contact.shape[0])
+    hidden = mix_quad(maps.contact[top, left], a, b)
+    return 1.0 - hidden if covered else np.float32(1.0)
+
+
+@compiled(**VECTOR_LEAF)
+def _place(u: Single, v: Single, n: int) -> tuple[Single, Single, Single, Single, Single]:
+    """Return the texel of a map n wide at or before (u, v), the fractions to the next, and whether there is one."""
+    end = np.float32(n - 1)
+    covered = (u >= 0.0) & (v >= 0.0) & (u < end) & (v < end)
+    u = u if covered else np.float32(0.0)
+    v = v if covered else np.float32(0.0)
+    left = np.int32(u)
+    top = np.int32(v)
+    return np.uint64(left), np.uint64(top), u - np.float32(left), v - np.float32(top), covered

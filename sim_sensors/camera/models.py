@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import Protocol
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
 from sim_sensors.camera.ground_texture import GroundTexture, ground_texture
@@ -17,7 +18,7 @@ from sim_sensors.camera.projection import ScreenTriangles, project
 from sim_sensors.camera.rasterizer import FAR, Visibility, rasterize
 from sim_sensors.camera.shading import shade
 from sim_sensors.camera.shadows import light_maps
-from sim_sensors.camera.sky import mirrored_sky, sky_of_view
+from sim_sensors.camera.sky import packed_sky, sky_of_view
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
@@ -246,7 +247,7 @@ class PinholeCamera:
         n = self.supersampling
         fx, fy, cx, cy = (n * value for value in self.intrinsics)
         sky_of_view(weather, pose[:3, :3], (fx, fy, cx, cy), (n * self.width, n * self.height))
-        mirrored_sky(weather)
+        packed_sky(weather)
 
     def visibility(self, scene: Drawable, pose: FloatArray) -> tuple[ScreenTriangles, Visibility]:
         """Return the visible triangle of each pixel: geometry without light."""
@@ -370,10 +371,24 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
         raise SensorError(f"camera pose has axes {rotation.tolist()}, want a rotation")
     if pose[2, 3] <= 0.0:
         raise SensorError(f"camera height is {pose[2, 3]} m, want above the ground, z = 0")
-    instances = scene.instances
-    box = bounding_boxes(scene.pool)[instances.mesh]
-    offset = pose[:3, 3] - instances.pose[:, :3]
-    cosine, sine = np.cos(instances.pose[:, 3]), np.sin(instances.pose[:, 3])
+    vehicle = _vehicle_around(scene, pose[:3, 3])
+    if vehicle > 0:
+        raise SensorError(
+            f"camera position {pose[:3, 3].tolist()} is inside vehicle {vehicle}, want it outside"
+        )
+    return pose
+
+
+def _vehicle_around(scene: Drawable, point: FloatArray) -> int:
+    """Return the number of the vehicle in whose bounding box a point is, 0 for none."""
+    instances, pool = scene.instances, scene.pool
+    away = np.abs(instances.pose[:, :2] - point[:2]).max(axis=1)
+    near = np.flatnonzero((away < pool.radius[instances.mesh]) & (instances.ids > 0))
+    if len(near) == 0:
+        return 0
+    box = bounding_boxes(pool)[instances.mesh[near]]
+    offset = point - instances.pose[near, :3]
+    cosine, sine = np.cos(instances.pose[near, 3]), np.sin(instances.pose[near, 3])
     local = np.stack(
         [
             cosine * offset[:, 0] + sine * offset[:, 1],
@@ -382,16 +397,11 @@ def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
         ],
         axis=1,
     )
-    inside = ((local > box[:, :3]) & (local < box[:, 3:])).all(axis=1) & (instances.ids > 0)
-    if inside.any():
-        vehicle = int(instances.ids[np.argmax(inside)])
-        raise SensorError(
-            f"camera position {pose[:3, 3].tolist()} is inside vehicle {vehicle}, want it outside"
-        )
-    return pose
+    inside = ((local > box[:, :3]) & (local < box[:, 3:])).all(axis=1)
+    return int(instances.ids[near[np.argmax(inside)]]) if inside.any() else 0
 
 
-@compiled(nogil=True)
+@compiled(parallel=True, nogil=True)
 def _geometry(
     visibility: Visibility, instance: NDArray[np.int32], ids: NDArray[np.int32]
 ) -> tuple[Float32Array, Float32Array, NDArray[np.int32]]:
@@ -401,7 +411,7 @@ def _geometry(
     seen = np.empty((height, width), dtype=np.int32)
     infinite = np.float32(np.inf)
     one = np.float32(1.0)
-    for y in range(height):
+    for y in prange(height):
         for x in range(width):
             inverse = visibility.inverse_depth[y, x]
             depth[y, x] = one / inverse if inverse > 0 else infinite

@@ -38,12 +38,16 @@ class ScreenTriangles(NamedTuple):
     # (n, 6) float32, px: x, y of the three corners; pixel (row, column) has its centre at (column + 0.5, row + 0.5)
     corners: Float32Array
     inverse_depth: FloatArray  # (n, 3) float64: 1/depth in 1/m at (x, y) px is a·x + b·y + c
+    # (n, 4) int32, px: first column, first row, and those after the last, of the pixels whose centres it may cover
+    box: IntArray
+    nearest: Float32Array  # (n,) float32, 1/m: no point has a greater inverse depth
+    is_back: NDArray[np.bool_]  # (n,) bool, whether its inner side is seen
     # (n, 9) float32: row-major 3×3 matrix from the ray (u, v, 1) in the camera frame to the interpolated outward
     # normal in the world frame, times a positive factor
     normal: Float32Array
     material: NDArray[np.uint8]  # (n,) uint8
     color: NDArray[np.uint8]  # (n, 3) uint8, sRGB
-    instance: IntArray  # (n,) int32, index into the instances, ascending
+    instance: IntArray  # (n,) int32, index into the instances, the nearest first
 
 
 def project(
@@ -65,10 +69,13 @@ def project(
         coarse_beyond: m; farther instances are drawn with the pool's coarse meshes, if it has any.
     """
     visible = _visible_instances(instances, pool.radius, pose, intrinsics, size)
+    away = np.linalg.norm(instances.pose[visible, :3] - pose[:3, 3], axis=1)
+    # The nearest first, since they hide others.
+    by_distance = np.argsort(away, kind="stable")
+    visible, away = visible[by_distance], away[by_distance]
     mesh = instances.mesh[visible]
     if pool.coarse is not None:
-        away = np.linalg.norm(instances.pose[visible, :3] - pose[:3, 3], axis=1) > coarse_beyond
-        mesh = np.where(away, pool.coarse[mesh], mesh)
+        mesh = np.where(away > coarse_beyond, pool.coarse[mesh], mesh)
     # A clipped triangle may become two.
     room = 2 * np.concatenate([[0], np.cumsum(pool.triangle_start[mesh + 1] - pool.triangle_start[mesh])])
     capacity = int(room[-1])
@@ -76,6 +83,9 @@ def project(
     out = ScreenTriangles(
         np.empty((capacity, 6), dtype=np.float32),
         np.empty((capacity, 3)),
+        np.empty((capacity, 4), dtype=np.int32),
+        np.empty(capacity, dtype=np.float32),
+        np.empty(capacity, dtype=np.bool_),
         np.empty((capacity, 9), dtype=np.float32),
         np.empty(capacity, dtype=np.uint8),
         np.empty((capacity, 3), dtype=np.uint8),
@@ -111,14 +121,7 @@ def project(
         for column in out:
             column[count : count + last - first] = column[first:last]
         count += last - first
-    return ScreenTriangles(
-        out.corners[:count],
-        out.inverse_depth[:count],
-        out.normal[:count],
-        out.material[:count],
-        out.color[:count],
-        out.instance[:count],
-    )
+    return ScreenTriangles._make(column[:count] for column in out)
 
 
 def _visible_instances(
@@ -171,7 +174,8 @@ def _project_parts(
             vertices, normals, triangles, material, color, vertex_start, triangle_start,
             visible, mesh, poses, camera, fx, fy, cx, cy, width, height, closed,
             begin[part], begin[part + 1], end[part],
-            np.empty((most_vertices, 3)), np.empty((3, 4)), np.empty((3, 3)), np.empty((4, 2)), out,
+            np.empty((most_vertices, 5)), np.empty((3, 4)), np.empty((3, 3)), np.empty((4, 2)),
+            np.empty(4, dtype=np.int32), out,
         )  # fmt: skip
 
 
@@ -202,9 +206,10 @@ def _project(
     to_camera: FloatArray,
     cross: FloatArray,
     polygon: FloatArray,
+    box: IntArray,
     out: ScreenTriangles,
 ) -> int:
-    """Fill `out` from row `count` on, and return the row after the last; `moved` to `polygon` are work arrays."""
+    """Fill `out` from row `count` on, and return the row after the last; `moved` to `box` are work arrays."""
     for index in range(first_instance, end_instance):
         q = visible[index]
         first_vertex = vertex_start[mesh[index]]
@@ -225,12 +230,19 @@ def _project(
                 moved[k, i] = (
                     to_camera[i, 0] * x + to_camera[i, 1] * y + to_camera[i, 2] * z + to_camera[i, 3]
                 )
+            # Where it is in the image, used if it is beyond the near plane.
+            scale = 1.0 / max(moved[k, 2], NEAR)
+            moved[k, 3] = fx * moved[k, 0] * scale + cx
+            moved[k, 4] = fy * moved[k, 1] * scale + cy
         for t in range(triangle_start[mesh[index]], triangle_start[mesh[index] + 1]):
             corner = triangles[t]
             a = moved[corner[0]]
             b = moved[corner[1]]
             c = moved[corner[2]]
             if a[2] < NEAR and b[2] < NEAR and c[2] < NEAR:
+                continue
+            corners = _clip(a, b, c, fx, fy, cx, cy, polygon)
+            if not _covers_pixels(polygon, corners, width, height, box):
                 continue
             for i in range(3):
                 j = (i + 1) % 3
@@ -242,9 +254,7 @@ def _project(
             # Seen edge-on (or degenerate), or from behind.
             if abs(volume) < 1e-12 or (volume > 0.0 and closed[material[t]]):
                 continue
-            corners = _clip(a, b, c, fx, fy, cx, cy, polygon)
-            if not _covers_pixels(polygon, corners, width, height):
-                continue
+            nearest = np.float32(1.0 / max(min(a[2], b[2], c[2]), NEAR))
             scale = 1.0 / volume
             inverse_x = (cross[0, 0] + cross[1, 0] + cross[2, 0]) * scale / fx
             inverse_y = (cross[0, 1] + cross[1, 1] + cross[2, 1]) * scale / fy
@@ -258,6 +268,10 @@ def _project(
                 out.inverse_depth[count, 0] = inverse_x
                 out.inverse_depth[count, 1] = inverse_y
                 out.inverse_depth[count, 2] = inverse_c
+                out.nearest[count] = nearest
+                out.is_back[count] = volume > 0.0
+                for i in range(4):
+                    out.box[count, i] = box[i]
                 for i in range(3):
                     in_x = 0.0
                     in_y = 0.0
@@ -288,22 +302,23 @@ def _clip(
     cy: float,
     polygon: FloatArray,
 ) -> int:
-    """Project the part of a triangle beyond the near plane into `polygon`, px; return its number of corners."""
+    """Project the part of a triangle beyond the near plane into `polygon`, px; return its number of corners.
+
+    A corner has its position in the camera frame, m, and in the image, px.
+    """
     if a[2] >= NEAR and b[2] >= NEAR and c[2] >= NEAR:
-        polygon[0, 0] = fx * a[0] / a[2] + cx
-        polygon[0, 1] = fy * a[1] / a[2] + cy
-        polygon[1, 0] = fx * b[0] / b[2] + cx
-        polygon[1, 1] = fy * b[1] / b[2] + cy
-        polygon[2, 0] = fx * c[0] / c[2] + cx
-        polygon[2, 1] = fy * c[1] / c[2] + cy
+        for i in range(2):
+            polygon[0, i] = a[3 + i]
+            polygon[1, i] = b[3 + i]
+            polygon[2, i] = c[3 + i]
         return 3
     count = 0
     for i in range(3):
         p = a if i == 0 else (b if i == 1 else c)
         q = b if i == 0 else (c if i == 1 else a)
         if p[2] >= NEAR:
-            polygon[count, 0] = fx * p[0] / p[2] + cx
-            polygon[count, 1] = fy * p[1] / p[2] + cy
+            polygon[count, 0] = p[3]
+            polygon[count, 1] = p[4]
             count += 1
         if (p[2] >= NEAR) != (q[2] >= NEAR):
             along = (NEAR - p[2]) / (q[2] - p[2])
@@ -314,8 +329,8 @@ def _clip(
 
 
 @compiled(**LEAF)
-def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int) -> bool:
-    """Return whether the bounding box of the polygon contains the centre of a pixel of the image."""
+def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int, box: IntArray) -> bool:
+    """Set `box` to the pixels whose centres are in the polygon's bounding box, and return whether there are any."""
     left = right = polygon[0, 0]
     top = bottom = polygon[0, 1]
     for i in range(1, corners):
@@ -323,8 +338,9 @@ def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int) -
         right = max(right, polygon[i, 0])
         top = min(top, polygon[i, 1])
         bottom = max(bottom, polygon[i, 1])
-    left = math.ceil(max(left, 0.0) - 0.5)
-    right = math.floor(min(right, float(width)) - 0.5)
-    top = math.ceil(max(top, 0.0) - 0.5)
-    bottom = math.floor(min(bottom, float(height)) - 0.5)
-    return bool(left <= right and top <= bottom)
+    # Corners are rounded to single precision, so the box is larger by a little.
+    box[0] = math.ceil(max(left, 0.0) - 0.501)
+    box[1] = math.ceil(max(top, 0.0) - 0.501)
+    box[2] = math.floor(min(right, float(width)) - 0.499) + 1
+    box[3] = math.floor(min(bottom, float(height)) - 0.499) + 1
+    return bool(box[0] < box[2] and box[1] < box[3])

@@ -1,7 +1,8 @@
 """Rasterizer: a z-buffer in horizontal bands.
 
 One thread writes each band of rows, with the triangles in a fixed order, so the result does not depend on the number of
-threads.
+threads. Most triangles are hidden: the far sides of cars, and cars behind cars. Front faces are therefore drawn first,
+and a triangle that is farther than all that is drawn around it is skipped.
 """
 
 from __future__ import annotations
@@ -26,6 +27,11 @@ FAR = 1000.0  # m, the ground ends there
 BAND = 16  # rows
 
 _GLASS = int(Material.GLASS)
+_FRONT, _BACK, _PANE = range(3)  # what the triangles of a band are, in the order in which they are drawn
+_KINDS = 3
+_STRIP = 8  # rows of a band for which it is known what is hidden
+_REFRESHED_AFTER = 128  # triangles drawn, until it is computed anew what they hide
+_MARGIN = 1.0 + 1e-6  # between the inverse depth of a triangle's corners and that of its pixels, rounded
 
 
 class Visibility(NamedTuple):
@@ -45,8 +51,6 @@ def rasterize(
     size: tuple[int, int],
     floor: FloatArray,
     minimum: float = 1.0 / FAR,
-    *,
-    panes: bool = True,
 ) -> Visibility:
     """Find the nearest opaque surface of every pixel, and the glass in front of it.
 
@@ -55,26 +59,26 @@ def rasterize(
         size: width, height, px.
         floor: (3,) inverse depth of the ground, a·x + b·y + c at (x, y) px.
         minimum: 1/m; ground with a smaller inverse depth is sky.
-        panes: whether to draw glass; if not, its three arrays are (0, 0).
     """
     width, height = size
-    glazed = (height, width) if panes else (0, 0)
+    shape = (height, width)
     out = Visibility(
-        np.empty((height, width), dtype=np.float32),
-        np.empty((height, width), dtype=np.int32),
-        np.empty(glazed, dtype=np.float32),
-        np.empty(glazed, dtype=np.int32),
-        np.empty(glazed, dtype=np.uint8),
+        np.empty(shape, dtype=np.float32),
+        np.empty(shape, dtype=np.int32),
+        np.empty(shape, dtype=np.float32),
+        np.empty(shape, dtype=np.int32),
+        np.empty(shape, dtype=np.uint8),
     )
-    start, members = _sort_into_bands(
-        triangles.corners, triangles.material, (height + BAND - 1) // BAND, height, panes
-    )
+    bands = (height + BAND - 1) // BAND
+    start, members = _sort_into_bands(triangles.box, triangles.is_back, triangles.material, bands)
     _rasterize(
         triangles.corners,
         triangles.inverse_depth,
+        triangles.box,
+        triangles.nearest,
         start,
         members,
-        interleaved(len(start) // 2),
+        interleaved(len(start) // _KINDS),
         floor,
         minimum,
         out.inverse_depth,
@@ -99,35 +103,30 @@ def interleaved(n: int) -> NDArray[np.int64]:
 
 @compiled(nogil=True)
 def _sort_into_bands(
-    corners: Float32Array, material: NDArray[np.uint8], n_bands: int, height: int, panes: bool
+    box: IntArray, is_back: NDArray[np.bool_], material: NDArray[np.uint8], n_bands: int
 ) -> tuple[NDArray[np.int64], IntArray]:
-    """Return the triangles of each band in their order: for band b, `members[start[2·b]:start[2·b + 1]]` are opaque.
+    """Return the triangles of each band in their order, by kind.
 
-    The panes of the band follow, up to `start[2·b + 2]`; without `panes` there are none.
+    Those of kind k in band b are `members[start[3·b + k]:start[3·b + k + 1]]`.
     """
-    n = corners.shape[0]
-    first = np.empty(n, dtype=np.int32)
-    last = np.empty(n, dtype=np.int32)
-    start = np.zeros(2 * n_bands + 1, dtype=np.int64)
+    n = box.shape[0]
+    kinds = np.empty(n, dtype=np.uint8)
+    start = np.zeros(_KINDS * n_bands + 1, dtype=np.int64)
     for t in range(n):
-        top = min(corners[t, 1], corners[t, 3], corners[t, 5])
-        bottom = max(corners[t, 1], corners[t, 3], corners[t, 5])
-        first[t] = int(min(max(top, 0.0), height - 1.0)) // BAND
-        last[t] = int(min(max(bottom, 0.0), height - 1.0)) // BAND
-        glass = material[t] == _GLASS
-        if glass and not panes:
-            last[t] = first[t] - 1
-        for band in range(first[t], last[t] + 1):
-            start[2 * band + glass + 1] += 1
-    for place in range(2 * n_bands):
+        kind = _PANE if material[t] == _GLASS else (_BACK if is_back[t] else _FRONT)
+        kinds[t] = kind
+        for band in range(box[t, 1] // BAND, (box[t, 3] - 1) // BAND + 1):
+            start[_KINDS * band + kind + 1] += 1
+    for place in range(_KINDS * n_bands):
         start[place + 1] += start[place]
-    members = np.empty(start[2 * n_bands], dtype=np.int32)
+    members = np.empty(start[_KINDS * n_bands], dtype=np.int32)
     fill = start[:-1].copy()
     for t in range(n):
-        glass = material[t] == _GLASS
-        for band in range(first[t], last[t] + 1):
-            members[fill[2 * band + glass]] = t
-            fill[2 * band + glass] += 1
+        kind = kinds[t]
+        for band in range(box[t, 1] // BAND, (box[t, 3] - 1) // BAND + 1):
+            place = _KINDS * band + kind
+            members[fill[place]] = t
+            fill[place] += 1
     return start, members
 
 
@@ -160,6 +159,8 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,
+    box: IntArray,
+    nearest: Float32Array,
     start: NDArray[np.int64],
     members: IntArray,
     order: NDArray[np.int64],
@@ -177,49 +178,134 @@ def _rasterize(
         top = band * BAND
         bottom = min(height, top + BAND)
         for y in range(top, bottom):
-            # In double precision: towards the horizon most of the digits cancel.
-            base = floor[1] * (y + 0.5) + floor[2] + 0.5 * floor[0]
-            for x in range(width):
-                value = base + floor[0] * x
-                depth[y, x] = value if value > minimum else 0.0
-            triangle[y] = -1
-            if pane.shape[0] > 0:
-                pane_depth[y] = 0.0
-                pane[y] = -1
-                n_panes[y] = 0
-        # Draw glass second, since it is drawn only in front of opaque surfaces.
-        for is_glass in range(2 if pane.shape[0] > 0 else 1):
-            for member in range(start[2 * band + is_glass], start[2 * band + is_glass + 1]):
+            _clear(y, floor, minimum, depth[y], triangle[y])
+            pane_depth[y] = 0.0
+            pane[y] = -1
+            n_panes[y] = 0
+        hiding = np.zeros((BAND // _STRIP, width), dtype=np.float32)
+        _refresh(depth[top:bottom], 0, width, hiding)
+        # Draw glass last, since it is drawn only in front of opaque surfaces.
+        for kind in range(_KINDS):
+            drawn, first, end = 0, width, 0
+            for member in range(start[_KINDS * band + kind], start[_KINDS * band + kind + 1]):
                 t = members[member]
-                ax, ay, bx, by, cx, cy = sorted_by_row(corners[t])
-                slope_ac = edge_slope(ax, ay, cx, cy)
-                slope_ab = edge_slope(ax, ay, bx, by)
-                slope_bc = edge_slope(bx, by, cx, cy)
-                step_x = planes[t, 0]
-                row_first = max(top, math.ceil(ay - 0.5))
-                row_end = min(bottom, math.ceil(cy - 0.5))
-                for y in range(row_first, row_end):
-                    py = y + 0.5
-                    long = ax + (py - ay) * slope_ac
-                    short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
-                    # Clamp before rounding: a clipped triangle can extend far beyond the image.
-                    x_first = math.ceil(max(min(long, short), 0.0) - 0.5)
-                    x_end = math.ceil(min(max(long, short), float(width)) - 0.5)
-                    base = planes[t, 0] * (x_first + 0.5) + planes[t, 1] * py + planes[t, 2]
-                    row_depth = depth[y]
-                    if is_glass == 0:
-                        row_triangle = triangle[y]
-                        for x in range(x_first, x_end):
-                            value = np.float32(base + step_x * (x - x_first))
-                            if value > row_depth[x]:
-                                row_depth[x] = value
-                                row_triangle[x] = t
-                    else:
-                        row_pane_depth = pane_depth[y]
-                        for x in range(x_first, x_end):
-                            value = np.float32(base + step_x * (x - x_first))
-                            if value > row_depth[x]:
-                                n_panes[y, x] = min(n_panes[y, x] + 1, 255)
-                                if value > row_pane_depth[x]:
-                                    row_pane_depth[x] = value
-                                    pane[y, x] = t
+                if _is_hidden(box[t], nearest[t], top, bottom, hiding):
+                    continue
+                if kind == _PANE:
+                    _draw_pane(t, corners[t], planes[t], top, bottom, depth, pane_depth, pane, n_panes)
+                    continue
+                _draw_opaque(t, corners[t], planes[t], top, bottom, depth, triangle)
+                drawn += 1
+                first, end = min(first, box[t, 0]), max(end, box[t, 2])
+                if drawn % _REFRESHED_AFTER == 0:
+                    _refresh(depth[top:bottom], first, end, hiding)
+                    first, end = width, 0
+            if kind != _PANE:
+                _refresh(depth[top:bottom], first, end, hiding)
+
+
+@compiled(**LEAF)
+def _clear(y: int, floor: FloatArray, minimum: float, depth: Float32Array, triangle: IntArray) -> None:
+    """Fill a row with the ground and the sky."""
+    # In double precision: towards the horizon most of the digits cancel.
+    base = floor[1] * (y + 0.5) + floor[2] + 0.5 * floor[0]
+    for x in range(depth.shape[0]):
+        value = base + floor[0] * x
+        depth[x] = value if value > minimum else 0.0
+        triangle[x] = -1
+
+
+@compiled(**LEAF)
+def _refresh(depth: Float32Array, first: int, end: int, hiding: Float32Array) -> None:
+    """Set the smallest inverse depth in each strip of the band, for some columns: whatever is farther is hidden."""
+    rows = depth.shape[0]
+    for strip in range((rows + _STRIP - 1) // _STRIP):
+        least = hiding[strip]
+        for x in range(first, end):
+            least[x] = depth[strip * _STRIP, x]
+        for y in range(strip * _STRIP + 1, min(rows, (strip + 1) * _STRIP)):
+            row = depth[y]
+            for x in range(first, end):
+                least[x] = min(least[x], row[x])
+
+
+@compiled(**LEAF)
+def _is_hidden(box: IntArray, nearest: float, top: int, bottom: int, hiding: Float32Array) -> bool:
+    """Return whether a triangle is behind what is drawn in its columns of the strips that it is in."""
+    limit = np.float32(nearest * _MARGIN)
+    for strip in range((max(box[1], top) - top) // _STRIP, (min(box[3], bottom) - 1 - top) // _STRIP + 1):
+        least = hiding[strip]
+        for x in range(box[0], box[2]):
+            if least[x] < limit:
+                return False
+    return True
+
+
+@compiled(**LEAF)
+def _draw_opaque(
+    t: int,
+    corners: Float32Array,
+    plane: FloatArray,
+    top: int,
+    bottom: int,
+    depth: Float32Array,
+    triangle: IntArray,
+) -> None:
+    """Draw a triangle into the rows `top` to `bottom`."""
+    ax, ay, bx, by, cx, cy = sorted_by_row(corners)
+    slope_ac = edge_slope(ax, ay, cx, cy)
+    slope_ab = edge_slope(ax, ay, bx, by)
+    slope_bc = edge_slope(bx, by, cx, cy)
+    for y in range(max(top, math.ceil(ay - 0.5)), min(bottom, math.ceil(cy - 0.5))):
+        py = y + 0.5
+        long = ax + (py - ay) * slope_ac
+        short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
+        x_first, x_end = _span(long, short, depth.shape[1])
+        base = plane[0] * (x_first + 0.5) + plane[1] * py + plane[2]
+        row_depth, row_triangle = depth[y], triangle[y]
+        for x in range(x_first, x_end):
+            value = np.float32(base + plane[0] * (x - x_first))
+            if value > row_depth[x]:
+                row_depth[x] = value
+                row_triangle[x] = t
+
+
+@compiled(**LEAF)
+def _draw_pane(
+    t: int,
+    corners: Float32Array,
+    plane: FloatArray,
+    top: int,
+    bottom: int,
+    depth: Float32Array,
+    pane_depth: Float32Array,
+    pane: IntArray,
+    n_panes: NDArray[np.uint8],
+) -> None:
+    """Draw a triangle of glass into the rows `top` to `bottom`, in front of what is opaque."""
+    ax, ay, bx, by, cx, cy = sorted_by_row(corners)
+    slope_ac = edge_slope(ax, ay, cx, cy)
+    slope_ab = edge_slope(ax, ay, bx, by)
+    slope_bc = edge_slope(bx, by, cx, cy)
+    for y in range(max(top, math.ceil(ay - 0.5)), min(bottom, math.ceil(cy - 0.5))):
+        py = y + 0.5
+        long = ax + (py - ay) * slope_ac
+        short = ax + (py - ay) * slope_ab if py < by else bx + (py - by) * slope_bc
+        x_first, x_end = _span(long, short, depth.shape[1])
+        base = plane[0] * (x_first + 0.5) + plane[1] * py + plane[2]
+        for x in range(x_first, x_end):
+            value = np.float32(base + plane[0] * (x - x_first))
+            if value > depth[y, x]:
+                n_panes[y, x] = min(n_panes[y, x] + 1, 255)
+                if value > pane_depth[y, x]:
+                    pane_depth[y, x] = value
+                    pane[y, x] = t
+
+
+@compiled(**LEAF)
+def _span(one: float, other: float, width: int) -> tuple[int, int]:
+    """Return the first pixel centre between two edges in a row, and the one after the last."""
+    # Clamp before rounding: a clipped triangle can extend far beyond the image.
+    first = math.ceil(max(min(one, other), 0.0) - 0.5)
+    end = math.ceil(min(max(one, other), float(width)) - 0.5)
+    return first, end

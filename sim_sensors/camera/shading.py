@@ -1,42 +1,55 @@
 """Deferred shading: the radiance of every pixel, from sky, ground or a surface, through haze and glass.
 
-The rasterizer has found the visible surfaces, so each pixel is shaded once, and once more for a pane of glass.
+The rasterizer has found the visible surfaces, so each pixel is shaded once, and once more for a pane of glass. Pixels
+of a kind are collected and shaded together.
 """
 
 from __future__ import annotations
-
-import math
-from typing import NamedTuple
 
 import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from sim_sensors.camera.daylight import Light, Vector, daylight
-from sim_sensors.camera.ground_shading import ground_level, ground_radiance
+from sim_sensors.camera.batches import (
+    BATCH_FIELDS,
+    Batch,
+    Places,
+    View,
+    fade_into_haze,
+    locate,
+    read,
+    write,
+)
+from sim_sensors.camera.daylight import Light, daylight
+from sim_sensors.camera.ground_shading import color_ground, ground_levels, light_ground, mirror_in_puddles
 from sim_sensors.camera.ground_texture import GroundTexture
 from sim_sensors.camera.light_maps import LightMaps
-from sim_sensors.camera.materials import LINEAR, RESPONSE, Materials, surface_radiance, through_glass
+from sim_sensors.camera.materials import (
+    LINEAR,
+    RESPONSE,
+    Materials,
+    Surfaces,
+    blotch_surfaces,
+    color_surfaces,
+    cover_with_glass,
+    detail_walls_and_leaves,
+    light_surfaces,
+    mirror_in_surfaces,
+    orient,
+    soil_surfaces,
+)
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.rasterizer import BAND, Visibility, interleaved
 from sim_sensors.camera.sky import sky_of_view
-from sim_sensors.camera.textures import FAST, LEAF, Tile, cloud_tile, grain_tile, hash_unit
+from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single, Tile, cloud_tile, grain_tile
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int32]
 
-
-class _View(NamedTuple):
-    """The camera: rotation (3, 3) camera to world, position (3,), intrinsics in px."""
-
-    rotation: FloatArray
-    position: FloatArray
-    fx: float
-    fy: float
-    cx: float
-    cy: float
+_BATCH = 512  # pixels of a kind that are collected before they are shaded; their data stay in the first-level cache
 
 
 def shade(
@@ -63,12 +76,26 @@ def shade(
         (h, w, 3) float32, linear RGB, relative (see `Weather`).
     """
     height, width = visibility.triangle.shape
-    view = _View(np.ascontiguousarray(pose[:3, :3]), np.ascontiguousarray(pose[:3, 3]), *intrinsics)
-    light = daylight(weather, sky_of_view(weather, view.rotation, intrinsics, (width, height)))
+    fx, fy, cx, cy = intrinsics
+    rotation = np.ascontiguousarray(pose[:3, :3])
+    light = daylight(weather, sky_of_view(weather, rotation, intrinsics, (width, height)))
+    maps = maps._replace(to_shadow=maps.to_shadow.astype(np.float32))
+    rays_down = rotation[2, 1] * (np.arange(height) + 0.5 - cy) / fy + rotation[2, 2]
+    level, to_grain = ground_levels(rays_down, float(pose[2, 3]), fx, ground.texel)
+    view = View(
+        rotation.astype(np.float32),
+        pose[:3, 3].astype(np.float32),
+        np.float32(fx),
+        np.float32(fy),
+        np.float32(cx),
+        np.float32(cy),
+    )
     image = np.empty((height, width, 3), dtype=np.float32)
     order = interleaved((height + BAND - 1) // BAND)
     grain, cloud = grain_tile(), cloud_tile()
-    _shade(triangles, visibility, view, light, ground, maps, grain, cloud, RESPONSE, LINEAR, order, image)
+    _shade(
+        triangles, visibility, view, light, level, to_grain, ground, maps, grain, cloud, RESPONSE, LINEAR, order, image
+    )  # fmt: skip
     return image
 
 
@@ -76,104 +103,204 @@ def shade(
 def _shade(
     triangles: ScreenTriangles,
     visibility: Visibility,
-    view: _View,
+    view: View,
     light: Light,
+    ground_level: Float32Array,
+    to_grain: Single,
     ground: GroundTexture,
     maps: LightMaps,
     grain: Tile,
     cloud: Tile,
-    response: FloatArray,
-    linear: FloatArray,
+    response: Float32Array,
+    linear: Float32Array,
     order: NDArray[np.int64],
     image: Float32Array,
 ) -> None:
+    height, width, _ = image.shape
     for task in prange(order.shape[0]):
-        # Assemble the tuple here: numba's parallel loops accept tuples from outside, but not nested ones.
+        # Assemble the tuples here: numba's parallel loops accept tuples from outside, but not nested ones.
         materials = Materials(grain, cloud, response, linear)
-        top = order[task] * BAND
-        for y in range(top, min(image.shape[0], top + BAND)):
-            _shade_row(y, triangles, visibility, view, light, ground, maps, materials, image)
+        room = _BATCH + width
+        on_ground, on_surface, on_pane = _new_places(room), _new_places(room), _new_places(room)
+        batch, surfaces = _new_batch(room), _new_surfaces(room)
+        grounds = others = panes = 0
+        end = min(height, order[task] * BAND + BAND)
+        for y in range(order[task] * BAND, end):
+            if _draw_sky(visibility.inverse_depth[y], light.background[y], image[y]):
+                old_grounds, old_others = grounds, others
+                grounds, others = _split(
+                    visibility.inverse_depth[y], visibility.triangle[y],
+                    on_ground.column, grounds, on_surface.column, others,
+                )  # fmt: skip
+                _note_row(y, old_grounds, grounds, visibility.triangle[y], on_ground)
+                _note_row(y, old_others, others, visibility.triangle[y], on_surface)
+            old_panes = panes
+            panes = _find_panes(visibility.pane[y], on_pane.column, panes)
+            _note_row(y, old_panes, panes, visibility.pane[y], on_pane)
+            if max(grounds, others, panes) < _BATCH and y < end - 1:
+                continue
+            if grounds > 0:
+                _shade_ground(
+                    grounds, on_ground, visibility, view, light,
+                    ground_level, to_grain, ground, maps, grain, batch, image,
+                )  # fmt: skip
+            if others > 0:
+                _shade_surfaces(
+                    others, on_surface, triangles, visibility, view, light, maps, materials, batch, surfaces, image
+                )  # fmt: skip
+            if panes > 0:
+                _shade_panes(panes, on_pane, triangles, visibility, view, light, maps, batch, surfaces, image)
+            grounds = others = panes = 0
 
 
-@compiled(**LEAF)
-def _shade_row(
-    y: int,
-    triangles: ScreenTriangles,
+@compiled
+def _new_places(n: int) -> Places:
+    i = np.empty((3, n), dtype=np.int32)
+    return Places(i[0], i[1], i[2])
+
+
+@compiled
+def _new_batch(n: int) -> Batch:
+    f = np.empty((BATCH_FIELDS, n), dtype=np.float32)
+    return Batch(
+        f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12], f[13], f[14]
+    )
+
+
+@compiled
+def _new_surfaces(n: int) -> Surfaces:
+    f = np.empty((13, n), dtype=np.float32)
+    material, inside = np.empty(n, dtype=np.int32), np.empty(n, dtype=np.bool_)
+    return Surfaces(
+        material, inside, f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7], f[8], f[9], f[10], f[11], f[12]
+    )  # fmt: skip
+
+
+@compiled(**VECTOR_LOOP)
+def _draw_sky(inverse_depth: Float32Array, background: Float32Array, image: Float32Array) -> bool:
+    """Fill a row with the sky where there is any, and return whether there is anything else."""
+    width = inverse_depth.shape[0]
+    covered = np.int32(0)
+    for x in range(width):
+        covered += np.int32(inverse_depth[x] > 0.0)
+    if covered < width:
+        for x in range(width):
+            for channel in range(3):
+                image[x, channel] = background[x, channel]
+    return bool(covered > 0)
+
+
+@compiled(**VECTOR_LOOP)
+def _split(
+    inverse_depth: Float32Array,
+    triangle: IntArray,
+    on_ground: IntArray,
+    grounds: int,
+    on_surface: IntArray,
+    others: int,
+) -> tuple[int, int]:
+    """Append the columns of a row that show the ground or a surface to two lists, and return the new lengths.
+
+    Each column is written to the end of both lists, and stays where the list grows: there are no branches to predict.
+    """
+    g, s = np.uint64(grounds), np.uint64(others)
+    for x in range(triangle.shape[0]):
+        surface = triangle[x] >= 0
+        on_ground[g] = x
+        on_surface[s] = x
+        g += np.uint64((inverse_depth[x] > 0.0) & (not surface))
+        s += np.uint64(surface)
+    return int(g), int(s)
+
+
+@compiled(**VECTOR_LOOP)
+def _find_panes(pane: IntArray, on_pane: IntArray, panes: int) -> int:
+    """Append the columns of a row that show glass, and return the new length."""
+    nearest = np.int32(-1)
+    for x in range(pane.shape[0]):
+        nearest = max(nearest, pane[x])
+    if nearest < 0:
+        return panes
+    p = np.uint64(panes)
+    for x in range(pane.shape[0]):
+        on_pane[p] = x
+        p += np.uint64(pane[x] >= 0)
+    return int(p)
+
+
+@compiled(**VECTOR_LOOP)
+def _note_row(y: int, begin: int, end: int, triangle: IntArray, places: Places) -> None:
+    """Note the row and the triangles of the places that a row has added."""
+    for i in range(begin, end):
+        places.row[i] = y
+        places.triangle[i] = triangle[np.uint64(places.column[i])]
+
+
+@compiled(fastmath=FAST, _nrt=False)
+def _shade_ground(
+    n: int,
+    places: Places,
     visibility: Visibility,
-    view: _View,
+    view: View,
     light: Light,
+    ground_level: Float32Array,
+    to_grain: Single,
     ground: GroundTexture,
     maps: LightMaps,
-    materials: Materials,
+    grain: Tile,
+    batch: Batch,
     image: Float32Array,
 ) -> None:
-    width = image.shape[1]
-    r = view.rotation
-    v = (y + 0.5 - view.cy) / view.fy
-    row_x = r[0, 1] * v + r[0, 2]
-    row_y = r[1, 1] * v + r[1, 2]
-    row_z = r[2, 1] * v + r[2, 2]
-    level = ground_level(row_z, view.position[2], view.fx, ground.texel)
-    grain_level = level + math.log2(ground.texel / (3.0 / 512))
-    for x in range(width):
-        inverse_depth = visibility.inverse_depth[y, x]
-        pane = visibility.pane[y, x]
-        if inverse_depth <= 0.0 and pane < 0:
-            for channel in range(3):
-                image[y, x, channel] = light.background[y, x, channel]
-            continue
-        u = (x + 0.5 - view.cx) / view.fx
-        dx = r[0, 0] * u + row_x
-        dy = r[1, 0] * u + row_y
-        dz = r[2, 0] * u + row_z
-        inverse_length = 1.0 / math.sqrt(u * u + v * v + 1.0)
-        t = visibility.triangle[y, x]
-        ray = (dx * inverse_length, dy * inverse_length, dz * inverse_length)
-        red = float(light.background[y, x, 0])
-        green = float(light.background[y, x, 1])
-        blue = float(light.background[y, x, 2])
-        if inverse_depth > 0.0:
-            depth = 1.0 / inverse_depth
-            point = _along(view, dx, dy, dz, depth)
-            if t < 0:
-                dither = hash_unit(x, y)
-                levels = int(level + dither), int(grain_level + dither)
-                red, green, blue = ground_radiance(
-                    point[0], point[1], ray, levels[0], levels[1], light, ground, maps, materials.grain
-                )
-            else:
-                normal = _normal(triangles.normal[t], u, v)
-                red, green, blue = surface_radiance(
-                    t, triangles, point, ray, normal, depth / view.fx, light, maps, materials
-                )
-            # 1 - exp(-k) to three decimals, for the k of usual road scenes.
-            k = light.haze * depth / inverse_length
-            fog = 1.0 - 1.0 / (1.0 + k * (1.0 + 0.5 * k))
-            red += (light.horizon[0] - red) * fog
-            green += (light.horizon[1] - green) * fog
-            blue += (light.horizon[2] - blue) * fog
-        if pane >= 0:
-            normal = _normal(triangles.normal[pane], u, v)
-            point = _along(view, dx, dy, dz, 1.0 / visibility.pane_inverse_depth[y, x])
-            red, green, blue = through_glass(
-                (red, green, blue), visibility.n_panes[y, x], point, ray, normal, light, maps
-            )
-        image[y, x, 0] = red
-        image[y, x, 1] = green
-        image[y, x, 2] = blue
+    locate(n, places, visibility.inverse_depth, view, batch)
+    color_ground(n, places, ground_level, to_grain, light.wetness, ground, grain, batch)
+    light_ground(n, light, maps, batch)
+    if light.wetness > 0.0:
+        mirror_in_puddles(n, light, batch)
+    fade_into_haze(n, light, batch)
+    write(n, places, batch, image)
 
 
-@compiled(**LEAF)
-def _along(view: _View, dx: float, dy: float, dz: float, depth: float) -> Vector:
-    """Return the point, world frame, at a depth along a ray."""
-    at = view.position
-    return at[0] + dx * depth, at[1] + dy * depth, at[2] + dz * depth
+@compiled(fastmath=FAST, _nrt=False)
+def _shade_surfaces(
+    n: int,
+    places: Places,
+    triangles: ScreenTriangles,
+    visibility: Visibility,
+    view: View,
+    light: Light,
+    maps: LightMaps,
+    materials: Materials,
+    batch: Batch,
+    surfaces: Surfaces,
+    image: Float32Array,
+) -> None:
+    locate(n, places, visibility.inverse_depth, view, batch)
+    orient(n, places, triangles.normal, view, batch, surfaces)
+    color_surfaces(n, places, triangles.material, triangles.color, materials, batch, surfaces)
+    blotch_surfaces(n, materials.cloud, view.fx, batch, surfaces)
+    detail_walls_and_leaves(n, view.fx, light, materials.grain, batch, surfaces)
+    soil_surfaces(n, materials.response, batch, surfaces)
+    light_surfaces(n, light, maps, batch, surfaces)
+    mirror_in_surfaces(n, light, maps, batch, surfaces)
+    fade_into_haze(n, light, batch)
+    write(n, places, batch, image)
 
 
-@compiled(**LEAF)
-def _normal(matrix: Float32Array, u: float, v: float) -> Vector:
-    x = matrix[0] * u + matrix[1] * v + matrix[2]
-    y = matrix[3] * u + matrix[4] * v + matrix[5]
-    z = matrix[6] * u + matrix[7] * v + matrix[8]
-    scale = 1.0 / math.sqrt(x * x + y * y + z * z + 1e-30)
-    return x * scale, y * scale, z * scale
+@compiled(fastmath=FAST, _nrt=False)
+def _shade_panes(
+    n: int,
+    places: Places,
+    triangles: ScreenTriangles,
+    visibility: Visibility,
+    view: View,
+    light: Light,
+    maps: LightMaps,
+    batch: Batch,
+    surfaces: Surfaces,
+    image: Float32Array,
+) -> None:
+    locate(n, places, visibility.pane_inverse_depth, view, batch)
+    orient(n, places, triangles.normal, view, batch, surfaces)
+    read(n, places, image, batch)
+    cover_with_glass(n, places, visibility.n_panes, light, maps, batch, surfaces)
+    write(n, places, batch, image)

@@ -19,6 +19,7 @@ from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
 from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
+from sim_sensors.camera.textures import quads
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Instances, Material, MeshPool
@@ -126,8 +127,7 @@ def _drawn(pool: MeshPool, rows: FloatArray, weather: Weather, x: float, y: floa
         shadow = np.zeros((_SHADOW_TEXELS, _SHADOW_TEXELS), dtype=np.float32)
     else:
         shadow = np.zeros((2, 2), dtype=np.float32)
-    contact = np.zeros((_CONTACT_TEXELS, _CONTACT_TEXELS), dtype=np.uint8)
-    footprints = np.zeros_like(contact)
+    contact, footprints = _no_contact()
     corner = (x - _WINDOW / 2, y - _WINDOW / 2)
     maps = LightMaps(shadow, _toward_the_sun(weather, x, y), contact, *corner, _CONTACT_SCALE)
     if len(shadow) == _SHADOW_TEXELS:
@@ -144,12 +144,18 @@ def _with_moving(maps: LightMaps, pool: MeshPool, moving: FloatArray) -> LightMa
         shadow = shadow.copy()
         _cast(pool, moving, maps.to_shadow, shadow)
     vehicles = moving[moving[:, 5] > 0]
-    footprints, contact = np.zeros_like(maps.contact), np.zeros_like(maps.contact)
+    contact, footprints = _no_contact()
     _print_footprints(pool, vehicles, maps, footprints)
     for box in _footprint_boxes(pool, vehicles, maps).tolist():
         _blur_footprints(footprints, contact, box)
-    contact = np.maximum(contact, maps.contact)
+    contact = np.maximum(contact.view(np.uint8), maps.contact.view(np.uint8)).view(np.uint32)
     return maps._replace(shadow=shadow, contact=contact)
+
+
+def _no_contact() -> tuple[NDArray[np.uint32], Image]:
+    """Return an empty contact map, and an empty image of footprints."""
+    shape = (_CONTACT_TEXELS, _CONTACT_TEXELS)
+    return np.zeros(shape, dtype=np.uint32), np.zeros(shape, dtype=np.uint8)
 
 
 def _toward_the_sun(weather: Weather, x: float, y: float) -> FloatArray:
@@ -344,7 +350,7 @@ def _print_footprints(
         np.maximum(part, stamp[top - box[0] : bottom - box[0], left - box[2] : right - box[2]], out=part)
 
 
-def _blur_footprints(footprints: Image, contact: Image, box: _Box) -> None:
+def _blur_footprints(footprints: Image, contact: NDArray[np.uint32], box: _Box) -> None:
     """Draw the contact map around a box: blurred twice, for the dark area between the wheels and for its border."""
     top, bottom, left, right = box
     reach = _BLUR_REACH
@@ -356,7 +362,7 @@ def _blur_footprints(footprints: Image, contact: Image, box: _Box) -> None:
     wider = _within((top - reach, bottom + reach, left - reach, right + reach), _CONTACT_TEXELS)
     part = footprints[wider[0] : wider[1], wider[2] : wider[3]]
     wide, tight = (cv2.GaussianBlur(part, (0, 0), sigma) for sigma in (_WIDE, _TIGHT))
-    both = cv2.addWeighted(wide, 0.5, tight, 0.46, 0.0)
+    both = quads(cv2.addWeighted(wide, 0.5, tight, 0.46, 0.0), False)
     contact[top:bottom, left:right] = both[
         top - wider[0] : bottom - wider[0], left - wider[2] : right - wider[2]
     ]

@@ -15,7 +15,7 @@ from numba import prange
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft2
 
-from sim_sensors.camera.textures import FAST, LEAF, cloud_tile, fractal_noise
+from sim_sensors.camera.textures import FAST, LEAF, VECTOR_LEAF, Single, cloud_noise, fractal_noise, mix
 from sim_sensors.camera.weather import Weather
 from sim_sensors.compilation import compiled
 
@@ -27,6 +27,7 @@ _SAMPLES = 3  # along each side of a texel
 _BEARINGS = 1024  # steps of the skyline
 _BELOW = -0.1  # z of a ray; nothing lower is sky, from any height below 100 m
 _KEPT_VIEWS = 8
+_MOST_11, _MOST_10 = 2047, 1023  # greatest numbers of 11 and 10 bits
 _NOISE = 256
 
 
@@ -68,7 +69,7 @@ def sky_of(weather: Weather) -> Sky:
     crowns = 0.05 + 0.022 * _first_row_of_noise(_BEARINGS, rng, 0.9)
     roofs = np.repeat(rng.uniform(0.02, 0.13, 64), _BEARINGS // 64)
     built = np.repeat(rng.random(64) < 0.3, _BEARINGS // 64)
-    sky, sun, tile = np.array(weather.sky), np.array(weather.sun), cloud_tile()
+    sky, sun = np.array(weather.sky), np.array(weather.sun)
     return Sky(
         np.array(weather.zenith),
         np.array(weather.horizon),
@@ -81,7 +82,7 @@ def sky_of(weather: Weather) -> Sky:
         built,
         sky + 0.35 * sun,
         min(0.85, 0.12 + weather.haze * 120.0),
-        tile.levels[: tile.size**2].reshape(tile.size, tile.size),
+        cloud_noise().astype(np.float32),
     )
 
 
@@ -171,6 +172,20 @@ def mirrored_sky(weather: Weather) -> Float32Array:
     return np.asarray(cv2.resize(dome, (_DOME, _DOME), interpolation=cv2.INTER_AREA), dtype=np.float32)
 
 
+@lru_cache(maxsize=8)
+def packed_sky(weather: Weather) -> tuple[NDArray[np.uint32], np.float32]:
+    """Return `mirrored_sky` for compiled code: one load fetches a texel.
+
+    Returns:
+        (160, 160) uint32, from the lowest bit on the square roots of blue (10 bits), green and red (11 bits each); and
+        the radiance of a colour's greatest code.
+    """
+    dome = mirrored_sky(weather)
+    brightest = max(float(dome.max()), 1e-6)
+    codes = np.round(np.sqrt(dome / brightest) * (_MOST_11, _MOST_11, _MOST_10)).astype(np.uint32)
+    return codes[..., 0] << 21 | codes[..., 1] << 10 | codes[..., 2], np.float32(brightest)
+
+
 @compiled(parallel=True, fastmath=FAST, nogil=True)
 def _fill_dome(sky: Sky, dome: Float32Array) -> None:
     n = dome.shape[0]
@@ -243,38 +258,48 @@ def _fill_view(
             view[y, x, 2] = blue
 
 
-@compiled(**LEAF)
-def look_up(dome: Float32Array, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0, in a map like `mirrored_sky`."""
+@compiled(**VECTOR_LEAF)
+def look_up(
+    dome: NDArray[np.uint32], brightest: np.float32, x: np.float32, y: np.float32, z: np.float32
+) -> tuple[Single, Single, Single]:
+    """Return the bilinear radiance in the unit direction (x, y, z), z ≥ 0, in a map of `packed_sky`."""
     n = dome.shape[0]
     scale = 0.5 / (1.0 + z)
-    u = (x * scale + 0.5) * n - 0.5
-    v = (y * scale + 0.5) * n - 0.5
-    left = min(max(int(u), 0), n - 2)
-    top = min(max(int(v), 0), n - 2)
-    a = min(max(u - left, 0.0), 1.0)
-    b = min(max(v - top, 0.0), 1.0)
-    weights = ((1 - a) * (1 - b), a * (1 - b), (1 - a) * b, a * b)
-    row, column = np.uint64(top), np.uint64(left)
-    return (
-        _mixed(dome, row, column, 0, weights),
-        _mixed(dome, row, column, 1, weights),
-        _mixed(dome, row, column, 2, weights),
+    last: Single = np.float32(n - 1.001)
+    u = min(max((x * scale + 0.5) * np.float32(n) - 0.5, 0.0), last)
+    v = min(max((y * scale + 0.5) * np.float32(n) - 0.5, 0.0), last)
+    left = np.int32(u)
+    top = np.int32(v)
+    a = u - np.float32(left)
+    b = v - np.float32(top)
+    row, column, one = np.uint64(top), np.uint64(left), np.uint64(1)
+    corners = (
+        dome[row, column],
+        dome[row, column + one],
+        dome[row + one, column],
+        dome[row + one, column + one],
     )
+    red = _between(corners, 21, _MOST_11, a, b)
+    green = _between(corners, 10, _MOST_11, a, b)
+    blue = _between(corners, 0, _MOST_10, a, b)
+    return red * red * brightest, green * green * brightest, blue * blue * brightest
 
 
-@compiled(**LEAF)
-def _mixed(
-    dome: Float32Array,
-    row: np.uint64,
-    column: np.uint64,
-    channel: int,
-    weights: tuple[float, float, float, float],
-) -> float:
-    one = np.uint64(1)
-    return float(
-        dome[row, column, channel] * weights[0]
-        + dome[row, column + one, channel] * weights[1]
-        + dome[row + one, column, channel] * weights[2]
-        + dome[row + one, column + one, channel] * weights[3]
-    )
+@compiled(**VECTOR_LEAF)
+def _between(
+    corners: tuple[Single, Single, Single, Single],
+    shift: int,
+    most: int,
+    a: Single,
+    b: Single,
+) -> Single:
+    """Interpolate one colour between four texels; its greatest code `most` is 1."""
+    c00, c01, c10, c11 = corners
+    above = mix(_code(c00, shift, most), _code(c01, shift, most), a)
+    below = mix(_code(c10, shift, most), _code(c11, shift, most), a)
+    return mix(above, below, b) / np.float32(most)
+
+
+@compiled(**VECTOR_LEAF)
+def _code(texel: Single, shift: int, most: int) -> Single:
+    return np.float32(np.int32((texel >> np.uint32(shift)) & np.uint32(most)))

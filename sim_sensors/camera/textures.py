@@ -3,29 +3,33 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sim_sensors.compilation import compiled
 
-Float32Array = NDArray[np.float32]
+Single = Any  # a scalar in compiled code, float32 mostly: numba knows its type
 
 # All fastmath flags except the one that excludes infinities: the depth of the sky is infinite.
 FAST = {"reassoc", "nsz", "arcp", "contract", "afn"}
-# Indices are unsigned in such functions: numba lets negative ones count from the end, which takes a comparison each.
 # For functions that are called per pixel or triangle and do not allocate: numba's reference counting of their array
-# arguments would cost ten times the computation.
+# arguments would cost ten times the computation. Indices are unsigned in such functions: numba lets negative ones count
+# from the end, which takes a comparison each.
 LEAF = {"fastmath": FAST, "_nrt": False, "forceinline": True}
+# Loops over pixels that become vector instructions: single precision, no two arrays overlap, no exceptions, and no
+# branches, so both sides of a choice are computed. And the functions called in such loops.
+VECTOR_LOOP = {"fastmath": FAST, "_nrt": False, "error_model": "numpy", "single": True, "distinct": True}
+VECTOR_LEAF = {**LEAF, "error_model": "numpy", "single": True}
 
 
 class Tile(NamedTuple):
     """A square, tileable grey texture with its image pyramid."""
 
-    # (total,) float32, 0 to 1, level after level, each row-major and half as wide as the previous one
-    levels: Float32Array
-    start: NDArray[np.int64]  # (n_levels,) int64, start of each level
+    # (total,) uint32, `quads` of the texels, 255 = 1; level after level, each row-major, half as wide as the previous
+    levels: NDArray[np.uint32]
+    start: NDArray[np.int32]  # (n_levels,) int32, start of each level
     size: int  # texels along a side of the finest level, a power of two
 
 
@@ -42,14 +46,38 @@ def fractal_noise(size: int, generator: np.random.Generator, slope: float) -> ND
 
 def make_tile(image: NDArray[np.float64]) -> Tile:
     """Pack a square image, a power of two wide and in [0, 1], with its pyramid down to 4 texels."""
-    level = np.ascontiguousarray(image, dtype=np.float32)
+    level = np.asarray(image)
     levels = [level]
     while level.shape[0] > 4:
         half = level.shape[0] // 2
         level = level.reshape(half, 2, half, 2).mean(axis=(1, 3))
         levels.append(level)
-    start = np.cumsum([0] + [part.size for part in levels[:-1]]).astype(np.int64)
-    return Tile(np.concatenate([part.ravel() for part in levels]), start, image.shape[0])
+    start = np.cumsum([0] + [part.size for part in levels[:-1]]).astype(np.int32)
+    packed = [quads(np.round(255.0 * part).astype(np.uint8), True).ravel() for part in levels]
+    return Tile(np.concatenate(packed), start, image.shape[0])
+
+
+@compiled(nogil=True)
+def quads(image: NDArray[np.uint8], tiled: bool) -> NDArray[np.uint32]:
+    """Pack each texel with the next in its row (second byte), column (third) and both (fourth).
+
+    One load then fetches all four texels of a bilinear sample. After the last texel comes the first in an image that is
+    `tiled`, else the last once more.
+    """
+    rows, columns = image.shape
+    packed = np.empty((rows, columns), dtype=np.uint32)
+    after = 0 if tiled else columns - 1
+    for row in range(rows):
+        here, below = image[row], image[row + 1 if row + 1 < rows else (0 if tiled else row)]
+        for column in range(columns - 1):
+            packed[row, column] = _quad(here[column], here[column + 1], below[column], below[column + 1])
+        packed[row, columns - 1] = _quad(here[columns - 1], here[after], below[columns - 1], below[after])
+    return packed
+
+
+@compiled(forceinline=True)
+def _quad(here: Single, right: Single, below: Single, across: Single) -> Single:
+    return np.uint32(here) | np.uint32(right) << 8 | np.uint32(below) << 16 | np.uint32(across) << 24
 
 
 @lru_cache(maxsize=1)
@@ -61,47 +89,65 @@ def grain_tile() -> Tile:
 
 
 @lru_cache(maxsize=1)
+def cloud_noise() -> NDArray[np.float64]:
+    """Return soft noise for dirt, plaster, leaves and clouds, (512, 512), 0 to 1, the same in every scene."""
+    return np.clip(0.5 + 0.2 * fractal_noise(512, np.random.default_rng(42), 1.35), 0.0, 1.0)
+
+
+@lru_cache(maxsize=1)
 def cloud_tile() -> Tile:
-    """Return soft noise for dirt, plaster, leaves and clouds, the same in every scene."""
-    image = 0.5 + 0.2 * fractal_noise(512, np.random.default_rng(42), 1.35)
-    return make_tile(np.clip(image, 0.0, 1.0))
+    """Return that noise as a tile."""
+    return make_tile(cloud_noise())
 
 
-@compiled(**LEAF)
-def sample_tile(tile: Tile, u: float, v: float, level: int) -> float:
+@compiled(**VECTOR_LEAF)
+def sample_tile(tile: Tile, u: Single, v: Single, level: int) -> Single:
     """Return the bilinear value at (u, v), in periods of the tile, at one level of its pyramid."""
     level = min(max(level, 0), tile.start.shape[0] - 1)
     n = tile.size >> level
-    x = u * n - 0.5
-    y = v * n - 0.5
-    column = int(np.floor(x))
-    row = int(np.floor(y))
-    a = x - column
-    b = y - row
+    x = u * np.float32(n) - 0.5
+    y = v * np.float32(n) - 0.5
+    column = np.floor(x)
+    row = np.floor(y)
     mask = n - 1
-    top = tile.start[level] + (row & mask) * n
-    bottom = tile.start[level] + ((row + 1) & mask) * n
-    left = column & mask
-    right = (column + 1) & mask
-    above = tile.levels[np.uint64(top + left)] * (1 - a) + tile.levels[np.uint64(top + right)] * a
-    below = tile.levels[np.uint64(bottom + left)] * (1 - a) + tile.levels[np.uint64(bottom + right)] * a
-    return float(above * (1 - b) + below * b)
+    i = tile.start[np.uint64(level)] + (np.int32(row) & mask) * n + (np.int32(column) & mask)
+    return mix_quad(tile.levels[np.uint64(i)], x - column, y - row)
 
 
-@compiled(**LEAF)
-def hash_unit(x: int, y: int) -> float:
-    """Hash two integers to a number in [0, 1)."""
+@compiled(**VECTOR_LEAF)
+def mix_quad(quad: Single, a: Single, b: Single) -> Single:
+    """Interpolate between the four texels of `quads`, from 0 to 1; a is the fraction along the row."""
+    above = mix(byte(quad, 0), byte(quad, 8), a)
+    below = mix(byte(quad, 16), byte(quad, 24), a)
+    return mix(above, below, b) * (1.0 / 255.0)
+
+
+@compiled(**VECTOR_LEAF)
+def byte(packed: Single, shift: int) -> Single:
+    """Return the eight bits from `shift` on."""
+    return np.float32(np.int32((packed >> np.uint32(shift)) & np.uint32(255)))
+
+
+@compiled(**VECTOR_LEAF)
+def mix(a: Single, b: Single, fraction: Single) -> Single:
+    """Interpolate from a to b."""
+    return a + (b - a) * fraction
+
+
+@compiled(**VECTOR_LEAF)
+def hash_unit(x: int, y: int) -> Single:
+    """Hash two integers to a number from 0 to 1."""
     h = (np.int64(x) * 374761393 + np.int64(y) * 668265263) & 0x7FFFFFFF
     h = ((h ^ (h >> 13)) * 1274126177) & 0x7FFFFFFF
-    return (h ^ (h >> 16)) / 2147483648.0
+    return np.float32(h ^ (h >> 16)) * (1.0 / 2147483648.0)
 
 
-@compiled(**LEAF)
-def pixel_level(texels: float) -> int:
+@compiled(**VECTOR_LEAF)
+def pixel_level(texels: Single) -> Single:
     """Return the level of a 512-texel tile at which a texel is as large as a pixel that spans `texels` periods."""
     level = 0
-    spans = texels * 512.0
-    while spans > 1.4 and level < 7:
-        spans *= 0.5
-        level += 1
+    limit = 1.4 / 512.0
+    for _ in range(7):
+        level += texels > limit
+        limit *= 2.0
     return level

@@ -140,7 +140,7 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     rows = rate(
         "camera",
         f"colour, depth, ids; {case}",
-        1.0 / each(lambda i: camera.render(scene, pose(i), weather, i)),
+        1.0 / each(lambda i: camera.render(scene, pose(i), weather, i).ids),
         "frames/s",
     )
     peers = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,22 +10,30 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
+from parkenv.errors import InputError
 from parkenv.evaluation.figures.picture_files import STYLE, save_picture
-from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, LabelledImage, read_uiuc_test
+from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
 from parkenv.perception.car_model import CarModel
+from parkenv.perception.car_regions import END_WIDEST
+from parkenv.perception.cross_validation import BLOCKS, scores_of
 from parkenv.perception.detection_scores import RecallPrecision, recall_precision
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.hog_detector import HogDetector
+
+Image = NDArray[np.uint8]
 
 _SMALLEST = {"single": 0.85, "multi": 0.8}
 _LARGEST = {"single": 1.2, "multi": 2.6}
 """Range of searched sizes relative to UIUC's 100×40 box; all cars of the single-scale set have the same size, those of
 the multi-scale set are 0.89 to 2.12 times as large."""
-
-
 _TOLERANCE = 1.25  # of these sizes, for detectors
+_CROP_RATES = (0.01, 0.1)  # of false positives
+_CROP_MIDDLE, _CROP_WIDTH = 0.19, 0.45
+"""Farthest a box's centre may be from its crop's, and least width, as fractions of the crop's sides."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +71,8 @@ def score_on(
     """Measure recall and precision on labelled images, by UIUC's matching rule.
 
     A model's windows are searched at the sizes of the set's cars. A detector looks as it does anywhere; its boxes of
-    other sizes, and of fronts and rears, are left out, as the sets label neither.
+    other sizes, and of fronts and rears, are left out, as the sets label neither. A box more than twice as wide as high
+    is a side.
     """
     detector = _searching(model, test_set) if isinstance(model, CarModel) else model
     found, begun = [], time.perf_counter()
@@ -94,12 +104,59 @@ def score_on(
 def _of_the_set(found: Detections, test_set: str) -> Detections:
     width = (found.regions[:, 2] - found.regions[:, 0]) / UIUC_SIZE[0]
     least, most = _SMALLEST[test_set] / _TOLERANCE, _LARGEST[test_set] * _TOLERANCE
-    return found.select(~found.end_on & (width >= least) & (width <= most))
+    size = found.boxes[:, 2:] - found.boxes[:, :2]
+    side = ~found.end_on | (size[:, 0] > END_WIDEST * size[:, 1])
+    return found.select(side & (width >= least) & (width <= most))
 
 
 def _searching(model: CarModel, test_set: str) -> HogDetector:
     height = UIUC_SIZE[1]
     return HogDetector.for_evaluation(model, _SMALLEST[test_set] * height, _LARGEST[test_set] * height)
+
+
+def recall_on_crops(
+    model: CarModel | Detector, crops: Crops, *, on_image: Callable[[], None] = lambda: None
+) -> list[dict[str, Any]]:
+    """Measure the fraction of crops of cars that are found at some rates of false positives, with 95 % intervals.
+
+    A crop's score is a model's of its window, or a detector's greatest probability of a box in the crop's middle, at
+    least 0.45 times as wide. Consecutive crops often show the same car: the intervals are over blocks of them.
+
+    Raises:
+        InputError: fewer crops of cars than blocks.
+    """
+    if len(crops.positives) < BLOCKS:
+        raise InputError(f"{len(crops.positives)} crops of cars, want at least {BLOCKS}")
+    cars, others = (_crop_scores(model, images, on_image) for images in (crops.positives, crops.negatives))
+    rows = []
+    for rate in _CROP_RATES:
+        hit = cars > np.quantile(others, 1.0 - rate, method="higher")
+        blocks = [block.mean() for block in np.array_split(hit, BLOCKS)]
+        rows.append(
+            {
+                "false_positives": rate,
+                "recall": float(hit.mean()),
+                "interval": float(1.96 * np.std(blocks, ddof=1) / math.sqrt(BLOCKS)),
+                "cars": len(cars),
+                "others": len(others),
+            }
+        )
+    return rows
+
+
+def _crop_scores(
+    model: CarModel | Detector, images: Sequence[Image], on_image: Callable[[], None]
+) -> NDArray[np.float64]:
+    if isinstance(model, CarModel):
+        return scores_of(model, images)
+    scores = []
+    for image in images:
+        found, size = model.detect(image), np.array(image.shape[1::-1])
+        off = np.abs(0.5 * (found.boxes[:, :2] + found.boxes[:, 2:]) / size - 0.5).max(axis=1)
+        wide = (found.boxes[:, 2] - found.boxes[:, 0]) / size[0]
+        scores.append(found.probability[(off < _CROP_MIDDLE) & (wide > _CROP_WIDTH)].max(initial=0.0))
+        on_image()
+    return np.array(scores, dtype=np.float64)
 
 
 def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
