@@ -25,7 +25,7 @@ hypothesis.settings.load_profile("parkenv")
 def pytest_runtest_setup():
     """Take back the threads, one per core, that numba's first parallel loop gives to torch and scikit-learn.
 
-    They share OpenMP's library, and spinning threads make a training take ten times the time.
+    They share OpenMP's library, and threads that wait for each other by spinning take the other test process's core.
     """
     if "PYTEST_XDIST_WORKER" in os.environ and "torch" in sys.modules:
         sys.modules["torch"].set_num_threads(1)
