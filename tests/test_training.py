@@ -511,17 +511,19 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     assert (tmp_path / "curve.png").stat().st_size > 10_000
 
 
-# One on-policy algorithm, and one with a replay buffer.
+# One on-policy algorithm, one with a replay buffer, and one on scans.
 @pytest.mark.slow
-@pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
-def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm):
+@pytest.mark.parametrize(
+    ("algorithm", "options"), [("maskable-ppo", ()), ("dqn", ()), ("maskable-ppo", ("--observation", "scan"))]
+)
+def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp_path, algorithm, options):
     out = tmp_path / "out"
     steps = (
         20_000 if algorithm == "maskable-ppo" else 13_000
     )  # two rollouts; a few thousand steps with updates
     command = [
-        "train", algorithm, "--scenario", "mini", "--steps", str(steps), "--trainings", "2", "--evaluate-every",
-        "6000", "--evaluation-episodes", "16", "--agents", "mdp", "--jobs", "2", "--out", str(out),
+        "train", algorithm, *options, "--scenario", "mini", "--steps", str(steps), "--trainings", "2",
+        "--evaluate-every", "6000", "--evaluation-episodes", "16", "--agents", "mdp", "--jobs", "2", "--out", str(out),
     ]  # fmt: skip
     process = subprocess.Popen(
         [*PARKENV, *command], stdout=subprocess.PIPE, stderr=subprocess.PIPE, start_new_session=True
