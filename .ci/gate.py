@@ -1,9 +1,9 @@
 """The gate: all that a change has to pass, in a fresh environment.
 
 The README's own commands, lint, types, slow tests, examples, documentation, the built package, and the oldest allowed
-versions of the dependencies. Stages that do not need each other run side by side: as many as there are cores, and one
-more of a single core, so that none is idle while a stage waits, or has one test left. A stage's output is printed when
-it ends, and a table of all stages' seconds at the end. The first failure stops the gate.
+versions of the dependencies. Stages that do not need each other run side by side, one more than there are cores for, so
+that none is idle while a stage waits or has one test left. A stage's output is printed when it ends, and a table of all
+stages' seconds at the end. The first failure stops the gate.
 """
 
 from __future__ import annotations
@@ -198,9 +198,7 @@ def run_all(stages: list[Stage], scratch: Path) -> list[Run]:
             done = {run.stage.name for run in ended}
             for stage in list(waiting):
                 busy = sum(run.stage.cores for run in running)
-                if set(stage.needs) & known <= done and (
-                    busy + stage.cores <= CORES or busy == 0 or (stage.cores == 1 and busy <= CORES)
-                ):
+                if set(stage.needs) & known <= done and busy <= CORES:
                     print(f"--- {stage.name} begins", flush=True)
                     waiting.remove(stage)
                     running.append(Run(stage, scratch))

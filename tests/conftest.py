@@ -2,6 +2,7 @@
 
 import gc
 import os
+import sys
 
 import hypothesis
 import pytest
@@ -19,6 +20,15 @@ hypothesis.settings.register_profile(
     suppress_health_check=[hypothesis.HealthCheck.too_slow, hypothesis.HealthCheck.function_scoped_fixture],
 )
 hypothesis.settings.load_profile("parkenv")
+
+
+def pytest_runtest_setup():
+    """Take back the threads, one per core, that numba's first parallel loop gives to torch and scikit-learn.
+
+    They share OpenMP's library, and threads that wait for each other by spinning take the other test process's core.
+    """
+    if "PYTEST_XDIST_WORKER" in os.environ and "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(1)
 
 
 def pytest_collection_finish():

@@ -262,14 +262,14 @@ def test_trainings_are_repeatable_and_learn(tmp_path):
 
     places = tuple(make_scenario(name) for name in ("mini", "campus"))
     held_out = (make_scenario(grid_lot(4, 10), name="grid", day_error=0.8),)
-    training = NetworkTraining("network", 400, 400, places, range(2_000_000, 2_000_010), held_out)
+    training = NetworkTraining("network", 200, 200, places, range(2_000_000, 2_000_005), held_out)
     curves = [training.train(0, tmp_path / str(i)) for i in range(2)]
     assert (tmp_path / "0" / MODEL).read_bytes() == (tmp_path / "1" / MODEL).read_bytes()
     for one, other in zip(*curves, strict=True):
         assert {**one, "wall_s": 0.0} == {**other, "wall_s": 0.0}
     card = NetworkPolicy.load(tmp_path / "0" / MODEL).card
     assert card.trained_on == ("mini", "campus")
-    assert card.decisions == curves[0][-1]["steps"] > 400
+    assert card.decisions == curves[0][-1]["steps"] > 200
     # A training that has ended is not repeated.
     before = (tmp_path / "0" / MODEL).stat().st_mtime_ns
     training.train(0, tmp_path / "0")

@@ -174,6 +174,17 @@ class _Fit:
     distance: FloatArray
     log_det: FloatArray
 
+    def where(self, mask: BoolArray, other: _Fit) -> _Fit:
+        """Return this fit for the car parks of `mask`, else the other."""
+        if not mask.any():
+            return other
+        return _Fit(
+            np.where(mask[:, None], self.step, other.step),
+            np.where(mask[:, None, None], self.gain, other.gain),
+            np.where(mask, self.distance, other.distance),
+            np.where(mask, self.log_det, other.log_det),
+        )
+
     def log_likelihood(self, n: NDArray[np.int64]) -> FloatArray:
         """Return the log-likelihood (c,) of n observed hours, multivariate t, up to what all curves share."""
         return np.asarray(
@@ -238,12 +249,12 @@ def filter_days(
             p = expit(z)
             weight = 1.0 / (settings.noise + 1.0 / (places * p * (1.0 - p) + 1.0))
             weight = np.where(np.isfinite(seen) & learned[:, None], weight, 0.0)
+            fit = own.fit(z, weight)
             if sunday is not None:
-                evidence = sunday.fit(z, weight).log_likelihood(hours) - own.fit(z, weight).log_likelihood(
-                    hours
-                )
-                curve = sunday.where(special.observe(date, evidence, hours >= _MIN_HOURS_SPECIAL), own)
-            fit = curve.fit(z, weight)
+                other = sunday.fit(z, weight)
+                evidence = other.log_likelihood(hours) - fit.log_likelihood(hours)
+                mask = special.observe(date, evidence, hours >= _MIN_HOURS_SPECIAL)
+                curve, fit = sunday.where(mask, own), other.where(mask, fit)
             error = fit.distance / np.maximum(hours, 1)
             memory = np.where(learned, np.minimum(memory + 1.0, _MEMORY), memory)
             step = (np.minimum(error, _MEMORY * scale) - scale) / memory

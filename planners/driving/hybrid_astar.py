@@ -120,7 +120,8 @@ def plan_path(
     if ends_room < -0.01:
         return None
     radius = vehicle.turning_radius * (1.0 + settings.reserve)
-    tried, origin = (-1.0, 0.0), np.asarray(target, dtype=np.float64)
+    # Copies, which are writable: compiled code for read-only arrays is another one.
+    tried, origin = (-1.0, 0.0), np.array(target, dtype=np.float64)
     expansions = 0
     for wanted, move in settings.attempts:
         margin = max(min(wanted, ends_room), 0.0)
@@ -129,7 +130,7 @@ def plan_path(
         tried = (margin, move)
         left = grid_distances(space, start[0], start[1], space.half[1] + margin)
         costs = DriveCosts(radius, margin, settings.change_m, settings.steer_m)
-        goal = np.asarray(start, dtype=np.float64)
+        goal = np.array(start, dtype=np.float64)
         limits = settings.greed, settings.most_expansions, settings.patience
         lengths, curvatures, opened = _search(space, left, origin, goal, costs, move, *limits)
         expansions += opened

@@ -38,7 +38,7 @@ def save_reach(rows: Sequence[Row], ylabel: str, path: Path) -> None:
     panels = list(dict.fromkeys(row["weather"] for row in rows))
     rigs, detectors = (list(dict.fromkeys(row[c] for row in rows)) for c in ("rig", "detector"))
     with mpl.rc_context(STYLE):
-        columns = min(3, len(panels))
+        columns = 2 if len(panels) == 4 else min(3, len(panels))
         lines = -(-len(panels) // columns)
         figure = Figure(figsize=(3.4 * columns + 0.6, 2.5 * lines + 0.9), layout="constrained")
         axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
@@ -50,7 +50,7 @@ def save_reach(rows: Sequence[Row], ylabel: str, path: Path) -> None:
                 color = COLORS[detectors.index(detector) % len(COLORS)]
                 line = LINES[rigs.index(rig) % len(LINES)]
                 # Offset the points, so that the intervals do not hide each other.
-                x = np.array([np.mean(r["distance_m"]) for r in its]) + 0.1 * (i - 1.5)
+                x = np.array([np.mean(r["distance_m"]) for r in its]) + 0.18 * (i - 1.5)
                 rate, low, high = (np.array([r[c] for r in its]) for c in ("rate", "low", "high"))
                 ax.plot(
                     x, rate, color=color, linestyle=line, marker="o", markersize=3, linewidth=1.5,
@@ -63,6 +63,8 @@ def save_reach(rows: Sequence[Row], ylabel: str, path: Path) -> None:
             ax.yaxis.set_major_formatter(mpl.ticker.PercentFormatter(1.0))
         for ax in axes[len(panels) :]:
             ax.remove()
+        for ax in axes[max(len(panels) - columns, 0) : len(panels)]:
+            ax.tick_params(labelbottom=True)
         figure.supxlabel("distance from the camera to the middle of the car, m", size=9.0)
         figure.supylabel(ylabel, size=9.0)
         handles, labels = axes[0].get_legend_handles_labels()

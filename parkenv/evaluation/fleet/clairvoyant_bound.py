@@ -91,7 +91,13 @@ def _bound_s(day: ParkingDay) -> float:
     if n_cars == 0:
         return 0.0
     begin = float(day.arrival.min())
-    day = day._replace(arrival=day.arrival - begin, free_from=np.maximum(day.free_from - begin, 0.0))
+    day = day._replace(
+        arrival=day.arrival - begin,
+        cost_s=np.array(
+            day.cost_s
+        ),  # can be written to, as the others: compiled code for both takes twice the time
+        free_from=np.maximum(day.free_from - begin, 0.0),
+    )
     target_s = float(_schedule_in_order(day))
     # A later parking would cost more than going elsewhere
     latest_s = np.minimum(day.patience_s, day.give_up_s)
