@@ -88,7 +88,7 @@ def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, flo
         >>> [round(x, 3) for x in rate_interval([5, 5], [10, 10])]
         [0.5, 0.299, 0.701]
         >>> [round(x, 3) for x in rate_interval([0, 10], [10, 10])]
-        [0.5, 0.095, 0.905]
+        [0.5, 0.055, 0.945]
     """
     hits, trials = np.asarray(right, dtype=np.float64), np.asarray(total, dtype=np.float64)
     hits, trials = hits[trials > 0.0], trials[trials > 0.0]
