@@ -32,12 +32,7 @@ def pytest_runtest_setup():
 
 
 def pytest_collection_finish():
-    """Modules and tests live to the end: let the garbage collector pass over them, and look less often.
-
-    Compiling makes many objects that reference counting frees.
-    """
-    gc.collect()
-    gc.freeze()
+    """Let the garbage collector look less often: compiling makes many objects that reference counting frees."""
     gc.set_threshold(20_000, 20, 20)
 
 
