@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
@@ -133,7 +133,7 @@ def run_detector_surveys(
                 else:
                     tasks.append(partial(_drive_together, scenario, settings, k))
                     of.append((k, group))
-        for (k, group), results in zip(of, _in_order(workers, tasks), strict=True):
+        for (k, group), results in zip(of, workers.in_order(tasks), strict=True):
             for i, result in zip(group, results, strict=True):
                 if keys[i][k] not in rows[i]:
                     _write_sightings(_sightings_file(surveys[i], k), result.score.sightings)
@@ -346,15 +346,6 @@ def _picture_size(rig: str) -> tuple[int, int]:
     its = SensorRig.named(rig)
     camera = [*(c for _, c, _ in its.cameras), *(pair.camera for _, pair, _ in its.stereo_cameras)][0]
     return camera.height, camera.width
-
-
-def _in_order(
-    workers: Workers, tasks: Sequence[Callable[[], list[SessionResult]]]
-) -> Iterator[list[SessionResult]]:
-    if workers.in_process or len(tasks) < 2:
-        yield from (task() for task in tasks)
-    else:
-        yield from workers.in_order(tasks)
 
 
 def _drive_together(
