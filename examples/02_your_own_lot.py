@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 
 from parkenv import Lane, Mouth, ParkingLot, make_scenario
-from parkenv.evaluation.experiments.compare import Case
 from parkenv.lots import read_lot, write_lot
+from parkenv.studies.compare.cases import Case
 
 # Twelve slots on either side of one aisle that runs east; cars stand nose-in, so they are entered at the rear.
 x = 6.0 + 2.5 * np.arange(12)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from parkenv import make_scenario
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
+from parkenv.studies.episodes import EpisodeRunner
 from planners import make_agent
 
 scenario = make_scenario("jam")

@@ -8,7 +8,7 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 import parkenv
 from parkenv.envs.search_sb3 import SearchVecEnv
-from parkenv.evaluation.experiments.statistics import mean_interval
+from parkenv.studies.statistics import mean_interval
 from planners import make_agent
 from planners.model_file import save_model
 

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from parkenv import make_scenario
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.statistics import mean_interval
-from parkenv.evaluation.experiments.surveys import run_survey, summarize
 from parkenv.lots import grid_lot
 from parkenv.mapping.learned_map import map_prior
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SurveySettings
-from parkenv.world.flat_map import FlatMap
-from parkenv.world.occupancy import ArrivalWindow
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.sensing.surveys import run_survey, summarize
+from parkenv.studies.statistics import mean_interval
+from parkenv.world.occupancy.constant_map import FlatMap
+from parkenv.world.occupancy.process import ArrivalWindow
 
 lot = grid_lot(4, 20)
 world = make_scenario(lot, arrival=ArrivalWindow.parse("11:00-13:00"))

@@ -12,8 +12,8 @@ from sb3_contrib import MaskablePPO
 
 import parkenv
 from parkenv.envs.search_sb3 import SearchVecEnv
-from parkenv.evaluation.experiments.statistics import mean_interval
-from parkenv.evaluation.simulate import make_search, simulate
+from parkenv.studies.simulate import make_search, simulate
+from parkenv.studies.statistics import mean_interval
 from planners import make_agent
 from planners.model_file import save_model
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from parkenv.errors import InputError
     from parkenv.scenarios.build import make_scenario, make_scenarios
     from parkenv.world.lot import Lane, Mouth, ParkingLot
-    from parkenv.world.occupancy import ArrivalWindow, OccupancyProcess
-    from parkenv.world.occupancy_log import OccupancyLog
-    from parkenv.world.recorded_occupancy import RecordedOccupancy
+    from parkenv.world.occupancy.log import OccupancyLog
+    from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
+    from parkenv.world.occupancy.recorded import RecordedOccupancy
     from parkenv.world.scenario import Scenario, SearchProblem
     from parkenv.world.sensor_model import SensorBand, SensorModel
     from parkenv.world.traffic import Traffic
@@ -34,14 +34,14 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _EXPORTS = {
-    "ArrivalWindow": "parkenv.world.occupancy",
+    "ArrivalWindow": "parkenv.world.occupancy.process",
     "InputError": "parkenv.errors",
     "Lane": "parkenv.world.lot",
     "Mouth": "parkenv.world.lot",
-    "OccupancyLog": "parkenv.world.occupancy_log",
-    "OccupancyProcess": "parkenv.world.occupancy",
+    "OccupancyLog": "parkenv.world.occupancy.log",
+    "OccupancyProcess": "parkenv.world.occupancy.process",
     "ParkingLot": "parkenv.world.lot",
-    "RecordedOccupancy": "parkenv.world.recorded_occupancy",
+    "RecordedOccupancy": "parkenv.world.occupancy.recorded",
     "Scenario": "parkenv.world.scenario",
     "SearchProblem": "parkenv.world.scenario",
     "SensorBand": "parkenv.world.sensor_model",

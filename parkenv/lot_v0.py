@@ -21,9 +21,9 @@ except ImportError as error:
         'parkenv.lot_v0 needs pettingzoo, which is not installed: pip install "parkenv[multi]"'
     ) from error
 
+from parkenv.engine.fleet_records import SEARCHING, TRUNCATED
 from parkenv.envs.fleet import Fleet
 from parkenv.envs.fleet_agents import MAX_CYCLES, METADATA, FleetAgents, Observation, car_of
-from parkenv.envs.fleet_records import SEARCHING, TRUNCATED
 from parkenv.envs.search import action_number
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource

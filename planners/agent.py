@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
-from parkenv.world.occupancy import World
+from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import SearchProblem
 from planners.names import AGENTS, ALGORITHMS, FILE_AGENTS, NETWORK
 

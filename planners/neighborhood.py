@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.sensor_model import SensorRates
 from planners.belief.planning_graph import VIEW, PlanningGraph
 from planners.road_table import RoadTable
-from planners.thesis.heap import pop, push
 from planners.thesis.label_setting import StoppingGraph, set_labels
 from planners.thesis.mdp import ParkingMDP
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

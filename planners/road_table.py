@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

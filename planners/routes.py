@@ -8,12 +8,12 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
-from planners.thesis.heap import pop, push
 from planners.thesis.label_setting import edges_in
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import VECTOR_LEAF, Tile, hash_unit, pixel_level, sample_tile
-from sim_sensors.compilation import compiled
 
 
 @compiled(**VECTOR_LEAF)

@@ -16,7 +16,7 @@ def few_searches():
     run_suite = benchmark.run_suite
 
     def run_first(*arguments):
-        from parkenv.evaluation.experiments.benchmark import Suite
+        from parkenv.studies.compare.benchmark import Suite
 
         named = Suite.named
 

@@ -4,8 +4,7 @@ import math
 
 import numpy as np
 
-from parkenv.world.day_error import centred_logits
-from parkenv.world.keyed_random import (
+from parkenv.compiled.keyed_random import (
     DAY_STREAM,
     ENTRY_STREAM,
     OBSERVATION_STREAM,
@@ -15,8 +14,9 @@ from parkenv.world.keyed_random import (
     world_key,
 )
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy import OccupancyProcess
-from parkenv.world.occupancy_log import weekday_of
+from parkenv.world.occupancy.day_error import centred_logits
+from parkenv.world.occupancy.log import weekday_of
+from parkenv.world.occupancy.process import OccupancyProcess
 
 
 def day_factor(process, key, slot, p):

@@ -8,10 +8,10 @@ import pytest
 from small_lots import cut_in_two
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
-from parkenv.evaluation.experiments.compare import Case, settings_of
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
+from parkenv.studies.compare.cases import Case, settings_of
+from parkenv.studies.episodes import EpisodeRunner
 from parkenv.world.scenario import SearchProblem
 from planners import AGENT_NAMES, make_agent
 

@@ -7,10 +7,10 @@ import pytest
 from parkenv import InputError, make_scenario
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.spec import FleetSpec
-from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+from parkenv.studies.spec import FleetSpec
 from parkenv.world.lot import PARK
 from planners import make_agent
 from planners.belief.rivals import CROWD, PASSED, _take_rates, usual_arrivals

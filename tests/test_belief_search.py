@@ -6,10 +6,10 @@ import pytest
 from small_lots import cut_in_two, features, small_lot
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel, make_scenario
-from parkenv.evaluation.experiments.compare import Case, at_occupancy
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
-from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.lots import grid_lot
+from parkenv.studies.compare.cases import Case, at_occupancy
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.statistics import mean_interval
 from parkenv.world.sensor_model import SensorBand
 from planners import make_agent
 from planners.belief.agent import WORK_PER_MS

@@ -8,9 +8,9 @@ from typer.testing import CliRunner
 
 from parkenv.cli import app
 from parkenv.errors import InputError
-from parkenv.evaluation.bench import sensors as bench_sensors
-from parkenv.evaluation.bench.rows import duration, rate, seconds_each
-from parkenv.evaluation.bench.sensors import (
+from parkenv.studies.bench import sensors as bench_sensors
+from parkenv.studies.bench.rows import duration, rate, seconds_each
+from parkenv.studies.bench.sensors import (
     GRID_CELL,
     embree_scanner,
     laser_rows,
@@ -86,8 +86,8 @@ def test_an_unknown_part_is_named():
 
 
 def test_days_of_fleets_are_measured(monkeypatch):
-    from parkenv.evaluation.bench import sumo
-    from parkenv.evaluation.bench.fleet import fleet_rows
+    from parkenv.studies.bench import sumo
+    from parkenv.studies.bench.fleet import fleet_rows
 
     monkeypatch.setattr(sumo, "sumo_folder", lambda: None)
     *rows, missing = fleet_rows(seed=0, seconds=0.0, worlds=2, large=400, day_cars=20, growth=(5,))
@@ -98,7 +98,7 @@ def test_days_of_fleets_are_measured(monkeypatch):
 
 
 def test_steps_are_measured_and_peers_that_are_not_there_are_named(monkeypatch):
-    from parkenv.evaluation.bench import env as bench_env
+    from parkenv.studies.bench import env as bench_env
 
     monkeypatch.setattr(bench_env, "find_spec", lambda name: None)
     rows = bench_env.env_rows(seed=0, seconds=0.0, batch=4, large=300, places=3)

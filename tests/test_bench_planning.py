@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from parkenv.evaluation.bench.planning import drive, forecast_process, planning_rows, transitions
 from parkenv.lots import grid_lot
+from parkenv.studies.bench.planning import drive, forecast_process, planning_rows, transitions
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import StoppingGraph, set_labels
 

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from parkenv import make_scenario
+from parkenv.engine.fleet_rules import RULES
 from parkenv.envs.fleet import DriverKind, Fleet
-from parkenv.envs.fleet_rules import RULES
 from parkenv.errors import InputError
-from parkenv.evaluation.bench import sumo
+from parkenv.studies.bench import sumo
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 
 STREET = make_scenario("street")

@@ -10,22 +10,22 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments import benchmark
-from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.benchmark import Suite, by_group, check_result, result_of, suite_lots
-from parkenv.evaluation.experiments.compare import run_cases
-from parkenv.evaluation.experiments.results import ResultFolder, write_summary
-from parkenv.evaluation.experiments.spec import TrainingSpec
-from parkenv.evaluation.lot_census import slots_by_kind
-from parkenv.evaluation.report.page import SCHEMA
-from parkenv.evaluation.training.search_task import SearchTask
 from parkenv.lots import grid_lot, read_lot, write_lot
 from parkenv.lots.lot_files import PLACES
 from parkenv.lots.provenance import combined, read_provenance
 from parkenv.scenarios.places import lot_share
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.world.day_error import DayError
-from parkenv.world.occupancy import Arrival
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare import benchmark
+from parkenv.studies.compare.benchmark import Suite, by_group, check_result, result_of, suite_lots
+from parkenv.studies.compare.cases import run_cases
+from parkenv.studies.lot_census import slots_by_kind
+from parkenv.studies.report.page import SCHEMA
+from parkenv.studies.results import ResultFolder, write_summary
+from parkenv.studies.spec import TrainingSpec
+from parkenv.studies.training.search_task import SearchTask
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.process import Arrival
 
 AGENTS = ("first-free", "greedy-goal")
 

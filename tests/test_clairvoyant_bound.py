@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from parkenv.envs.fleet import total_s
-from parkenv.evaluation.experiments.spec import FleetSpec
-from parkenv.evaluation.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
-from parkenv.evaluation.fleet.experiment import FleetExperiment
-from parkenv.evaluation.fleet.measures import Roads
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
+from parkenv.studies.fleet.experiment import FleetExperiment
+from parkenv.studies.fleet.measures import Roads
+from parkenv.studies.spec import FleetSpec
 
 
 def best_schedule_s(day):

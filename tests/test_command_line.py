@@ -14,8 +14,8 @@ from command_line import parkenv
 
 from parkenv.cli import app, compare, demo, survey, train
 from parkenv.cli.command import SHARED, read_docstring
-from parkenv.evaluation.experiments import spec as specs
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, RigName
+from parkenv.studies import spec as specs
 from planners.names import AGENTS
 from sim_sensors.camera.weather import PRESETS
 from sim_sensors.rig import RIG_NAMES

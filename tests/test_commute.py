@@ -11,15 +11,15 @@ from command_line import parkenv
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.commute import Commute, Course, calendar, run_commute
-from parkenv.evaluation.experiments.spec import CommuteSpec
 from parkenv.files.spec_file import read_tables
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore
-from parkenv.world.occupancy import ArrivalWindow
-from parkenv.world.occupancy_log import OccupancyLog
-from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.commute import Commute, Course, calendar, run_commute
+from parkenv.studies.spec import CommuteSpec
+from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.process import ArrivalWindow
+from parkenv.world.occupancy.recorded import RecordedOccupancy
 from planners.agent import make_agent
 
 SMALL = {

@@ -16,9 +16,9 @@ from command_line import PARKENV, parkenv
 from scipy import stats
 
 from parkenv import InputError, SensorModel
-from parkenv.evaluation.experiments.results import KEY_COLUMNS, OUTCOME_COLUMNS, ResultFolder
-from parkenv.evaluation.experiments.statistics import mean_interval, summarize
 from parkenv.lots import packaged_lot, write_lot
+from parkenv.studies.results import KEY_COLUMNS, OUTCOME_COLUMNS, ResultFolder
+from parkenv.studies.statistics import mean_interval, summarize
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 

@@ -16,17 +16,17 @@ from numba.core.dispatcher import Dispatcher
 import parkenv
 import planners
 import sim_sensors
-from sim_sensors import compilation
-from sim_sensors.compilation import cache_folder, compiled, seconds_spent
+from parkenv.compiled import jit as compilation
+from parkenv.compiled.jit import cache_folder, compiled, seconds_spent
 
 ROOT = Path(__file__).parents[1]
 COMPILES, CANNOT_KEEP = "compiling functions for this machine", "compiled functions cannot be kept in"
 OWN = {
-    "callee.py": "from sim_sensors.compilation import compiled\n@compiled\ndef f(x):\n    return x + 1.0\n",
+    "callee.py": "from parkenv.compiled.jit import compiled\n@compiled\ndef f(x):\n    return x + 1.0\n",
     "package/__init__.py": "from .rates import RATE\n",
     "package/rates.py": "RATE = 2.0\n",
     "caller.py": (
-        "from callee import f\nfrom package import \\\n    RATE\nfrom sim_sensors.compilation import compiled\n"
+        "from callee import f\nfrom package import \\\n    RATE\nfrom parkenv.compiled.jit import compiled\n"
         "@compiled(fastmath={'nnan', 'ninf', 'nsz', 'arcp', 'contract'})\ndef g(x):\n    return RATE * f(x)\n"
     ),
 }

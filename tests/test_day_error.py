@@ -14,9 +14,9 @@ from scipy.special import expit
 from scipy.stats import norm
 
 from parkenv import InputError, OccupancyProcess
-from parkenv.world.day_error import DayError, centred_logits, centring_table, nearness
-from parkenv.world.keyed_random import world_key
-from parkenv.world.occupancy import Arrival
+from parkenv.compiled.keyed_random import world_key
+from parkenv.world.occupancy.day_error import DayError, centred_logits, centring_table, nearness
+from parkenv.world.occupancy.process import Arrival
 
 
 @given(p=st.floats(1e-6, 1.0 - 1e-6), deviation=st.floats(0.0, 3.0))

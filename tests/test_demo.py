@@ -5,11 +5,11 @@ import json
 from command_line import parkenv
 from PIL import Image
 
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.demo import AGENTS, demo_cases, demo_survey
-from parkenv.evaluation.experiments.spec import DemoSpec
 from parkenv.mapping.store import MapStore
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.compare.demo import AGENTS, demo_cases, demo_survey
+from parkenv.studies.spec import DemoSpec
 
 
 def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):

@@ -8,7 +8,8 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
-from parkenv.evaluation.experiments.detector_surveys import (
+from parkenv.mapping.survey_score import SIGHTING
+from parkenv.studies.sensing.detector_surveys import (
     CAUSES,
     SurveyedDrive,
     _read_sightings,
@@ -17,8 +18,7 @@ from parkenv.evaluation.experiments.detector_surveys import (
     is_wanted,
     never_found,
 )
-from parkenv.evaluation.experiments.statistics import rate_interval
-from parkenv.mapping.survey_score import SIGHTING
+from parkenv.studies.statistics import rate_interval
 from sim_sensors.ground_truth import View
 
 

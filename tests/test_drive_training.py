@@ -22,11 +22,11 @@ from parkenv.driving.collision_world import CollisionWorld
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.workers import HERE
-from parkenv.evaluation.figures.learning_curves import across_seeds, save_success_curves
-from parkenv.evaluation.training.configs import DRIVE_CONFIGS, WAY_IN
-from parkenv.evaluation.training.curve_file import read_curve
-from parkenv.evaluation.training.drive_batch import (
+from parkenv.lots import packaged_lot
+from parkenv.studies.figures.learning_curves import across_seeds, save_success_curves
+from parkenv.studies.training.configs import DRIVE_CONFIGS, WAY_IN
+from parkenv.studies.training.curve_file import read_curve
+from parkenv.studies.training.drive_batch import (
     CONTACT,
     LEFT_AREA,
     PARKED,
@@ -34,9 +34,9 @@ from parkenv.evaluation.training.drive_batch import (
     DriveBatch,
     PreparedTask,
 )
-from parkenv.evaluation.training.drive_replay_buffer import TerminalGoalReplayBuffer
-from parkenv.evaluation.training.drive_training import DriveTraining, evaluate_parking, parked_on
-from parkenv.evaluation.training.drive_training_env import (
+from parkenv.studies.training.drive_replay_buffer import TerminalGoalReplayBuffer
+from parkenv.studies.training.drive_training import DriveTraining, evaluate_parking, parked_on
+from parkenv.studies.training.drive_training_env import (
     MASTERED,
     RECENT_DRIVES,
     STANDSTILL_DECISIONS,
@@ -44,8 +44,8 @@ from parkenv.evaluation.training.drive_training_env import (
     planned_path,
     slot_groups,
 )
-from parkenv.evaluation.training.rl_training import train_one
-from parkenv.lots import packaged_lot
+from parkenv.studies.training.rl_training import train_one
+from parkenv.studies.workers import HERE
 from planners.driving.parking_agents import make_parking_agent
 from planners.driving.policy_interface import (
     ACTION_REPEAT,

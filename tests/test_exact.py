@@ -18,9 +18,9 @@ from parkenv import (
     SensorModel,
     make_scenario,
 )
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import packaged_lot
-from parkenv.world.day_error import DayError
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution

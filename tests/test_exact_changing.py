@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
-from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.lots import grid_lot
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.statistics import mean_interval
 from planners import make_agent
 from planners.agent import SearchAgent
 from planners.bounds.exact import ExactSolution

@@ -10,10 +10,10 @@ from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.cli.schema import schemas
-from parkenv.evaluation.experiments.agent_spec import AgentSpec, parse_agent, split_agents
-from parkenv.evaluation.experiments.experiment import Experiment, run_experiment
-from parkenv.evaluation.experiments.spec import SPEC_FILE, ExperimentSpec
 from parkenv.files.spec_file import read_tables
+from parkenv.studies.agent_spec import AgentSpec, parse_agent, split_agents
+from parkenv.studies.compare.experiment import Experiment, run_experiment
+from parkenv.studies.spec import SPEC_FILE, ExperimentSpec
 from parkenv.world.scenario import KMH
 
 ROOT = Path(__file__).parents[1]

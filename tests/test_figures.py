@@ -8,18 +8,18 @@ from PIL import Image
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.episodes import EpisodeRunner, SearchTrace
-from parkenv.evaluation.experiments.results import episode_key
-from parkenv.evaluation.figures import search_pictures, time_figures
-from parkenv.evaluation.figures.picture_files import CAPTION, INK, save_picture
-from parkenv.evaluation.figures.rates_picture import save_rates
-from parkenv.evaluation.figures.registry import FIGURES, ComparisonResults, draw_figures, remove_figures
-from parkenv.evaluation.figures.search_pictures import BELIEF_MAP, draw_search, draw_searches
-from parkenv.evaluation.figures.time_distribution import draw_time_distribution
-from parkenv.evaluation.figures.time_figures import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
 from parkenv.lots import grid_lot
-from parkenv.world.occupancy import OccupancyProcess
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.episodes import EpisodeRunner, SearchTrace
+from parkenv.studies.figures import search_pictures, time_figures
+from parkenv.studies.figures.picture_files import CAPTION, INK, save_picture
+from parkenv.studies.figures.rates_picture import save_rates
+from parkenv.studies.figures.registry import FIGURES, ComparisonResults, draw_figures, remove_figures
+from parkenv.studies.figures.search_pictures import BELIEF_MAP, draw_search, draw_searches
+from parkenv.studies.figures.time_distribution import draw_time_distribution
+from parkenv.studies.figures.time_figures import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
+from parkenv.studies.results import episode_key
+from parkenv.world.occupancy.process import OccupancyProcess
 from planners.agent import make_agent
 from planners.names import AGENT_NAMES
 

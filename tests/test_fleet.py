@@ -17,9 +17,9 @@ from small_lots import small_lot
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv.engine.fleet_records import DUE, LEFT, PARKED, SEARCHING
+from parkenv.engine.fleet_rules import RULES
 from parkenv.envs.fleet import DriverKind, Fleet, total_s
-from parkenv.envs.fleet_records import DUE, LEFT, PARKED, SEARCHING
-from parkenv.envs.fleet_rules import RULES
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -37,8 +37,8 @@ GREEDY = DriverKind(rule=RULES["greedy-drive"])
 
 
 def test_no_function_for_a_record_is_compiled_for_one_that_merely_begins_like_it():
-    from parkenv.envs import fleet_records, search_records, shared_slots
-    from parkenv.world import occupancy_kernel
+    from parkenv.engine import fleet_records, search_records, shared_slots
+    from parkenv.world.occupancy import kernel as occupancy_kernel
 
     modules = (occupancy_kernel, shared_slots, search_records, fleet_records)
     records = {
@@ -75,7 +75,7 @@ def recorded_scenario():
 def counted_scenario():
     """Days of counted car parks, with a forecast that Python computes at every arrival."""
     from parkenv import ArrivalWindow
-    from parkenv.world.counted_occupancy import CountedOccupancy
+    from parkenv.world.occupancy.counted import CountedOccupancy
 
     mini = parkenv.make_scenario("mini")
     curve = np.stack([np.interp(range(24), [0, 10, 23], [0.2, top, 0.3]) for top in (0.9, 0.6)])
@@ -356,7 +356,7 @@ def test_a_forecast_computed_in_python_reaches_every_car():
         n_slots = scenario.lot.n_slots
 
         def forecast(self, arrival):
-            from parkenv.world.occupancy import Forecast
+            from parkenv.world.occupancy.process import Forecast
 
             return Forecast(np.full(self.n_slots, 0.25), np.full(self.n_slots, 1e-3))
 
@@ -375,7 +375,8 @@ def test_a_forecast_computed_in_python_reaches_every_car():
 @pytest.mark.slow
 def test_another_process_gives_the_same_run():
     program = (
-        "from parkenv.envs.fleet import *; from parkenv.envs.fleet_rules import *; from parkenv.world.demand import *;"
+        "from parkenv.envs.fleet import *; from parkenv.engine.fleet_rules import *;"
+        "from parkenv.world.demand import *;"
         "f = Fleet('campus', Demand(Headways(40)), drivers=[DriverKind(rule=RULES['greedy-drive'])]);"
         "f.reset(5); f.run(); print(f.cars['slot'].tolist(), f.cars['ended_at'].tolist())"
     )

@@ -10,15 +10,15 @@ from command_line import parkenv
 
 from parkenv.envs.fleet import total_s
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.spec import FleetSpec
-from parkenv.evaluation.figures.fleet_figure import looks_s
-from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting, summarize_days
-from parkenv.evaluation.fleet.measures import MEANS, Roads, gini
-from parkenv.evaluation.trips.calibration import Calibration
 from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.figures.fleet_figure import looks_s
+from parkenv.studies.fleet.experiment import FleetExperiment, Setting, summarize_days
+from parkenv.studies.fleet.measures import MEANS, Roads, gini
+from parkenv.studies.spec import FleetSpec
+from parkenv.studies.trips.calibration import Calibration
 from parkenv.world.scenario import SearchProblem
 
 

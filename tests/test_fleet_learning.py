@@ -14,19 +14,19 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
+from parkenv.engine.fleet_records import SEARCHING
+from parkenv.engine.fleet_rules import RULES
 from parkenv.envs.fleet import DriverKind, Fleet, total_s
 from parkenv.envs.fleet_network import NetworkRule
-from parkenv.envs.fleet_records import SEARCHING
-from parkenv.envs.fleet_rules import RULES
 from parkenv.envs.fleet_sb3 import FleetVecEnv, ShareNetwork, layers_of, network_rule
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.spec import TrainingSpec
-from parkenv.evaluation.fleet.drivers import MixedFleet, driver_of
-from parkenv.evaluation.training.curve_file import read_curve
-from parkenv.evaluation.training.fleet_task import FleetTask
-from parkenv.evaluation.training.fleet_training import FleetTraining
-from parkenv.evaluation.training.rl_training import train_one
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.drivers import MixedFleet, driver_of
+from parkenv.studies.spec import TrainingSpec
+from parkenv.studies.training.curve_file import read_curve
+from parkenv.studies.training.fleet_task import FleetTask
+from parkenv.studies.training.fleet_training import FleetTraining
+from parkenv.studies.training.rl_training import train_one
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 from planners.model_file import save_model
@@ -207,12 +207,12 @@ def fleet_training(steps=2048):
 
 @pytest.fixture
 def small_config(monkeypatch):
-    from parkenv.evaluation.training import configs
+    from parkenv.studies.training import configs
 
     settings = {**configs.SEARCH_CONFIGS["ppo"].settings, "n_steps": 32, "batch_size": 256}
     config = configs.TrainingConfig(8, "MultiInputPolicy", settings)
     monkeypatch.setattr(configs, "FLEET_CONFIGS", {"ppo": config, "maskable-ppo": config})
-    from parkenv.evaluation.training import fleet_task, fleet_training
+    from parkenv.studies.training import fleet_task, fleet_training
 
     for module in (fleet_task, fleet_training):
         monkeypatch.setattr(module, "FLEET_CONFIGS", {"ppo": config, "maskable-ppo": config})

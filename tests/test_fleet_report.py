@@ -14,10 +14,10 @@ from parkenv import make_scenario
 from parkenv.cli.arguments import Machines
 from parkenv.cli.report import Replays, make_report
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.spec import FleetSpec
-from parkenv.evaluation.fleet.experiment import FleetExperiment
-from parkenv.evaluation.report.fleet_recording import DRIVE, FAIL, QUEUE, choose_days
-from parkenv.evaluation.report.page import SCHEMA
+from parkenv.studies.fleet.experiment import FleetExperiment
+from parkenv.studies.report.fleet_recording import DRIVE, FAIL, QUEUE, choose_days
+from parkenv.studies.report.page import SCHEMA
+from parkenv.studies.spec import FleetSpec
 
 
 @pytest.fixture(scope="module")
@@ -148,7 +148,7 @@ def test_a_damaged_folder_is_refused_in_a_line(run, tmp_path, file, old, new, me
 
 
 def test_days_with_too_many_cars_are_not_replayed(run, tmp_path, monkeypatch):
-    monkeypatch.setattr("parkenv.evaluation.report.repetition.MOST_CARS", 15)
+    monkeypatch.setattr("parkenv.studies.report.repetition.MOST_CARS", 15)
     make_report(run, Machines(jobs=1), out=tmp_path / "page.html")
     data = data_of(tmp_path / "page.html")
     assert {its["arrivals_per_hour"] for its in data["fleets"]} == {20.0}

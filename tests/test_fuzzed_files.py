@@ -20,14 +20,6 @@ from test_typed_csv import SESSION
 from tiny_networks import Tiny
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.benchmark import Suite, check_result
-from parkenv.evaluation.experiments.results import ResultFolder
-from parkenv.evaluation.experiments.spec import ExperimentSpec
-from parkenv.evaluation.experiments.surveys import detection_by_distance, read_sessions
-from parkenv.evaluation.fleet.experiment import TABLE
-from parkenv.evaluation.report.page import page_data, write_page
-from parkenv.evaluation.report.run_folder import RunFolder
-from parkenv.evaluation.trips.calibration import Calibration, TripFolder
 from parkenv.files.images import read_image
 from parkenv.files.onnx_file import read_onnx
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
@@ -37,8 +29,16 @@ from parkenv.perception.car_datasets import read_uiuc_test
 from parkenv.perception.car_model import CarModel
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.world.occupancy import OccupancyProcess
-from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.studies.compare.benchmark import Suite, check_result
+from parkenv.studies.fleet.experiment import TABLE
+from parkenv.studies.report.page import page_data, write_page
+from parkenv.studies.report.run_folder import RunFolder
+from parkenv.studies.results import ResultFolder
+from parkenv.studies.sensing.surveys import detection_by_distance, read_sessions
+from parkenv.studies.spec import ExperimentSpec
+from parkenv.studies.trips.calibration import Calibration, TripFolder
+from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.sensor_model import SensorModel
 
 MINI = packaged_lot("mini")

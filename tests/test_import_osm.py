@@ -18,14 +18,14 @@ from typer.testing import CliRunner
 from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.figures.import_picture import save_import_picture
 from parkenv.lots import packaged_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.figures.import_picture import save_import_picture
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
 

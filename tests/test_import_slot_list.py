@@ -10,8 +10,6 @@ from scipy.sparse.csgraph import connected_components
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.figures.import_picture import save_import_picture
 from parkenv.lots import grid_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
 from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
@@ -19,6 +17,8 @@ from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.lots.importers.lot_import import import_lot
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.figures.import_picture import save_import_picture
 from parkenv.world.lot import Mouth
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"

@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from parkenv import make_scenario
+from parkenv.compiled.keyed_random import episode_key, seed_state
 from parkenv.errors import InputError
-from parkenv.evaluation.simulate import simulate
-from parkenv.evaluation.trip_recorder import TripRecorder
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
 from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
 from parkenv.mapping.store import VERSION, MapStore
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
-from parkenv.world.day_error import DayError
-from parkenv.world.keyed_random import episode_key, seed_state
-from parkenv.world.occupancy import Arrival, Forecast
+from parkenv.studies.simulate import simulate
+from parkenv.studies.trip_recorder import TripRecorder
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.process import Arrival, Forecast
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S, HOUR_S

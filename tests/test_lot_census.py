@@ -10,11 +10,11 @@ from command_line import parkenv
 from made_outlines import document, double_row, kerb, row, write
 
 from parkenv.errors import InputError
-from parkenv.evaluation.lot_census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
 from parkenv.lots import grid_lot, import_lot, packaged_lot, write_lot
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.scenarios.build import largest_lots
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.studies.lot_census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
 
 TOWN = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)

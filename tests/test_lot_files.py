@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 
 from parkenv.cli import app
 from parkenv.errors import InputError
-from parkenv.evaluation.figures.lot_picture import save_lot_picture
 from parkenv.files.file_names import is_plain
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.build import LOTS, build
 from parkenv.lots.checks import check_lot
+from parkenv.studies.figures.lot_picture import save_lot_picture
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"

@@ -5,8 +5,8 @@ import pytest
 import shapely
 
 from parkenv.driving.lot_outline import LotOutline
-from parkenv.evaluation.report.lot_data import describe_lot
 from parkenv.lots import packaged_lot
+from parkenv.studies.report.lot_data import describe_lot
 
 
 def polygons(paved):

@@ -16,12 +16,12 @@ from made_outlines import document, double_row, kerb, row, town, write
 
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
-from parkenv.evaluation.lot_survey import ManoeuvreKind, can_park, survey_lot
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.lots.outlines.infer import infer_lot
 from parkenv.lots.outlines.spaces import spaces_from_outlines
 from parkenv.lots.provenance import Provenance, read_provenance
+from parkenv.studies.lot_survey import ManoeuvreKind, can_park, survey_lot
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)

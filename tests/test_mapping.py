@@ -25,7 +25,7 @@ from parkenv.perception.range_scan import scan_from_laser
 from parkenv.perception.ranging import LocatedCars
 from parkenv.perception.slot_filter import P_FREE, P_OCCUPIED, SlotFilter
 from parkenv.world.lot_scene import slot_lot
-from parkenv.world.occupancy import Arrival
+from parkenv.world.occupancy.process import Arrival
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.movers import Movers
 from sim_sensors.rig import Mount

@@ -6,9 +6,9 @@ import pytest
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
-from parkenv.evaluation.experiments.compare import at_occupancy
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import city_lot, grid_lot
+from parkenv.studies.compare.cases import at_occupancy
+from parkenv.studies.episodes import EpisodeRunner
 from planners import make_agent
 from planners.neighborhood import Neighborhoods
 

@@ -13,8 +13,6 @@ from onnx import load as load_onnx
 from onnx import numpy_helper
 
 from parkenv import InputError
-from parkenv.evaluation.experiments.detector_drives import DrivePicture, score_on_drives
-from parkenv.evaluation.experiments.detector_scores import recall_on_crops, score_on
 from parkenv.files.onnx_file import read_onnx
 from parkenv.perception.car_datasets import Crops, LabelledImage
 from parkenv.perception.detector import Detections
@@ -23,6 +21,8 @@ from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
 from parkenv.perception.onnx_outputs import class_columns, decode_centers, guess_layout
 from parkenv.perception.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
 from parkenv.perception.training_crops import SIZES, ExampleMaker
+from parkenv.studies.sensing.detector_drives import DrivePicture, score_on_drives
+from parkenv.studies.sensing.detector_scores import recall_on_crops, score_on
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import Weather
 from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes

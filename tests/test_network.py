@@ -10,9 +10,9 @@ import pytest
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
-from parkenv.evaluation.simulate import simulate
 from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
+from parkenv.studies.simulate import simulate
 from planners.agent import agent_file, make_agent
 from planners.network.agent import NetworkAgent
 from planners.network.features import ACTION_FEATURES, CANDIDATES, PARKING, TOKEN_FEATURES, WAITING, Features
@@ -126,7 +126,7 @@ def test_the_look_ahead_knows_the_shortest_drive_and_walk_where_all_slots_are_fr
 
 def test_numpy_and_torch_agree():
     torch = pytest.importorskip("torch")
-    from parkenv.evaluation.training.network_fit import Network
+    from parkenv.studies.training.network_fit import Network
 
     rng = np.random.default_rng(0)
     n = 32
@@ -257,8 +257,8 @@ def test_without_news_it_does_not_circle_forever():
 
 @pytest.mark.slow
 def test_trainings_are_repeatable_and_learn(tmp_path):
-    from parkenv.evaluation.training.network_training import NetworkTraining
-    from parkenv.evaluation.training.rl_training import MODEL
+    from parkenv.studies.training.network_training import NetworkTraining
+    from parkenv.studies.training.rl_training import MODEL
 
     places = tuple(make_scenario(name) for name in ("mini", "campus"))
     held_out = (make_scenario(grid_lot(4, 10), name="grid", day_error=0.8),)

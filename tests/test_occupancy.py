@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from parkenv.compiled.keyed_random import keyed_exponential, keyed_uniform, world_key
+from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError
-from parkenv.world.keyed_random import keyed_exponential, keyed_uniform, world_key
-from parkenv.world.occupancy import Arrival, ArrivalWindow, OccupancyProcess
-from parkenv.world.pointers import address_of
+from parkenv.world.occupancy.process import Arrival, ArrivalWindow, OccupancyProcess
 from parkenv.world.week import HOUR_S, WEEK_S
 
 NINE = Arrival(9 * HOUR_S)
@@ -194,8 +194,8 @@ def test_a_slot_is_free_from_next_free_on_and_not_before(after, key):
 
 def test_two_processes_make_the_same_world():
     code = (
-        "import numpy as np; from parkenv.world.keyed_random import world_key;"
-        "from parkenv.world.occupancy import Arrival, OccupancyProcess;"
+        "import numpy as np; from parkenv.compiled.keyed_random import world_key;"
+        "from parkenv.world.occupancy.process import Arrival, OccupancyProcess;"
         "p = OccupancyProcess.from_demand(np.linspace(-2, 2, 9), np.zeros(168));"
         "print(p.world(world_key(3, 4), Arrival(0.0)).next_free(np.arange(9), 5e4).tolist())"
     )

@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from scipy.optimize import check_grad
 
+from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
-from parkenv.world.day_error import DayError
-from parkenv.world.day_error_fit import PRIOR_LEVEL, fit_day_error
-from parkenv.world.keyed_random import world_key
-from parkenv.world.occupancy import Arrival, OccupancyProcess
-from parkenv.world.occupancy_fit import Intervals, fit_constant_rates, fit_process, log_likelihood
-from parkenv.world.occupancy_log import OccupancyLog, weekday_of
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.day_error_fit import PRIOR_LEVEL, fit_day_error
+from parkenv.world.occupancy.fit import Intervals, fit_constant_rates, fit_process, log_likelihood
+from parkenv.world.occupancy.log import OccupancyLog, weekday_of
+from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"

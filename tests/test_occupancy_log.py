@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
-from parkenv.world.keyed_random import world_key
-from parkenv.world.occupancy import Arrival, ArrivalWindow
-from parkenv.world.occupancy_log import OccupancyLog, day_class, weekday_of
-from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
+from parkenv.world.occupancy.log import OccupancyLog, day_class, weekday_of
+from parkenv.world.occupancy.process import Arrival, ArrivalWindow
+from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping
 from parkenv.world.week import DAY_S, HOUR_S
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"

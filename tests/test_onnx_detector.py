@@ -13,14 +13,14 @@ from onnx import TensorProto, helper, numpy_helper
 from tiny_networks import SIZE, Tiny
 
 from parkenv import InputError, make_scenario
-from parkenv.evaluation.experiments.results import SETTINGS
-from parkenv.evaluation.experiments.spec import ExperimentSpec, SurveySpec
 from parkenv.files import known_names
 from parkenv.files.onnx_file import parse_onnx
 from parkenv.perception import detector_registry
 from parkenv.perception.detector_registry import detector_version, make_detector
 from parkenv.perception.onnx_detector import OnnxDetector
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.studies.results import SETTINGS
+from parkenv.studies.spec import ExperimentSpec, SurveySpec
 
 CARS = [0, 2]
 NAMES = ("Car", "person", "truck")

@@ -18,11 +18,11 @@ from parkenv.cli import app
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
-from parkenv.evaluation.bench import drive as bench_drive
-from parkenv.evaluation.bench.drive import bare_physics, environment_steps
-from parkenv.evaluation.experiments.workers import Workers
-from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.lots import packaged_lot, read_lot, write_lot
+from parkenv.studies.bench import drive as bench_drive
+from parkenv.studies.bench.drive import bare_physics, environment_steps
+from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
+from parkenv.studies.workers import Workers
 from planners.driving.car_path import CarPath
 from planners.driving.clearance import clearance, is_collision_free, room_at
 from planners.driving.hybrid_astar import SearchSettings, plan_path
@@ -279,7 +279,7 @@ def test_where_no_path_is_the_car_stays_and_that_is_said():
 
 
 def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
-    from parkenv.evaluation.trips import parking_runs
+    from parkenv.studies.trips import parking_runs
 
     no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
     monkeypatch.setattr(parking_runs, "make_parking_agent", lambda name: ParkingAgent(search=no_room))

@@ -14,17 +14,17 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from parkenv import InputError, SensorModel, make_scenario, make_scenarios
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.evaluation.bench.env import grids
-from parkenv.evaluation.experiments.spec import ExperimentSpec, TrainingSpec
-from parkenv.evaluation.training.cloning import clone
-from parkenv.evaluation.training.search_task import SearchTask
-from parkenv.evaluation.training.search_training import SearchTraining, episode_times
 from parkenv.lots import write_lot
 from parkenv.scenarios.places import by_size, lot_share, open_places, place_of_episode, split_places
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
-from parkenv.world.day_error import DayError
-from parkenv.world.real_week import DAY_ERROR, real_week_occupancy
-from parkenv.world.typical_week import typical_occupancy
+from parkenv.studies.bench.env import grids
+from parkenv.studies.spec import ExperimentSpec, TrainingSpec
+from parkenv.studies.training.cloning import clone
+from parkenv.studies.training.search_task import SearchTask
+from parkenv.studies.training.search_training import SearchTraining, episode_times
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.real_week import DAY_ERROR, real_week_occupancy
+from parkenv.world.occupancy.typical_week import typical_occupancy
 from planners.model_file import ModelCard
 
 LOTS = grids(6, seed=1)
@@ -321,14 +321,14 @@ def small(monkeypatch):
     """Fewer environments, and searches of at most 60 decisions: an untrained agent drives in circles."""
     import dataclasses
 
-    from parkenv.evaluation.training.configs import SEARCH_CONFIGS
+    from parkenv.studies.training.configs import SEARCH_CONFIGS
 
     config = SEARCH_CONFIGS["ppo"]
     few = dataclasses.replace(
         config, n_envs=16, settings={**config.settings, "batch_size": 256, "n_steps": 32}
     )
     monkeypatch.setitem(SEARCH_CONFIGS, "ppo", few)
-    monkeypatch.setattr("parkenv.evaluation.training.search_training.MAX_STEPS", 60)
+    monkeypatch.setattr("parkenv.studies.training.search_training.MAX_STEPS", 60)
 
 
 def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
@@ -384,10 +384,10 @@ def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         save(*arguments)
 
-    from parkenv.evaluation.training.checkpoint import save_checkpoint as save
+    from parkenv.studies.training.checkpoint import save_checkpoint as save
 
     with monkeypatch.context() as patch:
-        patch.setattr("parkenv.evaluation.training.rl_training.save_checkpoint", stopped)
+        patch.setattr("parkenv.studies.training.rl_training.save_checkpoint", stopped)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, tmp_path / "resumed")
     resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
@@ -434,7 +434,7 @@ def test_bad_options_of_held_out_places_are_one_line(tmp_path, options, message)
 
 @pytest.mark.slow
 def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
-    monkeypatch.setattr("parkenv.evaluation.training.search_training.clone", partial(clone, updates=50))
+    monkeypatch.setattr("parkenv.studies.training.search_training.clone", partial(clone, updates=50))
     out = folder / "trained"
     done = parkenv(
         "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 20_000, "--trainings", 1,

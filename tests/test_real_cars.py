@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from parkenv.evaluation.experiments.detector_scores import score_on
 from parkenv.perception.car_datasets import LabelledImage, read_crop_folder, read_uiuc_training
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.cross_validation import FALSE_POSITIVES, cross_validated, score_on_crops
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.training import TrainingSettings
+from parkenv.studies.sensing.detector_scores import score_on
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 UIUC, KITTI = DATA / "uiuc_cars_train", DATA / "kitti_crops" / "vehicles_and_background.zip"

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from parkenv import OccupancyLog, RecordedOccupancy, make_scenario
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.statistics import mean_interval
 from parkenv.lots import read_lot
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.statistics import mean_interval
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 MAP, LOG = DATA / "dlp" / "parking_map.yml", DATA / "cnr_ext" / "occupancy_15_days.csv.gz"

@@ -9,12 +9,12 @@ from gymnasium.utils.env_checker import check_env
 
 import parkenv  # noqa: F401  (registers the environments)
 from parkenv import make_scenario
-from parkenv.envs import rendering
-from parkenv.envs.rendering import SearchRenderer, belief_colors, clock
-from parkenv.envs.window import Window
 from parkenv.lots import city_lot
+from parkenv.show import rendering
+from parkenv.show.rendering import SearchRenderer, belief_colors, clock
+from parkenv.show.window import Window
 from parkenv.world.lot import PARK, Lane, ParkingLot
-from parkenv.world.occupancy import Arrival, OccupancyProcess
+from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 
 
 def row_lot(goal=(40.0, 0.0), vertical=False):

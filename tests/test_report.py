@@ -15,13 +15,13 @@ from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.cli.arguments import Machines
 from parkenv.cli.report import Replays, make_report
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.results import episode_key
-from parkenv.evaluation.report.page import SCHEMA, page_data
-from parkenv.evaluation.report.run_folder import RunFolder
-from parkenv.evaluation.report.search_recording import Encounter, choose, record
-from parkenv.evaluation.report.tables import table_of
 from parkenv.lots import packaged_lot, write_lot
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.report.page import SCHEMA, page_data
+from parkenv.studies.report.run_folder import RunFolder
+from parkenv.studies.report.search_recording import Encounter, choose, record
+from parkenv.studies.report.tables import table_of
+from parkenv.studies.results import episode_key
 from parkenv.world.lot import PARK
 from planners import make_agent
 

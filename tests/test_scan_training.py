@@ -16,15 +16,15 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.scan_observation import FIXED, PER_SCAN, SCANS, WAVELENGTHS_M, ScanObservation, scans_space
 from parkenv.envs.scan_vector import StackedScanVectorEnv
 from parkenv.envs.search_sb3 import SearchVecEnv
-from parkenv.evaluation.experiments.agent_spec import AgentSpec
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.fleet.drivers import driver_of
-from parkenv.evaluation.simulate import make_search, simulate
-from parkenv.evaluation.training.checkpoint import save_checkpoint
-from parkenv.evaluation.training.configs import SCAN_CONFIGS
-from parkenv.evaluation.training.rl_training import train_one
-from parkenv.evaluation.training.search_training import SearchTraining, episode_times
-from parkenv.evaluation.trips.driven_search import DrivenSearch
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.fleet.drivers import driver_of
+from parkenv.studies.simulate import make_search, simulate
+from parkenv.studies.training.checkpoint import save_checkpoint
+from parkenv.studies.training.configs import SCAN_CONFIGS
+from parkenv.studies.training.rl_training import train_one
+from parkenv.studies.training.search_training import SearchTraining, episode_times
+from parkenv.studies.trips.driven_search import DrivenSearch
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
 from planners.model_file import FIXED_OF_SCANS, NUMBERS_PER_SCAN, ModelCard, save_model
@@ -115,7 +115,7 @@ def small(monkeypatch):
     sizes = {"batch_size": 128, "n_steps": 16, "policy_kwargs": {"net_arch": [32]}}
     changed = dataclasses.replace(config, n_envs=8, settings={**config.settings, **sizes})
     monkeypatch.setitem(SCAN_CONFIGS, "maskable-ppo", changed)
-    monkeypatch.setattr("parkenv.evaluation.training.search_training.MAX_STEPS", 60)
+    monkeypatch.setattr("parkenv.studies.training.search_training.MAX_STEPS", 60)
 
 
 def training_of(steps):
@@ -135,7 +135,7 @@ def test_a_resumed_training_equals_an_unbroken_one_and_its_model_searches_in_the
 
     training = training_of(384)
     with monkeypatch.context() as patch:
-        patch.setattr("parkenv.evaluation.training.rl_training.save_checkpoint", killed)
+        patch.setattr("parkenv.studies.training.rl_training.save_checkpoint", killed)
         with pytest.raises(KeyboardInterrupt):
             train_one(training, 0, tmp_path / "resumed")
     resumed, whole = (train_one(training, 0, tmp_path / name).curve for name in ("resumed", "whole"))

@@ -7,10 +7,10 @@ from gymnasium.vector import AutoresetMode
 
 import parkenv
 from parkenv import InputError
+from parkenv.compiled import numpy_streams
 from parkenv.envs.scan_vector import ScanSearchVectorEnv
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot_scene import slot_lot
-from sim_sensors import numpy_streams
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 

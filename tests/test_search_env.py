@@ -17,12 +17,12 @@ from hypothesis import strategies as st
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
+from parkenv.engine.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
-from parkenv.world.decay import decay_factor
 from parkenv.world.lot import PARK
+from parkenv.world.occupancy.decay import decay_factor
 
 ENV_IDS = [name for name in gym.registry if name.startswith("parkenv/Search")]
 

@@ -10,10 +10,10 @@ from search_reference import ReferenceSearch
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.lots import grid_lot
-from parkenv.world.day_error import DayError
-from parkenv.world.occupancy import ArrivalWindow
-from parkenv.world.occupancy_log import OccupancyLog
-from parkenv.world.recorded_occupancy import RecordedOccupancy
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.process import ArrivalWindow
+from parkenv.world.occupancy.recorded import RecordedOccupancy
 
 LIMIT = 40
 N_SEARCHES = 3

@@ -13,8 +13,8 @@ from command_line import parkenv
 from parkenv import Scenario, make_scenario
 from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.trips.sensor_log import GRID_EVERY, record_search, record_session, sensor_log
 from parkenv.mapping.survey import Survey, SurveyFrame, SurveySettings
+from parkenv.studies.trips.sensor_log import GRID_EVERY, record_search, record_session, sensor_log
 from planners import make_agent
 
 
@@ -81,7 +81,7 @@ def test_a_failed_recording_leaves_nothing(mini: Scenario, tmp_path: Path) -> No
 def test_without_the_viewer_it_says_how_to_get_it(
     mini: Scenario, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("parkenv.evaluation.trips.sensor_log.find_spec", lambda _: None)
+    monkeypatch.setattr("parkenv.studies.trips.sensor_log.find_spec", lambda _: None)
     rig = SearchPerceptionEnv(mini).rig
     with pytest.raises(InputError, match=r"parkenv\[viewer\]"), sensor_log(tmp_path / "a.rrd", mini.lot, rig):
         pass

@@ -9,8 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from parkenv import InputError, SensorBand, SensorModel, Traffic, make_scenario
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.sensor_model_fit import BAND_ENDS, ObservationCounts, count_observations
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.sensing.sensor_model_fit import BAND_ENDS, ObservationCounts, count_observations
 from parkenv.world.lot import PARK
 from parkenv.world.sensor_model import SENSOR_MODEL_NAMES
 from planners import make_agent

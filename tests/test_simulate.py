@@ -7,9 +7,9 @@ import pytest
 from gymnasium.wrappers import TimeLimit
 
 from parkenv import make_scenario
-from parkenv.evaluation.simulate import EpisodeResult, Observer, Step, simulate
+from parkenv.compiled.jit import seconds_spent
+from parkenv.studies.simulate import EpisodeResult, Observer, Step, simulate
 from planners import make_agent
-from sim_sensors.compilation import seconds_spent
 
 MINI = make_scenario("mini")
 

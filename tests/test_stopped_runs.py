@@ -18,11 +18,11 @@ from command_line import parkenv
 from stopped_runs import COMMANDS, Run, finished, result_of, resume, trials
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments import workers
-from parkenv.evaluation.experiments.workers import Workers
 from parkenv.files import atomic_write
 from parkenv.files.atomic_write import append_text
 from parkenv.files.folder_lock import LOCK, folder_lock
+from parkenv.studies import workers
+from parkenv.studies.workers import Workers
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 
@@ -200,7 +200,7 @@ def test_workers_end_with_their_killed_parent(tmp_path, thread):
     script = (
         "import sys, threading, killed_once\n"
         "from functools import partial\n"
-        "from parkenv.evaluation.experiments.workers import Workers\n"
+        "from parkenv.studies.workers import Workers\n"
         "def work():\n"
         f"    list(Workers(2).results([partial(killed_once.wait, {str(tmp_path)!r})] * 2))\n"
         "other = threading.Thread(target=work)\n"

@@ -8,13 +8,13 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
-from parkenv.evaluation.experiments.surveys import map_error, run_survey
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings, drive_together
 from parkenv.mapping.survey_score import METHODS
 from parkenv.perception.pipeline import PerceptionPipeline
-from parkenv.world.occupancy import ArrivalWindow
+from parkenv.studies.sensing.surveys import map_error, run_survey
+from parkenv.world.occupancy.process import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 

@@ -30,20 +30,20 @@ from parkenv.envs.local_observation import LocalObservation, local_space
 from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.compare import Case
-from parkenv.evaluation.experiments.spec import TrainingSpec
-from parkenv.evaluation.figures.learning_curves import across_seeds, save_learning_curves
-from parkenv.evaluation.training.checkpoint import save_checkpoint
-from parkenv.evaluation.training.cloning import Demonstrations, clone
-from parkenv.evaluation.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
-from parkenv.evaluation.training.curve_file import read_curve
-from parkenv.evaluation.training.rl_training import TRAINING_SEEDS, train_one
-from parkenv.evaluation.training.search_task import SearchTask
-from parkenv.evaluation.training.search_training import SearchTraining, episode_times, search_times
-from parkenv.evaluation.training.training_task import curves_beside
-from parkenv.evaluation.trips.driven_search import DrivenSearch
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.world.day_error import DayError
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
+from parkenv.studies.spec import TrainingSpec
+from parkenv.studies.training.checkpoint import save_checkpoint
+from parkenv.studies.training.cloning import Demonstrations, clone
+from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
+from parkenv.studies.training.curve_file import read_curve
+from parkenv.studies.training.rl_training import TRAINING_SEEDS, train_one
+from parkenv.studies.training.search_task import SearchTask
+from parkenv.studies.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.studies.training.training_task import curves_beside
+from parkenv.studies.trips.driven_search import DrivenSearch
+from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
 from planners.model_file import FIXED_NUMBERS, NUMBERS_PER_SLOT, save_model
@@ -186,7 +186,7 @@ def stop_training(training, folder, monkeypatch):
         save_checkpoint(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr("parkenv.evaluation.training.rl_training.save_checkpoint", killed)
+        patch.setattr("parkenv.studies.training.rl_training.save_checkpoint", killed)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, folder)
 
@@ -200,7 +200,7 @@ def small_config(algorithm, monkeypatch):
     }
     small = dataclasses.replace(config, n_envs=16, settings={**config.settings, **sizes})
     monkeypatch.setitem(SEARCH_CONFIGS, algorithm, small)
-    monkeypatch.setattr("parkenv.evaluation.training.search_training.MAX_STEPS", 60)
+    monkeypatch.setattr("parkenv.studies.training.search_training.MAX_STEPS", 60)
 
 
 class Waits:
@@ -211,7 +211,7 @@ class Waits:
 
 
 def test_a_planner_that_finishes_nothing_cannot_be_cloned(monkeypatch):
-    monkeypatch.setattr("parkenv.evaluation.training.cloning.make_agent", lambda *_: Waits())
+    monkeypatch.setattr("parkenv.studies.training.cloning.make_agent", lambda *_: Waits())
     with pytest.raises(InputError, match="finished none of 1 searches on mini: nothing to clone"):
         Demonstrations.collect("waits", SCENARIO, [5_000_000])
 

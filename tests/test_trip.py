@@ -13,15 +13,17 @@ from typer.testing import CliRunner
 
 from parkenv import InputError, make_scenario
 from parkenv.cli import app
+from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
 from parkenv.driving.encounters import PREDICTION_TIMES_S
 from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
-from parkenv.evaluation.experiments.compare import blind_scenario
-from parkenv.evaluation.simulate import Observer
-from parkenv.evaluation.trips.calibration import (
+from parkenv.lots import packaged_lot
+from parkenv.studies.compare.cases import blind_scenario
+from parkenv.studies.simulate import Observer
+from parkenv.studies.trips.calibration import (
     OBSERVED,
     UNOBSERVED,
     Calibration,
@@ -30,14 +32,12 @@ from parkenv.evaluation.trips.calibration import (
     calibrate,
     drive_trips,
 )
-from parkenv.evaluation.trips.driven_search import DrivenSearch, DrivenSearchEnv
-from parkenv.evaluation.trips.executor import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, ParkingAttempt
-from parkenv.evaluation.trips.lot_driver import DrivingStyle, LotDriver
-from parkenv.evaluation.trips.sensor_log import record_trip
-from parkenv.lots import packaged_lot
-from parkenv.world.keyed_random import world_key
+from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
+from parkenv.studies.trips.executor import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, ParkingAttempt
+from parkenv.studies.trips.lot_driver import DrivingStyle, LotDriver
+from parkenv.studies.trips.sensor_log import record_trip
 from parkenv.world.lot_scene import LotScenes
-from parkenv.world.occupancy import OccupancyProcess
+from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
 from planners.driving.car_path import CarPath

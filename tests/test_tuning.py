@@ -7,9 +7,9 @@ from small_lots import small_lot
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.evaluation.experiments.episodes import EpisodeRunner
 from parkenv.lots import packaged_lot
-from parkenv.world.day_error import DayError
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.world.occupancy.day_error import DayError
 from planners import make_agent
 from planners.bounds.expected_time import expected_time
 from planners.thesis.tuning import tune_failure_cost

@@ -3,9 +3,9 @@
 import pytest
 
 from parkenv import InputError
-from parkenv.evaluation.experiments.results import read_rows
-from parkenv.evaluation.experiments.surveys import ERROR_COLUMNS, detection_by_distance, read_sessions
-from parkenv.evaluation.training.curve_file import read_curve
+from parkenv.studies.results import read_rows
+from parkenv.studies.sensing.surveys import ERROR_COLUMNS, detection_by_distance, read_sessions
+from parkenv.studies.training.curve_file import read_curve
 
 SESSION = {
     "key": "mini/laser/any/10m/0m0rad/seed0/00000", "weather": "dusk", "time_s": "291974.3", "parked": "5",

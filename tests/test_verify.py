@@ -8,12 +8,12 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.workers import Workers
-from parkenv.evaluation.verify import line, looks
-from parkenv.evaluation.verify.line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
-from parkenv.evaluation.verify.rows import certain_row, disagreeing, mean_row
-from parkenv.evaluation.verify.verification import tasks_of, verify
 from parkenv.files.known_names import VERIFY_CASES
+from parkenv.studies.verify import line, looks
+from parkenv.studies.verify.line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
+from parkenv.studies.verify.rows import certain_row, disagreeing, mean_row
+from parkenv.studies.verify.verification import tasks_of, verify
+from parkenv.studies.workers import Workers
 from planners.agent import make_agent
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv.envs.fleet_rules import RULES
-from parkenv.evaluation.verify import balance, blocking, entry, game, stays, strategies
-from parkenv.evaluation.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
-from parkenv.evaluation.verify.rows import disagreeing
+from parkenv.engine.fleet_rules import RULES
+from parkenv.studies.verify import balance, blocking, entry, game, stays, strategies
+from parkenv.studies.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
+from parkenv.studies.verify.rows import disagreeing
 from parkenv.world.demand import ExponentialTime
 from parkenv.world.week import HOUR_S
 

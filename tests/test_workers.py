@@ -12,7 +12,7 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.evaluation.experiments.workers import HERE, Workers, kill_workers
+from parkenv.studies.workers import HERE, Workers, kill_workers
 
 CLUSTERS = ("ray", "dask")
 

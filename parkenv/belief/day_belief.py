@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief, decay_to_prior
-from parkenv.world.day_error import DayError, centred_logits
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
+from parkenv.world.occupancy.day_error import DayError, centred_logits
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
@@ -59,7 +59,7 @@ class DayBelief:
 
     Args:
         belief: belief about these slots before any observation.
-        nearness: (n_slots,) see `parkenv.world.day_error.nearness`; over the whole lot.
+        nearness: (n_slots,) see `parkenv.world.occupancy.day_error.nearness`; over the whole lot.
         certain: whether the forecast is right on every day, whatever is observed.
         rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
             None: there are no such cars.
@@ -67,7 +67,7 @@ class DayBelief:
     Examples:
         The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
 
-        >>> from parkenv.world.day_error import nearness
+        >>> from parkenv.world.occupancy.day_error import nearness
         >>> belief = SlotBelief.of_forecast(np.full(40, 0.6), np.zeros(40))
         >>> belief.day_error = np.array([0.8, 0.0])
         >>> day = DayBelief(belief, nearness(np.arange(40.0)))

@@ -10,9 +10,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-from parkenv.world.decay import decay_factor
-from sim_sensors.compilation import compiled
+from parkenv.world.occupancy.decay import decay_factor
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
@@ -44,7 +44,7 @@ class SlotBelief:
             `observed_at`, time of that observation, s since the search began; -1 if there was none.
         time: current time, s since the search began.
         day_error: (2,) float, logits, how far whole days differ from the forecast: standard deviations over days of
-            the level and of the slope to the goal; see `parkenv.world.day_error`.
+            the level and of the slope to the goal; see `parkenv.world.occupancy.day_error`.
 
     Examples:
         Slot 1 is observed free and stays likely to be free for a while.

@@ -124,7 +124,7 @@ def main() -> None:
                 # What was interrupted could not close its files.
                 warnings.simplefilter("ignore", ResourceWarning)
     if received:
-        if workers := sys.modules.get("parkenv.evaluation.experiments.workers"):
+        if workers := sys.modules.get("parkenv.studies.workers"):
             workers.kill_workers()
         code = 128 + received[0]
     sys.exit(code if isinstance(code, int) else 0)

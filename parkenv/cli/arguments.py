@@ -44,10 +44,10 @@ from parkenv.files.file_names import file_name
 from parkenv.files.known_names import BackendName, ForecastFrom
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.spec import Grid, Workplace
-    from parkenv.evaluation.experiments.workers import Workers
     from parkenv.files.spec_file import Spec
     from parkenv.scenarios.spec import ScenarioSpec, TrafficSpec
+    from parkenv.studies.spec import Grid, Workplace
+    from parkenv.studies.workers import Workers
 
     SpecT = TypeVar("SpecT", bound=Spec)
 
@@ -271,7 +271,7 @@ class Costs:
         Raises:
             InputError: the text has no numbers, or a number is out of range.
         """
-        from parkenv.evaluation.experiments.spec import FAILURE_COST_SWEEP
+        from parkenv.studies.spec import FAILURE_COST_SWEEP
 
         if self.failure_cost == "sweep":
             base = base.changed(failure_s=FAILURE_COST_SWEEP)
@@ -337,7 +337,7 @@ def workers_of(place: Machines | Workplace) -> Workers:
     Raises:
         InputError: the options are incompatible.
     """
-    from parkenv.evaluation.experiments.workers import Workers
+    from parkenv.studies.workers import Workers
 
     return Workers(place.jobs or None, place.backend or "loky", place.address)
 
@@ -417,7 +417,7 @@ def one_agent(agents: str) -> str:
     Raises:
         InputError: there are several agents, or none.
     """
-    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.studies.agent_spec import split_agents
 
     names = split_agents(agents)
     if len(names) != 1:
@@ -431,7 +431,7 @@ def saved(folder: Path, kind: type[SpecT]) -> SpecT:
     Raises:
         InputError: there is none.
     """
-    from parkenv.evaluation.experiments.spec import SPEC_FILE
+    from parkenv.studies.spec import SPEC_FILE
 
     file = folder / SPEC_FILE
     if not file.exists():

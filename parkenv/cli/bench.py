@@ -10,7 +10,7 @@ from parkenv.cli.tables import make_console, make_table, save_summary
 from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.bench.rows import BenchRow
+    from parkenv.studies.bench.rows import BenchRow
 
 PARTS = {
     "sensors": "sensor_rows",
@@ -20,7 +20,7 @@ PARTS = {
     "drive": "drive_rows",
     "fleet": "fleet_rows",
 }
-"""Modules of `parkenv.evaluation.bench`, and the function of each that measures."""
+"""Modules of `parkenv.studies.bench`, and the function of each that measures."""
 
 
 def bench(
@@ -44,7 +44,7 @@ def bench(
         seed (N >= 0): Of the lots and the noise.
         out, -o (DIR): Folder for summary.json, and a table of each part for a page.  [default: none]
     """
-    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.studies.results import make_folder
 
     chosen = parts or list(PARTS)
     for part in chosen:
@@ -57,7 +57,7 @@ def bench(
     rows: list[BenchRow] = []
     for part in chosen:
         with console.status(f"Measuring {part}"):
-            measure = getattr(import_module(f"parkenv.evaluation.bench.{part}"), PARTS[part])
+            measure = getattr(import_module(f"parkenv.studies.bench.{part}"), PARTS[part])
             measured = measure(seed, seconds)
         rows += measured
         if out is not None:

@@ -17,7 +17,7 @@ from parkenv.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.evaluation.experiments.spec import BenchmarkSpec
+    from parkenv.studies.spec import BenchmarkSpec
 
 RESULT = "result.json"
 PLACES = "-places"
@@ -54,8 +54,8 @@ def run(
             trained on (the suite v2-places).
         by (TEXT): Who submits the result: a name, an address of the code.  [default: nobody]
     """
-    from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import BenchmarkSpec
+    from parkenv.studies.agent_spec import split_agents
+    from parkenv.studies.spec import BenchmarkSpec
 
     suite += PLACES if places else ""
     out = out or Path("results") / suite
@@ -74,11 +74,11 @@ def run_suite(spec: BenchmarkSpec, out: Path, folder: args.ReportedRun) -> None:
     Raises:
         InputError: an agent cannot be made, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.benchmark import Suite, result_of
-    from parkenv.evaluation.experiments.compare import run_cases
-    from parkenv.evaluation.experiments.experiment import agent_fingerprints
-    from parkenv.evaluation.experiments.results import ResultFolder, write_summary
-    from parkenv.evaluation.experiments.spec import SPEC_FILE
+    from parkenv.studies.compare.benchmark import Suite, result_of
+    from parkenv.studies.compare.cases import run_cases
+    from parkenv.studies.compare.experiment import agent_fingerprints
+    from parkenv.studies.results import ResultFolder, write_summary
+    from parkenv.studies.spec import SPEC_FILE
 
     suite = Suite.named(spec.suite)
     cases = suite.cases(spec.agents)
@@ -125,7 +125,7 @@ def check(results: list[Path], /) -> None:
     Options:
         results (FILE): Result files.
     """
-    from parkenv.evaluation.experiments.benchmark import check_result
+    from parkenv.studies.compare.benchmark import check_result
 
     console = make_console()
     with console.status("Checking"):
@@ -149,10 +149,10 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
         results (FILE|DIR): Result files, or folders with result.json files in them.
         out, -o (FILE.html): The page.
     """
-    from parkenv.evaluation.experiments.benchmark import check_result
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.report.benchmark_page import benchmark_data
-    from parkenv.evaluation.report.page import write_page
+    from parkenv.studies.compare.benchmark import check_result
+    from parkenv.studies.report.benchmark_page import benchmark_data
+    from parkenv.studies.report.page import write_page
+    from parkenv.studies.results import make_folder
 
     files = [each for path in results for each in (sorted(path.rglob(RESULT)) if path.is_dir() else [path])]
     if not files:
@@ -177,7 +177,7 @@ def show(suite: str = "v2", /, places: bool = False) -> None:
         suite (SUITE): The suite.  [default: v2]
         places: Show the places of the suite instead of its packaged scenarios.
     """
-    from parkenv.evaluation.experiments.benchmark import SUITES, Suite
+    from parkenv.studies.compare.benchmark import SUITES, Suite
 
     its = Suite.named(suite + PLACES if places else suite)
     console = make_console()
@@ -210,7 +210,7 @@ def show(suite: str = "v2", /, places: bool = False) -> None:
 
 
 def _print(console: Console, results: list[dict[str, Any]]) -> None:
-    from parkenv.evaluation.experiments.benchmark import by_group
+    from parkenv.studies.compare.benchmark import by_group
 
     lines = []
     columns: list[str] = []

@@ -11,9 +11,9 @@ from parkenv.cli import arguments as args
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError
-from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import RigName
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -57,13 +57,13 @@ def calibrate(
     Results:
         resume: Go on with the trips in --out.
     """
-    from parkenv.evaluation.experiments.agent_spec import AgentSpec
-    from parkenv.evaluation.experiments.experiment import agent_fingerprints, fingerprints, flat_tables
-    from parkenv.evaluation.trips import calibration
-    from parkenv.evaluation.trips.driven_search import DrivenSearch
-    from parkenv.evaluation.trips.lot_driver import DrivingStyle
     from parkenv.perception.detector_registry import detector_version
     from parkenv.scenarios.build import build
+    from parkenv.studies.agent_spec import AgentSpec
+    from parkenv.studies.compare.experiment import agent_fingerprints, fingerprints, flat_tables
+    from parkenv.studies.trips import calibration
+    from parkenv.studies.trips.driven_search import DrivenSearch
+    from parkenv.studies.trips.lot_driver import DrivingStyle
     from parkenv.world.scenario import KMH
 
     spec = traffic.on(world.spec(scenario))
@@ -147,14 +147,14 @@ def trip(
         notice (M): Metres along its path at which the car notices at the latest that it would drive into a taken slot.
         v_drive_kmh (V): Speed limit on the lanes, km/h.  [default: the scenario's, 10]
     """
-    from parkenv.evaluation.experiments.compare import blind_scenario
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.picture_files import save_film
-    from parkenv.evaluation.figures.trip_pictures import COLORS, FPS, film_trip
-    from parkenv.evaluation.trips.driven_search import DrivenSearch
-    from parkenv.evaluation.trips.lot_driver import DrivingStyle
-    from parkenv.evaluation.trips.sensor_log import record_trip, require_viewer, sensor_log
     from parkenv.scenarios.build import build
+    from parkenv.studies.compare.cases import blind_scenario
+    from parkenv.studies.figures.picture_files import save_film
+    from parkenv.studies.figures.trip_pictures import COLORS, FPS, film_trip
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.trips.driven_search import DrivenSearch
+    from parkenv.studies.trips.lot_driver import DrivingStyle
+    from parkenv.studies.trips.sensor_log import record_trip, require_viewer, sensor_log
     from parkenv.world.scenario import KMH
 
     if out.suffix.lower() != ".gif":

@@ -11,12 +11,12 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.evaluation.plurals import plural
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from parkenv.evaluation.experiments.spec import CommuteSpec
+    from parkenv.studies.spec import CommuteSpec
 
 PICTURE = "commute.png"
 
@@ -85,8 +85,8 @@ def commute(
     Results:
         figures: Draw the picture.  [default: figures]
     """
-    from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import CommuteSpec
+    from parkenv.studies.agent_spec import split_agents
+    from parkenv.studies.spec import CommuteSpec
 
     base = CommuteSpec()
     if folder.resume:
@@ -110,7 +110,7 @@ def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> No
         InputError: the commute cannot be run, or the folder cannot be used.
         KeyboardInterrupt: the run was interrupted; the results of finished days are printed and in the folder.
     """
-    from parkenv.evaluation.experiments.commute import run_commute
+    from parkenv.studies.compare.commute import run_commute
 
     console = make_console()
     result = run_into(out, run_commute, spec, folder, console, doing="Driving", unit="searches")
@@ -119,7 +119,7 @@ def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> No
     if not result.complete:
         raise KeyboardInterrupt
     if spec.figures:
-        from parkenv.evaluation.figures.commute_curves import save_commute_curves
+        from parkenv.studies.figures.commute_curves import save_commute_curves
 
         with console.status("Drawing the picture"):
             save_commute_curves(result.rows, out / PICTURE)

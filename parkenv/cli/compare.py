@@ -18,14 +18,14 @@ from parkenv.cli.tables import (
 )
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
-from parkenv.evaluation.plurals import plural
 from parkenv.files.known_names import RigName
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from parkenv.evaluation.experiments.compare import Case
-    from parkenv.evaluation.experiments.spec import ExperimentSpec
+    from parkenv.studies.compare.cases import Case
+    from parkenv.studies.spec import ExperimentSpec
 
 Row = dict[str, Any]
 
@@ -93,9 +93,9 @@ def compare(
     Results:
         figures: Draw figures.  [default: figures]
     """
-    from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import FAILURE_COST_SWEEP, ExperimentSpec
     from parkenv.scenarios.build import largest_lots
+    from parkenv.studies.agent_spec import split_agents
+    from parkenv.studies.spec import FAILURE_COST_SWEEP, ExperimentSpec
 
     sweep = costs.failure_cost == "sweep"
     if folder.resume:
@@ -135,12 +135,12 @@ def run_comparison(
         InputError: the experiment cannot be run, or the folder cannot be used.
         KeyboardInterrupt: the run was interrupted; the results of finished episodes are printed and in the folder.
     """
-    from parkenv.evaluation.experiments.experiment import run_experiment
-    from parkenv.evaluation.figures.registry import draw_figures
+    from parkenv.studies.compare.experiment import run_experiment
+    from parkenv.studies.figures.registry import draw_figures
     from parkenv.world.scenario import KMH
 
     if rerun is not None:
-        from parkenv.evaluation.trips.sensor_log import require_viewer
+        from parkenv.studies.trips.sensor_log import require_viewer
 
         if spec.rig is None:
             raise InputError("--rerun records what sensors measure: add --rig laser")
@@ -180,7 +180,7 @@ def setting_count(rows: list[Row]) -> int:
 def _record(case: Case, seeds: range, path: Path) -> None:
     """Record the first episode of a case with its sensors."""
     from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.evaluation.trips.sensor_log import record_search, sensor_log
+    from parkenv.studies.trips.sensor_log import record_search, sensor_log
     from planners.agent import make_agent
 
     env = SearchPerceptionEnv(case.scenario, rig=str(case.rig), detector=case.detector)

@@ -14,17 +14,17 @@ from parkenv.cli.compare import result_tables
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, print_recorded, progress_bar
-from parkenv.evaluation.plurals import plural
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.spec import DemoSpec
-    from parkenv.evaluation.experiments.workers import Workers
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SurveySettings
+    from parkenv.studies.spec import DemoSpec
+    from parkenv.studies.workers import Workers
     from parkenv.world.scenario import Scenario
 
 FIGURES = ("time_split", "time_distribution")
-"""Names of figures in `parkenv.evaluation.figures.registry`."""
+"""Names of figures in `parkenv.studies.figures.registry`."""
 FILM = "search.gif"
 NEXT = (
     (
@@ -79,8 +79,8 @@ def demo(
     Sensors:
         every (M >= 0.1): Metres between captures.  [default: 2.5]
     """
-    from parkenv.evaluation.experiments.demo import QUICK
-    from parkenv.evaluation.experiments.spec import DemoSpec
+    from parkenv.studies.compare.demo import QUICK
+    from parkenv.studies.spec import DemoSpec
 
     settings = (QUICK if quick else {}) | args.not_none(sessions=sessions, episodes=episodes, every=every)
     spec = DemoSpec().changed(
@@ -96,18 +96,18 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.compare import run_cases, table
-    from parkenv.evaluation.experiments.demo import AGENTS, FILMED, demo_cases, demo_survey
-    from parkenv.evaluation.experiments.results import ResultFolder
-    from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import run_survey, summarize
-    from parkenv.evaluation.experiments.warm_up import warm_up_tasks
-    from parkenv.evaluation.figures.registry import ComparisonResults, draw_figures
-    from parkenv.evaluation.figures.search_film import film_search
-    from parkenv.evaluation.figures.survey_pictures import save_detections, save_session
-    from parkenv.evaluation.report.drive_recording import record_drive
-    from parkenv.evaluation.trips.sensor_log import require_viewer
     from parkenv.mapping.store import MapStore
+    from parkenv.studies.compare.cases import run_cases, table
+    from parkenv.studies.compare.demo import AGENTS, FILMED, demo_cases, demo_survey
+    from parkenv.studies.compare.warm_up import warm_up_tasks
+    from parkenv.studies.figures.registry import ComparisonResults, draw_figures
+    from parkenv.studies.figures.search_film import film_search
+    from parkenv.studies.figures.survey_pictures import save_detections, save_session
+    from parkenv.studies.report.drive_recording import record_drive
+    from parkenv.studies.results import ResultFolder
+    from parkenv.studies.sensing.surveys import run_survey, summarize
+    from parkenv.studies.spec import SPEC_FILE
+    from parkenv.studies.trips.sensor_log import require_viewer
 
     if rerun is not None:
         require_viewer()
@@ -188,10 +188,10 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
 
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
     """Draw the map at the middle of the arrival window, and the true probabilities."""
-    from parkenv.evaluation.experiments.surveys import mean_occupancy
-    from parkenv.evaluation.figures.survey_pictures import save_map
     from parkenv.mapping.inference import predict
-    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.studies.figures.survey_pictures import save_map
+    from parkenv.studies.sensing.surveys import mean_occupancy
+    from parkenv.world.occupancy.process import DAY_NAMES
     from parkenv.world.week import DAY_S
 
     shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
@@ -204,8 +204,8 @@ def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) ->
 def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) -> None:
     """Record the first session and the first search on one timeline."""
     from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.evaluation.trips.sensor_log import record_search, record_session, sensor_log
     from parkenv.mapping.survey import Survey
+    from parkenv.studies.trips.sensor_log import record_search, record_session, sensor_log
     from planners.agent import make_agent
 
     env = SearchPerceptionEnv(known, rig="laser", detector=settings.detector)
@@ -216,8 +216,8 @@ def _record(known: Scenario, settings: SurveySettings, seed: int, path: Path) ->
 
 def _settings(spec: DemoSpec) -> dict[str, Any]:
     """Return what determines the outcome of the searches."""
-    from parkenv.evaluation.experiments.experiment import fingerprints, flat_tables
     from parkenv.perception.detector_registry import detector_version
+    from parkenv.studies.compare.experiment import fingerprints, flat_tables
 
     return {
         "version": __version__,
@@ -229,6 +229,6 @@ def _settings(spec: DemoSpec) -> dict[str, Any]:
 
 def _goes_on(out: Path) -> bool:
     """Return whether the folder holds an unfinished demo."""
-    from parkenv.evaluation.experiments.results import SETTINGS, SUMMARY
+    from parkenv.studies.results import SETTINGS, SUMMARY
 
     return (out / SETTINGS).exists() and not (out / SUMMARY).exists()

@@ -12,8 +12,8 @@ from parkenv.cli.detector_drives import compare_on_drives
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
-from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import distinct_names, file_name
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -55,14 +55,14 @@ def detect(
         step (N >= 1): Of a video, look at every N-th frame.
         out, -o (DIR): Folder for NAME_cars.png, NAME_cars.mp4, boxes.csv and summary.json.  [default: none]
     """
-    from parkenv.evaluation.experiments.detection_run import (
+    from parkenv.files.csv_writing import write_csv
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.sensing.detection_run import (
         BOX_COLUMNS,
         detect_in_image,
         detect_in_video,
         require_readable,
     )
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.files.csv_writing import write_csv
 
     finder = _finder(model, detector, threshold, least_height)
     chosen = require_readable(images)  # a damaged one is refused before any work
@@ -398,10 +398,10 @@ def evaluate_detector(
 def _evaluate_on_drives(
     scenario: str, names: Sequence[str], pictures: int, false_positives: float, seed: int, out: Path
 ) -> None:
-    from parkenv.evaluation.experiments.detector_drives import drive_pictures, score_on_drives
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.perception.detector_registry import make_detector
     from parkenv.scenarios.build import make_scenario
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.sensing.detector_drives import drive_pictures, score_on_drives
 
     if pictures < 1:
         raise InputError(f"--pictures is {pictures}, want at least 1")
@@ -444,9 +444,9 @@ def _model_or_detector(model: str, detector: str | None) -> CarModel | Detector:
 
 
 def _evaluate_on_crops(folder: Path, model: str, detector: str | None, out: Path) -> None:
-    from parkenv.evaluation.experiments.detector_scores import recall_on_crops
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.perception.car_datasets import read_crop_folder
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.sensing.detector_scores import recall_on_crops
 
     loaded, crops = _model_or_detector(model, detector), read_crop_folder(folder)
     make_folder(out)
@@ -471,9 +471,9 @@ def _evaluate_on_crops(folder: Path, model: str, detector: str | None, out: Path
 def _evaluate_on_uiuc(uiuc: Path, model: str, detector: str | None, out: Path) -> None:
     from rich.progress import Progress
 
-    from parkenv.evaluation.experiments.detector_scores import save_curves, score_on_uiuc
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.perception.car_model import CarModel
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.sensing.detector_scores import save_curves, score_on_uiuc
 
     loaded = _model_or_detector(model, detector)
     make_folder(out)

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
-from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -34,12 +34,12 @@ def compare_on_drives(
     Raises:
         InputError: an invalid option, a scenario that cannot be made, or a folder that cannot be used.
     """
-    from parkenv.evaluation.experiments import detector_surveys as compared
-    from parkenv.evaluation.experiments.spec import SurveySpec
-    from parkenv.evaluation.experiments.surveys import survey_of
-    from parkenv.evaluation.figures.detector_pictures import save_misses, save_reach
     from parkenv.files.csv_writing import write_csv
     from parkenv.perception.detector_registry import make_detector
+    from parkenv.studies.figures.detector_pictures import save_misses, save_reach
+    from parkenv.studies.sensing import detector_surveys as compared
+    from parkenv.studies.sensing.surveys import survey_of
+    from parkenv.studies.spec import SurveySpec
 
     spec = SurveySpec().changed(scenario=drives, sessions=sessions, every=every, seed=seed, **machines.given)
     for name in detectors:

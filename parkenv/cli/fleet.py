@@ -11,10 +11,10 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.evaluation.plurals import plural
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.spec import FleetSpec
+    from parkenv.studies.spec import FleetSpec
 
 Row = dict[str, Any]
 
@@ -96,8 +96,8 @@ def fleet(
     Results:
         figures: Draw the picture.  [default: figures]
     """
-    from parkenv.evaluation.experiments.agent_spec import split_agents
-    from parkenv.evaluation.experiments.spec import FleetSpec
+    from parkenv.studies.agent_spec import split_agents
+    from parkenv.studies.spec import FleetSpec
 
     base = FleetSpec()
     if folder.resume:
@@ -136,7 +136,7 @@ def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
         InputError: the experiment cannot be run, or the folder cannot be used.
         KeyboardInterrupt: the run was interrupted; the results of finished days are printed and in the folder.
     """
-    from parkenv.evaluation.fleet.experiment import run_fleets
+    from parkenv.studies.fleet.experiment import run_fleets
 
     console = make_console()
     result = run_into(out, run_fleets, spec, folder, console, doing="Driving", unit="days")
@@ -151,7 +151,7 @@ def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
     if not result.complete:
         raise KeyboardInterrupt
     if spec.figures:
-        from parkenv.evaluation.figures.fleet_figure import save_fleet_figure
+        from parkenv.studies.figures.fleet_figure import save_fleet_figure
 
         with console.status("Drawing the picture"):
             save_fleet_figure(result.rows, its, title, out / PICTURE)

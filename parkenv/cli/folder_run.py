@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import TaskID
 
-    from parkenv.evaluation.experiments.spec import CommuteSpec, ExperimentSpec, FleetSpec
+    from parkenv.studies.spec import CommuteSpec, ExperimentSpec, FleetSpec
 
 Result = TypeVar("Result")
 

@@ -12,8 +12,8 @@ from parkenv.cli.command import add, group
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
-from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
+from parkenv.studies.plurals import plural
 
 AUTO = "auto"
 """Value of `--entry` and `--goal` that allows a guess."""
@@ -36,8 +36,8 @@ def show(lot: str, /, graph: bool = False, out: Path | None = None) -> None:
         graph: Also draw the drive graph.
         out, -o (FILE): Picture: .png, .pdf or .svg.  [default: NAME.png]
     """
-    from parkenv.evaluation.figures.lot_picture import save_lot_picture
     from parkenv.lots import load_lot
+    from parkenv.studies.figures.lot_picture import save_lot_picture
 
     its_lot = load_lot(lot)
     picture = out or Path(file_name(its_lot.name, ".png"))
@@ -67,9 +67,9 @@ def check(place: Path, /, drive: bool | None = None) -> None:
             Dragon Lake map (.yml) or a lot.
         drive: Plan how the car drives into each kind of slot.  [default: drive]
     """
-    from parkenv.evaluation.lot_survey import survey_lot
     from parkenv.lots import check_lot, read_lot
     from parkenv.lots.file_formats import lot_format
+    from parkenv.studies.lot_survey import survey_lot
 
     console = make_console(soft_wrap=True)
     problems = check_lot(place)
@@ -181,7 +181,7 @@ def import_place(
     for left in draft.left_out:
         console.print(f"left out: {left}", style="yellow")
     if picture is not None:
-        from parkenv.evaluation.figures.import_picture import save_import_picture
+        from parkenv.studies.figures.import_picture import save_import_picture
 
         save_import_picture(draft, picture)
         console.print(f"Picture: {picture}")
@@ -196,11 +196,11 @@ def import_place(
 
 def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> None:
     """Write every car park of a town, a table of what became of each, and contact sheets."""
-    from parkenv.evaluation.figures.contact_sheet import save_contact_sheets
-    from parkenv.evaluation.lot_survey import survey_lot
     from parkenv.lots import write_lot
     from parkenv.lots.outlines.town import import_town
     from parkenv.lots.provenance import Provenance
+    from parkenv.studies.figures.contact_sheet import save_contact_sheets
+    from parkenv.studies.lot_survey import survey_lot
 
     rows: list[dict[str, object]] = []
     lots = []
@@ -274,11 +274,11 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
         drive: Plan how the car drives into each kind of slot, as `parkenv lot check` does.  [default: drive]
         out, -o (DIR): Folder for census.csv, summary.json, census.png and contact sheets.
     """
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.census_figure import save_census
-    from parkenv.evaluation.figures.contact_sheet import save_contact_sheets
-    from parkenv.evaluation.lot_census import COLUMNS, count_lot, lot_files
     from parkenv.files.csv_writing import write_csv
+    from parkenv.studies.figures.census_figure import save_census
+    from parkenv.studies.figures.contact_sheet import save_contact_sheets
+    from parkenv.studies.lot_census import COLUMNS, count_lot, lot_files
+    from parkenv.studies.results import make_folder
 
     files = lot_files(places)
     make_folder(out)

@@ -9,7 +9,7 @@ from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
-from parkenv.evaluation.plurals import plural
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -52,8 +52,8 @@ def fit(
         timezone (NAME): Local time of counts with hour_utc.
         out, -o (DIR): Folder for summary.json and, of a log, process.json and rates.png.
     """
-    from parkenv.evaluation.experiments.results import make_folder
     from parkenv.forecast.counts import Counts, is_counts
+    from parkenv.studies.results import make_folder
 
     make_folder(out)
     console = make_console()
@@ -68,9 +68,9 @@ def _fit_log(log: Path, max_gap_h: float, out: Path, console: Console) -> None:
 
     import numpy as np
 
-    from parkenv.evaluation.figures.rates_picture import save_rates
-    from parkenv.world.occupancy_fit import fit_process
-    from parkenv.world.occupancy_log import OccupancyLog
+    from parkenv.studies.figures.rates_picture import save_rates
+    from parkenv.world.occupancy.fit import fit_process
+    from parkenv.world.occupancy.log import OccupancyLog
     from parkenv.world.week import DAY_S, HOUR_S
 
     record = OccupancyLog.read(log)
@@ -192,11 +192,11 @@ def evaluate(
 
     import numpy as np
 
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_counts, shown_week
     from parkenv.forecast.comparison import MODELS, compare
     from parkenv.forecast.counts import Counts, is_counts
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
+    from parkenv.studies.figures.forecast_picture import save_forecast, shown_counts, shown_week
+    from parkenv.studies.results import make_folder
 
     make_folder(out)
     console = make_console()
@@ -295,9 +295,9 @@ def _print_notes(counts: Counts, console: Console) -> None:
 def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: Console) -> None:
     import numpy as np
 
-    from parkenv.evaluation.figures.forecast_picture import save_forecast, shown_slots
     from parkenv.forecast.slot_comparison import compare_slot_days
-    from parkenv.world.occupancy_log import OccupancyLog
+    from parkenv.studies.figures.forecast_picture import save_forecast, shown_slots
+    from parkenv.world.occupancy.log import OccupancyLog
 
     recorded = OccupancyLog.read(log)
     first = recorded.days[len(recorded.days) // 2] if from_ is None else str(iso_date("--from", from_))

@@ -10,11 +10,11 @@ from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.cli.trust import readable_models
 from parkenv.errors import InputError, nearest
-from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.trips.parking_runs import Parking, ParkingCase
+    from parkenv.studies.trips.parking_runs import Parking, ParkingCase
     from planners.agent import Agent
 
 SCENARIOS = "campus,street"
@@ -62,9 +62,9 @@ def park(
         slack (M >= 0): Distance around the slot kept clear of parked cars, m.
     """
     from parkenv.driving.parking_task import KINDS, WAYS
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from parkenv.scenarios.build import build
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from planners.driving.parking_agents import make_parking_agent
 
     kinds = None if kind == "all" else _chosen("--kind", kind, KINDS)
@@ -141,9 +141,9 @@ def _picture(
     folder: Path,
 ) -> None:
     """Write pictures of successes and failures, and an animation of the episode `film`."""
-    from parkenv.evaluation.figures.parking_pictures import save_parkings
-    from parkenv.evaluation.figures.picture_files import save_film
-    from parkenv.evaluation.trips.parking_runs import park_once
+    from parkenv.studies.figures.parking_pictures import save_parkings
+    from parkenv.studies.figures.picture_files import save_film
+    from parkenv.studies.trips.parking_runs import park_once
 
     lots = {case.lot.name: case.lot for case in cases}
     failures = [p for p in parkings if not p.row["parked"]][:SHOWN_FAILURES]

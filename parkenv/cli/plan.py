@@ -34,13 +34,13 @@ def plan(
     """
     import numpy as np
 
-    from parkenv.evaluation.experiments.agent_spec import AgentSpec
-    from parkenv.evaluation.experiments.compare import Case, settings_of
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.experiments.spec import Grid
-    from parkenv.evaluation.figures.picture_files import save_picture
-    from parkenv.evaluation.figures.search_pictures import draw_searches
     from parkenv.scenarios.build import build
+    from parkenv.studies.agent_spec import AgentSpec
+    from parkenv.studies.compare.cases import Case, settings_of
+    from parkenv.studies.figures.picture_files import save_picture
+    from parkenv.studies.figures.search_pictures import draw_searches
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.spec import Grid
     from planners.agent import make_agent
     from planners.thesis.replanning import StaticAgent
 

@@ -17,8 +17,8 @@ from parkenv.files.known_names import SCENARIO_NAMES
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from parkenv.evaluation.experiments.spec import TrainingSpec
     from parkenv.scenarios.spec import ScenarioSpec
+    from parkenv.studies.spec import TrainingSpec
 
 
 def publish(
@@ -52,11 +52,11 @@ def publish(
             fleet, 16]
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
-    from parkenv.evaluation.experiments.results import make_folder, write_summary
-    from parkenv.evaluation.fleet.publication import FleetPublication
-    from parkenv.evaluation.publication import CARD, FILM, MODEL, Publication
-    from parkenv.evaluation.training.training_task import FIGURE, TEST_SEED
     from parkenv.scenarios.build import build
+    from parkenv.studies.fleet.publication import FleetPublication
+    from parkenv.studies.publication import CARD, FILM, MODEL, Publication
+    from parkenv.studies.results import make_folder, write_summary
+    from parkenv.studies.training.training_task import FIGURE, TEST_SEED
     from planners.model_file import ModelCard
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -103,9 +103,9 @@ def _best(folder: Path, trust: bool) -> tuple[TrainingSpec, Path, Sequence[Scena
     Raises:
         InputError: the folder holds no finished training.
     """
-    from parkenv.evaluation.experiments.spec import TrainingSpec
-    from parkenv.evaluation.report.run_folder import RunFolder
-    from parkenv.evaluation.training.rl_training import MODEL
+    from parkenv.studies.report.run_folder import RunFolder
+    from parkenv.studies.spec import TrainingSpec
+    from parkenv.studies.training.rl_training import MODEL
 
     run = RunFolder.read(folder)
     spec = run.spec()

@@ -14,10 +14,10 @@ from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.spec import Workplace
-    from parkenv.evaluation.fleet.experiment import FleetExperiment, Setting
-    from parkenv.evaluation.report.fleet_recording import FleetDay
-    from parkenv.evaluation.report.repetition import Cases
+    from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+    from parkenv.studies.report.fleet_recording import FleetDay
+    from parkenv.studies.report.repetition import Cases
+    from parkenv.studies.spec import Workplace
 
 PAGE = "report.html"
 EPISODES, SENSED, DAYS = 20, 4, 8
@@ -92,12 +92,12 @@ def make_report(
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
             are not trusted.
     """
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.report.fleet_recording import choose_days, differing_days
-    from parkenv.evaluation.report.page import page_data, write_page
-    from parkenv.evaluation.report.repetition import Repetition, differences, drawable, drawable_settings
-    from parkenv.evaluation.report.run_folder import RunFolder
-    from parkenv.evaluation.report.search_recording import choose, record
+    from parkenv.studies.report.fleet_recording import choose_days, differing_days
+    from parkenv.studies.report.page import page_data, write_page
+    from parkenv.studies.report.repetition import Repetition, differences, drawable, drawable_settings
+    from parkenv.studies.report.run_folder import RunFolder
+    from parkenv.studies.report.search_recording import choose, record
+    from parkenv.studies.results import make_folder
 
     run = RunFolder.read(folder)
     make_folder(folder if out is None else out.parent)
@@ -177,7 +177,7 @@ def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:
 
 def _agents_of(known: Sequence[str], agents: str) -> list[str]:
     """Return the agents that `--agents` names."""
-    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.studies.agent_spec import split_agents
 
     for name in (names := split_agents(agents)):
         if name not in known:

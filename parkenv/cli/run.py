@@ -52,8 +52,8 @@ def run(
         experiment (FILE|DIR): An experiment file (.toml, .json), or the folder of a run.
         out, -o (DIR): Folder for the results.  [default: results/NAME of the file]
     """
-    from parkenv.evaluation.experiments import spec as specs
     from parkenv.files.spec_file import read_tables
+    from parkenv.studies import spec as specs
 
     file = experiment
     if file.is_dir():

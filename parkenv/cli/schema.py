@@ -18,8 +18,8 @@ KINDS = ("scenario", "compare", "commute", "fleet", "benchmark", "survey", "demo
 
 def schemas() -> dict[str, dict[str, Any]]:
     """Return the schema of each kind of file, made from the models that validate it."""
-    from parkenv.evaluation.experiments import spec as specs
     from parkenv.scenarios.spec import ScenarioSpec
+    from parkenv.studies import spec as specs
 
     models: tuple[type[BaseModel], ...] = (
         ScenarioSpec,
@@ -53,7 +53,7 @@ def schema(kind: str | None = None, /, out: Path | None = None) -> None:
     if out is None:
         echo(json.dumps(made[kind or "scenario"], indent=1))
         return
-    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.studies.results import make_folder
 
     make_folder(out)
     for name, content in made.items():

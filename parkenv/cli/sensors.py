@@ -45,12 +45,12 @@ def preview(
     from rich.progress import track
     from scipy.spatial import cKDTree
 
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.experiments.spec import BUSY
-    from parkenv.evaluation.figures.picture_files import save_film
-    from parkenv.evaluation.figures.sensor_pictures import save_sensor_preview, with_boxes
+    from parkenv.compiled.keyed_random import world_key
     from parkenv.scenarios.build import build
-    from parkenv.world.keyed_random import world_key
+    from parkenv.studies.figures.picture_files import save_film
+    from parkenv.studies.figures.sensor_pictures import save_sensor_preview, with_boxes
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.spec import BUSY
     from parkenv.world.lot_scene import LotScenes, slot_lot
     from planners.routes import DriveRoutes
     from sim_sensors.camera.weather import Weather

@@ -23,7 +23,7 @@ def writing_into(out: Path, resumed_by: str | None = None) -> Iterator[None]:
     Raises:
         InputError: the folder cannot be made or written, or another process writes into it.
     """
-    from parkenv.evaluation.experiments.results import make_folder
+    from parkenv.studies.results import make_folder
 
     made = [folder for folder in (out, *out.parents) if not folder.exists()]
     make_folder(out)

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-from parkenv.evaluation.interruption import unsafe_to_raise
+from parkenv.studies.interruption import unsafe_to_raise
 
 
 @contextmanager

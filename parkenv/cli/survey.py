@@ -10,12 +10,12 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
-from parkenv.evaluation.plurals import plural
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
+from parkenv.studies.plurals import plural
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.experiments.spec import SurveySpec
+    from parkenv.studies.spec import SurveySpec
 
 MOST_ROWS = 12
 """Slots in the table of a map; files have all."""
@@ -77,7 +77,7 @@ def survey(
         record (FILE.mcap): Also record images, scans and poses of the first session (extra bags), for `parkenv
             map-drive`.  [default: none]
     """
-    from parkenv.evaluation.experiments.spec import BUSY, SurveySpec
+    from parkenv.studies.spec import BUSY, SurveySpec
 
     windows = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
     spec = SurveySpec().changed(
@@ -101,8 +101,13 @@ def run_survey_of(
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.experiments.surveys import (
+    from parkenv.mapping.discovery import score_discovery
+    from parkenv.mapping.inference import predict
+    from parkenv.mapping.recorded_drive import record_drive, require_recordable
+    from parkenv.mapping.store import MapStore
+    from parkenv.mapping.survey import Survey
+    from parkenv.studies.figures import survey_pictures as pictures
+    from parkenv.studies.sensing.surveys import (
         MAP_FILE,
         mean_occupancy,
         run_survey,
@@ -110,13 +115,8 @@ def run_survey_of(
         summarize,
         survey_of,
     )
-    from parkenv.evaluation.figures import survey_pictures as pictures
-    from parkenv.evaluation.trips.sensor_log import record_session, require_viewer, sensor_log
-    from parkenv.mapping.discovery import score_discovery
-    from parkenv.mapping.inference import predict
-    from parkenv.mapping.recorded_drive import record_drive, require_recordable
-    from parkenv.mapping.store import MapStore
-    from parkenv.mapping.survey import Survey
+    from parkenv.studies.spec import SPEC_FILE
+    from parkenv.studies.trips.sensor_log import record_session, require_viewer, sensor_log
 
     if rerun is not None:
         require_viewer()
@@ -239,8 +239,6 @@ def map_drive(
         localise (none|scan-matching): scan-matching: the poses are odometry that drifts; correct it.
         out, -o (DIR): Folder for map.sqlite, to which the session is added, map.png and summary.json.
     """
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.survey_pictures import save_map
     from parkenv.mapping.drive_calibration import DriveCalibration
     from parkenv.mapping.inference import predict
     from parkenv.mapping.recorded_drive import RecordedDrive
@@ -248,6 +246,8 @@ def map_drive(
     from parkenv.mapping.store import MapStore
     from parkenv.perception.detector_registry import make_detector
     from parkenv.scenarios.build import build
+    from parkenv.studies.figures.survey_pictures import save_map
+    from parkenv.studies.results import make_folder
 
     its = build(args.World(lot=lot).spec(scenario))
     finder = make_detector(detector or its.detector)
@@ -307,13 +307,13 @@ def show_map(
         confidence (P): Of the interval, 0 to 1.
         out, -o (DIR): Folder for map.png, slots.csv, summary.json.  [default: none]
     """
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.survey_pictures import save_map
     from parkenv.files.csv_writing import write_csv
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.scenarios.build import build
-    from parkenv.world.occupancy import DAY_NAMES
+    from parkenv.studies.figures.survey_pictures import save_map
+    from parkenv.studies.results import make_folder
+    from parkenv.world.occupancy.process import DAY_NAMES
     from parkenv.world.week import DAY_S, HOUR_S
 
     its = build(args.World(lot=lot).spec(scenario))

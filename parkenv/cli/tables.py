@@ -94,7 +94,7 @@ def command_line() -> list[str]:
 
 def save_summary(folder: Path, seed: int | None, rows: Any, **more: Any) -> None:
     """Write the `summary.json` of a command."""
-    from parkenv.evaluation.experiments.results import write_summary
+    from parkenv.studies.results import write_summary
 
     head = {"command": command_line(), "version": __version__, "seed": seed}
     write_summary(folder, head | more | {"rows": rows})

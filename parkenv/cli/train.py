@@ -19,10 +19,10 @@ from parkenv.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.evaluation.experiments.spec import TrainingSpec
-    from parkenv.evaluation.experiments.workers import Workers
-    from parkenv.evaluation.training.rl_training import AnyTraining
-    from parkenv.evaluation.training.training_task import Row, TrainingTask
+    from parkenv.studies.spec import TrainingSpec
+    from parkenv.studies.training.rl_training import AnyTraining
+    from parkenv.studies.training.training_task import Row, TrainingTask
+    from parkenv.studies.workers import Workers
 
 
 def train(
@@ -67,7 +67,7 @@ def train(
     any lot; or raw laser scans, on one lot. In a fleet, one network drives all cars, or a share of them. Driving agents
     park the car in a slot, with hindsight experience replay (sac, tqc) or the dense reward (ppo); their curriculum
     starts just outside the slot. All are evaluated in held-out worlds; each seed's best model is kept, and tested at
-    the end. Hyperparameters are in parkenv/evaluation/training/configs.py.
+    the end. Hyperparameters are in parkenv/studies/training/configs.py.
 
     Examples:
         parkenv train maskable-ppo --scenario campus
@@ -137,7 +137,7 @@ def train(
         resume: Continue from the checkpoints in --out; the models equal those of an unbroken training.
         tensorboard: Keep logs for TensorBoard in --out.
     """
-    from parkenv.evaluation.experiments.spec import TrainingSpec
+    from parkenv.studies.spec import TrainingSpec
 
     if day_error and not (scenario or lot):
         raise InputError("--day-error goes with --scenario or --lot")
@@ -168,21 +168,21 @@ def _seconds(minutes: float | None) -> float | None:
 
 
 def _agents(text: str | None) -> list[str] | None:
-    from parkenv.evaluation.experiments.agent_spec import split_agents
+    from parkenv.studies.agent_spec import split_agents
 
     return None if text is None else [] if text == "none" else split_agents(text)
 
 
 def _task_of(spec: TrainingSpec) -> TrainingTask:
-    from parkenv.evaluation.training.drive_task import DriveTask
-    from parkenv.evaluation.training.search_task import SearchTask
+    from parkenv.studies.training.drive_task import DriveTask
+    from parkenv.studies.training.search_task import SearchTask
 
     if spec.env == "search" and spec.algorithm == "network":
-        from parkenv.evaluation.training.network_task import NetworkTask
+        from parkenv.studies.training.network_task import NetworkTask
 
         return NetworkTask(spec)
     if spec.env == "fleet":
-        from parkenv.evaluation.training.fleet_task import FleetTask
+        from parkenv.studies.training.fleet_task import FleetTask
 
         return FleetTask(spec)
     return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
@@ -194,9 +194,9 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.evaluation.experiments.spec import SPEC_FILE
-    from parkenv.evaluation.training.rl_training import MODEL
-    from parkenv.evaluation.training.training_task import FIGURE, Trained, curves_beside
+    from parkenv.studies.spec import SPEC_FILE
+    from parkenv.studies.training.rl_training import MODEL
+    from parkenv.studies.training.training_task import FIGURE, Trained, curves_beside
 
     task = _task_of(spec)
     task.check()
@@ -223,7 +223,7 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside
 
 def _require_free(out: Path, settings: Row, folder: args.ReportedRun) -> None:
     """Check that the folder holds no training, or one to resume or replace."""
-    from parkenv.evaluation.experiments.results import read_settings, require_same_settings
+    from parkenv.studies.results import read_settings, require_same_settings
 
     if folder.resume and folder.overwrite:
         raise InputError("--resume and --overwrite exclude each other")
@@ -240,8 +240,8 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     """Write the settings of the new training, and remove the results of the previous one."""
     import shutil
 
-    from parkenv.evaluation.experiments.results import SUMMARY, write_settings
-    from parkenv.evaluation.training.training_task import FIGURE
+    from parkenv.studies.results import SUMMARY, write_settings
+    from parkenv.studies.training.training_task import FIGURE
 
     # Delete the summary: a folder without one holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):
@@ -266,8 +266,8 @@ def _train_all(
 
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from parkenv.evaluation.training.curve_file import CURVE, read_curve
-    from parkenv.evaluation.training.rl_training import train_one
+    from parkenv.studies.training.curve_file import CURVE, read_curve
+    from parkenv.studies.training.rl_training import train_one
 
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[score]}"), TimeElapsedColumn(),

@@ -28,8 +28,8 @@ def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] 
     Raises:
         InputError: it names some and is not trusted; the message lists them, classes with their files.
     """
-    from parkenv.evaluation.experiments.agent_spec import classes_in
     from parkenv.files.user_class import find_module
+    from parkenv.studies.agent_spec import classes_in
 
     classes = classes_in(spec, given)
     named = [f"{name} ({find_module(name) or 'not found'})" for name in classes]

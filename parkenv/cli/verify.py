@@ -12,7 +12,7 @@ from parkenv.cli.tables import make_console, make_table, progress_bar, save_summ
 from parkenv.files.known_names import VERIFY_CASES
 
 if TYPE_CHECKING:
-    from parkenv.evaluation.verify.rows import Row
+    from parkenv.studies.verify.rows import Row
 
 
 def verify(
@@ -36,12 +36,12 @@ def verify(
         seed (N >= 0): First seed of the simulated cases.
         out, -o (DIR): Folder for summary.json and verify.png.  [default: none]
     """
-    from parkenv.evaluation.experiments.results import make_folder
-    from parkenv.evaluation.figures.verify_figure import save_verification
-    from parkenv.evaluation.plurals import plural
-    from parkenv.evaluation.verify.rows import CONFIDENCE, disagreeing
-    from parkenv.evaluation.verify.verification import tasks_of
-    from parkenv.evaluation.verify.verification import verify as rows_of
+    from parkenv.studies.figures.verify_figure import save_verification
+    from parkenv.studies.plurals import plural
+    from parkenv.studies.results import make_folder
+    from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
+    from parkenv.studies.verify.verification import tasks_of
+    from parkenv.studies.verify.verification import verify as rows_of
 
     tasks = tasks_of(VERIFY_CASES if cases is None else args.words("--cases", cases), seed)
     if out is not None:

@@ -13,7 +13,7 @@ from parkenv.driving.collision_world import ObstacleKind, Obstacles
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.world.lot import Mouth
 from parkenv.world.lot_scene import LotScenes, slot_lot
-from parkenv.world.occupancy import World
+from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 
 FloatArray = NDArray[np.float64]

@@ -11,8 +11,8 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors import numpy_streams
-from sim_sensors.compilation import compiled
+from parkenv.compiled import numpy_streams
+from parkenv.compiled.jit import compiled
 from sim_sensors.laser.footprints import FAR, LANES, Cells, ScanPlane
 from sim_sensors.slot_scenes import NOSE_GAP_M, SlotLot
 

@@ -13,7 +13,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
+from parkenv.driving.drive_state import DriveState
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.driving.yielding_traffic import YieldingTraffic
@@ -26,16 +28,14 @@ from parkenv.envs.drive_observation import (
     obstacle_map,
     scan_plane,
 )
-from parkenv.envs.drive_state import DriveState
 from parkenv.errors import InputError
 from parkenv.lots import load_lot
-from parkenv.world.keyed_random import world_key
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import Traffic
 from sim_sensors.laser.scanner import LaserScanner
 
 if TYPE_CHECKING:
-    from parkenv.envs.drive_rendering import DriveRenderer
+    from parkenv.show.drive_rendering import DriveRenderer
 
 FloatArray = NDArray[np.float64]
 
@@ -349,7 +349,7 @@ length and width over the car's |
             )
             return None
         if self._renderer is None:
-            from parkenv.envs.drive_rendering import DriveRenderer
+            from parkenv.show.drive_rendering import DriveRenderer
 
             self._renderer = DriveRenderer(self.tasks.lot)
         frame = self._renderer.frame(self.state, [outline for _, outline in self._moving()])

@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
 
 FloatArray = NDArray[np.float64]
 

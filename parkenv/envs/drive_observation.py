@@ -9,10 +9,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.parking_task import REACH, ParkingTask
 from parkenv.driving.vehicle import VehicleParameters
-from sim_sensors.compilation import compiled
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 

@@ -14,8 +14,10 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv.envs.event_queue import EVENT
-from parkenv.envs.fleet_kernel import (
+from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform, world_key
+from parkenv.compiled.memory import address_of
+from parkenv.engine.event_queue import EVENT
+from parkenv.engine.fleet_kernel import (
     FINISHED,
     NEEDS_FORECAST,
     NEEDS_REPORTS,
@@ -31,8 +33,7 @@ from parkenv.envs.fleet_kernel import (
     init_forecast_at,
     release_at,
 )
-from parkenv.envs.fleet_network import NetworkRule
-from parkenv.envs.fleet_records import (
+from parkenv.engine.fleet_records import (
     CAR,
     DUE,
     FLEET,
@@ -42,7 +43,17 @@ from parkenv.envs.fleet_records import (
     STATES,
     STEP,
 )
-from parkenv.envs.fleet_rules import Rule
+from parkenv.engine.fleet_rules import Rule
+from parkenv.engine.search_kernel import (
+    COUNT_METRICS,
+    REWARD_TERMS,
+    STEP_RESULT,
+    TIME_METRICS,
+    step_result_at,
+)
+from parkenv.engine.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
+from parkenv.engine.shared_slots import BACKGROUNDS, NO_CAR, SHARED_SLOT, shared_slots_taken_at
+from parkenv.envs.fleet_network import NetworkRule
 from parkenv.envs.local_observation import (
     FIRST_NEAR,
     PER_NEAR,
@@ -50,17 +61,12 @@ from parkenv.envs.local_observation import (
     observe_surroundings_at,
 )
 from parkenv.envs.search import action_number, space_of
-from parkenv.envs.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS, step_result_at
-from parkenv.envs.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
-from parkenv.envs.shared_slots import BACKGROUNDS, NO_CAR, SHARED_SLOT, shared_slots_taken_at
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
-from parkenv.world.counted_occupancy import CountedOccupancy
 from parkenv.world.demand import Demand
-from parkenv.world.keyed_random import ARRIVAL_STREAM, keyed_uniform, world_key
-from parkenv.world.occupancy_kernel import RECORDED_DAY
-from parkenv.world.pointers import address_of
+from parkenv.world.occupancy.counted import CountedOccupancy
+from parkenv.world.occupancy.kernel import RECORDED_DAY
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import DAY_S, hour_of_week
 
@@ -78,7 +84,7 @@ class DriverKind:
     Args:
         weight: relative number of such drivers. A car's kind follows from its own random number, so with two kinds and
             equal demand, the drivers of the first kind stay the same, and more join them, as its weight grows.
-        rule: compiled driver that decides, see `parkenv.envs.fleet_rules.RULES`; None: Python decides.
+        rule: compiled driver that decides, see `parkenv.engine.fleet_rules.RULES`; None: Python decides.
         knows: what these drivers know of the slots besides the forecast: `own`, their own observations; `shared`, also
             those on the live map; `reserve`, the slot that a guidance system has reserved for them; `full`, the true
             state of every slot.
@@ -179,7 +185,7 @@ class Fleet:
         InputError: a value out of its range; the message names the field.
 
     Examples:
-        >>> from parkenv.envs.fleet_rules import RULES
+        >>> from parkenv.engine.fleet_rules import RULES
         >>> from parkenv.world.demand import Demand, Headways
         >>> fleet = Fleet("campus", Demand(Headways(cars=3)), drivers=[DriverKind(rule=RULES["greedy-drive"])])
         >>> fleet.reset(seed=1)
@@ -625,7 +631,7 @@ class Fleet:
         return self._cars
 
     def state_names(self) -> list[str]:
-        """Return the state of each car by name; see `parkenv.envs.fleet_records.STATES`."""
+        """Return the state of each car by name; see `parkenv.engine.fleet_records.STATES`."""
         return [STATES[state] for state in self._cars["state"]]
 
     def poses(self) -> CarPoses:

@@ -10,21 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.fleet_records import car_at, fleet_at
-from parkenv.envs.fleet_rules import Rule
-from parkenv.envs.local_observation import (
-    FIRST_NEAR,
-    N_MOVES,
-    PER_NEAR,
-    SAMPLES,
-    Surroundings,
-    observe_surroundings,
-)
-from parkenv.envs.search_records import N_ACTIONS, N_REGIONS, scenario_at, search_at
-from parkenv.errors import InputError
-from parkenv.world.keyed_random import RULE_STREAM, keyed_uniform
-from parkenv.world.occupancy_kernel import inlined, kernel
-from parkenv.world.pointers import (
+from parkenv.compiled.keyed_random import RULE_STREAM, keyed_uniform
+from parkenv.compiled.memory import (
     ADDRESS,
     address_of,
     float32_array,
@@ -37,6 +24,19 @@ from parkenv.world.pointers import (
     record_at,
     uint8s,
 )
+from parkenv.engine.fleet_records import car_at, fleet_at
+from parkenv.engine.fleet_rules import Rule
+from parkenv.engine.search_records import N_ACTIONS, N_REGIONS, scenario_at, search_at
+from parkenv.envs.local_observation import (
+    FIRST_NEAR,
+    N_MOVES,
+    PER_NEAR,
+    SAMPLES,
+    Surroundings,
+    observe_surroundings,
+)
+from parkenv.errors import InputError
+from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.scenario import SearchProblem
 
 Layer = tuple[NDArray[np.float32], NDArray[np.float32]]

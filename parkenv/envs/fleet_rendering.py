@@ -7,10 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.driving.lot_outline import LotOutline
-from parkenv.envs import drawing
-from parkenv.envs.drawing import Color, FloatArray, Image
 from parkenv.envs.fleet import CarPoses, Fleet
-from parkenv.envs.rendering import (
+from parkenv.show import drawing
+from parkenv.show.drawing import Color, FloatArray, Image
+from parkenv.show.rendering import (
     CAR,
     CAR_BODY,
     HEIGHT,
@@ -30,7 +30,7 @@ from parkenv.envs.rendering import (
     lot_corners,
     paint_slots,
 )
-from parkenv.envs.window import Window
+from parkenv.show.window import Window
 
 SLOT: Color = (126, 130, 136)
 FLEET_PARKED: Color = (74, 150, 226)

@@ -12,21 +12,21 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from parkenv.compiled.memory import uint8s
+from parkenv.engine.fleet_kernel import act_at, advance_at, release_at
+from parkenv.engine.fleet_records import CAR, SEARCHING, TRUNCATED, car_at, fleet_at
+from parkenv.engine.search_records import N_ACTIONS, scenario_at, search_at
+from parkenv.engine.shared_slots import NO_CAR
 from parkenv.envs.fleet import MAX_STEPS, DriverKind, Fleet, total_s
-from parkenv.envs.fleet_kernel import act_at, advance_at, release_at
 from parkenv.envs.fleet_network import Layer, NetworkRule, observe_locally
-from parkenv.envs.fleet_records import CAR, SEARCHING, TRUNCATED, car_at, fleet_at
 from parkenv.envs.local_observation import local_space
-from parkenv.envs.search_records import N_ACTIONS, scenario_at, search_at
-from parkenv.envs.shared_slots import NO_CAR
 from parkenv.envs.shared_vec_env import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import Demand
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
-from parkenv.world.occupancy_kernel import kernel
-from parkenv.world.pointers import uint8s
+from parkenv.world.occupancy.kernel import kernel
+from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
 
 LEARNERS = 0
 """The kind of drivers that learn."""

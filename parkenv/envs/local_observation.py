@@ -44,9 +44,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.search import SearchEnv
-from parkenv.envs.search_kernel import add_column, decay_belief, forecast_of
-from parkenv.envs.search_records import (
+from parkenv.compiled.jit import compiled
+from parkenv.compiled.memory import float64s, in_one_block, int32s, int64s
+from parkenv.engine.search_kernel import add_column, decay_belief, forecast_of
+from parkenv.engine.search_records import (
     BLOCK_BITS,
     BLOCK_SIZE,
     N_ACTIONS,
@@ -58,12 +59,11 @@ from parkenv.envs.search_records import (
     search_at,
     slot_at,
 )
+from parkenv.envs.search import SearchEnv
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
-from parkenv.world.occupancy_kernel import inlined, kernel, prefetch_forecast
-from parkenv.world.pointers import float64s, in_one_block, int32s, int64s
+from parkenv.world.occupancy.kernel import inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import SearchProblem
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

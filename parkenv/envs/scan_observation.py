@@ -26,10 +26,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.search_records import N_ACTIONS
+from parkenv.engine.search_records import N_ACTIONS
 from parkenv.envs.sensors import SearchSensorsEnv
 from parkenv.errors import InputError
-from parkenv.world.occupancy_kernel import kernel
+from parkenv.world.occupancy.kernel import kernel
 from parkenv.world.scenario import SearchProblem
 
 SCANS = 4

@@ -13,22 +13,22 @@ from gymnasium.vector.utils import batch_space, create_empty_array
 from numba import get_num_threads
 from numpy.typing import NDArray
 
+from parkenv.compiled import numpy_streams
+from parkenv.compiled.jit import compiled
+from parkenv.compiled.memory import address_of
+from parkenv.compiled.threads import in_threads
+from parkenv.engine.search_kernel import take_step
+from parkenv.engine.search_records import PROCESS_KIND, search_at
 from parkenv.envs.car_footprints import CarLibrary, Scratch, draw_car, put_car, remove_car
 from parkenv.envs.scan_observation import SCANS, ScanHistory, goal_of, observe_scans, scans_space
 from parkenv.envs.search import LATEST
-from parkenv.envs.search_kernel import take_step
-from parkenv.envs.search_records import PROCESS_KIND, search_at
 from parkenv.envs.search_vector import ParkSearchVectorEnv, Steps, report_step
 from parkenv.envs.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import FARTHEST
 from parkenv.errors import InputError
-from parkenv.perception.threads import in_threads
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.lot_scene import CARS_APART, slot_lot
-from parkenv.world.occupancy_kernel import CURSOR, cursor_at, kernel, process_at, process_state
-from parkenv.world.pointers import address_of
-from sim_sensors import numpy_streams
-from sim_sensors.compilation import compiled
+from parkenv.world.occupancy.kernel import CURSOR, cursor_at, kernel, process_at, process_state
 from sim_sensors.laser.kernel import BEAMS_PER_DRAW, scan_all
 from sim_sensors.laser.scanner import NOISE_TABLE_SIZE, LaserScanner, noise_table
 from sim_sensors.rig import SensorRig

@@ -11,23 +11,23 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.search_kernel import (
+from parkenv.compiled.keyed_random import seed_state
+from parkenv.engine.search_kernel import (
     begin_search_at,
     init_external_forecast_at,
     step_exact_at,
     step_noisy_at,
 )
-from parkenv.envs.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
-from parkenv.envs.search_state import SearchState
+from parkenv.engine.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
+from parkenv.engine.search_state import SearchState
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
-from parkenv.world.day_error import MAX_LOGITS
-from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
+from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.scenario import Scenario, SearchProblem
 
 if TYPE_CHECKING:
-    from parkenv.envs.rendering import SearchRenderer
+    from parkenv.show.rendering import SearchRenderer
 
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
@@ -319,7 +319,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observation(vertex), reward, over, False, info
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act, observe, and return the numbers named by `parkenv.envs.search_kernel.STEP_RESULT`."""
+        """Act, observe, and return the numbers named by `parkenv.engine.search_kernel.STEP_RESULT`."""
         result: tuple[Any, ...] = self._step(self._address, action)
         return result
 
@@ -336,7 +336,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             )
             return None
         if self._renderer is None:
-            from parkenv.envs.rendering import SearchRenderer
+            from parkenv.show.rendering import SearchRenderer
 
             self._renderer = SearchRenderer(self.scenario)
         state = self.state

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.envs.local_observation import Surroundings
-from parkenv.envs.search_records import (
+from parkenv.compiled.memory import int32s, int64s, prefetch
+from parkenv.engine.search_records import (
     EDGE,
     N_ACTIONS,
     PROCESS_KIND,
@@ -20,9 +20,9 @@ from parkenv.envs.search_records import (
     scenario_at,
     search_at,
 )
-from parkenv.world.occupancy import IntArray
-from parkenv.world.occupancy_kernel import inlined, prefetch_forecast
-from parkenv.world.pointers import int32s, int64s, prefetch
+from parkenv.envs.local_observation import Surroundings
+from parkenv.world.occupancy.kernel import inlined, prefetch_forecast
+from parkenv.world.occupancy.process import IntArray
 
 _APART = 2  # searches between two stages
 _LINE = 64  # bytes of a cache line

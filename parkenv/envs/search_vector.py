@@ -12,9 +12,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
-from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.envs.search import space_of
-from parkenv.envs.search_kernel import (
+from parkenv.compiled.keyed_random import seed_state
+from parkenv.compiled.memory import uint8s
+from parkenv.engine.search_kernel import (
     COUNT_METRICS,
     REWARD_TERMS,
     TIME_METRICS,
@@ -24,15 +24,15 @@ from parkenv.envs.search_kernel import (
     take_step,
     write_clock,
 )
+from parkenv.engine.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
+from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
+from parkenv.envs.search import space_of
 from parkenv.envs.search_prefetch import prefetch_searches
-from parkenv.envs.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
-from parkenv.world.keyed_random import seed_state
 from parkenv.world.lot import ACTIONS, PARK
-from parkenv.world.occupancy import BoolArray, FloatArray, IntArray
-from parkenv.world.occupancy_kernel import kernel
-from parkenv.world.pointers import uint8s
+from parkenv.world.occupancy.kernel import kernel
+from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
 
 OBSERVATIONS = ("full", "occupancy", "local")
 MAX_ENVS = 1_000_000

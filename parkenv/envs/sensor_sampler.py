@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.envs.search_state import SearchState
+from parkenv.compiled.threads import in_threads
+from parkenv.engine.search_state import SearchState
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
-from parkenv.perception.threads import in_threads
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather

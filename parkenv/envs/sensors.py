@@ -10,8 +10,8 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from parkenv.engine.search_state import SearchState
 from parkenv.envs.search import LATEST, SearchEnv
-from parkenv.envs.search_state import SearchState
 from parkenv.envs.sensor_sampler import SensorSampler, make_rig
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture

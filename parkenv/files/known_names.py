@@ -30,6 +30,6 @@ KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
-"""Recorded days that a forecast is made from; see `parkenv.world.recorded_occupancy`."""
+"""Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
 VERIFY_CASES = ("line", "looks", "entry", "stays", "blocking", "balance", "strategies", "game")
-"""Cases of `parkenv verify`: modules of `parkenv.evaluation.verify`."""
+"""Cases of `parkenv verify`: modules of `parkenv.studies.verify`."""

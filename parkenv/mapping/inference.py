@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from scipy.stats import beta
 
 from parkenv.errors import InputError
-from parkenv.world.occupancy import Arrival, Forecast
-from parkenv.world.occupancy_kernel import MAX_PROBABILITY, MIN_PROBABILITY
+from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
+from parkenv.world.occupancy.process import Arrival, Forecast
 from parkenv.world.week import DAY_S, HOUR_S
 
 FloatArray = NDArray[np.float64]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.grid import OccupancyGrid
@@ -22,9 +23,8 @@ from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
-from parkenv.world.keyed_random import world_key
 from parkenv.world.lot_scene import LotScenes, slot_lot
-from parkenv.world.occupancy import Arrival, ArrivalWindow, World
+from parkenv.world.occupancy.process import Arrival, ArrivalWindow, World
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, poses_along

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.world.decay import decay_factor
-from parkenv.world.occupancy import Forecast
+from parkenv.world.occupancy.decay import decay_factor
+from parkenv.world.occupancy.process import Forecast
 
 FloatArray = NDArray[np.float64]
 

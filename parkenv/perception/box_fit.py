@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

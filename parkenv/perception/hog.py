@@ -17,8 +17,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-from sim_sensors.compilation import compiled
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]

@@ -13,11 +13,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError
 from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
 from parkenv.perception.detector import Detections, GroundBand
 from parkenv.perception.hog import CELL, Descriptor, correlate
-from parkenv.perception.threads import in_threads
 
 Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import BandDetector, Detections, Detector, GroundBand
@@ -26,7 +27,6 @@ from parkenv.perception.ranging import (
     localize_median,
 )
 from parkenv.perception.slot_filter import SlotFilter, SlotObservation
-from parkenv.perception.threads import in_threads
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Capture, Mount, SensorRig

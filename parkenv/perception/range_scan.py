@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from sim_sensors.camera.models import StereoCamera, StereoFrame
-from sim_sensors.compilation import compiled
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount
 

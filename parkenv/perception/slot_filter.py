@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.jit import compiled
 from parkenv.perception.range_scan import RangeScan
 from parkenv.perception.ranging import LocatedCars
 from parkenv.world.lot import Mouth, ParkingLot
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

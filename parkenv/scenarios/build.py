@@ -23,20 +23,20 @@ from parkenv.scenarios.spec import (
     TypicalWeek,
     scenario_specs,
 )
-from parkenv.world.day_error import DayError
-from parkenv.world.flat_map import FlatMap
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy import OccupancyModel, OccupancyProcess, PriorModel
-from parkenv.world.real_week import real_week_occupancy
+from parkenv.world.occupancy.constant_map import FlatMap
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.process import OccupancyModel, OccupancyProcess, PriorModel
+from parkenv.world.occupancy.real_week import real_week_occupancy
+from parkenv.world.occupancy.typical_week import attraction, typical_occupancy, with_event
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.traffic import Traffic
-from parkenv.world.typical_week import attraction, typical_occupancy, with_event
 
 if TYPE_CHECKING:
     from parkenv.forecast.counts import Counts
     from parkenv.forecast.day_forecast import DayForecast
-    from parkenv.world.counted_occupancy import CountedOccupancy
+    from parkenv.world.occupancy.counted import CountedOccupancy
 
 MIN_PAST_DAYS = 7
 """Days of counts that a forecast needs at least."""
@@ -197,8 +197,8 @@ def _lot(spec: LotSpec) -> ParkingLot:
 def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
     if spec.log is not None:
         from parkenv.forecast.counts import is_counts
-        from parkenv.world.occupancy_log import OccupancyLog
-        from parkenv.world.recorded_occupancy import RecordedOccupancy, read_mapping
+        from parkenv.world.occupancy.log import OccupancyLog
+        from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping
 
         if is_counts(spec.log[0]):
             raise InputError(
@@ -224,7 +224,7 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
 
 
 def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: int) -> CountedOccupancy:
-    from parkenv.world.counted_occupancy import CountedOccupancy
+    from parkenv.world.occupancy.counted import CountedOccupancy
 
     changed = spec.file.stat().st_mtime_ns if spec.file.exists() else 0
     counts, forecast = _forecast_counts(spec.file, changed, spec.timezone, first, past)

@@ -8,8 +8,8 @@ from collections.abc import Container, Sequence
 
 import numpy as np
 
+from parkenv.compiled.keyed_random import PLACE_STREAM, keyed_uniform, world_key
 from parkenv.errors import InputError
-from parkenv.world.keyed_random import PLACE_STREAM, keyed_uniform, world_key
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 

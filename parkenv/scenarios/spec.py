@@ -28,9 +28,9 @@ from parkenv.files.known_names import (
 )
 from parkenv.files.limited_reading import is_there
 from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
-from parkenv.world import real_week
-from parkenv.world.day_error import MAX_LOGITS
-from parkenv.world.occupancy import ArrivalWindow
+from parkenv.world.occupancy import real_week
+from parkenv.world.occupancy.day_error import MAX_LOGITS
+from parkenv.world.occupancy.process import ArrivalWindow
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
@@ -500,7 +500,8 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
 def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
     """Return the scenario of a lot alone: the lot's first goal, any of its entries, a week as in busy real car parks.
 
-    The week and how days differ from it are derived from counts of real car parks, see `parkenv.world.real_week`: on
+    The week and how days differ from it are derived from counts of real car parks, see
+    `parkenv.world.occupancy.real_week`: on
     workdays fuller than nine in ten of them, 55 % at 8:00 and 82 % at 11:00, more near the goal.
 
     Args:

@@ -18,8 +18,7 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 from scipy.stats import poisson
 
-from parkenv.errors import InputError
-from parkenv.world.keyed_random import (
+from parkenv.compiled.keyed_random import (
     ENTRY_STREAM,
     GOAL_STREAM,
     HEADWAY_STREAM,
@@ -28,7 +27,8 @@ from parkenv.world.keyed_random import (
     STAY_STREAM,
     car_uniforms,
 )
-from parkenv.world.occupancy_log import OccupancyLog
+from parkenv.errors import InputError
+from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
 FloatArray = NDArray[np.float64]

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.world.lot import Mouth, ParkingLot, is_building
-from parkenv.world.occupancy import World
+from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 from parkenv.world.traffic import LotTraffic
 from sim_sensors.scene import Scene

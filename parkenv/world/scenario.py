@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
-from parkenv.world.occupancy import Arrival, ArrivalWindow, Forecast, OccupancyModel, PriorModel
+from parkenv.world.occupancy.process import Arrival, ArrivalWindow, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
 from parkenv.world.traffic import Traffic
 

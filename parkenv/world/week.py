@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
 
 HOUR_S = 3600.0
 DAY_S = 86_400.0

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, SlotBelief
 from parkenv.errors import InputError
-from parkenv.world.day_error import nearness
 from parkenv.world.lot import PARK
+from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path

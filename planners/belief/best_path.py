@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.jit import compiled
 from planners.belief.path_evaluation import evaluate_path, expected_cost_to_slot, options_at_hand
 from planners.belief.path_rollout import is_worth_an_attempt, rollout_path
 from planners.belief.planning_graph import (
@@ -20,7 +21,6 @@ from planners.belief.planning_graph import (
     Records,
     is_hidden,
 )
-from sim_sensors.compilation import compiled
 
 MOST_OPTIONS = 12  # maximum number of slots known to be free that are considered, best first
 NOWHERE, ATTEMPT = -1, -2

@@ -13,6 +13,7 @@ from __future__ import annotations
 import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE
+from parkenv.compiled.jit import compiled
 from planners.belief.path_rollout import p_free_when_first_observed
 from planners.belief.planning_graph import (
     BeliefSnapshot,
@@ -23,7 +24,6 @@ from planners.belief.planning_graph import (
     copy_weights,
     decayed_part,
 )
-from sim_sensors.compilation import compiled
 
 KEPT_IN_MIND = 32  # number of stops for which a passed free slot is remembered
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.jit import compiled
 from planners.belief.planning_graph import (
     BeliefSnapshot,
     FloatArray,
@@ -21,7 +22,6 @@ from planners.belief.planning_graph import (
     mean_over_days,
     needs_attempt,
 )
-from sim_sensors.compilation import compiled
 
 NEGLIGIBLE = 0.002
 """P(no slot worth stopping for was found) at which a path ends; the remaining time is estimated."""

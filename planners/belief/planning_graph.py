@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -17,11 +17,11 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
 from planners.belief.agent import BeliefAgent
 from planners.neighborhood import MOST_VERTICES, Neighborhood
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

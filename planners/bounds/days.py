@@ -7,7 +7,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.world.day_error import DayError, centred_logits, nearness
+from parkenv.world.occupancy.day_error import DayError, centred_logits, nearness
 
 FloatArray = NDArray[np.float64]
 

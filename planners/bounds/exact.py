@@ -27,14 +27,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-from parkenv.world.day_error import EXACT, DayError
 from parkenv.world.lot import PARK
+from parkenv.world.occupancy.day_error import EXACT, DayError
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 from planners.bounds.days import Days
 from planners.road_table import RoadTable
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

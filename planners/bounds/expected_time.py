@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
-from parkenv.world.day_error import EXACT, DayError
 from parkenv.world.lot import PARK
+from parkenv.world.occupancy.day_error import EXACT, DayError
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Agent
 from planners.bounds.days import Days, FloatArray

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.occupancy import World
+from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
 from planners.routes import DriveRoutes

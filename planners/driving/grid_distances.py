@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import compiled
 from planners.driving.clearance import CELL_M, Clearance
-from planners.thesis.heap import pop, push
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

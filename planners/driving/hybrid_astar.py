@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
 from planners.driving.car_path import CarPath
@@ -22,8 +24,6 @@ from planners.driving.grid_distances import GRID_CELLS, grid_distances
 from planners.driving.path_shortening import shorten_path
 from planners.driving.reeds_shepp import PIECES, Words, distance_between, words_buffer
 from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot
-from planners.thesis.heap import pop, push
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]

@@ -5,12 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import move_along
 from planners.driving.car_path import SHORTEST_ARC
 from planners.driving.clearance import Clearance
 from planners.driving.reeds_shepp import Words, words_buffer
 from planners.driving.reeds_shepp_shots import DriveCosts, cheapest_shot
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

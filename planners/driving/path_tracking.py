@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
 from planners.driving.car_path import CarPath
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

@@ -14,8 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STEERING, YAW, VehicleParameters
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]

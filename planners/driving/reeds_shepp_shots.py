@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import move_along
 from planners.driving.clearance import Clearance, is_collision_free
 from planners.driving.reeds_shepp import Words, word_cost, words_between
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

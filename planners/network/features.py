@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.jit import compiled
 from planners.belief.path_evaluation import expected_cost_to_slot, options_at_hand
 from planners.belief.planning_graph import (
     BeliefSnapshot,
@@ -27,7 +28,6 @@ from planners.belief.planning_graph import (
     needs_attempt,
 )
 from planners.network.lookahead import Scratch, best_option, next_target, path_value
-from sim_sensors.compilation import compiled
 
 ACTION_COUNT = 6
 """Four moves, parking, waiting."""

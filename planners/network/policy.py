@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
 from parkenv import __version__
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
@@ -42,7 +43,6 @@ from planners.network.features import (
     TOKEN_FEATURES,
     Features,
 )
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float32]
 

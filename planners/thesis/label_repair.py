@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.heap import push
+from parkenv.compiled.jit import compiled
 from planners.thesis import label_setting
-from planners.thesis.heap import push
 from planners.thesis.label_setting import FloatArray, Labels, StoppingGraph
-from sim_sensors.compilation import compiled
 
 REACH = 0.1  # fraction of the lot's vertices that a repair may change; above it the plan is made from scratch
 _LEAST_REACH = 64

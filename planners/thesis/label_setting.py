@@ -31,11 +31,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import compiled
 from parkenv.world.lot import PARK
-from planners.thesis.heap import pop, push
 from planners.thesis.mdp import ParkingMDP
 from planners.thesis.policy_iteration import Solution, policy_iteration
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-from parkenv.world.day_error import nearness
 from parkenv.world.lot import PARK
+from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
 from planners.thesis.label_repair import repair
@@ -26,7 +27,6 @@ from planners.thesis.label_setting import (
     with_p_free,
 )
 from planners.thesis.mdp import ParkingMDP
-from sim_sensors.compilation import compiled
 
 RELEVANT_CHANGE = 0.01  # replan once a probability differs by more than this from that of the plan
 SOLVERS = ("label_setting", "policy_iteration")

@@ -17,16 +17,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.jit import compiled
+from parkenv.compiled.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
 from parkenv.errors import InputError
-from parkenv.world.day_error import EXACT, DayError, centred_logits, nearness
-from parkenv.world.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
+from parkenv.world.occupancy.day_error import EXACT, DayError, centred_logits, nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.planning_graph import PlanningGraph
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 from planners.thesis.replanning import Plan, ReplanningAgent
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

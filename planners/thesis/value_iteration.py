@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from planners.thesis.mdp import ParkingMDP
 from planners.thesis.policy_iteration import Solution
-from sim_sensors.compilation import compiled
 
 FloatArray = NDArray[np.float64]
 

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.daylight import Light
 from sim_sensors.camera.textures import VECTOR_LOOP, Single
-from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 IntArray = NDArray[np.int32]

@@ -7,13 +7,13 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import Batch, Places
 from sim_sensors.camera.daylight import SHADOW_BIAS, Light
 from sim_sensors.camera.ground_texture import GroundTexture, sample_ground
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.sky import look_up
 from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, hash_unit, sample_tile
-from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 

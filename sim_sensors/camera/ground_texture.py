@@ -11,8 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import VECTOR_LEAF, Single, byte, fractal_noise, mix
-from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Ground
 
 _FINEST = 0.025  # m a texel

@@ -11,9 +11,9 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.rasterizer import BAND, interleaved
 from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single
-from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
 
 Float32Array = NDArray[np.float32]

@@ -7,11 +7,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import Batch, Places, View
 from sim_sensors.camera.daylight import SHADOW_BIAS, Light, mirrored
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, mix, pixel_level, sample_tile
-from sim_sensors.compilation import compiled
 from sim_sensors.facades import facade
 from sim_sensors.mesh import Material
 

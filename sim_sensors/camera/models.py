@@ -11,6 +11,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.ground_texture import GroundTexture, ground_texture
 from sim_sensors.camera.image_sensor import ImageSensor
 from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
@@ -20,7 +21,6 @@ from sim_sensors.camera.shading import shade
 from sim_sensors.camera.shadows import light_maps
 from sim_sensors.camera.sky import packed_sky, sky_of_view
 from sim_sensors.camera.weather import Weather
-from sim_sensors.compilation import compiled
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Ground, Instances, MeshPool
 

@@ -15,8 +15,8 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF
-from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Instances, Material, MeshPool
 
 Float32Array = NDArray[np.float32]

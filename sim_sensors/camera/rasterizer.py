@@ -14,9 +14,9 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.textures import FAST, LEAF
-from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Material
 
 Float32Array = NDArray[np.float32]

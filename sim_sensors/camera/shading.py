@@ -10,6 +10,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import (
     BATCH_FIELDS,
     Batch,
@@ -43,7 +44,6 @@ from sim_sensors.camera.rasterizer import BAND, Visibility, interleaved
 from sim_sensors.camera.sky import sky_of_view
 from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single, Tile, cloud_tile, grain_tile
 from sim_sensors.camera.weather import Weather
-from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]

@@ -18,10 +18,10 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
 from sim_sensors.camera.textures import quads
 from sim_sensors.camera.weather import Weather
-from sim_sensors.compilation import compiled
 from sim_sensors.mesh import Instances, Material, MeshPool
 
 FloatArray = NDArray[np.float64]

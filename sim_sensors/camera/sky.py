@@ -15,9 +15,9 @@ from numba import prange
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft2
 
+from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF, VECTOR_LEAF, Single, cloud_noise, fractal_noise, mix
 from sim_sensors.camera.weather import Weather
-from sim_sensors.compilation import compiled
 
 Float32Array = NDArray[np.float32]
 FloatArray = NDArray[np.float64]

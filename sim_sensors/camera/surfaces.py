@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
 from sim_sensors.mesh import Mesh
 
 FloatArray = NDArray[np.float64]

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
 
 Single = Any  # a scalar in compiled code, float32 mostly: numba knows its type
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_sensors.compilation import compiled
+from parkenv.compiled.jit import compiled
 from sim_sensors.laser.footprints import LANES, LARGEST_IN_A_CELL_M, NO_RETURN, OCTAGON, QUAD, WALL
 
 Float32Array = NDArray[np.float32]

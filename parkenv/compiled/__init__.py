@@ -1,0 +1,1 @@
+"""Compiled code: functions, memory, heaps and keyed streams of random numbers; nothing of parking."""

@@ -1,0 +1,1 @@
+"""The searches of one car and of many: records and compiled kernels."""

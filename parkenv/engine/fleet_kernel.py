@@ -1,0 +1,437 @@
+"""The compiled engine of a world with many cars: events in continuous time.
+
+A car of the fleet is a search of `parkenv.engine.search_kernel`, with the same steps and the same belief; only the
+slots are shared. At each moment the engine first carries out what is over by then: departures, arrivals, and steps,
+after which cars observe. Then the cars that have to decide do so one after another, in the order in which their steps
+ended. A decision acts at once: of two cars before the same slot the first gets it, the second has a failed attempt.
+The next moment is that of the next event.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from parkenv.compiled.keyed_random import car_key
+from parkenv.compiled.memory import call_at, int64s
+from parkenv.engine.event_queue import ARRIVAL, DEPARTURE, REACH, event_at, pop_event, push_event
+from parkenv.engine.fleet_interactions import (
+    block_lane,
+    blocked_until,
+    clear_lanes,
+    hold_slot,
+    release_slot,
+)
+from parkenv.engine.fleet_knowledge import clear_live_map, inform, report_slot, report_view
+from parkenv.engine.fleet_records import (
+    BALKED,
+    GAVE_UP,
+    LEFT,
+    OWN_KNOWLEDGE,
+    PARKED,
+    RESERVE_KNOWLEDGE,
+    SEARCHING,
+    TRUNCATED,
+    car_at,
+    fleet_at,
+    step_at,
+)
+from parkenv.engine.search_kernel import (
+    SCENARIO_BYTES,
+    drive_or_park,
+    enter,
+    finish_step,
+    give_up,
+    init_prior,
+    observe,
+    refresh_belief,
+    write_clock,
+)
+from parkenv.engine.search_records import EXTERNAL_KIND, N_ACTIONS, scenario_at, search_at
+from parkenv.engine.shared_slots import NO_CAR, empty_shared_slots, shared_slot_at
+from parkenv.world.lot import PARK
+from parkenv.world.occupancy.kernel import inlined, kernel
+
+(
+    FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,
+) = range(-1, -9, -1)  # fmt: skip
+"""Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records are
+needed; Python must compute the forecast of the car `pending`; a compiled driver chose an unknown action; more room for
+reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
+
+LEAVE = -1
+"""Action of compiled drivers: give up and park elsewhere."""
+TAKE_SLOT = 16
+"""Action of compiled drivers: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
+_ON_TICK = 1e-9  # fraction of a tick
+
+
+# ---- from Python
+
+
+@kernel
+def begin_world_at(address: int) -> None:
+    """Begin the world of a FLEET record whose cars are due."""
+    fleet = fleet_at(address, 0)
+    empty_shared_slots(address)
+    clear_live_map(fleet)
+    clear_lanes(fleet)
+    fleet.time = fleet.arrival
+    fleet.n_events = fleet.event_number = fleet.next_car = 0
+    fleet.first_ready = fleet.n_ready = 0
+    fleet.pending = NO_CAR
+    fleet.n_searching = fleet.n_parked = fleet.n_gone = fleet.n_decisions = 0
+    fleet.searching_s = fleet.parked_s = 0.0
+    fleet.n_kept_steps = 0
+
+
+@kernel
+def advance_at(address: int, until: float) -> int:
+    """Carry out events and the decisions of compiled drivers.
+
+    Args:
+        address: address of the FLEET record.
+        until: s since Monday 00:00, time to stop at; infinite: stop when all searches are over.
+
+    Returns:
+        The car whose decision, or the end of whose search, Python must handle; or a negative number, see `FINISHED`.
+    """
+    fleet = fleet_at(address, 0)
+    while True:
+        if fleet.report_capacity > 0 and fleet.n_reports + fleet.n_slots >= fleet.report_capacity:
+            return NEEDS_REPORTS
+        if fleet.step_capacity > 0 and fleet.n_kept_steps == fleet.step_capacity:
+            return NEEDS_STEPS
+        if not (fleet.next_car < fleet.n_cars or fleet.n_events > 0) and fleet.n_ready == 0:
+            break
+        if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
+            number = int64s(fleet.ready)[fleet.first_ready]
+            car = car_at(fleet.cars, number)
+            if car.rule == 0 or car.state != SEARCHING:
+                return NEEDS_RESERVATIONS if _lacks_reservation(fleet, car) else int(number)
+            if _lacks_reservation(fleet, car):
+                return NEEDS_RESERVATIONS
+            if not act(fleet, number, call_at(car.rule, address, number)):
+                return WRONG_ACTION
+            continue
+        if until == np.inf and fleet.n_searching == 0 and fleet.next_car == fleet.n_cars:
+            return FINISHED
+        if not _is_due(fleet, until):
+            break
+        status = _next_event(fleet)
+        if status < 0:
+            return int(status)
+    if until < np.inf:
+        _pass_time(fleet, max(until, fleet.time))
+    return PAUSED if fleet.n_searching > 0 or fleet.next_car < fleet.n_cars else FINISHED
+
+
+@kernel
+def act_at(address: int, action: int) -> None:
+    """Carry out the decision of the car that is first in the queue."""
+    fleet = fleet_at(address, 0)
+    act(fleet, int64s(fleet.ready)[fleet.first_ready], action)
+
+
+@kernel
+def release_at(address: int) -> None:
+    """Remove the car whose search is over from the head of the queue, and free its SEARCH record."""
+    fleet = fleet_at(address, 0)
+    number = _first_ready(fleet)
+    _free_search(fleet, car_at(fleet.cars, number))
+
+
+@kernel
+def init_forecast_at(address: int) -> None:
+    """Initialise the belief of the car `pending` with its external forecast."""
+    fleet = fleet_at(address, 0)
+    search = search_at(car_at(fleet.cars, fleet.pending).search, 0)
+    if search.belief != 0:
+        init_prior(search)
+    _inform(fleet, fleet.pending)
+    fleet.pending = NO_CAR
+
+
+@kernel
+def inform_reserving_at(address: int) -> None:
+    """After slots have been reserved: tell the cars that are to decide."""
+    fleet = fleet_at(address, 0)
+    fleet.reservations_stale = False
+    for i in range(fleet.n_ready):
+        number = int64s(fleet.ready)[(fleet.first_ready + i) % fleet.n_cars]
+        car = car_at(fleet.cars, number)
+        if car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING:
+            _inform(fleet, number)
+
+
+# ---- events
+
+
+@inlined
+def _is_due(fleet: Any, time: float) -> bool:
+    """Return whether the next event is not after a time, s."""
+    if fleet.n_events > 0 and event_at(fleet.events, 0).time <= time:
+        return True
+    return bool(fleet.next_car < fleet.n_cars and car_at(fleet.cars, fleet.next_car).arrival <= time)
+
+
+@inlined
+def _next_event(fleet: Any) -> int:
+    """Carry out the next event; returns a negative number if Python must help first or after it."""
+    if fleet.next_car < fleet.n_cars:
+        arrival = car_at(fleet.cars, fleet.next_car).arrival
+        if fleet.n_events > 0:
+            event = event_at(fleet.events, 0)
+            arrives = event.time > arrival or (event.time == arrival and event.kind > ARRIVAL)
+        else:
+            arrives = True
+        if arrives:
+            if fleet.n_free == 0:
+                return NEEDS_SEARCH
+            _pass_time(fleet, arrival)
+            return int(_arrive(fleet))
+    event = event_at(fleet.events, 0)
+    _pass_time(fleet, event.time)
+    fleet.reservations_stale = True
+    kind = event.kind
+    number = pop_event(fleet)
+    if kind == DEPARTURE:
+        _depart(fleet, number)
+    else:
+        _reach(fleet, number)
+    return 0
+
+
+@inlined
+def _pass_time(fleet: Any, time: float) -> None:
+    elapsed = time - fleet.time
+    fleet.searching_s += fleet.n_searching * elapsed
+    fleet.parked_s += fleet.n_parked * elapsed
+    fleet.time = time
+
+
+@kernel
+def _arrive(fleet: Any) -> int:
+    """Begin the search of the next car."""
+    number = fleet.next_car
+    fleet.next_car += 1
+    car = car_at(fleet.cars, number)
+    fleet.n_free -= 1
+    car.search = int64s(fleet.free_searches)[fleet.n_free]
+    car.moves = int64s(fleet.free_moves)[fleet.n_free]
+    car.target, car.n_moves, car.reserved, car.informed_until = NO_CAR, 0, NO_CAR, -np.inf
+    fleet.reservations_stale = True
+    search = search_at(car.search, 0)
+    search.place, search.car = car.place, number
+    car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
+    search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
+    enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
+    car.state = SEARCHING
+    fleet.n_searching += 1
+    _make_ready(fleet, number)
+    write_clock(search)
+    if scenario_at(search.scenario, 0).prior_kind == EXTERNAL_KIND:
+        fleet.pending = number
+        return NEEDS_FORECAST
+    if search.belief != 0:
+        init_prior(search)
+    _inform(fleet, number)
+    return 0
+
+
+@kernel
+def _reach(fleet: Any, number: int) -> None:
+    """End the step of a car: it observes, and is asked again unless its search is over."""
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    until = blocked_until(fleet, car, number)
+    if until > fleet.time:
+        _queue(fleet, car, search, number, until)
+        return
+    observe(search)
+    if car.shares:
+        report_view(fleet, search)
+    if car.knows != OWN_KNOWLEDGE and car.knows != RESERVE_KNOWLEDGE:
+        inform(fleet, number)
+    _complete_step(search)
+    if search.over:
+        _end_search(fleet, number, GAVE_UP)
+    elif search.time - search.arrival >= car.patience_s:
+        give_up(search)
+        _end_search(fleet, number, BALKED)
+    elif search.n_steps >= fleet.max_steps:
+        _end_search(fleet, number, TRUNCATED)
+    else:
+        _make_ready(fleet, number)
+
+
+@inlined
+def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None:
+    """Let a car wait before a blocked vertex until a time, s."""
+    car.queues_since = min(car.queues_since, fleet.time)
+    before = search.step_drive_s
+    search.step_drive_s += until - fleet.time
+    search.time = until
+    if fleet.tick_s > 0.0:
+        _round_up(fleet, search)
+    car.queued_s += search.step_drive_s - before
+    block_lane(fleet, search.previous_vertex, search.time, number)
+    push_event(fleet, search.time, REACH, number)
+
+
+@inlined
+def _complete_step(search: Any) -> None:
+    finish_step(search)
+    if search.belief != 0:
+        refresh_belief(search)
+    write_clock(search)
+
+
+@inlined
+def _inform(fleet: Any, number: int) -> None:
+    """Give a car what it knows beyond its own observations, and refresh its belief."""
+    car = car_at(fleet.cars, number)
+    if car.knows != OWN_KNOWLEDGE:
+        search = search_at(car.search, 0)
+        inform(fleet, number)
+        if search.belief != 0:
+            refresh_belief(search)
+
+
+@inlined
+def _lacks_reservation(fleet: Any, car: Any) -> bool:
+    """Return whether slots must be reserved anew before a car decides."""
+    return bool(fleet.reservations_stale and car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING)
+
+
+@inlined
+def _depart(fleet: Any, number: int) -> None:
+    car = car_at(fleet.cars, number)
+    shared_slot_at(fleet.slots, car.slot).car = NO_CAR
+    block_lane(fleet, car.slot, fleet.time + fleet.manoeuvre_s, number)
+    if car.shares:
+        report_slot(fleet, car.slot, False, 0.0)
+    car.state, car.left_at = LEFT, fleet.time
+    fleet.n_parked -= 1
+    fleet.n_gone += 1
+
+
+# ---- decisions
+
+
+@kernel
+def act(fleet: Any, number: int, action: int) -> bool:
+    """Carry out the decision of the first car in the queue; returns whether there is such an action."""
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    if not (LEAVE <= action < N_ACTIONS or TAKE_SLOT <= action < TAKE_SLOT + fleet.n_slots):
+        return False
+    _first_ready(fleet)
+    fleet.n_decisions += 1
+    fleet.reservations_stale = True
+    if action == LEAVE:
+        search.step_drive_s = search.step_failed_s = search.step_walk_s = search.step_parking_cost_s = 0.0
+        search.step_gave_up_s = 0.0
+        give_up(search)
+        _end_search(fleet, number, BALKED)
+        return True
+    if action >= TAKE_SLOT:
+        search.vertex = action - TAKE_SLOT
+        action = PARK
+    origin = search.vertex
+    car.queues_since = np.inf
+    drive_or_park(search, action)
+    car.stands, car.vertex = search.vertex == car.vertex, search.vertex
+    if search.parked:
+        _complete_step(search)
+        shared = shared_slot_at(fleet.slots, search.vertex)
+        shared.car, shared.leaves_at = number, fleet.time + car.stay_s
+        block_lane(fleet, search.vertex, fleet.time + fleet.manoeuvre_s, number)
+        car.slot = search.vertex
+        if car.shares:
+            report_slot(fleet, car.slot, True, 1.0)
+        _end_search(fleet, number, PARKED)
+        push_event(fleet, fleet.time + car.stay_s, DEPARTURE, number)
+        return True
+    if fleet.tick_s > 0.0:
+        _round_up(fleet, search)
+    if car.stands:
+        hold_slot(fleet, car, number)
+        block_lane(fleet, search.vertex, search.time, number)
+    else:
+        release_slot(fleet, car)
+    push_event(fleet, search.time, REACH, number)
+    if fleet.step_capacity > 0:
+        _keep_step(fleet, search, number, origin)
+    return True
+
+
+@inlined
+def _keep_step(fleet: Any, search: Any, number: int, origin: int) -> None:
+    step = step_at(fleet.steps, fleet.n_kept_steps)
+    step.car, step.begin, step.end = number, fleet.time, search.time
+    step.origin, step.vertex, step.failed = origin, search.vertex, search.step_failed_s > 0.0
+    fleet.n_kept_steps += 1
+
+
+@inlined
+def _round_up(fleet: Any, search: Any) -> None:
+    """Let a step end at a full tick after the beginning of the world, and at least one tick later."""
+    begin = fleet.arrival
+    ticks = max(
+        math.ceil((search.time - begin) / fleet.tick_s - _ON_TICK),
+        math.floor((fleet.time - begin) / fleet.tick_s + 0.5) + 1.0,
+    )
+    later = begin + ticks * fleet.tick_s
+    search.step_drive_s += later - search.time
+    search.time = later
+
+
+@kernel
+def _end_search(fleet: Any, number: int, state: int) -> None:
+    """Record the end of a search."""
+    car = car_at(fleet.cars, number)
+    search = search_at(car.search, 0)
+    car.state, car.ended_at = state, fleet.time
+    car.drive_s, car.failed_s, car.walk_s = search.drive_s, search.failed_s, search.walk_s
+    car.parking_cost_s, car.gave_up_s = search.parking_cost_s, search.gave_up_s
+    car.driven_m, car.walked_m = search.driven_m, search.walked_m
+    car.failed_parks, car.slots_passed, car.n_steps = search.failed_parks, search.slots_passed, search.n_steps
+    release_slot(fleet, car)
+    fleet.n_searching -= 1
+    if state == PARKED:
+        fleet.n_parked += 1
+    else:
+        fleet.n_gone += 1
+    if state == TRUNCATED:
+        car.gave_up_s += scenario_at(search.scenario, 0).give_up_s
+    if car.rule == 0:
+        _make_ready(fleet, number)
+    else:
+        _free_search(fleet, car)
+
+
+@inlined
+def _make_ready(fleet: Any, number: int) -> None:
+    """Add a car to the end of the queue."""
+    int64s(fleet.ready)[(fleet.first_ready + fleet.n_ready) % fleet.n_cars] = number
+    fleet.n_ready += 1
+
+
+@inlined
+def _first_ready(fleet: Any) -> Any:
+    """Remove the first car from the queue, and return it."""
+    number = int64s(fleet.ready)[fleet.first_ready]
+    fleet.first_ready = (fleet.first_ready + 1) % fleet.n_cars
+    fleet.n_ready -= 1
+    return number
+
+
+@inlined
+def _free_search(fleet: Any, car: Any) -> None:
+    int64s(fleet.free_searches)[fleet.n_free] = car.search
+    int64s(fleet.free_moves)[fleet.n_free] = car.moves
+    fleet.n_free += 1
+    car.search = 0

@@ -1,0 +1,610 @@
+"""The compiled search: the effect of an action on the car, its observations and its belief.
+
+`parkenv/Search-v2` and its batch both run this code, so they agree to the bit. The cost of a step does not grow with
+the lot: only slots that a search has observed or queried get a column in its tables.
+
+Functions named `..._at` take an address: that of a record of `Searches`, where they are called from Python.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from parkenv.belief.slot_belief import bayes_update, decay_to_prior
+from parkenv.compiled.keyed_random import (
+    ARRIVAL_STREAM,
+    ENTRY_STREAM,
+    OBSERVATION_STREAM,
+    PLACE_STREAM,
+    VIEW_STREAM,
+    episode_key,
+    keyed_uniform,
+)
+from parkenv.compiled.memory import float32s, float64s, int32s, int64s
+from parkenv.engine.search_records import (
+    BLOCK_BITS,
+    BLOCK_SIZE,
+    DECAY_RATE,
+    EXTERNAL_KIND,
+    FORECAST,
+    LOG_KIND,
+    N_ACTIONS,
+    NEVER_OBSERVED,
+    OBSERVED_AT,
+    P_OBSERVED,
+    PROCESS_KIND,
+    SCENARIO,
+    SENTINEL,
+    SHARED_KIND,
+    block_at,
+    edge_at,
+    scenario_at,
+    search_at,
+    slot_at,
+)
+from parkenv.engine.shared_slots import is_slot_open
+from parkenv.world.lot import PARK
+from parkenv.world.occupancy import kernel as worlds
+from parkenv.world.occupancy.kernel import inlined, kernel
+from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
+from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
+
+REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
+TIME_METRICS = (
+    "drive_s",
+    "failed_s",
+    "walk_s",
+    "parking_cost_s",
+    "gave_up_s",
+    "total_s",
+    "driven_m",
+    "walked_m",
+)
+COUNT_METRICS = ("failed_parks", "slots_passed")
+STEP_RESULT = ("reward", *REWARD_TERMS, *TIME_METRICS, *COUNT_METRICS, "parked", "over", "vertex")
+"""Names of the numbers that a step returns; metrics are those of the episode so far."""
+SCENARIO_BYTES = SCENARIO.itemsize
+
+# ---- one search, from Python
+
+
+@kernel
+def begin_search_at(address: int) -> None:
+    """Begin the next episode; an external prior must then be queried and `init_prior` called."""
+    search = search_at(address, 0)
+    arrive(search)
+    if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
+        init_prior(search)
+    write_clock(search)
+
+
+@kernel
+def init_external_forecast_at(address: int) -> None:
+    """Initialise the belief with the forecast in `Searches.external_forecast`."""
+    init_prior(search_at(address, 0))
+
+
+# One function for each kind of sensor, so that only the kind in use is compiled.
+
+
+@kernel
+def step_exact_at(address: int, action: int) -> tuple[Any, ...]:
+    """Take a valid action with an exact sensor; returns as `step_result`."""
+    search = search_at(address, 0)
+    drive_or_park(search, action)
+    if not search.parked:
+        observe_exact(search)
+    result: tuple[Any, ...] = complete_step(search)
+    return result
+
+
+@kernel
+def step_noisy_at(address: int, action: int) -> tuple[Any, ...]:
+    """Take a valid action with a noisy sensor; returns as `step_result`."""
+    search = search_at(address, 0)
+    drive_or_park(search, action)
+    if not search.parked:
+        observe_noisy(search)
+    result: tuple[Any, ...] = complete_step(search)
+    return result
+
+
+# ---- the parts of a step from Python, for environments that drive or observe differently
+
+
+@kernel
+def act_at(address: int, action: int) -> None:
+    """Move along the graph or attempt to park, without observing yet."""
+    drive_or_park(search_at(address, 0), action)
+
+
+@kernel
+def set_step_time_at(address: int, begin: float, drive_s: float, failed_s: float) -> None:
+    """Set the times, s, for driving and for failed attempts, of the step that began at `begin`."""
+    search = search_at(address, 0)
+    search.time = begin + (drive_s + failed_s)
+    search.step_drive_s, search.step_failed_s = drive_s, failed_s
+
+
+@kernel
+def fail_attempt_at(address: int) -> None:
+    """Count a failed attempt at a free slot; `set_step_time_at` sets its time."""
+    search = search_at(address, 0)
+    search.failed_parks += 1
+    search.n_steps += 1
+    search.step_walk_s = search.step_parking_cost_s = 0.0
+
+
+@kernel
+def observe_at(address: int) -> None:
+    """Observe the slots in view with the scenario's sensor model."""
+    observe(search_at(address, 0))
+
+
+@kernel
+def apply_observations_at(
+    address: int, slots: IntArray, taken: BoolArray, hit_rate: FloatArray, false_alarm_rate: FloatArray
+) -> None:
+    """Update the belief from observations of some slots, (k,) contiguous each, instead of `observe_at`."""
+    search = search_at(address, 0)
+    mark_passed(search)
+    for i in range(slots.size):
+        apply_observation(search, column_of(search, slots[i]), taken[i], hit_rate[i], false_alarm_rate[i])
+
+
+@kernel
+def set_taken_at(address: int, slot: int) -> None:
+    """Set P(taken) of a slot to 1, as after a failed attempt."""
+    search = search_at(address, 0)
+    set_belief(search, column_of(search, slot), True, 1.0)
+
+
+@kernel
+def finish_step_at(address: int) -> tuple[Any, ...]:
+    """Add the step to the episode and update the full belief; returns as `step_result`."""
+    result: tuple[Any, ...] = complete_step(search_at(address, 0))
+    return result
+
+
+@kernel
+def step_result_at(address: int) -> tuple[Any, ...]:
+    """Return the numbers named by `STEP_RESULT` of the last step, without changing anything."""
+    result: tuple[Any, ...] = step_result(search_at(address, 0))
+    return result
+
+
+@kernel
+def read_belief_at(
+    address: int, p_occupied: FloatArray, p_observed: FloatArray, observed_at: FloatArray
+) -> None:
+    """Overwrite arrays that hold the forecast, (n_slots,) each, with the belief in observed slots."""
+    search = search_at(address, 0)
+    for column in range(1, search.n_columns + 1):
+        record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+        p_occupied[record.slot] = belief_now(search, column)
+        if record.observed:
+            block = block_at(search.blocks, column >> BLOCK_BITS)
+            p_observed[record.slot] = block.p_observed[i]
+            observed_at[record.slot] = block.observed_at[i] - search.arrival
+
+
+# ---- an episode
+
+
+@inlined
+def complete_step(search: Any) -> tuple[Any, ...]:
+    """Add the step to the episode, update belief and observed time; returns as `step_result`."""
+    finish_step(search)
+    refresh_belief(search)
+    write_clock(search)
+    result: tuple[Any, ...] = step_result(search)
+    return result
+
+
+@inlined
+def step_result(search: Any) -> tuple[Any, ...]:
+    """Return the numbers named by `STEP_RESULT`.
+
+    Compiled code makes a plain tuple six times as fast as a named one.
+    """
+    drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
+    parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s
+    total_s = search.drive_s + search.failed_s + search.walk_s + search.parking_cost_s + search.gave_up_s
+    return (
+        -(drive + failed + walk + parking + gave_up), -drive, -failed, -walk, -parking, -gave_up,
+        search.drive_s, search.failed_s, search.walk_s, search.parking_cost_s, search.gave_up_s, total_s,
+        search.driven_m, search.walked_m,
+        search.failed_parks, search.slots_passed, search.parked, search.over, search.vertex,
+    )  # fmt: skip
+
+
+@kernel
+def arrive(search: Any) -> None:
+    """Begin a search in the place and the world of its seed and episode, without observations."""
+    key = episode_key(search.seed_state, search.episode)
+    search.place = int(keyed_uniform(key, PLACE_STREAM, 0, 0) * search.n_places)
+    search.scenario = search.scenarios + search.place * SCENARIO_BYTES
+    scenario = scenario_at(search.scenario, 0)
+    day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * scenario.n_weekdays)
+    midnight = int64s(scenario.weekdays)[day] * DAY_S
+    second_of_window = keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (
+        scenario.window_end - scenario.window_start
+    )
+    arrival = midnight + (scenario.window_start + second_of_window)
+    entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * scenario.n_entries)
+    enter(search, key, day, arrival, midnight, int64s(scenario.entries)[entry])
+
+
+@kernel
+def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float, vertex: int) -> None:
+    """Begin a search of the record's scenario at a time and a vertex, without observations.
+
+    Args:
+        search: a SEARCH record with `scenario` and `place`.
+        key: key of the world.
+        day: index of the weekday or recorded day among the scenario's.
+        arrival: s since Monday 00:00.
+        midnight: beginning of that day, s since Monday 00:00.
+        vertex: vertex of the entry.
+    """
+    scenario = scenario_at(search.scenario, 0)
+    clear_slots(search)
+    search.process = scenario.world
+    _, hour, second = hour_of_week(arrival)
+    search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
+    search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
+    if scenario.world_kind == PROCESS_KIND:
+        worlds.draw_day(worlds.process_at(scenario.world, 0), search)
+    search.vertex = search.previous_vertex = vertex
+    search.parked = search.over = False
+    search.drive_s = search.failed_s = search.walk_s = search.parking_cost_s = search.gave_up_s = 0.0
+    search.step_drive_s = search.step_failed_s = search.step_walk_s = 0.0
+    search.step_parking_cost_s = search.step_gave_up_s = 0.0
+    search.driven_m = search.walked_m = search.n_observed_free = search.n_expected_free = 0.0
+    search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = (
+        search.n_last_observed_taken
+    ) = 0
+    search.remembered_slot = -1
+    _write_day_error(search)
+
+
+@inlined
+def _write_day_error(search: Any) -> None:
+    """Write the day error of the forecast, unless the prior is external."""
+    scenario, day_error = scenario_at(search.scenario, 0), float32s(search.day_error)
+    if scenario.prior_kind == LOG_KIND:
+        day = worlds.recorded_day_at(scenario.prior, search.day)
+        day_error[0], day_error[1] = worlds.recorded_day_level(day, search.second_of_day), 0.0
+    elif scenario.prior_kind == PROCESS_KIND:
+        for i in range(2):
+            day_error[i] = worlds.process_at(scenario.prior, 0).day_error[i]
+
+
+@kernel
+def clear_slots(search: Any) -> None:
+    """Remove all slots from their columns."""
+    columns = int32s(search.columns)
+    for column in range(1, search.n_columns + 1):
+        columns[slot_at(search.slots, column).slot] = SENTINEL
+        # Whole blocks are computed, so empty columns must hold finite numbers.
+        block_at(search.blocks, column >> BLOCK_BITS).decay_rate[column & (BLOCK_SIZE - 1)] = 0.0
+    search.n_columns = 0
+
+
+@inlined
+def take_step(search: Any, action: int) -> None:
+    """Do everything in a step that does not depend on the sensor; its costs go to the fields `step_*`."""
+    drive_or_park(search, action)
+    if not search.parked:
+        observe(search)
+    finish_step(search)
+
+
+@inlined
+def write_clock(search: Any) -> None:
+    """Write the observed time: s since Monday 00:00, and since the search began."""
+    search.clock[0], search.clock[1] = search.time, search.time - search.arrival
+
+
+@kernel
+def drive_or_park(search: Any, action: int) -> None:
+    """Move the car, or attempt to park."""
+    scenario, vertex = scenario_at(search.scenario, 0), search.vertex
+    edge = edge_at(scenario.edges, vertex * N_ACTIONS + action)
+    drive_s, failed_s, walk_s, parking_cost_s = edge.seconds, 0.0, 0.0, 0.0
+    search.driven_m += edge.metres
+    target = edge.target
+    if target != vertex:
+        search.previous_vertex, search.vertex = vertex, target
+    elif action == PARK and vertex < scenario.n_slots:
+        column = column_of(search, vertex)
+        taken = is_taken(search, column, search.time)
+        if taken:
+            search.failed_parks += 1
+            set_belief(search, column, taken, 1.0)
+            failed_s = scenario.failure_s
+        else:
+            search.parked = True
+            walk_s = float64s(scenario.walk_s)[vertex]
+            parking_cost_s = float64s(scenario.parking_cost_s)[vertex]
+            search.walked_m = float64s(scenario.walk_m)[vertex]
+    search.time += drive_s + failed_s
+    search.step_drive_s, search.step_failed_s = drive_s, failed_s
+    search.step_walk_s, search.step_parking_cost_s = walk_s, parking_cost_s
+    search.n_steps += 1
+
+
+@inlined
+def finish_step(search: Any) -> None:
+    """Add the step to the episode; give up if every slot was last observed taken."""
+    scenario = scenario_at(search.scenario, 0)
+    full = search.n_last_observed_taken == scenario.n_slots and scenario.leave_full_lot
+    search.step_gave_up_s = scenario.give_up_s if full else 0.0
+    search.over = full or search.parked
+    search.drive_s += search.step_drive_s
+    search.failed_s += search.step_failed_s
+    search.walk_s += search.step_walk_s
+    search.parking_cost_s += search.step_parking_cost_s
+    search.gave_up_s += search.step_gave_up_s
+
+
+@inlined
+def give_up(search: Any) -> None:
+    """End a search after a step: the car parks elsewhere, at the give-up penalty."""
+    penalty = scenario_at(search.scenario, 0).give_up_s
+    search.step_gave_up_s += penalty
+    search.gave_up_s += penalty
+    search.over = True
+
+
+# ---- what is observed
+
+
+@inlined
+def observe(search: Any) -> None:
+    """Observe the slots in view with the scenario's sensor model."""
+    if scenario_at(search.scenario, 0).exact_sensor:
+        observe_exact(search)
+    else:
+        observe_noisy(search)
+
+
+@inlined
+def observe_exact(search: Any) -> None:
+    """Observe the true states of the slots in view.
+
+    If a slot's state cannot have changed, only the time of its observation is updated.
+    """
+    scenario, time = scenario_at(search.scenario, 0), search.time
+    viewed, columns = int64s(scenario.viewed), int32s(search.columns)
+    observed_at, since_arrival = float32s(search.belief), time - search.arrival
+    first = OBSERVED_AT * search.width
+    starts = int64s(scenario.view_starts)
+    for i in range(starts[search.vertex], starts[search.vertex + 1]):
+        slot = viewed[i]
+        column = np.int64(columns[slot])
+        if time >= slot_at(search.slots, column).valid_until:
+            column = observe_changed(search, slot)
+        block_at(search.blocks, column >> BLOCK_BITS).observed_at[column & (BLOCK_SIZE - 1)] = time
+        if search.belief != 0:
+            observed_at[first + slot] = since_arrival
+    mark_passed(search)
+
+
+@kernel
+def observe_changed(search: Any, slot: int) -> int:
+    """Observe the true state of a slot that may have changed; returns its column."""
+    column: int = column_of(search, slot)
+    taken = is_taken(search, column, search.time)
+    set_belief(search, column, taken, 1.0 if taken else 0.0)
+    return column
+
+
+@kernel
+def observe_noisy(search: Any) -> None:
+    """Observe the slots in view with misses and errors."""
+    scenario, key, time = scenario_at(search.scenario, 0), search.key, search.time
+    viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
+    seen_rate, hit_rate = float64s(scenario.seen_rate), float64s(scenario.hit_rate)
+    false_alarm_rate = float64s(scenario.false_alarm_rate)
+    mark_passed(search)
+    # Keyed by the millisecond: two observations of a slot at the same time have the same error.
+    millisecond = int(time * 1000.0)
+    for i in range(starts[search.vertex], starts[search.vertex + 1]):
+        slot = viewed[i]
+        # Occlusions persist: one random number per slot and search; only a higher rate of seeing can overcome it.
+        if keyed_uniform(key, VIEW_STREAM, slot, 0) >= seen_rate[i]:
+            continue
+        column = column_of(search, slot)
+        rate = hit_rate[i] if is_taken(search, column, time) else false_alarm_rate[i]
+        taken = keyed_uniform(key, OBSERVATION_STREAM, slot, millisecond) < rate
+        apply_observation(search, column, taken, hit_rate[i], false_alarm_rate[i])
+
+
+@inlined
+def apply_observation(
+    search: Any, column: int, taken: bool, hit_rate: float, false_alarm_rate: float
+) -> None:
+    """Update the belief in a slot from one observation (Bayes' rule)."""
+    p = bayes_update(belief_now(search, column), taken, hit_rate, false_alarm_rate)
+    set_belief(search, column, taken, p)
+
+
+@kernel
+def mark_passed(search: Any) -> None:
+    """Count the slot that the car stops at, once per search."""
+    if search.vertex < scenario_at(search.scenario, 0).n_slots:
+        record = slot_at(search.slots, column_of(search, search.vertex))
+        if not record.passed:
+            record.passed = True
+            search.slots_passed += 1
+
+
+# ---- the belief
+
+
+@inlined
+def set_belief(search: Any, column: int, observed_taken: bool, p: float) -> None:
+    """Set P(taken) of a slot to `p` after an observation at the current time."""
+    set_belief_of(search, column, observed_taken, p, search.time)
+
+
+@kernel
+def set_belief_of(search: Any, column: int, observed_taken: bool, p: float, time: float) -> None:
+    """Set P(taken) of a slot to `p` after an observation at a time, s, not before the arrival."""
+    record, i = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+    block = block_at(search.blocks, column >> BLOCK_BITS)
+    if not record.observed:
+        record.observed = True
+        search.n_observed += 1
+        search.n_observed_free += 0.0 if observed_taken else 1.0
+        search.n_expected_free += 1.0 - block.prior[i]
+    search.n_last_observed_taken += int(observed_taken) - int(record.observed_taken)
+    record.observed_taken = observed_taken
+    block.p_observed[i], block.observed_at[i] = p, time
+    if search.belief != 0:
+        belief, width = float32s(search.belief), search.width
+        belief[P_OBSERVED * width + record.slot] = p
+        belief[OBSERVED_AT * width + record.slot] = time - search.arrival
+
+
+@inlined
+def belief_now(search: Any, column: int) -> float:
+    """Return the current belief in the slot of a column."""
+    block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+    elapsed = search.time - block.observed_at[i]
+    return float(decay_to_prior(block.prior[i], block.decay_rate[i], block.p_observed[i], elapsed))
+
+
+@kernel
+def refresh_belief(search: Any) -> None:
+    """Write the current belief into `p_occupied`; only slots with a column can have changed."""
+    decay_belief(search)
+    p_occupied, end = float32s(search.p_occupied), search.n_columns + 1
+    for first in range(0, end, BLOCK_SIZE):
+        block = block_at(search.blocks, first >> BLOCK_BITS)
+        # Fixed length, so that the loop is unrolled.
+        for i in range(BLOCK_SIZE):
+            if SENTINEL < first + i < end:
+                p_occupied[slot_at(search.slots, first + i).slot] = block.p_occupied[i]
+
+
+@kernel
+def decay_belief(search: Any) -> None:
+    """Compute the current belief in all slots with a column."""
+    time = search.time
+    for number in range((search.n_columns + BLOCK_SIZE) >> BLOCK_BITS):
+        block = block_at(search.blocks, number)
+        # Fixed length, so that the loop is vectorised.
+        for i in range(BLOCK_SIZE):
+            block.p_occupied[i] = decay_to_prior(
+                block.prior[i], block.decay_rate[i], block.p_observed[i], time - block.observed_at[i]
+            )
+
+
+@inlined
+def column_of(search: Any, slot: int) -> Any:
+    """Return the column of a slot, a new one if it has none."""
+    column = np.int64(int32s(search.columns)[slot])
+    if column == SENTINEL:
+        column = add_column(search, slot)
+    return column
+
+
+@kernel
+def add_column(search: Any, slot: int) -> int:
+    """Give a slot a column, and write its forecast there."""
+    column = search.n_columns + 1
+    search.n_columns = column
+    int32s(search.columns)[slot] = column
+    record = slot_at(search.slots, column)
+    record.slot, record.sojourn, record.valid_until = slot, 0, 0.0
+    record.observed = record.observed_taken = record.passed = False
+    block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+    prior, rate = forecast_of(search, slot)
+    block.prior[i] = block.p_observed[i] = block.p_occupied[i] = prior
+    block.decay_rate[i], block.observed_at[i] = rate, search.arrival
+    return int(column)
+
+
+# ---- the truth and the forecast
+
+
+@inlined
+def is_taken(search: Any, column: int, time: float) -> bool:
+    """Return whether the slot of a column is taken at a time, s; times must not decrease between calls."""
+    record = slot_at(search.slots, column)
+    if time >= record.valid_until:
+        find_state(search, record, time)
+    return bool(record.occupied)
+
+
+@kernel
+def find_state(search: Any, record: Any, time: float) -> None:
+    """Compute whether a slot is taken at a time beyond the known part of its sojourn."""
+    scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
+    if scenario.world_kind == LOG_KIND:
+        worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
+    elif scenario.world_kind == SHARED_KIND:
+        # Another car may change it at any time, so `valid_until` stays 0.
+        record.occupied = not is_slot_open(search.process, slot, search.car, time)
+    else:
+        worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
+
+
+@kernel
+def forecast_of(search: Any, slot: int) -> tuple[float, float]:
+    """Return the forecast P(taken) of a slot, and its decay rate, 1/s."""
+    scenario = scenario_at(search.scenario, 0)
+    if scenario.prior_kind == EXTERNAL_KIND:
+        external = float64s(search.external_forecast)
+        return external[slot], external[search.width + slot]
+    if scenario.prior_kind == LOG_KIND:
+        day = worlds.recorded_day_at(scenario.prior, search.day)
+        p, rate = worlds.recorded_forecast(day, slot, search.second_of_day)
+    else:
+        p, rate = worlds.process_forecast(
+            worlds.process_at(scenario.prior, 0), search.hour, search.second_of_hour, slot
+        )
+    return min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY), rate
+
+
+@kernel
+def init_prior(search: Any) -> None:
+    """Initialise the full belief with the forecast of every slot."""
+    scenario, width = scenario_at(search.scenario, 0), search.width
+    belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
+    if scenario.prior_kind == PROCESS_KIND:
+        _init_process_prior(search)
+    else:
+        for slot in range(n):
+            belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot] = forecast_of(search, slot)
+    for slot in range(n):
+        p_occupied[slot] = belief[P_OBSERVED * width + slot] = belief[FORECAST * width + slot]
+        belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
+    # Padding past the last slot; the previous place may have been larger.
+    for slot in range(n, width):
+        p_occupied[slot] = belief[FORECAST * width + slot] = belief[P_OBSERVED * width + slot] = 1.0
+        belief[DECAY_RATE * width + slot] = 0.0
+        belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
+
+
+@kernel
+def _init_process_prior(search: Any) -> None:
+    """Write the forecast of all slots, vectorised, from marginals precomputed at the full hour."""
+    scenario, width, hour, second = (
+        scenario_at(search.scenario, 0), search.width, search.hour, search.second_of_hour,
+    )  # fmt: skip
+    process, n = worlds.process_at(scenario.prior, 0), scenario.n_slots
+    worlds.keep_hourly_marginals(process, hour)
+    factors, profiles = float64s(process.factors), float64s(process.profiles)
+    start, belief = float64s(process.hourly_marginals), float32s(search.belief)
+    arriving, leaving = profiles[hour], profiles[WEEK_HOURS + hour]
+    for slot in range(n):
+        arrival = factors[slot] * arriving
+        rate = arrival + factors[n + slot] * leaving
+        p = worlds.marginal_later(start[hour * n + slot], arrival, rate, second)
+        belief[FORECAST * width + slot] = min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY)
+        belief[DECAY_RATE * width + slot] = rate

@@ -1,0 +1,464 @@
+"""Scenarios and searches as records with named fields, for the compiled search."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at
+from parkenv.errors import InputError
+from parkenv.world.lot import MOVES, PARK
+from parkenv.world.occupancy.counted import CountedOccupancy
+from parkenv.world.occupancy.kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
+from parkenv.world.occupancy.log import weekday_of
+from parkenv.world.occupancy.process import (
+    Arrival,
+    OccupancyModel,
+    OccupancyProcess,
+    PriorModel,
+)
+from parkenv.world.occupancy.recorded import RecordedOccupancy
+from parkenv.world.scenario import Scenario
+
+N_ACTIONS = PARK + 1
+PROCESS_KIND, LOG_KIND, EXTERNAL_KIND, SHARED_KIND = range(4)
+"""Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival; slots
+that a fleet of cars shares."""
+
+EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
+"""Result of an action at a vertex: the vertex that it leads to, s, m.
+
+Parking, and actions that the graph does not have, lead back to the same vertex.
+"""
+
+SCENARIO = np.dtype(
+    [
+        ("n_slots", np.int64),
+        ("exact_sensor", np.bool_),
+        ("failure_s", np.float64),
+        ("give_up_s", np.float64),
+        # Whether a search ends once every slot was last observed taken.
+        ("leave_full_lot", np.bool_),
+        # Arrival window and entries: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
+        ("window_start", np.float64),
+        ("window_end", np.float64),
+        ("n_weekdays", np.int64),
+        ("weekdays", ADDRESS),
+        ("n_entries", np.int64),
+        ("entries", ADDRESS),
+        # (n_vertices, 5) EDGE records.
+        ("edges", ADDRESS),
+        # (n_vertices, 5) uint8, mask of the actions that the graph has.
+        ("action_masks", ADDRESS),
+        # (n_slots,) float64: walk to the goal, s and m; parking cost, s.
+        ("walk_s", ADDRESS),
+        ("walk_m", ADDRESS),
+        ("parking_cost_s", ADDRESS),
+        # Slots in view of vertex v are viewed[view_starts[v]] to viewed[view_starts[v + 1]], excluded; int64 both.
+        ("view_starts", ADDRESS),
+        ("viewed", ADDRESS),
+        # For each of `viewed`, float64: P(in sight), P(observed taken | taken), P(observed taken | free).
+        ("seen_rate", ADDRESS),
+        ("hit_rate", ADDRESS),
+        ("false_alarm_rate", ADDRESS),
+        # For PROCESS_KIND, a PROCESS record (that of the world may change from search to search, see SEARCH); for
+        # LOG_KIND, RECORDED_DAY records, one for each of `weekdays`; for SHARED_KIND, the SHARED_WORLD record.
+        ("world_kind", np.int64),
+        ("world", ADDRESS),
+        ("prior_kind", np.int64),
+        ("prior", ADDRESS),
+    ],
+    align=True,
+)
+"""The constant part of the searches in a scenario; the comments describe the arrays at the addresses."""
+
+_TABLES = tuple(
+    name
+    for name in SCENARIO.names or ()
+    if SCENARIO[name] == ADDRESS
+    and name not in ("n_slots", "n_weekdays", "n_entries", "world_kind", "prior_kind")
+)
+_PROCESS_TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
+N_REGIONS = 4
+
+_PROGRESS = [
+    # Sums over the episode, s and m.
+    ("drive_s", np.float64),
+    ("failed_s", np.float64),
+    ("walk_s", np.float64),
+    ("parking_cost_s", np.float64),
+    ("gave_up_s", np.float64),
+    ("driven_m", np.float64),
+    ("walked_m", np.float64),
+    ("failed_parks", np.int64),
+    ("slots_passed", np.int64),
+    ("n_steps", np.int64),
+    # Costs of the last step, s.
+    ("step_drive_s", np.float64),
+    ("step_failed_s", np.float64),
+    ("step_walk_s", np.float64),
+    ("step_parking_cost_s", np.float64),
+    ("step_gave_up_s", np.float64),
+    # Current status; times in s since Monday 00:00.
+    ("vertex", np.int64),
+    ("previous_vertex", np.int64),
+    ("time", np.float64),
+    ("parked", np.bool_),
+    ("over", np.bool_),
+    # The world; index of the weekday or recorded day among the scenario's; second of that day at the arrival.
+    *WORLD_FIELDS,
+    ("day", np.int64),
+    ("second_of_day", np.float64),
+    # Counts: slots with a column in the tables; slots observed; of those, free when first observed, expected to be
+    # free, and taken when last observed.
+    ("n_columns", np.int64),
+    ("n_observed", np.int64),
+    ("n_observed_free", np.float64),
+    ("n_expected_free", np.float64),
+    ("n_last_observed_taken", np.int64),
+    # For the local observation: forecast fraction of free slots in each quarter of the lot; the best slot observed
+    # free, or -1.
+    ("free_by_region", np.float64, (N_REGIONS,)),
+    ("remembered_slot", np.int64),
+    # Index of the search's scenario.
+    ("place", np.int64),
+]
+_EPISODES = [("episode", np.int64), ("seed_state", np.uint64), ("clock", np.float32, (2,))]
+
+PROGRESS_FIELDS = tuple(str(entry[0]) for entry in _PROGRESS + _EPISODES)
+"""Fields of a SEARCH record that a search changes."""
+
+SEARCH = np.dtype(
+    [
+        *_PROGRESS,
+        # Number of the episode, and the mixed seed: together they give `key`.
+        *_EPISODES[:2],
+        # Time since Monday 00:00, and since the search began, as observed.
+        _EPISODES[2],
+        # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
+        ("scenarios", ADDRESS),
+        ("n_places", np.int64),
+        # Number of the car in its fleet, where slots are shared.
+        ("car", np.int64),
+        # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
+        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
+        # record of the world, if it is a process, or SHARED_WORLD record.
+        ("scenario", ADDRESS),
+        ("blocks", ADDRESS),
+        ("slots", ADDRESS),
+        ("columns", ADDRESS),
+        ("external_forecast", ADDRESS),
+        ("day_error", ADDRESS),
+        ("process", ADDRESS),
+        # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
+        # observation, or 0 if these are not kept.
+        ("width", np.int64),
+        ("p_occupied", ADDRESS),
+        ("belief", ADDRESS),
+    ],
+    align=True,
+)
+"""A running search."""
+
+SENTINEL = 0  # column shared by all slots without their own: they were not observed
+
+SLOT = np.dtype(
+    [
+        ("slot", np.int32),
+        *CURSOR_FIELDS,
+        ("observed", np.bool_),
+        ("observed_taken", np.bool_),
+        ("passed", np.bool_),
+    ],
+    align=True,
+)
+"""A slot with a column: true state as in CURSOR; whether it was observed, was last observed taken, was passed."""
+
+BLOCK_BITS = 3
+BLOCK_SIZE = 1 << BLOCK_BITS
+BLOCK = np.dtype(
+    [
+        (name, np.float64, (BLOCK_SIZE,))
+        for name in ("prior", "decay_rate", "p_observed", "observed_at", "p_occupied")
+    ],
+    align=True,
+)
+"""The belief in 8 slots: forecast; decay rate, 1/s; P(taken) after the last observation; its time, s; current P(taken).
+
+A few vector instructions update a block, and the data of a search stay close together in memory.
+"""
+
+FORECAST, DECAY_RATE, P_OBSERVED, OBSERVED_AT = range(4)  # the parts of the observation's `belief`
+NEVER_OBSERVED = -1.0  # `observed_at` of a slot not observed in this search
+
+scenario_at, search_at, edge_at = record_at(SCENARIO), record_at(SEARCH), record_at(EDGE)
+slot_at, block_at = record_at(SLOT), record_at(BLOCK)
+
+
+class ScenarioRecords:
+    """Scenarios as records, and the arrays that the records point to: one set of tables for any number of searches.
+
+    Attributes:
+        records: (n,) of the dtype SCENARIO.
+        scenarios: the scenarios.
+        n_bytes: memory of records and arrays, bytes.
+
+    Raises:
+        InputError: an occupancy that is neither a process nor a log.
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario]) -> None:
+        self._kept: list[Any] = []
+        self.scenarios = tuple(scenarios)
+        self.records = np.zeros(len(scenarios), SCENARIO)
+        for record, scenario in zip(self.records, scenarios, strict=True):
+            self._write_search(record, scenario)
+            self._write_occupancy(record, scenario)
+        if len(scenarios) > 1:
+            self._join()
+        arrays = {id(array): array for array in _arrays_in(self._kept)}
+        self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
+
+    def _join(self) -> None:
+        """Move the tables of all scenarios into one block of memory."""
+        processes = [one for one in self._kept if isinstance(one, OccupancyProcess)]
+        tables = [one for one in self._kept if isinstance(one, np.ndarray)]
+        others = [one for one in self._kept if not isinstance(one, np.ndarray | OccupancyProcess)]
+        tables += [getattr(one, name) for one in processes for name in _PROCESS_TABLES]
+        copies = in_one_block(tables)
+        moved = {
+            address_of(old, old.dtype): address_of(new, new.dtype)
+            for old, new in zip(tables, copies, strict=True)
+        }
+        for one in processes:
+            record = one.record.copy()
+            for name in _PROCESS_TABLES:
+                record[name] = moved[int(record[name][0])]
+            moved[address_of(one.record, PROCESS)] = address_of(record, PROCESS)
+            others += [record, *(value for value in (one.nearness, one._centring) if value is not None)]
+        for name in _TABLES:
+            self.records[name] = [moved.get(int(address), int(address)) for address in self.records[name]]
+        self._kept = [*copies, *others]
+
+    def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
+        array = np.ascontiguousarray(values, dtype)
+        array.flags.writeable = False
+        self._kept.append(array)
+        return address_of(array, dtype)
+
+    def _write_search(self, record: np.void, scenario: Scenario) -> None:
+        lot, masks = scenario.lot, scenario.action_masks
+        edges = np.zeros(masks.shape, EDGE)
+        edges["target"] = np.arange(lot.n_vertices)[:, None]
+        edges["seconds"] = scenario.wait_s
+        moves = masks[:, : len(MOVES)] == 1
+        edges["target"][:, :PARK][moves] = lot.neighbors[moves]
+        edges["seconds"][:, :PARK][moves] = scenario.move_s[moves]
+        edges["metres"][:, :PARK][moves] = lot.edge_length[moves]
+        edges["seconds"][: lot.n_slots, PARK] = 0.0
+        entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
+        starts, viewed = scenario.slots_in_view
+        rates = scenario.sensor_rates
+        numbers = {
+            "n_slots": lot.n_slots,
+            "exact_sensor": scenario.sensor_model.perfect,
+            "failure_s": scenario.failure_s,
+            "give_up_s": scenario.give_up_s,
+            "leave_full_lot": True,
+            "window_start": scenario.arrival.start_s,
+            "window_end": scenario.arrival.end_s,
+            "n_entries": len(entries),
+            "entries": self._keep(entries, np.int64),
+            "edges": self._keep(edges, EDGE),
+            "action_masks": self._keep(masks, np.uint8),
+            "walk_s": self._keep(scenario.walk_s),
+            "walk_m": self._keep(lot.walk_m(scenario.goal)),
+            "parking_cost_s": self._keep(scenario.parking_cost_s),
+            "view_starts": self._keep(starts, np.int64),
+            "viewed": self._keep(viewed, np.int64),
+            "seen_rate": self._keep(rates.seen),
+            "hit_rate": self._keep(rates.hit),
+            "false_alarm_rate": self._keep(rates.false_alarm),
+        }
+        for name, value in numbers.items():
+            record[name] = value
+
+    def _write_occupancy(self, record: np.void, scenario: Scenario) -> None:
+        occupancy, prior = scenario.occupancy, scenario.prior
+        if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
+            weekdays = [weekday_of(day) for day in occupancy.days_in(scenario.arrival)]
+        else:
+            weekdays = list(scenario.arrival.weekdays)
+        record["weekdays"], record["n_weekdays"] = self._keep(weekdays, np.int64), len(weekdays)
+        record["world_kind"], record["world"] = self._kind_and_address(occupancy, scenario)
+        if record["world_kind"] == EXTERNAL_KIND:
+            raise InputError(
+                f"occupancy is a {type(occupancy).__name__}, want an OccupancyProcess, a RecordedOccupancy or a "
+                "CountedOccupancy"
+            )
+        if isinstance(prior or occupancy, CountedOccupancy):
+            record["prior_kind"] = EXTERNAL_KIND
+        elif prior is None or prior is occupancy:
+            record["prior_kind"], record["prior"] = record["world_kind"], record["world"]
+        elif isinstance(prior, OccupancyProcess):
+            record["prior_kind"], record["prior"] = self._kind_and_address(prior, scenario)
+        else:
+            record["prior_kind"] = EXTERNAL_KIND
+
+    def _kind_and_address(self, model: OccupancyModel | PriorModel, scenario: Scenario) -> tuple[int, int]:
+        if isinstance(model, OccupancyProcess):
+            self._kept.append(model)
+            return PROCESS_KIND, address_of(model.record, PROCESS)
+        if isinstance(model, RecordedOccupancy):
+            self._kept += [model, days := model.day_records(model.days_in(scenario.arrival))]
+            return LOG_KIND, address_of(days, RECORDED_DAY)
+        if isinstance(model, CountedOccupancy):
+            # A process for every day, made when a search begins on it: `Searches.complete_arrival`.
+            self._kept.append(first := model.process_of(model.days_in(scenario.arrival)[0]))
+            return PROCESS_KIND, address_of(first.record, PROCESS)
+        return EXTERNAL_KIND, 0
+
+
+def _arrays_in(kept: Sequence[Any]) -> Iterator[NDArray[Any]]:
+    """Yield the arrays among what is kept, and those of its occupancy models."""
+    for one in kept:
+        if isinstance(one, np.ndarray):
+            yield one
+        else:
+            yield from (value for value in vars(one).values() if isinstance(value, np.ndarray))
+
+
+class Searches:
+    """One or more running searches as records, and the arrays that the records point to.
+
+    Args:
+        scenarios: scenarios of the searches; if there are several, one is drawn for each episode.
+        n: number of searches.
+        full_belief: whether to keep `p_occupied` and `belief` up to date.
+
+    Attributes:
+        records: (n,) of the dtype SEARCH.
+        slots: (n, m + 1) of the dtype SLOT, a column for each slot that a search has observed or queried, in order of
+            first use; the first column is the sentinel. m is the number of slots of the largest lot.
+        external_forecast: (n, 2, m) float64, forecast and decay rate of priors that only Python can compute; else
+            (0, 2, 0).
+        needs_python: whether an arrival is complete only after `complete_arrival`.
+        day_error: (n, 2) float32, logits, day error of each search's forecast: level and slope.
+        p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
+        belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
+            not kept.
+    """
+
+    def __init__(self, scenarios: ScenarioRecords, n: int, full_belief: bool) -> None:
+        m = int(scenarios.records["n_slots"].max())
+        external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
+        counted = any(isinstance(one.occupancy, CountedOccupancy) for one in scenarios.scenarios)
+        self.needs_python = external or counted
+        self.scenarios = scenarios
+        self.records = np.zeros(n, SEARCH)
+        self.slots = np.zeros((n, m + 1), SLOT)
+        self._blocks = np.zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
+        # Zeros stand for the sentinel; the system allocates no memory for pages that are never written.
+        self._columns = np.zeros((n, m), np.int32)
+        self.external_forecast = np.zeros((n, 2, m) if external else (0, 2, 0))
+        self.day_error = np.zeros((n, 2), np.float32)
+        # Padding past the last slot of a smaller lot: taken, constant, never observed.
+        self.p_occupied = np.ones((n, m) if full_belief else (0, 0), np.float32)
+        self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
+        self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
+        self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
+        self.records["width"] = m
+        self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
+        self.records["n_places"] = len(scenarios.records)
+        self._find_scenarios()
+        for name, array in self._arrays().items():
+            first = address_of(array, array.dtype)
+            self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
+
+    def complete_arrival(self, search: int) -> None:
+        """Add what only Python can compute about a search that has just begun: an external forecast, a counted day."""
+        scenario, record = self.scenario_of(search), self.records[search]
+        self._find_process(search)
+        if self.scenarios.records["prior_kind"][record["place"]] != EXTERNAL_KIND:
+            return
+        arrival = arrival_of(scenario, record)
+        forecast = scenario.forecast(arrival)
+        n = len(forecast.p_occupied)
+        self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
+        self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
+
+    def scenario_of(self, search: int) -> Scenario:
+        """Return the scenario of a search's episode."""
+        return self.scenarios.scenarios[int(self.records["place"][search])]
+
+    def _find_scenarios(self) -> None:
+        """Write the addresses that follow from the places."""
+        place = self.records["place"]
+        self.records["scenario"] = self.records["scenarios"] + place * SCENARIO.itemsize
+        self.records["process"] = self.scenarios.records["world"][place]
+
+    def _find_process(self, search: int) -> None:
+        """Write the address of the process of a counted day; it differs from computer process to process."""
+        scenario = self.scenario_of(search)
+        if isinstance(scenario.occupancy, CountedOccupancy):
+            day = arrival_of(scenario, self.records[search]).day
+            self.records[search]["process"] = address_of(scenario.occupancy.process_of(day).record, PROCESS)
+
+    def _arrays(self) -> dict[str, NDArray[Any]]:
+        """The arrays with a row for each search, keyed by the SEARCH field that holds the row's address."""
+        return {
+            "slots": self.slots,
+            "blocks": self._blocks,
+            "columns": self._columns,
+            "external_forecast": self.external_forecast,
+            "day_error": self.day_error,
+            "p_occupied": self.p_occupied,
+            "belief": self.belief,
+        }
+
+    @property
+    def address(self) -> int:
+        """Address of the records, for compiled code; valid while this object lives."""
+        return address_of(self.records, SEARCH)
+
+    @property
+    def n_bytes(self) -> int:
+        """Memory of the searches, bytes, without the shared tables of the scenarios."""
+        return sum(array.nbytes for array in (self.records, *self._arrays().values()))
+
+    def save(self) -> tuple[NDArray[Any], ...]:
+        """Return copies of everything that a search changes."""
+        return (self.records.copy(), *(array.copy() for array in self._arrays().values()))
+
+    def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
+        """Restore a copy returned by `save` of searches in the same scenarios; records may be given as bytes, uint8.
+
+        Raises:
+            InputError: the number of slots differs.
+        """
+        records, *arrays = saved
+        records = records.view(SEARCH)
+        width = int(records["width"][0])
+        if width != self.records["width"][0]:
+            raise InputError(f"state is of a lot with {width} slots, this one has {self.records['width'][0]}")
+        for name in PROGRESS_FIELDS:
+            self.records[name] = records[name]
+        if not ((self.records["place"] >= 0) & (self.records["place"] < len(self.scenarios.records))).all():
+            raise InputError("state is of other scenarios")
+        self._find_scenarios()
+        for mine, array in zip(self._arrays().values(), arrays, strict=True):
+            mine[...] = array.view(mine.dtype)
+        if self.needs_python:
+            for search in range(len(self.records)):
+                self._find_process(search)
+
+
+def arrival_of(scenario: Scenario, record: np.void) -> Arrival:
+    """Return the arrival of the search in a SEARCH record."""
+    time = float(record["arrival"])
+    if isinstance(scenario.occupancy, RecordedOccupancy | CountedOccupancy):
+        return Arrival(time, scenario.occupancy.days_in(scenario.arrival)[int(record["day"])])
+    return Arrival(time)

@@ -1,1 +1,0 @@
-"""Evaluation of agents: episodes, statistics, result folders and figures."""

@@ -1,1 +1,0 @@
-"""Comparisons of agents: specification, execution, results."""

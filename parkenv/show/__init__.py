@@ -1,0 +1,1 @@
+"""Pictures of lots, cars and searches."""

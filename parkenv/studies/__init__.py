@@ -1,0 +1,1 @@
+"""Studies: runs of agents, trips, surveys and trainings, with their results."""

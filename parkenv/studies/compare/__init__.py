@@ -1,0 +1,1 @@
+"""Comparisons of agents, the benchmark, commutes and the demo."""

@@ -1,0 +1,296 @@
+"""Benchmark suites: fixed scenarios, seeds and metrics that make results of different groups comparable.
+
+A suite is a JSON file in the folder `suites`. The places of a suite, real car parks, are a suite of their own
+(`v2-places`), so that a result of either part can be complete. A published suite never changes; improvements go into a
+new suite. A result file names its suite, contains the total time of every search, and can be checked by anybody.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import jsonschema
+import numpy as np
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_json
+from parkenv.lots.lot_files import PLACES
+from parkenv.scenarios.build import make_scenario
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct, table
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.results import ResultFolder, Row
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.process import ArrivalWindow
+from parkenv.world.scenario import KMH, Scenario
+from parkenv.world.sensor_model import SensorModel
+from planners.agent import make_agent
+
+RESULT_FORMAT = "parkenv-benchmark-result"
+RESULT_VERSION = 1
+SUITES = ("v1", "v2", "v2-places")
+METRICS = (
+    "episodes", "parked_fraction", "total_s", "total_s_ci95", "regret_s", "regret_s_ci95", "failed_parks",
+    "decision_ms", "decision_ms_p99",
+)  # fmt: skip
+"""Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score."""
+RESAMPLES = 2000
+_ROUNDING = 1e-6
+_FOLDER = Path(__file__).parent / "suites"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One scenario of a suite."""
+
+    name: str  # name of the task
+    scenario: str  # a packaged scenario, or the name of a file in `parkenv.lots.lot_files.PLACES`
+    occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
+    # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
+    sensor_model: str = "perfect"
+    v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
+    # how far days differ from the forecast, logits: (level,) or (level, slope)
+    day_error: tuple[float, ...] = (0.0,)
+    group: str | None = None  # kind of place, for tables; None in suites of packaged scenarios
+
+    def made(self, arrival: ArrivalWindow) -> Scenario:
+        """Make the scenario, named after the task."""
+        days = DayError(*self.day_error)
+        source = self.scenario if self.group is None else PLACES / f"{self.scenario}.geojson"
+        made = make_scenario(source, name=self.name, arrival=arrival, day_error=days)
+        if self.sensor_model != "perfect":
+            made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
+        if self.v_walk_kmh is not None:
+            made = made.replace(v_walk=self.v_walk_kmh * KMH)
+        return made if self.occupancy_level is None else at_occupancy(made, self.occupancy_level)
+
+
+@dataclass(frozen=True)
+class Suite:
+    """A benchmark suite."""
+
+    name: str  # name, such as v1
+    description: str  # one sentence
+    arrival: ArrivalWindow  # when searches begin
+    seeds: range  # seeds; every task has one search per seed
+    tasks: tuple[Task, ...]
+    fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
+
+    @classmethod
+    def named(cls, name: str) -> Self:
+        """Load a packaged suite.
+
+        Raises:
+            InputError: an unknown name; the message lists the known ones.
+
+        Examples:
+            >>> suite = Suite.named("v1")
+            >>> suite.tasks[0].name, len(suite.seeds)
+            ('campus', 1000)
+        """
+        if name not in SUITES:
+            raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
+        content = _packaged(name)
+        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
+        first = content["first_seed"]
+        return cls(
+            name,
+            content["description"],
+            ArrivalWindow.parse(content["arrival"], content["days"]),
+            range(first, first + content["episodes"]),
+            tuple(_task(**task) for task in content["tasks"]),
+            hashlib.sha256(canonical.encode()).hexdigest(),
+        )
+
+    def cases(self, agents: Sequence[AgentSpec]) -> list[tuple[Case, range]]:
+        """Return the cases for `run_cases`: every agent in every task.
+
+        Raises:
+            InputError: an agent does not exist or does not support a task.
+        """
+        worlds = [task.made(self.arrival) for task in self.tasks]
+        for world in worlds:
+            for agent in agents:
+                make_agent(agent.name, world, **agent.options)
+        cases = [Case(world, agent.name, options=agent.options) for world in worlds for agent in agents]
+        require_distinct(cases)
+        return [(case, self.seeds) for case in cases]
+
+
+def _task(
+    sight: str = "perfect", day_error: Sequence[float] = (0.0,), lot_share: float | None = None, **fields: Any
+) -> Task:
+    """Return a task of a suite's file; v1 is older than days that differ from their forecast."""
+    del lot_share  # see `suite_lots`
+    return Task(sensor_model=sight, day_error=tuple(day_error), **fields)
+
+
+def result_of(
+    suite: Suite,
+    cases: Sequence[tuple[Case, range]],
+    folder: ResultFolder,
+    command: Sequence[str],
+    by: str = "",
+) -> Row:
+    """Build the content of a result file from a folder in which all cases are finished.
+
+    Args:
+        suite: the suite.
+        cases: all cases.
+        folder: their finished episodes.
+        command: the command that ran them.
+        by: who submits the result; dated today.
+
+    Raises:
+        InputError: the wall times of an agent's decisions are lost.
+    """
+    episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for case, seeds in cases:
+        rows = [folder.episodes[case.key(s)] for s in seeds]
+        episodes.setdefault(case.label, {})[case.scenario.name] = {
+            column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")
+        }
+    measured = table(cases, folder)
+    for row in measured:
+        if missing := [metric for metric in METRICS if metric not in row]:
+            raise InputError(
+                f"{folder.path}: holds no {missing[0]} of {row['agent']} in {row['scenario']}, as timings.csv is not "
+                "whole; run the suite again with --overwrite"
+            )
+    rows = [
+        {
+            "task": row["scenario"],
+            "agent": row["agent"],
+            **{metric: row[metric] for metric in METRICS},
+            "score": _score(episodes[row["agent"]][row["scenario"]]),
+        }
+        for row in measured
+    ]
+    return {
+        "format": RESULT_FORMAT,
+        "version": RESULT_VERSION,
+        "suite": suite.name,
+        "suite_sha256": suite.fingerprint,
+        "parkenv": __version__,
+        "command": list(command),
+        "by": by,
+        "date": datetime.now(UTC).date().isoformat(),
+        "rows": rows,
+        "scores": {agent: _mean_score(tasks) for agent, tasks in episodes.items()},
+        "episodes": episodes,
+    }
+
+
+def check_result(path: Path) -> Row:
+    """Read a result file, and check that it is complete, consistent, and from the suite's own worlds.
+
+    The check recomputes the clairvoyant bounds of all searches, which differ in other worlds or with other costs and
+    speeds. It cannot verify the times of an agent; for that, run the agent again.
+
+    Raises:
+        InputError: the check failed; the message says where, with agent and task.
+    """
+    try:
+        result: Row = read_json(path)
+        jsonschema.validate(result, _packaged("result.schema"))
+    except jsonschema.ValidationError as error:
+        raise InputError(f"{path}: {error.json_path} {error.message[:200]}") from error
+    suite = Suite.named(result["suite"])
+    if result["suite_sha256"] != suite.fingerprint:
+        raise InputError(f"{path}: made with settings that are not those of suite {suite.name}")
+    bounds = {task.name: _bounds(task, suite) for task in suite.tasks}
+    by_row = {(row["agent"], row["task"]): row for row in result["rows"]}
+    wanted = {(agent, task.name) for agent in result["episodes"] for task in suite.tasks}
+    if by_row.keys() != wanted or result["scores"].keys() != result["episodes"].keys():
+        raise InputError(f"{path}: rows or scores are not those of its agents in the suite's tasks")
+    for agent, tasks in result["episodes"].items():
+        for task in suite.tasks:
+            _check_task(path, agent, task.name, tasks.get(task.name), by_row[agent, task.name], suite, bounds)
+        if abs(result["scores"][agent] - _mean_score(tasks)) > _ROUNDING:
+            raise InputError(f"{path}: the score of {agent} is not what its searches come to")
+    return result
+
+
+def _check_task(
+    path: Path,
+    agent: str,
+    task: str,
+    searches: Mapping[str, Sequence[float]] | None,
+    row: Row,
+    suite: Suite,
+    bounds: Mapping[str, Sequence[float]],
+) -> None:
+    where = f"{path}: {agent} in {task}"
+    counts = {len(times) for times in searches.values()} if searches else {0}
+    if searches is None or counts != {len(suite.seeds)} or row["episodes"] != len(suite.seeds):
+        raise InputError(f"{where}: wants {len(suite.seeds)} searches, has {min(counts)}")
+    if not np.allclose(searches["bound_s"], bounds[task], rtol=0.0, atol=2 * _ROUNDING):
+        raise InputError(f"{where}: was not run in the suite's worlds, at its costs and speeds")
+    total, bound = np.array(searches["total_s"]), np.array(searches["bound_s"])
+    if (total < bound - 2 * _ROUNDING).any():
+        raise InputError(f"{where}: a search beats the clairvoyant bound")
+    told = row["total_s"], row["regret_s"], row["score"]
+    if not np.allclose(told, (total.mean(), (total - bound).mean(), _score(searches)), atol=1e-4):
+        raise InputError(f"{where}: its row is not what its searches come to")
+
+
+@functools.cache
+def _bounds(task: Task, suite: Suite) -> list[float]:
+    scenario = task.made(suite.arrival)
+    runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
+    return [runner.bound_s(seed) for seed in suite.seeds]
+
+
+@functools.cache
+def suite_lots() -> Mapping[float, str]:
+    """Return the places of all suites, which no agent is trained on: names by the `lot_share` of their lots."""
+    suites = (_packaged(name) for name in SUITES)
+    return {
+        task["lot_share"]: task["name"] for suite in suites for task in suite["tasks"] if "lot_share" in task
+    }
+
+
+def by_group(result: Row) -> list[tuple[str, str, float, float]]:
+    """Return a suite's result by kind of place: agent, kind, mean total time, s, and mean score, over its places."""
+    groups: dict[str, list[str]] = {}
+    for task in Suite.named(result["suite"]).tasks:
+        if task.group is not None:
+            groups.setdefault(task.group, []).append(task.name)
+    rows = {(row["agent"], row["task"]): row for row in result["rows"]}
+    return [
+        (agent, group, *(float(np.mean([rows[agent, name][key] for name in names])) for key in ("total_s", "score")))
+        for agent in result["scores"]
+        for group, names in groups.items()
+    ]  # fmt: skip
+
+
+def _score(searches: Mapping[str, Sequence[float]]) -> float:
+    return float(np.mean(searches["bound_s"]) / np.mean(searches["total_s"]))
+
+
+def score_interval(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> tuple[float, float, float]:
+    """Return an agent's score and its 95 % bootstrap interval; equal searches have equal intervals."""
+    rng = np.random.default_rng(0)
+    resampled = np.zeros(RESAMPLES)
+    for searches in tasks.values():
+        bound, total = np.array(searches["bound_s"]), np.array(searches["total_s"])
+        drawn = rng.integers(len(total), size=(RESAMPLES, len(total)))
+        resampled += bound[drawn].mean(axis=1) / total[drawn].mean(axis=1) / len(tasks)
+    low, high = np.quantile(resampled, (0.025, 0.975))
+    return _mean_score(tasks), float(low), float(high)
+
+
+def _mean_score(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> float:
+    return float(np.mean([_score(searches) for searches in tasks.values()]))
+
+
+def _packaged(name: str) -> Any:
+    return read_json(_FOLDER / f"{name}.json")

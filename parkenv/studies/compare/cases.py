@@ -1,0 +1,302 @@
+"""Compare agents in the same worlds: run their episodes in parallel and summarise them."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from parkenv.compiled.keyed_random import world_key
+from parkenv.errors import InputError
+from parkenv.scenarios.places import seeds_by_place
+from parkenv.studies.agent_spec import AgentSpec, label_of
+from parkenv.studies.episodes import EpisodeRunner, SearchTrace
+from parkenv.studies.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
+from parkenv.studies.statistics import mean_interval, summarize
+from parkenv.studies.workers import HERE, Workers
+from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
+from parkenv.world.scenario import KMH, Scenario
+from parkenv.world.sensor_model import SensorModel
+from parkenv.world.week import DAY_S
+from planners.agent import make_agent, shown_name
+
+BLIND = "-blind"  # suffix of the names of scenarios whose slots are not observed before an attempt
+BLOCK = 10  # episodes per task: a crash loses few of them, and the overhead of starting a task stays small
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One agent in one scenario, with the costs and speeds of one setting."""
+
+    scenario: Scenario  # the scenario, with the setting's costs and speeds
+    agent: str
+    occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
+    # simulated sensors that observe the slots; None to use the scenario's sensor model
+    rig: str | None = None
+    options: Mapping[str, Any] = field(default_factory=dict)  # options of the agent, for `make_agent`
+    # detector for the rig's images, for `make_detector`; None for the packaged one
+    detector: str | None = None
+    every: float | None = None  # least distance between the rig's captures, m; None for the environment's
+
+    @property
+    def label(self) -> str:
+        """Name of the agent with its options, for tables."""
+        return label_of(shown_name(self.agent), dict(self.options))
+
+    @property
+    def columns(self) -> Row:
+        """The columns that identify this case in tables."""
+        return {
+            "scenario": self.scenario.name,
+            "occupancy_level": self.occupancy_level,
+            "agent": self.label,
+            "failure_cost_s": float(self.scenario.failure_s),
+            "v_walk_kmh": round(self.scenario.v_walk / KMH, 6),
+            "v_drive_kmh": round(self.scenario.v_drive / KMH, 6),
+        }
+
+    def key(self, seed: int) -> tuple[Any, ...]:
+        """Return the key of an episode in a `ResultFolder`."""
+        return episode_key({**self.columns, "seed": seed})
+
+    def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
+        """Run one episode per seed; return rows of `episodes.csv` and of `timings.csv`."""
+        runner = self.runner()
+        rows, timings = [], []
+        for seed in seeds:
+            episode = runner.run(seed)
+            rows.append({**self.columns, **episode.row})
+            microseconds = " ".join(str(round(1e6 * s)) for s in episode.decision_s)
+            timings.append({**self.columns, "seed": seed, "decisions_us": microseconds})
+        return rows, timings
+
+    def run_reporting(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row], list[str]]:
+        """Like `run`, but also return the warnings: those of a worker process would not reach the user in order."""
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("default")
+            rows, timings = self.run(seeds)
+        return rows, timings, [f"{self.label} in {self.scenario.name}: {w.message}" for w in caught]
+
+    def trace(self, seed: int) -> SearchTrace:
+        """Run one episode, and return its trace for a picture."""
+        return self.runner().run(seed).trace
+
+    def runner(self) -> EpisodeRunner:
+        """Return a runner of this case's episodes."""
+        agent = make_agent(self.agent, self.scenario, **self.options)
+        return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector, self.every)
+
+
+def require_distinct(cases: Iterable[Case]) -> None:
+    """Check that no two cases would share their rows, as two of a user's agents with the same `name` would.
+
+    Raises:
+        InputError: two agents are called the same.
+    """
+    counts = Counter(tuple(case.columns.values()) for case in cases)
+    if counts and (most := counts.most_common(1)[0])[1] > 1:
+        raise InputError(f"two agents are called {most[0][2]!r}, want different names")
+
+
+def settings_of(
+    scenario: Scenario,
+    failure_s: Sequence[float] | None = None,
+    v_walk_kmh: Sequence[float] | None = None,
+    v_drive_kmh: Sequence[float] | None = None,
+) -> list[Scenario]:
+    """Return the scenario in every combination of failure cost, s, and speeds, km/h; None keeps its own value."""
+    axes = [
+        [{"failure_s": value} for value in failure_s or ()],
+        [{"v_walk": value * KMH} for value in v_walk_kmh or ()],
+        [{"v_drive": value * KMH} for value in v_drive_kmh or ()],
+    ]
+    return [
+        scenario.replace(**failure, **walk, **drive)
+        for failure, walk, drive in itertools.product(*(axis or [{}] for axis in axes))
+    ]
+
+
+def blind_scenario(scenario: Scenario) -> Scenario:
+    """Return a renamed scenario in which slots are not observed before a parking attempt."""
+    return scenario.replace(name=f"{scenario.name}{BLIND}", sensor_model=SensorModel.blind())
+
+
+def at_occupancy(scenario: Scenario, level: float) -> Scenario:
+    """Return the scenario with a mean occupancy of `level` at the middle of its arrival window, on its first day.
+
+    Raises:
+        InputError: its occupancy is a recorded log, which cannot be changed.
+    """
+    window = scenario.arrival
+    middle = (window.start_s + window.end_s) / 2
+    # Occupancy differs between days, so the level can hold on one day only.
+    day = window.weekdays[0]
+    moment = ArrivalWindow((day,), middle, middle)
+
+    def adjusted(model: Any) -> Any:
+        if model is None:
+            return None
+        if not isinstance(model, OccupancyProcess):
+            raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
+        return model.at_mean_occupancy(level, day * DAY_S + middle)
+
+    return scenario.replace(
+        arrival=moment, occupancy=adjusted(scenario.occupancy), prior=adjusted(scenario.prior)
+    )
+
+
+def run_cases(
+    cases: Sequence[tuple[Case, range]],
+    folder: ResultFolder,
+    *,
+    workers: Workers = HERE,
+    block_size: int = BLOCK,
+    on_progress: Callable[[int], None] = lambda _: None,
+) -> None:
+    """Run the episodes that the folder does not hold yet.
+
+    Args:
+        cases: cases, each with the seeds of its episodes.
+        folder: folder for finished episodes.
+        workers: where episodes run; results do not depend on it.
+        block_size: episodes per task.
+        on_progress: called with the number of episodes just finished.
+
+    Raises:
+        KeyboardInterrupt: passed on; finished episodes are in the folder.
+    """
+    tasks = [
+        (case, block)
+        for case, seeds in cases
+        for block in _blocks([s for s in seeds if case.key(s) not in folder.episodes], block_size)
+    ]
+    done = sum(len(seeds) for _, seeds in cases) - sum(len(block) for _, block in tasks)
+    on_progress(done)
+    told = set()
+    work = [partial(case.run_reporting, block) for case, block in tasks]
+    for _, (rows, timings, messages) in workers.results(work):
+        folder.add(rows, timings)
+        on_progress(len(rows))
+        for message in messages:
+            # Warn once per agent and scenario: numbers in the text differ between episodes.
+            if (topic := message.partition(":")[0]) not in told:
+                told.add(topic)
+                warnings.warn(message, stacklevel=2)
+
+
+def rows_of(
+    agents: Sequence[AgentSpec],
+    places: Scenario | Sequence[Scenario],
+    seeds: Sequence[int],
+    workers: Workers,
+    name: str | None = None,
+) -> list[Row]:
+    """Run searches without saving them, and return the `table` row of each agent.
+
+    Args:
+        agents: the agents.
+        places: a scenario; or several, of which each seed draws one as the environment does.
+        seeds: one search each.
+        workers: where they run.
+        name: name of the places in the rows; that of the first if absent.
+    """
+    places = [places] if isinstance(places, Scenario) else places
+    work: list[tuple[Case, Sequence[int]]] = []
+    for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
+        cases = [Case(place, agent.name, options=agent.options) for agent in agents]
+        require_distinct(cases)
+        work += [(case, block) for case in cases for block in _blocks(its, 5 * BLOCK)]
+    episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
+    for number, (rows, _) in workers.results([partial(case.run, block) for case, block in work]):
+        episodes[work[number][0].label] += rows
+    by_seed = {label: sorted(rows, key=lambda row: row["seed"]) for label, rows in episodes.items()}
+    first = by_seed[cases[0].label]
+    columns = {"scenario": places[0].name if name is None else name}
+    return [
+        summarize(case.columns | columns, by_seed[case.label], None if i == 0 else first)
+        for i, case in enumerate(cases)
+    ]
+
+
+def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
+    """Check, before anything is written, that the scenario has a world and a forecast for every search.
+
+    Raises:
+        InputError: it has not, e.g. because a log has no other day to forecast from.
+    """
+    days = set()
+    for seed in seeds:
+        key = world_key(seed, 0)
+        arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
+        if arrival.day not in days:
+            days.add(arrival.day)
+            scenario.forecast(arrival)
+            scenario.occupancy.world(key, arrival)
+
+
+def _blocks(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
+    for i in range(0, len(seeds), size):
+        yield seeds[i : i + size]
+
+
+def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:
+    """Return a row for every case with finished episodes, in order; differences are to the first agent.
+
+    If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
+    """
+    rows = []
+    first: dict[tuple[Any, ...], list[Row]] = {}
+    for case, seeds in cases:
+        keys = [key for s in seeds if (key := case.key(s)) in folder.episodes]
+        if not keys:
+            continue
+        episodes = [folder.episodes[key] for key in keys]
+        columns = case.columns
+        setting = tuple(v for k, v in columns.items() if k != "agent")
+        decision_s = list(itertools.chain.from_iterable(folder.decision_s(key) for key in keys))
+        rows.append(summarize(columns, episodes, first.get(setting), decision_s))
+        first.setdefault(setting, episodes)
+    names = [c for c in SETTING_COLUMNS if c != "agent"]
+    optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == "exact"}
+    for row in rows:
+        best = optimum.get(tuple(row[c] for c in names))
+        if best is not None:
+            row["gap_to_exact"] = row["total_s"] / best - 1.0
+    return rows
+
+
+def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:
+    """Bin episodes by the occupancy at arrival, and return their mean total times.
+
+    Args:
+        rows: episodes.
+        edges: ascending edges of the occupancy bins.
+
+    Returns:
+        Rows with agent, failure_cost_s, occupancy (the bin's mean), total_s, total_s_ci95, episodes.
+    """
+    bins: dict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
+    for row in rows:
+        place = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
+        if 0 <= place < len(edges) - 1:
+            bins[row["agent"], row["failure_cost_s"], place].append(row)
+    result = []
+    for (agent, failure, _), inside in sorted(bins.items(), key=lambda item: item[0][1:]):
+        mean, low, high = mean_interval([r["total_s"] for r in inside])
+        result.append(
+            {
+                "agent": agent,
+                "failure_cost_s": failure,
+                "occupancy": float(np.mean([r["occupancy"] for r in inside])),
+                "episodes": len(inside),
+                "total_s": mean,
+                "total_s_ci95": [low, high],
+            }
+        )
+    return result

@@ -1,0 +1,109 @@
+"""Contact sheets: many lots in one picture, to look through an import."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.studies.figures.lot_picture import ENTRY, GOAL, GROUND, INK
+from parkenv.studies.figures.picture_files import STYLE, save_picture
+from parkenv.world.lot import ParkingLot, corner_points
+
+COLUMNS = 6
+WIDTH, HEIGHT, KEY = 2.8, 3.2, 0.4
+"""Width and height of a lot with its caption, and the height of the key, inches."""
+SCALES = (5, 10, 20, 50, 100, 200, 500)
+"""Lengths of the scale bar, m."""
+LONGEST_NAME = 28
+LARGEST = 60
+"""Number of lots in one sheet."""
+SLOT, ONE_WAY, TWO_WAY, TIE = "#9db8d2", "#aa3377", "#333a42", "#8fa58f"
+
+
+def save_contact_sheets(lots: Sequence[tuple[str, ParkingLot]], folder: Path) -> list[Path]:
+    """Draw lots, 60 in a sheet, into `contact-sheet-1.png` and so on in a folder, and return the files.
+
+    Raises:
+        InputError: a file cannot be written.
+    """
+    files = []
+    for k in range(0, len(lots), LARGEST):
+        files.append(folder / f"contact-sheet-{k // LARGEST + 1}.png")
+        save_contact_sheet(lots[k : k + LARGEST], files[-1])
+    return files
+
+
+def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path) -> None:
+    """Draw up to 60 lots side by side: slots tied to their lanes, one-way lanes with arrows, entries and goals.
+
+    Args:
+        lots: captions, whose first line is bold, and lots; each is drawn at a scale of its own, with a bar.
+        path: the file.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    shown = lots[:LARGEST]
+    columns = min(COLUMNS, max(len(shown), 1))
+    rows = -(-len(shown) // columns)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(WIDTH * columns, HEIGHT * rows + KEY))
+        grid = figure.subplots(rows, columns, squeeze=False)
+        for ax in grid.flat[len(shown) :]:
+            ax.remove()
+        for ax, (caption, lot) in zip(grid.flat, shown, strict=False):
+            _draw_lot(ax, lot)
+            name, _, details = caption.partition("\n")
+            ax.set_title(_shortened(name), fontsize=10, weight="bold", color=INK, pad=16)
+            ax.text(0.0, 1.02, details, transform=ax.transAxes, fontsize=9, color=INK, va="bottom")
+        bottom = KEY / (HEIGHT * rows + KEY)
+        figure.tight_layout(pad=0.6, w_pad=1.0, h_pad=1.0, rect=(0.0, bottom, 1.0, 1.0))
+        handles = [
+            Line2D([], [], linestyle="", marker="^", color=ENTRY, label="entry"),
+            Line2D([], [], linestyle="", marker="*", color=GOAL, markeredgecolor=INK, label="goal"),
+            Line2D([], [], color=TWO_WAY, label="lane"),
+            Line2D([], [], color=ONE_WAY, label="one-way lane"),
+        ]
+        figure.legend(handles=handles, loc="lower center", ncols=4 if columns > 2 else 2, fontsize=9)
+        save_picture(figure, path)
+
+
+def _draw_lot(ax: Axes, lot: ParkingLot) -> None:
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.set(xticks=[], yticks=[], facecolor=GROUND)
+    ax.spines[:].set_visible(False)
+    corners = corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width)
+    ax.add_collection(PolyCollection(list(corners), facecolors=SLOT, edgecolors="white", linewidths=0.3))
+    mouth = lot.mouth_xy()
+    ties = np.stack([mouth, nearest_on_lanes(lot.lanes, mouth)[0]], axis=1)
+    ax.add_collection(LineCollection(list(ties), colors=TIE, linewidths=0.4))
+    colors = [ONE_WAY if lane.oneway else TWO_WAY for lane in lot.lanes]
+    ax.add_collection(LineCollection([lane.points for lane in lot.lanes], colors=colors, linewidths=1.1))
+    for lane in lot.lanes:
+        if lane.oneway:
+            arrow = {"arrowstyle": "->", "color": ONE_WAY}
+            ax.annotate("", lane.points[-1], lane.points[-2], arrowprops=arrow)
+    ax.plot(*lot.entries.T, "^", color=ENTRY, markersize=6)
+    ax.plot(*lot.goals.T, "*", color=GOAL, markeredgecolor=INK, markeredgewidth=0.4, markersize=9)
+    low_x, low_y, high_x, high_y = lot.bounds()
+    extent = max((high_x - low_x) / WIDTH, (high_y - low_y) / HEIGHT) * WIDTH
+    length = max((step for step in SCALES if step < 0.4 * extent), default=SCALES[0])
+    # Room for the bar below the lot.
+    bar_y = low_y - 0.08 * extent
+    ax.plot([low_x, low_x + length], [bar_y, bar_y], color=INK, linewidth=1.5, solid_capstyle="butt")
+    ax.text(low_x + length, bar_y, f" {length} m", fontsize=8, color=INK, va="center")
+    ax.autoscale_view()
+
+
+def _shortened(name: str) -> str:
+    return (
+        name if len(name) <= LONGEST_NAME else f"{name[: LONGEST_NAME // 2]}…{name[-LONGEST_NAME // 2 + 1 :]}"
+    )

@@ -1,0 +1,159 @@
+"""Figure of an experiment with many cars: search time, price of anarchy, members and others."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
+from parkenv.studies.fleet.measures import Roads
+from parkenv.world.scenario import SearchProblem
+
+Row = dict[str, Any]
+
+KNOWLEDGE_COLORS = {"own": INK, "shared": "#e69f00", "reserve": "#0072b2", "full": "#009e73"}
+_STYLES: tuple[tuple[Any, str], ...] = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
+_GREY = "#999999"
+_CLOSED_FORM = "slots looked at in random order"
+
+
+def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, path: str | Path) -> None:
+    """Draw the summary of an experiment.
+
+    Panels: search time against occupancy, with the closed form of slots looked at in random order; price of anarchy
+    against demand, if it is known; what members and others gain, if there are several shares and `own`.
+
+    Args:
+        rows: of `summarize_days`.
+        problem: lot and speeds.
+        title: title of the figure.
+        path: file to write.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
+    mixed = [row for row in rows if 0.0 < row["share"] < 1.0]
+    priced = [row for row in whole if np.isfinite(row["price_of_anarchy"])]
+    panels: list[Callable[[Axes], None]] = [lambda ax: _draw_search(ax, whole, problem)]
+    if priced:
+        panels.append(lambda ax: _draw_price(ax, priced))
+    if mixed and any(row["knows"] == "own" for row in rows):
+        panels.append(lambda ax: _draw_shares(ax, rows))
+    agents = list(dict.fromkeys(row["agents"] for row in rows))
+    known = list(dict.fromkeys(row["knows"] for row in rows))
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(0.6 + 4.0 * len(panels), 3.9), layout="constrained")
+        for ax, draw in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+            draw(ax)
+            ax.grid(visible=True)
+        handles = [Line2D([], [], color=KNOWLEDGE_COLORS[name], label=f"knows: {name}") for name in known]
+        handles += [
+            Line2D([], [], color="#666666", linestyle=line, marker=marker, markersize=4, label=agent)
+            for agent, (line, marker) in zip(agents, _cycled(agents), strict=True)
+        ]
+        handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 3 + len(panels)))
+        figure.suptitle(title, x=0.01, ha="left")
+        save_picture(figure, path, f"{title}: search time, price of anarchy, members and others.")
+
+
+def _cycled(agents: Sequence[str]) -> list[tuple[Any, str]]:
+    return [_STYLES[i % len(_STYLES)] for i in range(len(agents))]
+
+
+def _curves(rows: Sequence[Row]) -> Iterator[tuple[list[Row], dict[str, Any]]]:
+    """Yield the rows of each agent and knowledge in order of demand, and their style."""
+    agents = list(dict.fromkeys(row["agents"] for row in rows))
+    for agent, (line, marker) in zip(agents, _cycled(agents), strict=True):
+        for name, color in KNOWLEDGE_COLORS.items():
+            its = [row for row in rows if (row["agents"], row["knows"]) == (agent, name)]
+            if its:
+                its.sort(key=lambda row: row["arrivals_per_hour"])
+                yield (
+                    its,
+                    {"color": color, "linestyle": line, "marker": marker, "markersize": 4, "capsize": 2},
+                )
+
+
+def _errors(rows: Sequence[Row], name: str) -> np.ndarray:
+    """Return the distances of the ends of the 95 % intervals from the means, (2, n)."""
+    mean = np.array([row[name] for row in rows])
+    ends = np.array([row[f"{name}_ci95"] for row in rows], float).reshape(-1, 2).T
+    return np.asarray(np.nan_to_num(np.abs(ends - mean)))
+
+
+def _draw_search(ax: Axes, rows: Sequence[Row], problem: SearchProblem) -> None:
+    for its, style in _curves(rows):
+        x = [100.0 * row["occupancy"] for row in its]
+        ax.errorbar(x, [row["search_s"] for row in its], _errors(its, "search_s"), linewidth=1.2, **style)
+    low = min(row["occupancy"] for row in rows)
+    occupancy = np.linspace(low, 1.0, 200)
+    ax.plot(100.0 * occupancy, looks_s(problem, occupancy), color=_GREY, linewidth=1.0)
+    most = max(row["search_s"] for row in rows)
+    ax.set(xlabel="mean occupancy, %", ylabel="s", ylim=(0.0, 1.25 * most), title="Search time")
+
+
+def looks_s(problem: SearchProblem, occupancy: np.ndarray) -> np.ndarray:
+    """Return the search time, s, of looking at slots in random order, (n + 1)/(m + 1) of them if m of n are free.
+
+    A look takes the median drive from a slot to the next one; the drive from the entry to the first slot comes before.
+    """
+    lot, n = problem.lot, problem.lot.n_slots
+    source, column = np.nonzero(lot.neighbors[:n] >= 0)
+    to_slot = lot.neighbors[source, column] < n
+    hop_s = float(np.median(problem.move_s[source[to_slot], column[to_slot]])) if to_slot.any() else 0.0
+    first_s = Roads(problem).first_slot_m / problem.v_drive
+    return np.asarray(first_s + hop_s * ((n + 1.0) / ((1.0 - occupancy) * n + 1.0) - 1.0))
+
+
+def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:
+    for its, style in _curves(rows):
+        x = [row["arrivals_per_hour"] for row in its]
+        ax.errorbar(
+            x,
+            [row["price_of_anarchy"] for row in its],
+            _errors(its, "price_of_anarchy"),
+            linewidth=1.2,
+            **style,
+        )
+    ax.set(xlabel="arrivals per hour", title="Total time over that of reservations for all")
+    ax.set_xticks(sorted({row["arrivals_per_hour"] for row in rows}))
+
+
+def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
+    """Draw how much members (filled) and others (hollow) gain or lose, at the demand with the highest price of anarchy.
+
+    Of the first agent; without prices, at the greatest demand.
+    """
+    agent = rows[0]["agents"]
+    its = [row for row in rows if row["agents"] == agent and row["knows"] != "own"]
+    own = [row for row in rows if row["agents"] == agent and row["knows"] == "own"]
+    price = {row["arrivals_per_hour"]: np.nan_to_num(row["price_of_anarchy"]) for row in own}
+    chosen = max(price, key=lambda a: (price[a], a))
+    ax.axhline(0.0, color=KNOWLEDGE_COLORS["own"], linewidth=1.0, linestyle=":")
+    for name, color in KNOWLEDGE_COLORS.items():
+        known = sorted(
+            (row for row in its if (row["knows"], row["arrivals_per_hour"]) == (name, chosen)),
+            key=lambda row: row["share"],
+        )
+        for group, face in (("members_difference_s", color), ("others_difference_s", "white")):
+            there = [row for row in known if np.isfinite(row[group])]
+            if there:
+                x, y = [100.0 * row["share"] for row in there], [row[group] for row in there]
+                ax.errorbar(
+                    x, y, _errors(there, group), color=color, marker="o", markersize=4, capsize=2,
+                    markerfacecolor=face, linestyle="-" if group[0] == "m" else "--", linewidth=1.2,
+                )  # fmt: skip
+    ax.set(
+        xlabel="share of members, %",
+        ylabel="s",
+        title=f"Change for members (filled) and others, {chosen:g}/h",
+    )

@@ -1,0 +1,192 @@
+"""Figure of a forecasting model: reliability, a week with its intervals, and how often the intervals hold."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import date
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from parkenv.forecast.comparison import Compared
+from parkenv.forecast.counts import HOURS, Counts, FloatArray
+from parkenv.forecast.day_forecast import draw_days
+from parkenv.forecast.scores import Band, mean_where
+from parkenv.forecast.slot_comparison import SlotScores
+from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
+
+_BLUE, _ORANGE = "#0072b2", "#d55e00"
+_WEEK = 7
+_LEVELS = ((0.05, 0.95, 0.16), (0.25, 0.75, 0.3))
+
+
+class ShownForecast(NamedTuple):
+    """What the figure of a model shows."""
+
+    model: str
+    log_loss: float
+    crps: float
+    coverage_90: float
+    place: str  # whose days are shown
+    days: Sequence[tuple[date, int]]  # shown one after the other, and the number of their values
+    draws: FloatArray  # (k, n) equally likely values of the n hours or half-hours
+    forecast: FloatArray  # (n,)
+    observed: FloatArray  # (n,)
+    reliability: FloatArray  # (3, b), see `parkenv.forecast.scores.reliability`
+    weight: str  # what reliability is weighted by
+    by_forecast: list[Band]  # coverage by forecast fullness
+    by_observed: list[Band]
+
+
+def shown_counts(compared: Compared, counts: Counts, week: tuple[int, int]) -> ShownForecast:
+    """Return what to show of a model of counts.
+
+    Args:
+        compared: its forecasts and scores.
+        counts: what was observed.
+        week: car park and first day to show, by index (`shown_week`).
+    """
+    forecast, scores, (park, monday) = compared.forecast, compared.scores, week
+    dates = counts.days[monday : monday + _WEEK]
+    days = slice(monday - forecast.first, monday - forecast.first + _WEEK)
+    draws = np.moveaxis(draw_days(forecast.mean[park, days], forecast.covariance[park, days]), 1, 0)
+    return ShownForecast(
+        compared.model, mean_where(scores.log_loss), mean_where(scores.crps), mean_where(scores.day_held),
+        counts.car_parks[park], [(day, HOURS) for day in dates], draws.reshape(len(draws), -1),
+        forecast.occupancy[park, days].ravel(), counts.occupied[park, monday : monday + _WEEK].ravel(),
+        scores.reliability(), "hours", scores.coverage_by_band(), scores.coverage_by_band(observed=True),
+    )  # fmt: skip
+
+
+def shown_slots(scores: SlotScores, place: str) -> ShownForecast:
+    """Return what to show of a model of slots: the last days that were scored, a week at most.
+
+    Args:
+        scores: of the model.
+        place: name of the log.
+    """
+    days = scores.days[-_WEEK:]
+    draws, forecast, observed = (
+        np.concatenate([getattr(day, name) for day in days], axis=-1)
+        for name in ("draws", "forecast", "observed")
+    )
+    return ShownForecast(
+        scores.model, scores.log_loss, float(scores.crps), scores.coverage_90,
+        f"{place}: mean over the slots", [(date.fromordinal(day.number), day.forecast.size) for day in days],
+        draws, forecast, observed,
+        scores.reliability(), "slots' half-hours", scores.coverage_by_band(), scores.coverage_by_band(observed=True),
+    )  # fmt: skip
+
+
+def shown_week(counts: Counts, first: int) -> tuple[int, int]:
+    """Return car park and first day, by index, of the week to show: from Monday on, with many readings that vary most.
+
+    Args:
+        counts: what was observed.
+        first: index of the first day that may be shown.
+    """
+    mondays = [d for d in range(first, len(counts.days) - _WEEK + 1) if counts.weekday[d] == 0]
+    best, chosen = -1.0, (0, first)
+    for monday in mondays:
+        week = counts.occupied[:, monday : monday + _WEEK].reshape(len(counts.car_parks), -1)
+        known = np.isfinite(week)
+        middle = np.where(known, week, 0.0).sum(axis=1) / np.maximum(known.sum(axis=1), 1)
+        spread = np.sqrt(np.where(known, (week - middle[:, None]) ** 2, 0.0).mean(axis=1))
+        worth = spread * known.mean(axis=1) ** 4
+        if worth.max() > best:
+            best, chosen = float(worth.max()), (int(worth.argmax()), monday)
+    return chosen
+
+
+def save_forecast(shown: ShownForecast, path: Path) -> None:
+    """Draw the figure of one model.
+
+    Args:
+        shown: what to draw.
+        path: the PNG to write.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(10.5, 5.6), layout="constrained")
+        grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.15), width_ratios=(1.0, 1.6))
+        _draw_days(figure.add_subplot(grid[0, :]), shown)
+        reliability, coverage = (figure.add_subplot(grid[1, column]) for column in (0, 1))
+        _draw_reliability(reliability, shown)
+        _draw_coverage(coverage, shown)
+        figure.suptitle(
+            f"{shown.model}: day-ahead forecasts, log-loss {shown.log_loss:.4f}, "
+            f"CRPS {shown.crps:.4f}, {shown.coverage_90:.1%} of days in their 90 % interval",
+            x=0.01,
+            ha="left",
+        )
+        save_picture(figure, path, f"Day-ahead forecasts of {shown.model} and what was counted")
+
+
+def _draw_days(ax: Axes, shown: ShownForecast) -> None:
+    starts = np.cumsum([0, *(n for _, n in shown.days)])
+    x = np.arange(shown.forecast.size)
+    for start, stop in pairwise(starts):
+        # Days need not follow each other: no line between them.
+        day = slice(start, stop)
+        for low, high, alpha in _LEVELS:
+            bounds = np.quantile(shown.draws[:, day], (low, high), axis=0)
+            label = f"{high - low:.0%} interval" if start == 0 else "_nolegend_"
+            ax.fill_between(x[day], *bounds, color=_BLUE, alpha=alpha, linewidth=0, label=label)
+        label = "forecast" if start == 0 else "_nolegend_"
+        ax.plot(x[day], shown.forecast[day], color=_BLUE, linewidth=1.3, label=label)
+    ax.plot(x, shown.observed, ".", color=INK, markersize=3.0, label="counted")
+    ax.set_xticks(starts[:-1], [f"{day:%a %d %b %Y}" for day, _ in shown.days], ha="left")
+    ax.set(xlim=(0, max(x.size - 1, 1)), ylim=(0, 1.02), ylabel="occupied", title=shown.place)
+    ax.yaxis.set_major_formatter(PercentFormatter(1.0))
+    ax.grid(axis="x")
+    ax.legend(ncols=4, loc="lower right", bbox_to_anchor=(1.0, 1.0), borderaxespad=0.0)
+
+
+def _draw_reliability(ax: Axes, shown: ShownForecast) -> None:
+    forecast, observed, n = shown.reliability
+    ax.plot([0, 1], [0, 1], color="#999999", linewidth=0.8)
+    ax.vlines(
+        forecast, 0, 0.25 * n / n.max(), color="#bbbbbb", linewidth=5.0, label=f"share of {shown.weight}"
+    )
+    ax.plot(forecast, observed, "o-", color=_BLUE, markersize=3.5, linewidth=1.2, label="counted")
+    ax.set(xlim=(0, 1), ylim=(0, 1), xlabel="forecast to be occupied", ylabel="occupied", title="Reliability")
+    for axis in (ax.xaxis, ax.yaxis):
+        axis.set_major_formatter(PercentFormatter(1.0))
+    ax.set_aspect("equal")
+    ax.legend(loc="upper left")
+
+
+def _draw_coverage(ax: Axes, shown: ShownForecast) -> None:
+    for bands, color, shift, height, label in (
+        (shown.by_forecast, _BLUE, -0.1, 0.545, "days by forecast fullness"),
+        (shown.by_observed, _ORANGE, 0.1, 0.515, "days by counted fullness"),
+    ):
+        for i, band in enumerate(bands):
+            if (held := band["coverage_90"]) is None:
+                continue
+            days = int(band["days"] or 0)
+            error = 1.96 * np.sqrt(max(held * (1.0 - held), 0.25 / days) / days)
+            ax.errorbar(
+                i + shift, held, error, fmt="o", color=color, markersize=4.5, linewidth=1.2,
+                label=label,
+            )  # fmt: skip
+            label = "_nolegend_"
+            ax.annotate(
+                f"{days:,}", (i, height), ha="center", fontsize=7.5, color=color,
+                rotation=0, annotation_clip=True,
+            )  # fmt: skip
+    ax.axhspan(0.8, 0.97, color="#eeeeee", zorder=0)
+    ax.axhline(0.9, color="#999999", linewidth=0.8)
+    names = [f"{band['from']:.0%}–{band['to']:.0%}" for band in shown.by_forecast]
+    ax.set_xticks(range(len(names)), names)
+    ax.set(
+        xlim=(-0.5, len(names) - 0.5), ylim=(0.5, 1.0), xlabel="mean occupancy of the day (below: number of days)",
+        ylabel="days in their 90 % interval", title="Coverage",
+    )  # fmt: skip
+    ax.yaxis.set_major_formatter(PercentFormatter(1.0))
+    ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)

@@ -1,0 +1,129 @@
+"""Figure for checking a lot import: what was read from the file, and what is missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from textwrap import wrap
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from parkenv.lots.importers.lot_draft import LotDraft
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.studies.figures.lot_picture import ENTRY, GOAL, GROUND, INK, draw_walls
+from parkenv.studies.figures.picture_files import save_picture
+from parkenv.world.lot import Lane, corner_points, is_building, mouth_points
+
+FloatArray = NDArray[np.float64]
+
+SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
+AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
+ROAD = "#333a42"
+TIE = "#9aa0a6"
+ARROW_EVERY = 15.0
+"""Distance between arrows on a one-way lane, m."""
+
+
+def save_import_picture(draft: LotDraft, path: str | Path) -> None:
+    """Draw a draft, complete or not, to a PNG file.
+
+    Slots are coloured by their source, each with a line from its open side to its lane. One-way lanes have arrows.
+    Missing parts are listed below the drawing.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    notes = [line for text in draft.missing for line in wrap(f"missing: {text}", 110)]
+    points = _extent(draft)
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(high - low, 20.0)
+    scale = 9.0 / size.max()
+    room = 0.7 + 0.18 * len(notes)
+    width, height = max(size[0] * scale, 5.0), max(size[1] * scale, 2.0)
+    figure = Figure(figsize=(width, height + room))
+    ax = figure.add_axes((0.07, (room + 0.1) / (height + room), 0.92, (height - 0.4) / (height + room)))
+    _draw(draft, ax)
+    margin = 0.04 * size.max()
+    ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    ax.set_title(f"{draft.name}: {len(draft.slots)} slots, {len(draft.lanes)} lanes", loc="left", fontsize=9)
+    handles: list[Patch | Line2D] = [
+        Patch(facecolor=SOURCE_COLORS[k % len(SOURCE_COLORS)], label=source)
+        for k, source in enumerate(_sources(draft))
+    ]
+    for label, marker, color, many in (
+        ("entry", "^", ENTRY, draft.entries),
+        ("goal", "*", GOAL, draft.goals),
+    ):
+        if len(many):
+            handles.append(
+                Line2D([], [], marker=marker, color=color, markeredgecolor=INK, linestyle="", label=label)
+            )
+    if handles:
+        figure.legend(handles=handles, loc="lower left", ncols=4, fontsize=7, frameon=False)
+    for k, text in enumerate(reversed(notes)):
+        figure.text(0.01, (0.3 + 0.18 * k) / (height + room), text, fontsize=7, color="#bb2222")
+    save_picture(figure, path)
+
+
+def _sources(draft: LotDraft) -> list[str]:
+    return list(dict.fromkeys(draft.slot_source))
+
+
+def _extent(draft: LotDraft) -> FloatArray:
+    slots = draft.slots
+    parts = [corner_points(slots.xy, slots.yaw, slots.length, slots.width).reshape(-1, 2)]
+    parts += [lane.points for lane in draft.lanes]
+    parts += [draft.entries.reshape(-1, 2), draft.goals.reshape(-1, 2), *draft.outlines, draft.loose]
+    points = np.concatenate(parts)
+    return points if len(points) else np.zeros((1, 2))
+
+
+def _draw(draft: LotDraft, ax: Axes) -> None:
+    ax.set_aspect("equal")
+    ax.set_facecolor(GROUND)
+    ax.tick_params(labelsize=7)
+    ax.set_xlabel("m", fontsize=7)
+    ax.add_collection(PolyCollection(list(draft.outlines), facecolors=AREA, edgecolors=AREA_EDGE, zorder=0.5))
+    draw_walls(ax, *([w for w in draft.walls if is_building(w) == closed] for closed in (True, False)))
+    ax.plot(*draft.loose.T, "o", color=SOURCE_COLORS[0], markersize=4, zorder=1.0)
+    slots = draft.slots
+    sources = _sources(draft)
+    colors = [SOURCE_COLORS[sources.index(source) % len(SOURCE_COLORS)] for source in draft.slot_source]
+    corners = corner_points(slots.xy, slots.yaw, slots.length, slots.width)
+    ax.add_collection(
+        PolyCollection(list(corners), facecolors=colors, edgecolors="white", linewidths=0.4, zorder=1.0)
+    )
+    lines = [lane.points for lane in draft.lanes]
+    ax.add_collection(LineCollection(lines, colors=ROAD, linewidths=1.2, zorder=1.2))
+    if lines and len(slots):
+        mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+        on_lane = nearest_on_lanes(draft.lanes, mouth)[0]
+        ax.add_collection(
+            LineCollection(list(np.stack([mouth, on_lane], axis=1)), colors=TIE, linewidths=0.5, zorder=1.1)
+        )
+    for lane in draft.lanes:
+        if lane.oneway:
+            _draw_arrows(lane, ax)
+    ax.plot(*draft.entries.reshape(-1, 2).T, "^", color=ENTRY, markeredgecolor=INK, markersize=9, zorder=2)
+    ax.plot(*draft.goals.reshape(-1, 2).T, "*", color=GOAL, markeredgecolor=INK, markersize=14, zorder=2)
+
+
+def _draw_arrows(lane: Lane, ax: Axes) -> None:
+    step = np.diff(lane.points, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    for start, way, far in zip(lane.points, step, length, strict=False):
+        n = max(1, round(far / ARROW_EVERY))
+        for share in (np.arange(n) + 0.5) / n:
+            at = start + share * way
+            ax.annotate(
+                "",
+                tuple(at + 0.5 * way / far),
+                tuple(at - 0.5 * way / far),
+                arrowprops={"arrowstyle": "-|>", "color": ROAD, "mutation_scale": 9},
+                zorder=1.3,
+            )

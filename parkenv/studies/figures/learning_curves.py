@@ -1,0 +1,165 @@
+"""Learning curves: scores against training decisions, with planners for comparison."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.layout_engine import ConstrainedLayoutEngine
+from matplotlib.ticker import FuncFormatter, PercentFormatter
+
+from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
+from parkenv.studies.figures.time_figures import spread
+from parkenv.studies.statistics import mean_interval
+
+COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
+"""Colours of trainings: as many as are easy to tell apart."""
+OFF_SCALE = 2.0
+"""Times above this multiple of the lowest are cut off."""
+_APART = 0.045  # least distance of two labels, fraction of the axis
+_MARGIN_IN = 0.12  # beside the labels, inches
+
+Curves = Sequence[Sequence[Mapping[str, Any]]]
+
+
+def columns_of(measure: str) -> tuple[str, str, str]:
+    """Return the column names of the interval's ends and the median of a measure."""
+    unit = "_s" if measure.endswith("_s") else ""
+    return f"low{unit}", f"high{unit}", f"median{unit}"
+
+
+def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, float]]:
+    """Return the mean over seeds with its 95 % interval, and the median, at evaluations that all seeds have.
+
+    Args:
+        curves: rows of `curve.csv` of each seed.
+        measure: the column.
+
+    Returns:
+        Rows with steps, `measure` and its `columns_of`.
+    """
+    low_name, high_name, median_name = columns_of(measure)
+    rows = []
+    for evaluations in zip(*curves, strict=False):
+        values = [row[measure] for row in evaluations]
+        mean, low, high = mean_interval(values)
+        row = {"steps": float(np.mean([row["steps"] for row in evaluations])), measure: mean}
+        rows.append(row | {low_name: low, high_name: high, median_name: float(np.median(values))})
+    return rows
+
+
+def save_learning_curves(
+    curves: Mapping[str, Curves], planners: Mapping[str, float], title: str, path: Path
+) -> None:
+    """Draw each algorithm's total time, and planners as horizontal lines.
+
+    A single algorithm is drawn as the mean over seeds with its interval. Several are drawn as medians: their intervals
+    would hide each other, and medians are robust against single searches that drive in circles. Single seeds are thin
+    lines.
+
+    Args:
+        curves: rows of `curve.csv` by algorithm and seed.
+        planners: mean total time, s, of each planner in the same worlds.
+        title: title of the figure.
+        path: the PNG file to write.
+    """
+    with mpl.rc_context(STYLE):
+        layout = ConstrainedLayoutEngine(w_pad=_MARGIN_IN)
+        figure = Figure(figsize=(7.2, 4.2 if len(curves) == 1 else 4.8), layout=layout)
+        axes = figure.subplots()
+        highest = 0.0
+        for (name, its), color in zip(curves.items(), COLORS, strict=False):
+            drawn = _draw(axes, name, its, "total_s", color, alone=len(curves) == 1)
+            highest = max([highest, *drawn[len(drawn) // 10 :]])
+        low = min([*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c)])
+        # An untrained policy drives in circles, so cut off high values to keep the end of the curves readable.
+        high = min(max([highest, *planners.values()]), OFF_SCALE * low)
+        margin = 0.06 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)
+        shown = {name: t for name, t in planners.items() if t <= high + margin}
+        ascending = sorted(shown.items(), key=lambda item: item[1])
+        bottom, top = axes.get_ylim()
+        heights = spread([(seconds - bottom) / (top - bottom) for _, seconds in ascending], _APART)
+        for (name, seconds), height in zip(ascending, heights, strict=True):
+            _mark(axes, seconds, f"{name}  {seconds:.1f}", height)
+        axes.set(xlabel="decisions in training", ylabel="mean total time, s", title=title)
+        if len(curves) == 1:
+            axes.legend(loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=1.0)
+        else:
+            figure.legend(loc="outside lower left", ncols=2, frameon=False)
+        save_picture(figure, path, "Learning curves, and planners in the same worlds")
+
+
+def save_success_curves(
+    curves: Mapping[str, Curves], kinds: Sequence[str], planner: Mapping[str, float], title: str, path: Path
+) -> None:
+    """Draw the success rates of algorithms and of the planner, one panel per kind of slot.
+
+    As in `save_learning_curves`, a single algorithm is drawn as the mean over seeds, several as medians.
+
+    Args:
+        curves: rows of `curve.csv` by algorithm and seed; see `DriveTraining.evaluate`.
+        kinds: kinds of slots.
+        planner: success rate of the planner in the same tasks, by kind; empty to draw none.
+        title: title of the figure.
+        path: the PNG file to write.
+    """
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(2.4 + 2.8 * len(kinds), 3.4), layout="constrained")
+        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
+        for axes, kind in zip(panels, kinds, strict=True):
+            for (name, its), color in zip(curves.items(), COLORS, strict=False):
+                _draw(axes, name, its, f"{kind}_success", color, alone=len(curves) == 1)
+            if kind in planner:
+                share = planner[kind]
+                axes.axhline(share, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+                axes.annotate(
+                    f"planner {share:.0%}", (0.0, share), xycoords=("axes fraction", "data"), xytext=(4, 3),
+                    textcoords="offset points", fontsize=8, color=INK,
+                )  # fmt: skip
+            axes.set(title=kind, xlabel="decisions in training", ylim=(-0.03, 1.1))
+            axes.set_yticks(np.linspace(0.0, 1.0, 6))
+            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+        panels[0].set_ylabel("success rate")
+        panels[-1].legend(
+            loc="lower right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8
+        )
+        figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
+        save_picture(figure, path)
+
+
+def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str, *, alone: bool) -> Sequence[float]:
+    """Draw the mean over seeds with its interval, or the median, and single seeds as thin lines; return the line."""
+    rows = across_seeds(curves, measure)
+    low, high, median = columns_of(measure)
+    steps, line = [row["steps"] for row in rows], [row[measure if alone else median] for row in rows]
+    words = f"{len(curves)} seeds" if alone or len(curves) == 1 else f"median of {len(curves)} seeds"
+    for single in curves:
+        axes.plot([r["steps"] for r in single], [r[measure] for r in single], color=color, lw=0.5, alpha=0.35)
+    if alone and len(curves) > 1:
+        axes.fill_between(
+            steps, [row[low] for row in rows], [row[high] for row in rows], color=color, alpha=0.2, lw=0
+        )
+    axes.plot(steps, line, color=color, lw=2.0, label=f"{name}, {words}")
+    axes.set_xlim(left=0.0)
+    axes.xaxis.set_major_formatter(FuncFormatter(_count))
+    axes.grid(axis="y")
+    return line
+
+
+def _mark(axes: Axes, value: float, words: str, height: float) -> None:
+    """Draw a horizontal line, with a label beside the axes at a height given as a fraction of theirs."""
+    axes.axhline(value, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
+    axes.annotate(
+        words, (1.0, height), xycoords="axes fraction", xytext=(5, 0),
+        textcoords="offset points", va="center", fontsize=8, color=INK,
+    )  # fmt: skip
+
+
+def _count(x: float, _: Any) -> str:
+    return f"{x / 1e6:g} M" if x >= 1e6 else f"{x / 1e3:g} k" if x >= 1e3 else f"{x:g}"

@@ -1,0 +1,301 @@
+"""Pictures of single searches, as in T Fig. 4.7 to 4.12."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.lines import Line2D
+from matplotlib.path import Path as MplPath
+from matplotlib.patheffects import Normal, Stroke
+from matplotlib.textpath import TextPath
+from matplotlib.transforms import Affine2D
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.episodes import SearchTrace
+from parkenv.studies.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
+from parkenv.studies.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
+from parkenv.studies.figures.registry import ComparisonResults, Drawn, Setting
+from parkenv.studies.results import SETTING_AXES
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import KMH
+
+FloatArray = NDArray[np.float64]
+
+PATH, WALK = "#ffd000", "#1852ba"
+PICTURED = ("belief", "oracle", "first-free", "greedy-goal")
+"""Agents whose paths are drawn beside those of the first and of the fastest agent, the most interesting first."""
+MOST_PICTURED = 4
+POLICY_SCALE = 2.2
+"""Least scale, points per metre, at which arrows at every vertex are legible."""
+
+
+def draw_search(trace: SearchTrace, ax: Axes) -> None:
+    """Draw one search as in T Fig. 4.9 to 4.12.
+
+    At each slot, an inner disc shows the true occupancy and an outer ring the forecast. The path (from 1 to 2) and the
+    walk follow and, if there is room, the first plan's action at each vertex (T Fig. 4.8). Set the final size of the
+    axes first: line widths and arrows depend on the scale.
+
+    Args:
+        trace: the search.
+        ax: axes to draw in; sets their limits, aspect and title.
+    """
+    lot = trace.scenario.lot
+    draw_lot(lot, ax)
+    scale = points_per_m(ax)
+    draw_discs(lot, ax, trace.forecast, BELIEF_MAP(trace.occupied.astype(np.float64)))
+    if _shows_policy(trace, scale):
+        _draw_policy(trace, ax, scale)
+    _draw_path(trace, ax, scale)
+    title = _title(trace, ax.get_window_extent().width / ax.figure.dpi)
+    ax.set_title(title, loc="left", fontsize=mpl.rcParams["font.size"], linespacing=1.35)
+
+
+def _title(trace: SearchTrace, width: float) -> str:
+    """Describe the search, with lines broken to a width in inches at the current font size."""
+    scenario, metrics = trace.scenario, trace.metrics
+    terms = [
+        f"{metrics[key]:.0f} {name}"
+        for key, (name, _) in TIME_COLORS.items()
+        if key not in OPTIONAL_TIMES or metrics[key]
+    ]
+    replans = metrics.get("replans", 0)
+    planned = f"; {replans} replan{'s' if replans > 1 else ''}" if replans else ""
+    lines = (
+        f"{trace.agent}: failure cost {scenario.failure_s:g} s, walk {scenario.v_walk / KMH:g}, "
+        f"drive {scenario.v_drive / KMH:g} km/h",
+        f"total {metrics['total_s']:.0f} s = {' + '.join(terms)}{planned}",
+    )
+    letters = int(width * 72 / (0.6 * mpl.rcParams["font.size"]))
+    return "\n".join(line for text in lines for line in textwrap.wrap(text, max(letters, 10)))
+
+
+def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
+    lot, parked = trace.scenario.lot, bool(trace.metrics["parked"])
+    xy = lot.vertex_xy[trace.path]
+    if parked:
+        end = lot.slot_xy[trace.path[-1]]
+        goal = lot.goals[trace.scenario.goal]
+        xy = np.vstack([xy, end])
+        ax.plot(
+            *np.stack([end, goal], axis=1),
+            color=WALK,
+            linewidth=1.8,
+            linestyle=(0, (3, 2)),
+            zorder=3,
+            path_effects=[Stroke(linewidth=3.4, foreground="white"), Normal()],
+        )
+    width = float(np.clip(0.5 * scale, 1.2, 3.0))
+    ax.plot(
+        *xy.T,
+        color=PATH,
+        linewidth=width,
+        solid_joinstyle="round",
+        zorder=3.1,
+        path_effects=[Stroke(linewidth=width + 1.6, foreground=INK), Normal()],
+    )
+    step = np.diff(xy, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    if length.any():
+        driven = np.r_[0.0, np.cumsum(length)]
+        # About one mark per inch of path, but not hundreds on a long search.
+        n = int(np.clip(driven[-1] * scale / 60.0, 1, 18))
+        at = (np.arange(n) + 0.5) / n * driven[-1]
+        leg = np.clip(np.searchsorted(driven, at, side="right") - 1, 0, len(length) - 1)
+        ahead = step[leg] / length[leg, None]
+        middle = xy[leg] + (at - driven[leg])[:, None] * ahead
+        ax.add_collection(
+            PolyCollection(
+                _placed(_ARROWHEAD * (3.0 + 1.4 * width) / scale, middle, ahead),
+                facecolors=PATH,
+                edgecolors=INK,
+                linewidths=0.8,
+                zorder=3.2,
+            )
+        )
+    for number, point, color in (("1", xy[0], INK), ("2", xy[-1], WALK if parked else "#c03219")):
+        ax.plot(*point, marker="o", markersize=11, color=color, markeredgecolor="white", zorder=6)
+        ax.annotate(
+            number,
+            point,
+            color="white",
+            weight="bold",
+            fontsize=8,
+            ha="center",
+            va="center_baseline",
+            zorder=6.1,
+        )
+
+
+_ARROWHEAD = np.array([[1.0, 0.0], [-0.8, 0.9], [-0.35, 0.0], [-0.8, -0.9]])
+_ARROW = np.array(
+    [[1.0, 0.0], [0.25, 0.42], [0.25, 0.13], [-1.0, 0.13], [-1.0, -0.13], [0.25, -0.13], [0.25, -0.42]]
+)
+
+
+def _shows_policy(trace: SearchTrace, scale: float) -> bool:
+    return trace.policy is not None and scale >= POLICY_SCALE
+
+
+def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
+    lot, policy = trace.scenario.lot, trace.policy
+    assert policy is not None
+    drives = np.flatnonzero(policy < PARK)
+    target = lot.neighbors[drives, policy[drives]]
+    drives, target = drives[target >= 0], target[target >= 0]
+    ahead = lot.vertex_xy[target] - lot.vertex_xy[drives]
+    ahead /= np.maximum(np.hypot(ahead[:, 0], ahead[:, 1]), 1e-9)[:, None]
+    colors = np.where(np.isin(np.arange(lot.n_vertices), trace.path), INK, "white")
+    ax.add_collection(
+        PolyCollection(
+            _placed(0.95 * _ARROW, lot.vertex_xy[drives], ahead),
+            facecolors=list(colors[drives]),
+            edgecolors="none",
+            zorder=3.5,
+        )
+    )
+    size = min(2.1 * scale, 14.0)
+    for color, extra in ((INK, 1.6), ("white", 0.0)):
+        ax.plot(
+            *lot.vertex_xy[np.flatnonzero(policy == PARK)].T,
+            linestyle="none",
+            marker=_text_marker("P"),
+            markersize=size,
+            color=color,
+            markeredgewidth=extra,
+            zorder=3.6,
+        )
+
+
+def _text_marker(text: str) -> MplPath:
+    """Return bold text as a marker; markers of mathematical text would need it in names, too."""
+    path = TextPath((0, 0), text, prop=FontProperties(weight="bold"))
+    return path.transformed(Affine2D().translate(*-path.get_extents().get_points().mean(axis=0)))
+
+
+def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatArray]:
+    """Place a shape, (k, 2) m with its nose towards +x, at each point, rotated to its heading."""
+    turn = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)
+    return list(at[:, None] + shape @ turn)
+
+
+def searches(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield `draw_searches` for each scenario and setting: some agents in the same world.
+
+    These are the first agent, the fastest one, and those in `PICTURED`; at most `MOST_PICTURED`.
+    """
+    settings: dict[tuple[str, Setting], list[Case]] = {}
+    for case, _ in results.cases:
+        if case.scenario.name in results.scenarios:
+            c = case.columns
+            setting = tuple(c[name] for name in SETTING_AXES)
+            settings.setdefault((c["scenario"], setting), []).append(case)
+    totals = {(*_setting_of(row), row["agent"]): row["total_s"] for row in results.rows}
+    for (name, setting), cases in settings.items():
+        acting = [case for case in cases if case.agent != "oracle"]
+        fastest = min(
+            acting,
+            key=lambda case: totals.get((*_setting_of(case.columns), case.label), np.inf),
+            default=cases[0],
+        )
+        wanted = [cases[0], fastest, *(c for word in PICTURED for c in cases if c.agent == word)]
+        labels = list(dict.fromkeys(case.label for case in wanted))[:MOST_PICTURED]
+        drawn = [case for case in cases if case.label in labels]
+        yield name, setting, draw_searches([case.trace(results.seed) for case in drawn])
+
+
+def _setting_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
+    return tuple(row[name] for name in ("scenario", *SETTING_AXES))
+
+
+def draw_searches(traces: Sequence[SearchTrace]) -> Figure:
+    """Draw searches of several agents or settings in the same world side by side.
+
+    Args:
+        traces: at least one search.
+
+    Raises:
+        InputError: there are no traces.
+    """
+    if not traces:
+        raise InputError("no search to draw")
+    bounds = np.array([trace.scenario.lot.bounds() for trace in traces])
+    across, up = (bounds[:, 2:] - bounds[:, :2]).T
+    aspect = float(
+        np.max((up + 6.0 + 0.1 * np.maximum(across, up)) / (across + 6.0 + 0.04 * np.maximum(across, up)))
+    )
+    columns = 1 if len(traces) == 1 or (len(traces) == 2 and aspect < 0.6) else 2
+    lines = -(-len(traces) // columns)
+    # All sizes in inches. Line widths depend on the size of the axes, so the axes get their final place here.
+    width = 9.6 if columns == 1 else 7.0
+    height = min(width * aspect, 8.0)
+    width = height / aspect
+    zoom = 1.0 if columns == 1 else 1.2
+    key, gap = 0.66 * zoom, 0.14
+    with mpl.rc_context({**STYLE, "font.size": 10.0 * zoom}):
+        title = 0.12 + 0.19 * zoom * max(_title(trace, width).count("\n") + 1 for trace in traces)
+        total = max(columns * (width + gap) + gap, 7.4 * zoom), lines * (height + title) + key
+        figure = Figure(figsize=total)
+        side = (total[0] - columns * (width + gap) + gap) / 2
+        for i, trace in enumerate(traces):
+            line, column = divmod(i, columns)
+            left = side + column * (width + gap)
+            bottom = total[1] - (line + 1) * (height + title)
+            box = left / total[0], bottom / total[1], width / total[0], height / total[1]
+            draw_search(trace, figure.add_axes(box))
+        policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(traces, figure.axes, strict=True))
+        _draw_key(figure, key, zoom, policy=policy)
+    return figure
+
+
+def _draw_key(figure: Figure, height: float, zoom: float, *, policy: bool) -> None:
+    """Draw the legend along the lower edge."""
+    disc: dict[str, Any] = {
+        "linestyle": "none",
+        "marker": "o",
+        "markeredgecolor": INK,
+        "markeredgewidth": 0.5,
+    }
+    disc["markersize"] = 8 * zoom
+    cased = [Stroke(linewidth=3.8, foreground=INK), Normal()]
+    handles = [
+        Line2D([], [], color=BELIEF_MAP(0.0), label="true occupancy: free", **disc),
+        Line2D([], [], color=BELIEF_MAP(1.0), label="taken", **disc),
+        Line2D([], [], color=PATH, linewidth=2.2, path_effects=cased, label="driven, 1 to 2"),
+        Line2D([], [], color=WALK, linewidth=1.8, linestyle=(0, (3, 2)), label="walk to the goal"),
+    ]
+    if policy:
+        plan = _text_marker("P→")
+        handles.append(
+            Line2D([], [], linestyle="none", marker=plan, markersize=16 * zoom, color=INK, label="first plan")
+        )
+    width, total = figure.get_size_inches()
+    middle = 0.4 * height
+    bar = figure.add_axes(
+        ((width / 2 - 3.5 * zoom) / width, middle / total, 1.3 * zoom / width, 0.11 * zoom / total)
+    )
+    bar.imshow(np.linspace(0, 1, 256)[None], aspect="auto", cmap=BELIEF_MAP, extent=(0, 1, 0, 1))
+    bar.set_yticks([])
+    bar.set_xticks([0, 0.5, 1], ["0", "0.5", "1"])
+    bar.tick_params(length=2, labelsize=8 * zoom, pad=1)
+    bar.set_title("ring: forecast P(taken)", fontsize=8.5 * zoom, pad=3, loc="center")
+    figure.legend(
+        handles=handles,
+        loc="center left",
+        bbox_to_anchor=((width / 2 - 2.0 * zoom) / width, (middle + 0.05 * zoom) / total),
+        ncols=len(handles),
+        fontsize=8.5 * zoom,
+        handletextpad=0.6,
+        handlelength=1.8,
+        columnspacing=1.1,
+    )

@@ -1,0 +1,355 @@
+"""Figures of mean total times: split into parts, and against occupancy, failure cost and forecast."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.studies.compare.cases import BLIND, against_occupancy
+from parkenv.studies.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
+from parkenv.studies.figures.registry import ComparisonResults, Drawn
+from parkenv.studies.plurals import plural
+from parkenv.studies.results import SETTING_AXES
+
+FloatArray = NDArray[np.float64]
+Row = Mapping[str, Any]
+
+AGENT_COLORS = {
+    "mdp": "#0072b2",
+    "mdp-static": "#56b4e9",
+    "mdp-tuned": "#117733",
+    "greedy-goal": "#e69f00",
+    "greedy-drive": "#d55e00",
+    "first-free": "#009e73",
+    "random": "#8c8c8c",
+    "oracle": "#000000",
+    "belief": "#cc79a7",
+    "belief-rivals": "#661100",
+    "exact": "#882255",
+    "network": "#44aa99",
+    "dqn": "#999933",
+    "ppo": "#332288",
+    "maskable-ppo": "#aa4499",
+}
+"""Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
+OTHER_AGENT = "#5c4a3d"
+OCCUPANCY_BINS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
+"""Bin edges for averaging episodes if the run has no occupancy levels."""
+OFF_SCALE = 3.0
+"""Totals above this multiple of the median are cut off, so that they do not compress the rest."""
+
+
+def time_splits(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield `draw_time_split` of each scenario."""
+    for name in results.scenarios:
+        yield name, None, draw_time_split(results.rows_of(name))
+
+
+def times_against_occupancy(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield `draw_time_against_occupancy` of each scenario, at the first speeds."""
+    for name in results.scenarios:
+        rows = [
+            {**row, "occupancy": row["occupancy_level"]}
+            for row in results.occupancy_rows
+            if row["scenario"] == name
+        ]
+        if not rows:
+            cases = [(case, seeds) for case, seeds in results.cases if case.scenario.name == name]
+            speeds = cases[0][0].scenario.v_walk, cases[0][0].scenario.v_drive
+            episodes = [
+                episode
+                for case, seeds in cases
+                if (case.scenario.v_walk, case.scenario.v_drive) == speeds
+                for episode in results.episodes_of(case, seeds)
+            ]
+            rows = against_occupancy(episodes, OCCUPANCY_BINS)
+        if rows:
+            yield name, None, draw_time_against_occupancy(rows)
+
+
+def times_against_failure_cost(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield `draw_time_against_failure_cost` of each scenario of a sweep."""
+    for name in results.failure_cost_sweeps:
+        yield name, None, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + BLIND))
+
+
+def times_against_map(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield `draw_time_against_map` of each scenario with flat forecasts, at the first cost and speeds."""
+    forecasts = results.flat_forecasts
+    if not forecasts:
+        return
+    setting = {c: results.rows[0][c] for c in SETTING_AXES}
+    rows = [row for row in results.rows if setting.items() <= row.items()]
+    for name in dict.fromkeys(varied for varied, _ in forecasts.values()):
+        probability = {flat: p for flat, (varied, p) in forecasts.items() if varied == name}
+        flat = [row for row in rows if row["scenario"] in probability]
+        own = [row for row in rows if row["scenario"] == name]
+        yield name, None, draw_time_against_map(flat, own, probability)
+
+
+def draw_time_split(rows: Sequence[Row]) -> Figure:
+    """Draw mean total times: a panel per setting, a bar per agent, split into drive, failed attempts and walk.
+
+    Args:
+        rows: rows of one scenario, as `parkenv compare` writes them to `summary.json`.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    _require_rows(rows)
+    panels: dict[tuple[Any, ...], list[Row]] = {}
+    for row in rows:
+        panels.setdefault(tuple(row[k] for k in SETTING_AXES), []).append(row)
+    most = max(len(panel) for panel in panels.values())
+    columns = 1 if len(panels) == 1 else 2 if len(panels) <= 4 else 3
+    lines = -(-len(panels) // columns)
+    limit = _limit(rows)
+    with mpl.rc_context(STYLE):
+        figure = Figure(
+            figsize=((6.5, 9.0, 12.0)[columns - 1], 0.95 + lines * (0.62 + 0.26 * most)), layout="constrained"
+        )
+        axes = figure.subplots(lines, columns, squeeze=False, sharex=True)
+        for ax, (setting, panel) in zip(axes.flat, panels.items(), strict=False):
+            _draw_split(ax, panel, limit)
+            ax.set_title("failure cost {:g} s, walk {:g}, drive {:g} km/h".format(*setting))
+        for ax in axes.flat[len(panels) :]:
+            ax.remove()
+        for column in range(columns):
+            lowest = (len(panels) - 1 - column) // columns
+            axes[lowest, column].tick_params(labelbottom=True)
+            axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
+        handles: list[Any] = [
+            Patch(color=color, label=name)
+            for key, (name, color) in TIME_COLORS.items()
+            if key not in OPTIONAL_TIMES or any(row[key] for row in rows)
+        ]
+        handles.append(
+            Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
+        )
+        figure.legend(handles=handles, loc="outside lower center", ncols=5 if columns > 1 else 3)
+        _name(figure, rows)
+    return figure
+
+
+def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
+    y = np.arange(len(rows))
+    total = np.array([row["total_s"] for row in rows])
+    left = np.zeros(len(rows))
+    for key, (_, color) in TIME_COLORS.items():
+        part = np.array([row[key] for row in rows])
+        ax.barh(
+            y,
+            np.minimum(left + part, limit) - np.minimum(left, limit),
+            0.66,
+            np.minimum(left, limit),
+            color=color,
+        )
+        left += part
+    for i, row in enumerate(rows):
+        low, high = _interval(row)
+        cut = total[i] > limit
+        if low < limit and not cut:
+            ax.plot([low, min(high, limit)], [i, i], color=INK, linewidth=1.3, solid_capstyle="butt")
+            ends = [end for end in (low, high) if end <= limit]
+            ax.plot(ends, [i] * len(ends), linestyle="none", marker="|", color=INK, markersize=6)
+        if cut:
+            _draw_break(ax, i, limit)
+        weight = "bold" if total[i] == total.min() else "normal"
+        ax.annotate(
+            f"{total[i]:,.0f} s",
+            (1.0, i),
+            (44, 0),
+            xycoords=ax.get_yaxis_transform(),
+            textcoords="offset points",
+            va="center",
+            ha="right",
+            weight=weight,
+            annotation_clip=False,
+        )
+    if all(row.get("bound_s") is not None for row in rows):
+        bound = float(np.mean([row["bound_s"] for row in rows]))
+        ax.axvline(bound, color=INK, linestyle=(0, (3, 2)), linewidth=1.2, zorder=3)
+    ax.set(xlim=(0, limit), ylim=(len(rows) - 0.5, -0.5))
+    ax.set_yticks(y, [row["agent"] for row in rows])
+    ax.tick_params(axis="y", length=0)
+    ax.spines["left"].set_visible(False)
+    ax.grid(axis="x")
+
+
+def _draw_break(ax: Axes, y: float, limit: float) -> None:
+    """Mark a truncated bar with two slanted lines near its end."""
+    slant = np.array([[-0.008, 0.46], [0.008, -0.46]])
+    for at in (0.925, 0.95):
+        xy = np.array([at, y]) + slant
+        ax.plot(limit * xy[:, 0], xy[:, 1], color="white", linewidth=2.6)
+
+
+def draw_time_against_occupancy(rows: Sequence[Row]) -> Figure:
+    """Draw the total time against occupancy: a panel per failure cost, a line per agent.
+
+    Args:
+        rows: rows with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    _require_rows(rows)
+    costs = sorted({row["failure_cost_s"] for row in rows})
+    columns = min(len(costs), 2)
+    lines = -(-len(costs) // columns)
+    limit = _limit(rows)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.0 if columns == 1 else 10.0, 0.4 + 3.7 * lines), layout="constrained")
+        axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
+        for ax, cost in zip(axes.flat, costs, strict=False):
+            its = [row for row in rows if row["failure_cost_s"] == cost]
+            _draw_lines(ax, its, limit, lambda row: 100.0 * float(row["occupancy"]))
+            ax.set_title(f"failure cost {cost:g} s")
+            ax.set_xlabel("occupancy at the arrival, %")
+        for ax in axes.flat[len(costs) :]:
+            ax.remove()
+        for ax in axes[:, 0]:
+            ax.set_ylabel("mean total time, s; 95 % interval")
+        _name(figure, rows)
+    return figure
+
+
+def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]) -> Figure:
+    """Draw the total time against the failure cost, with and without observations of slots before an attempt.
+
+    Args:
+        observed: rows of one scenario with failure_cost_s, agent, total_s, total_s_ci95.
+        blind: the same without observations from the lane.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    _require_rows(observed)
+    _require_rows(blind)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 4.2), layout="constrained")
+        panels = (("slots observed from the lane", observed), ("no observation before an attempt", blind))
+        for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
+            _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
+            last = max(row["failure_cost_s"] for row in rows)
+            # A symmetric log scale includes a cost of 0.
+            ax.set_xscale("symlog", linthresh=1.0, linscale=0.4)
+            ticks = [tick for tick in (0, 1, 2, 5, 10, 20, 50, 100) if tick <= last]
+            ax.set(xlim=(0.0, 1.08 * last), xticks=ticks, xticklabels=[str(tick) for tick in ticks])
+            ax.minorticks_off()
+            ax.set_title(title)
+            ax.set_xlabel("failure cost, s (in the world and in the planners' models)")
+            ax.set_ylabel("mean total time, s; 95 % interval")
+        _name(figure, observed)
+    return figure
+
+
+def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Mapping[str, float]) -> Figure:
+    """Draw the total time against a forecast that is the same for every slot.
+
+    Args:
+        rows: rows with scenario, agent, total_s, total_s_ci95, of one world with several flat forecasts.
+        own: rows of the same world with its own forecast, drawn dashed.
+        forecast: P(taken) of each flat forecast, by scenario.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    _require_rows(rows)
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(6.6, 4.2), layout="constrained")
+        ax = figure.subplots()
+        limit = _limit(rows)
+        _draw_lines(ax, rows, limit, lambda row: 100.0 * forecast[row["scenario"]])
+        for row in own:
+            color = AGENT_COLORS.get(row["agent"], OTHER_AGENT)
+            ax.axhline(row["total_s"], color=color, linewidth=0.9, linestyle=(0, (2, 3)), zorder=1)
+        ax.set_title("dashed: with the scenario's own forecast")
+        ax.set_xlabel("forecast P(taken) of every slot, %")
+        ax.set_ylabel("mean total time, s; 95 % interval")
+        _name(figure, own or rows)
+    return figure
+
+
+def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Row], float]) -> None:
+    """Draw a line per agent; `along` returns a row's x value."""
+    ends = []
+    places = [along(row) for row in rows]
+    for agent in dict.fromkeys(row["agent"] for row in rows):
+        own = sorted((row for row in rows if row["agent"] == agent), key=along)
+        color = AGENT_COLORS.get(agent, OTHER_AGENT)
+        x = np.array([along(row) for row in own])
+        total = np.array([row["total_s"] for row in own])
+        # NaN where there is no interval, e.g. of a single search: no band there.
+        low, high = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
+        dashes = (0, (4, 2)) if agent == "oracle" else "-"
+        # The interval of a line beyond the limit would only cover the others.
+        ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.15, linewidth=0)
+        ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)
+        ends.append((total[-1], x[-1], agent, color))
+    ax.set(xlim=(min(places) - 1.0, max(places) + 1.0), ylim=(0, limit))
+    ends.sort()
+    heights = spread([min(total / limit, 1.0) for total, *_ in ends], 0.062)
+    for (total, x, agent, color), height in zip(ends, heights, strict=True):
+        off = total > limit
+        link = {"arrowstyle": "-", "color": color, "linewidth": 0.7, "relpos": (0, 0.5), "shrinkB": 3}
+        ax.annotate(
+            f"{agent} ↑ {total:,.0f} s" if off else agent,
+            (x, min(total, limit)),
+            (1.035, height),
+            textcoords="axes fraction",
+            va="center",
+            color=color,
+            weight="bold",
+            fontsize=8.5,
+            arrowprops=None if off else link,
+            annotation_clip=False,
+        )
+    ax.grid(axis="y")
+
+
+def spread(places: Sequence[float], gap: float) -> FloatArray:
+    """Move ascending positions at least `gap` apart, as little as possible, and not above 1 if they fit."""
+    spread = np.array(places, dtype=np.float64)
+    for i in range(1, len(spread)):
+        spread[i] = max(spread[i], spread[i - 1] + gap)
+    spread[-1:] = np.minimum(spread[-1:], max(1.0, gap * (len(spread) - 1)))
+    for i in range(len(spread) - 2, -1, -1):
+        spread[i] = min(spread[i], spread[i + 1] - gap)
+    return spread
+
+
+def _limit(rows: Sequence[Row]) -> float:
+    """Return the upper limit of the total-time axis: above all totals within `OFF_SCALE` medians."""
+    total = np.array([row["total_s"] for row in rows])
+    near = total[total <= OFF_SCALE * np.median(total)]
+    return float(1.12 * near.max()) or 1.0
+
+
+def _interval(row: Row) -> tuple[float, float]:
+    """Return the confidence interval of the total; the mean twice if there is none."""
+    low, high = (row["total_s"] if end is None or end != end else end for end in row["total_s_ci95"])
+    return low, high
+
+
+def _require_rows(rows: Sequence[Row]) -> None:
+    if not rows:
+        raise InputError("no rows to draw")
+
+
+def _name(figure: Figure, rows: Sequence[Row]) -> None:
+    """Title a figure with the scenario if all rows share it."""
+    names = {row.get("scenario") for row in rows} - {None}
+    episodes = {int(row["episodes"]) for row in rows if "episodes" in row}
+    if len(names) == 1:
+        each = f", {plural(episodes.pop(), 'search', 'searches')} each" if len(episodes) == 1 else ""
+        figure.suptitle(f"{names.pop()}{each}", x=0.01, ha="left", weight="bold")

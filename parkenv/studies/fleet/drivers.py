@@ -1,0 +1,156 @@
+"""Agents that drive the cars of a fleet, and fleets in which some cars have another driver than the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+
+from parkenv.engine.fleet_rules import RULES, Rule
+from parkenv.envs.fleet import DriverKind, Fleet, total_s
+from parkenv.errors import InputError
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.statistics import mean_interval
+from parkenv.studies.workers import Workers
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
+from parkenv.world.scenario import Scenario
+from planners.agent import ClairvoyantAgent, make_agent
+from planners.learned import LearnedAgent
+from planners.names import EXPECTS_RIVALS
+
+Row = dict[str, Any]
+_WITHOUT_NETWORK_RULE = ("recurrent-ppo",)
+
+
+def driver_of(
+    spec: AgentSpec, scenario: Scenario, arrivals_per_hour: float | None = None
+) -> tuple[Rule | None, Any]:
+    """Return the compiled driver of an agent, or else the agent itself, which decides in Python.
+
+    Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
+    actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
+    An agent that expects rivals is told how many cars arrive in an hour, if that is given, as by a forecast of traffic.
+
+    Raises:
+        InputError: there is no such agent, or it is none for fleets.
+    """
+    if not spec.options and spec.name in RULES:
+        return RULES[spec.name], None
+    expects = spec.name == EXPECTS_RIVALS and arrivals_per_hour is not None
+    told = {"arrivals_per_hour": arrivals_per_hour} if expects else {}
+    agent = make_agent(spec.name, scenario, **told | spec.options)
+    if isinstance(agent, ClairvoyantAgent):
+        raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
+    if isinstance(agent, LearnedAgent):
+        if agent.local_k is None:
+            raise InputError(
+                f"agent {spec.label!r} observes laser scans, which the cars of a fleet do not have"
+            )
+        if agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
+            from parkenv.envs.fleet_sb3 import network_rule
+
+            sampled = agent.card.algorithm != "dqn"
+            return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
+    return None, agent
+
+
+def demand_in(scenario: Scenario, per_hour: float, stay_s: float, patience_s: float) -> Demand:
+    """Return the demand of a number of cars an hour in the hours of a scenario.
+
+    Args:
+        scenario: its hours of arrival are meant.
+        per_hour: cars an hour.
+        stay_s: mean of the exponentially distributed stays, s.
+        patience_s: search time after which a car goes elsewhere, s.
+
+    Raises:
+        InputError: the hours end when they begin, or a number is out of range.
+    """
+    window = scenario.arrival
+    if window.end_s <= window.start_s:
+        raise InputError(
+            f"the arrivals of {scenario.name!r} are at one time, want hours in which cars arrive; "
+            "set --hours, e.g. 08:00-12:00"
+        )
+    return Demand(
+        PoissonArrivals(per_hour, window.start_s, window.end_s),
+        ExponentialTime(stay_s),
+        ConstantTime(patience_s),
+    )
+
+
+@dataclass(frozen=True)
+class MixedFleet:
+    """A lot and a demand in which a share of the cars, the *members*, has one driver, and the others have another.
+
+    Args:
+        scenario: lot, residents, speeds and costs.
+        demand: when cars arrive, how long they stay and search.
+        knows: what members know, as of `DriverKind`; the others know their own observations.
+        share: share of the members.
+        among: agent that drives the others; None if all are members.
+        max_steps: limit of a car's decisions.
+    """
+
+    scenario: Scenario
+    demand: Demand
+    knows: str = "own"
+    share: float = 1.0
+    among: AgentSpec | None = None
+    max_steps: int = 2000
+
+    @property
+    def name(self) -> str:
+        """The fleet in a table: `every car`, or `0.1 among greedy-drive`."""
+        return "every car" if self.among is None else f"{self.share:g} among {self.among.label}"
+
+    def run_day(self, member: AgentSpec | Rule, seed: int, day: int) -> Row:
+        """Run a day; return mean times, s, of members and others, and the fraction of the members that parked.
+
+        Args:
+            member: driver of the members.
+            seed: seed of the days.
+            day: index of the day.
+        """
+        rule, agent = (member, None) if isinstance(member, Rule) else driver_of(member, self.scenario)
+        kinds, agents = [DriverKind(self.share, rule, self.knows, shares=self.knows == "shared")], [agent]
+        if self.among is not None:
+            other_rule, other = driver_of(self.among, self.scenario)
+            kinds.append(DriverKind(1.0 - self.share, other_rule))
+            agents.append(other)
+        fleet = Fleet(
+            self.scenario, self.demand, drivers=kinds, max_steps=self.max_steps, leave_full_lot=False
+        )
+        fleet.reset(seed, day)
+        fleet.run(agents)
+        cars, members = fleet.cars, fleet.cars["kind"] == 0
+        return {
+            "cars": int(members.sum()),
+            "total_s": _mean(total_s(cars)[members]),
+            "search_s": _mean((cars["ended_at"] - cars["arrival"])[members]),
+            "parked_fraction": _mean((cars["slot"] >= 0)[members]),
+            "others_s": _mean(total_s(cars)[~members]),
+        }
+
+    def row(self, member: AgentSpec | Rule, seed: int, days: int, workers: Workers | None = None) -> Row:
+        """Return means over days, with 95 % intervals; see `run_day`."""
+        tasks = [partial(self.run_day, member, seed, day) for day in range(days)]
+        return summary([task() for task in tasks] if workers is None else list(workers.in_order(tasks)))
+
+
+def summary(days: Sequence[Row]) -> Row:
+    """Return the row of some days; days without members, or without others, do not count for their means."""
+    row: Row = {"days": len(days), "cars": sum(day["cars"] for day in days)}
+    for name in ("parked_fraction", "total_s", "search_s", "others_s"):
+        values = [day[name] for day in days if not np.isnan(day[name])]
+        row[name], low, high = mean_interval(values)
+        if name != "parked_fraction":
+            row[f"{name}_ci95"] = [low, high]
+    return row
+
+
+def _mean(values: Any) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")

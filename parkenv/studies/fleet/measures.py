@@ -1,0 +1,128 @@
+"""Measures of one day with many cars."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv.envs.fleet import Fleet, total_s
+from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
+from parkenv.world.scenario import SearchProblem
+
+FloatArray = NDArray[np.float64]
+BoolArray = NDArray[np.bool_]
+
+MEANS = (
+    "total_s", "median_s", "p95_s", "gini", "search_s", "queued_s", "failed_attempts", "driven_m", "cruised_m",
+    "cruising_share", "balked_fraction", "occupancy", "members_s", "others_s", "bound_s", "clairvoyant_s",
+)  # fmt: skip
+"""Measures of a day, of which a summary has the mean over days."""
+
+
+class Roads:
+    """Shortest drives from the entries of a scenario.
+
+    Args:
+        problem: lot, goal, speeds and costs.
+
+    Attributes:
+        first_slot_m: mean drive from an entry to the slot that is nearest to it, m.
+    """
+
+    def __init__(self, problem: SearchProblem) -> None:
+        lot = problem.lot
+        entries = np.unique(lot.entry_vertices)
+        metres = dijkstra(lot.drive_matrix(), indices=entries)[:, : lot.n_slots]
+        self._metres = dict(zip(map(int, entries), metres, strict=True))
+        self._entries, self._drive_s = entries, metres / problem.v_drive
+        self._cost_s, self._give_up_s = problem.arrival_cost_s, problem.give_up_s
+        self.first_slot_m = float(metres.min(axis=1).mean())
+        self._alone_s = {
+            entry: float((row / problem.v_drive + problem.arrival_cost_s).min())
+            for entry, row in self._metres.items()
+        }
+
+    def metres(self, cars: NDArray[np.void]) -> FloatArray:
+        """Return the shortest drive of parked cars from entry to slot, (n,) m."""
+        return np.array(
+            [self._metres[int(e)][s] for e, s in zip(cars["entry"], cars["slot"], strict=True)], np.float64
+        )
+
+    def alone_s(self, cars: NDArray[np.void]) -> FloatArray:
+        """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster."""
+        return np.array([self._alone_s[int(entry)] for entry in cars["entry"]])
+
+    def parking_day(self, fleet: Fleet) -> ParkingDay:
+        """Return the day of a fleet that has been reset: its cars to come, and when its residents leave."""
+        cars = fleet.cars
+        leaves_at = np.where(fleet.taken(), fleet.slots["leaves_at"], -np.inf)
+        return ParkingDay(
+            arrival=np.array(cars["arrival"], np.float64),
+            stay_s=np.array(cars["stay_s"], np.float64),
+            patience_s=np.array(cars["patience_s"], np.float64),
+            entry=np.searchsorted(self._entries, cars["entry"]).astype(np.int64),
+            drive_s=self._drive_s,
+            cost_s=np.asarray(self._cost_s, np.float64),
+            free_from=leaves_at.astype(np.float64),
+            give_up_s=float(self._give_up_s),
+        )
+
+
+def gini(values: FloatArray) -> float:
+    """Return the Gini coefficient of values of at least 0: 0 if all are equal, near 1 if one has everything.
+
+    Examples:
+        >>> gini(np.array([2.0, 2.0, 2.0])), round(gini(np.array([0.0, 0.0, 1.0])), 3)
+        (0.0, 0.667)
+    """
+    n, total = len(values), float(values.sum())
+    if n == 0 or total == 0.0:
+        return 0.0
+    ranks = np.arange(1, n + 1)
+    return float(2.0 * (ranks * np.sort(values)).sum() / (n * total) - (n + 1.0) / n)
+
+
+def day_measures(
+    fleet: Fleet, roads: Roads, members: BoolArray, occupancy: float, clairvoyant_s: float
+) -> dict[str, Any]:
+    """Return the measures of a day whose searches are all over.
+
+    Args:
+        fleet: the fleet.
+        roads: its shortest drives.
+        members: (n_cars,) which cars know more than their own observations.
+        occupancy: mean share of taken slots while cars arrived.
+        clairvoyant_s: lower bound on the total time of all cars together, s.
+    """
+    cars = fleet.cars
+    times, parked = total_s(cars), cars["slot"] >= 0
+    direct_m = np.zeros(len(cars))
+    direct_m[parked] = roads.metres(cars[parked])
+    cruised_m = np.maximum(cars["driven_m"] - direct_m, 0.0)
+    driven_m = float(cars["driven_m"].sum())
+    return {
+        "cars": len(cars),
+        "total_s": float(times.mean()),
+        "median_s": float(np.median(times)),
+        "p95_s": float(np.quantile(times, 0.95)),
+        "gini": gini(times),
+        "search_s": float((cars["ended_at"] - cars["arrival"]).mean()),
+        "queued_s": float(cars["queued_s"].mean()),
+        "failed_attempts": float(cars["failed_parks"].mean()),
+        "driven_m": driven_m / len(cars),
+        "cruised_m": float(cruised_m.mean()),
+        "cruising_share": float(cruised_m.sum()) / driven_m if driven_m else 0.0,
+        "balked_fraction": float((~parked).mean()),
+        "occupancy": occupancy,
+        "members_s": _mean(times[members]),
+        "others_s": _mean(times[~members]),
+        "bound_s": float(roads.alone_s(cars).mean()),
+        "clairvoyant_s": clairvoyant_s / len(cars),
+    }
+
+
+def _mean(values: FloatArray) -> float:
+    return float(values.mean()) if len(values) else float("nan")

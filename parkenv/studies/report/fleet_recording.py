@@ -1,0 +1,199 @@
+"""Record days with many cars for the replay of a report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.engine.fleet_records import LEFT, PARKED
+from parkenv.engine.shared_slots import NO_CAR
+from parkenv.envs.fleet import Fleet, total_s
+from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+from parkenv.studies.report.lot_data import describe_lot
+from parkenv.world.scenario import Scenario
+
+MOST_CARS = 5_000
+"""Days on which more cars are expected are not replayed: the page would not load."""
+DRIVE, FAIL, QUEUE, WAIT = range(4)
+"""What a car does on its way to a point of its track: drive; a failed attempt, a queue and a wait leave it there."""
+STRAIGHT_M = 0.1
+"""A car that drives on at the same speed needs no point in between if it is that close to a straight line, m."""
+AGREES_S = 1e-6
+
+Recording = dict[str, Any]
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class FleetDay:
+    """A day of a setting.
+
+    Attributes:
+        experiment: the experiment.
+        setting: one of its settings.
+        day: number of the day.
+    """
+
+    experiment: FleetExperiment
+    setting: Setting
+    day: int
+
+    def record(self, counted: Mapping[tuple[Any, ...], float]) -> Recording:
+        """Repeat the day, and record it: times in centiseconds since the day's arrivals begin.
+
+        Args:
+            counted: mean total time, s, of the days in the original run, by `FleetExperiment.key`.
+        """
+        experiment, scenario = self.experiment, self.experiment.scenario
+        fleet, agents = experiment.fleet(self.setting)
+        fleet.keep_steps()
+        fleet.reset(experiment.spec.seed, self.day)
+        fleet.run(agents, until=fleet.begin)
+        residents = fleet.slots["leaves_at"].copy()
+        fleet.run(agents)
+        cars, begin = fleet.cars, fleet.begin
+        mean_s = float(total_s(cars).mean())
+        before = counted.get(experiment.key(self.setting, self.day))
+        return {
+            "lot": describe_lot(scenario.lot),
+            "fleet": {
+                "scenario": scenario.name,
+                **self.setting.columns,
+                "day": self.day,
+                "begin_s": round(begin, 3),
+                "goal": scenario.goal,
+                "duration": _centiseconds(float(cars["ended_at"].max()) - begin),
+                "total_s": mean_s,
+                "counted_s": before,
+                "agrees": None if before is None else abs(before - mean_s) <= AGREES_S,
+                "residents": _residents(residents, begin),
+                **_cars(cars, begin),
+                "tracks": _tracks(fleet, scenario),
+            },
+        }
+
+
+def choose_days(
+    experiment: FleetExperiment, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
+) -> list[FleetDay]:
+    """Choose days for a replay.
+
+    Args:
+        experiment: the experiment.
+        settings: settings to choose from.
+        count: number of days to choose: the first day of each setting, those in which all or none are members first,
+            then the next day.
+        days: all of these days instead.
+    """
+    if not settings:
+        return []
+    if days is not None:
+        return [FleetDay(experiment, setting, day) for setting in settings for day in days]
+    most = max(setting.share for setting in settings)
+    order = sorted(range(len(settings)), key=lambda i: settings[i].share not in (0.0, most))
+    needed = min(experiment.spec.days, -(-count // len(settings)))
+    chosen = [(i, day) for day in range(needed) for i in order][:count]
+    return [FleetDay(experiment, settings[i], day) for i, day in sorted(chosen)]
+
+
+def differing_days(recorded: Sequence[Recording]) -> list[str]:
+    """Return a note for every day whose mean total time differs from that in the results."""
+    return [
+        f"{its['agents']}, {its['knows']}, share {its['share']:g}, {its['arrivals_per_hour']:g} cars an hour, day "
+        f"{its['day']}: run again the mean was {its['total_s']:.2f} s, days.csv says {its['counted_s']:.2f} s"
+        for its in (one["fleet"] for one in recorded)
+        if its["agrees"] is False
+    ]
+
+
+def _residents(leaves_at: FloatArray, begin: float) -> list[int]:
+    """Return [slot, time of departure, ...] of the cars that are parked when the day begins."""
+    slots = np.flatnonzero(leaves_at > begin)
+    return [number for slot in slots for number in (int(slot), _centiseconds(leaves_at[slot] - begin))]
+
+
+def _cars(cars: NDArray[np.void], begin: float) -> Recording:
+    """Return lists over cars: arrival, end of the search, slot or -1, departure or -1, member or not."""
+    parked = np.isin(cars["state"], (PARKED, LEFT))
+    leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], np.inf)
+    return {
+        "arrival": [_centiseconds(t - begin) for t in cars["arrival"]],
+        "ended": [_centiseconds(t - begin) for t in cars["ended_at"]],
+        "slot": [int(slot) for slot in np.where(parked, cars["slot"], NO_CAR)],
+        "leaves": [_centiseconds(t - begin) if np.isfinite(t) else -1 for t in leaves],
+        "member": [int(kind == 0) for kind in cars["kind"]],
+    }
+
+
+def _tracks(fleet: Fleet, scenario: Scenario) -> list[list[int]]:
+    """Return the track of each car: its entry; for each point the centiseconds to it, and 4 x vertex + what it does.
+
+    The position is linear in between.
+    """
+    xy, cars, begin = scenario.lot.vertex_xy, fleet.cars, fleet.begin
+    steps = fleet.steps
+    steps = steps[np.argsort(steps["car"], kind="stable")]
+    first = np.searchsorted(steps["car"], np.arange(len(cars) + 1))
+    return [
+        _track(
+            steps[first[i] : first[i + 1]],
+            xy,
+            begin,
+            int(car["entry"]),
+            float(car["arrival"]),
+            float(car["ended_at"]),
+        )
+        for i, car in enumerate(cars)
+    ]
+
+
+def _track(
+    steps: NDArray[np.void], xy: FloatArray, begin: float, entry: int, arrival: float, ended: float
+) -> list[int]:
+    points: list[tuple[float, int, int]] = []  # time, vertex, what the car does until then
+    time, vertex = arrival, entry
+    for _, started, end, origin, target, failed in steps.tolist():
+        if started > time:
+            points.append((started, vertex, QUEUE))
+        kind = FAIL if failed else DRIVE if target != origin else WAIT
+        points.append((end, target, kind))
+        time, vertex = end, target
+    if ended > time:
+        points.append((ended, vertex, QUEUE))
+    track, before = [entry], _centiseconds(arrival - begin)
+    for when, vertex, kind in _without_straight(points, xy, arrival, entry):
+        now = _centiseconds(when - begin)
+        track += [now - before, 4 * vertex + kind]
+        before = now
+    return track
+
+
+def _without_straight(
+    points: Sequence[tuple[float, int, int]], xy: FloatArray, time: float, vertex: int
+) -> list[tuple[float, int, int]]:
+    """Leave out points at which a car drives straight on at the same speed."""
+    kept: list[tuple[float, int, int]] = []
+    x0, y0 = xy[vertex]
+    speed: tuple[float, float] | None = None  # of the straight line under way, m/s
+    start = time
+    for i, (when, at, kind) in enumerate(points):
+        x, y = xy[at]
+        if kind == DRIVE and when > start and speed is None:
+            speed = (x - x0) / (when - start), (y - y0) / (when - start)
+        follows = points[i + 1] if i + 1 < len(points) else None
+        if kind == DRIVE and speed is not None and follows is not None and follows[2] == DRIVE:
+            ahead, elapsed = xy[follows[1]], follows[0] - start
+            off = max(abs(x0 + speed[0] * elapsed - ahead[0]), abs(y0 + speed[1] * elapsed - ahead[1]))
+            if off <= STRAIGHT_M:
+                continue
+        kept.append((when, at, kind))
+        x0, y0, start, speed = x, y, when, None
+    return kept
+
+
+def _centiseconds(seconds: float) -> int:
+    return round(100 * float(seconds))

@@ -1,0 +1,141 @@
+"""What of a run can be repeated for its report: searches, survey drives and days of fleets, from its specification."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from parkenv.files.spec_file import Spec
+from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import Survey, SurveySettings
+from parkenv.studies import spec as specs
+from parkenv.studies.compare.benchmark import Suite
+from parkenv.studies.compare.cases import Case
+from parkenv.studies.compare.demo import demo_cases, demo_survey
+from parkenv.studies.compare.experiment import Experiment, require_unchanged
+from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+from parkenv.studies.report.drive_recording import record_drive
+from parkenv.studies.report.fleet_recording import MOST_CARS
+from parkenv.studies.report.run_folder import RunFolder
+from parkenv.studies.report.search_recording import MOST_SLOTS
+from parkenv.studies.results import read_settings
+from parkenv.studies.sensing.surveys import MAP_FILE, survey_of
+from parkenv.world.scenario import Scenario
+
+Cases = list[tuple[Case, Sequence[int]]]
+"""Searches: cases with their seeds."""
+BESIDE_MODELS = 3
+"""Number of planners shown beside a trained model."""
+
+
+@dataclass(frozen=True, eq=False)
+class Repetition:
+    """The searches, survey drives and days of a run.
+
+    Args:
+        cases: the searches.
+        survey: scenario and settings of the drives.
+        sessions: number of drives.
+        fleets: the experiment with many cars.
+    """
+
+    cases: Cases
+    survey: tuple[Scenario, SurveySettings] | None = None
+    sessions: int = 0
+    fleets: FleetExperiment | None = None
+
+    @classmethod
+    def of_run(cls, run: RunFolder, spec: Spec | None) -> Repetition:
+        """Return what a run can repeat; nothing without its specification.
+
+        Raises:
+            InputError, OSError: the run cannot be repeated.
+        """
+        match spec:
+            case specs.ExperimentSpec():
+                require_unchanged(spec, read_settings(run.path) or {})
+                return cls([*Experiment(spec).cases])
+            case specs.FleetSpec():
+                require_unchanged(spec, read_settings(run.path) or {})
+                return cls([], fleets=FleetExperiment(spec))
+            case specs.BenchmarkSpec():
+                return cls([*Suite.named(spec.suite).cases(spec.agents)])
+            case specs.SurveySpec():
+                return cls([], survey_of(spec), len(run.sessions()))
+            case specs.DemoSpec():
+                its, settings = demo_survey(spec)
+                with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
+                    log = store.log()
+                return cls([*demo_cases(spec, its, log)], (its, settings), len(log.time))
+            case specs.TrainingSpec():
+                return cls(_trained(run, spec))
+        return cls([])
+
+    def drive(self, number: int, frames: int) -> dict[str, Any]:
+        """Repeat one survey drive, and return its recording."""
+        assert self.survey is not None
+        return record_drive(Survey(*self.survey), number, most_frames=frames)[1]
+
+
+def drawable(cases: Cases) -> tuple[Cases, list[str]]:
+    """Return the searches on lots that are small enough to draw, and notes on the others."""
+    slots = {case.scenario.name: case.scenario.lot.n_slots for case, _ in cases}
+    large = {name: n for name, n in slots.items() if n > MOST_SLOTS}
+    notes = [
+        f"{name} has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"
+        for name, n in large.items()
+    ]
+    return [(case, its) for case, its in cases if case.scenario.name not in large], notes
+
+
+def drawable_settings(
+    fleets: FleetExperiment, settings: Sequence[Setting]
+) -> tuple[list[Setting], list[str]]:
+    """Return the settings with few enough cars, on a small enough lot, to draw, and notes on the others."""
+    if (n := fleets.scenario.lot.n_slots) > MOST_SLOTS:
+        return [], [f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
+    window = fleets.scenario.arrival
+    most = MOST_CARS / ((window.end_s - window.start_s) / 3600.0)
+    rates = dict.fromkeys(one.arrivals_per_hour for one in settings if one.arrivals_per_hour > most)
+    notes = [
+        f"days with {rate:g} cars an hour have more than the {MOST_CARS} cars that are drawn: no replay"
+        for rate in rates
+    ]
+    return [one for one in settings if one.arrivals_per_hour <= most], notes
+
+
+def differences(watched: Sequence[dict[str, Any]]) -> list[str]:
+    """Return a note for every search whose total time differs from that in the results."""
+    return [
+        f"{search['agent']}, {e['world']['scenario']}, seed {e['world']['seed']}: run again it took "
+        f"{search['total_s']:.2f} s, episodes.csv says {search['counted_s']:.2f} s"
+        for e in watched
+        for search in e["searches"]
+        if search["agrees"] is False
+    ]
+
+
+def _trained(run: RunFolder, spec: specs.TrainingSpec) -> Cases:
+    """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
+    if spec.env != "search" or not run.summary.get("transfer"):
+        return []
+    # These load torch.
+    from parkenv.studies.training.rl_training import MODEL
+    from parkenv.studies.training.search_task import SearchTask
+    from parkenv.studies.training.training_task import TEST_SEED
+
+    best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
+    model = run.path / f"seed_{int(best['seed'])}" / MODEL
+    task = SearchTask(spec)
+    seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
+    cases: Cases = []
+    for name, (scenario, *_) in task.tests.items():
+        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
+        beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
+        cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
+        made = {
+            case.label: case for case in (Case(scenario, a.name, options=a.options) for a in task.compared)
+        }
+        cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
+    return cases

@@ -1,0 +1,131 @@
+"""Read a run folder: summary, figures and episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Self
+
+import jsonschema
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_json
+from parkenv.files.spec_file import Spec, read_tables
+from parkenv.studies.fleet.experiment import TABLE
+from parkenv.studies.results import (
+    SETTINGS,
+    SUMMARY,
+    SUMMARY_PARTIAL,
+    Row,
+    episode_key,
+    read_rows,
+    without_nan,
+)
+from parkenv.studies.sensing.surveys import read_sessions
+from parkenv.studies.spec import SPEC_FILE, SPECS
+from parkenv.studies.training.curve_file import CURVE, read_curve
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A finished run.
+
+    Attributes:
+        path: the folder.
+        summary: content of `summary.json`.
+        figures: the PNG files in the folder, by name.
+        kind: compare, survey, demo, train, ...; the command's name if the folder holds no specification.
+    """
+
+    path: Path
+    summary: Mapping[str, Any]
+    figures: tuple[Path, ...]
+    kind: str
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a run folder.
+
+        Raises:
+            InputError: there is no folder or no finished run in it, the run is of another version, or the summary is
+                damaged.
+        """
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
+        file = path / SUMMARY
+        if not file.exists():
+            if (path / SUMMARY_PARTIAL).exists() or (path / SETTINGS).exists():
+                raise InputError(
+                    f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
+                )
+            raise InputError(f"{path}: holds no {SUMMARY}; want a folder that a command with --out wrote")
+        summary = read_json(file, finite=True)
+        if not isinstance(summary, dict):
+            raise InputError(f"{file}: want the summary of a command")
+        spec, command = path / SPEC_FILE, summary.get("command")
+        kind = read_tables(spec).get("kind") if spec.exists() else None
+        kind = str(kind or (command[1] if isinstance(command, list) and len(command) > 1 else ""))
+        try:
+            jsonschema.validate(
+                {**summary, "kind": kind}, read_json(Path(__file__).with_name("summary.schema.json"))
+            )
+        except jsonschema.ValidationError as error:
+            raise InputError(
+                f"{file}: is not as a command wrote it: {error.json_path:.80} {error.message:.200}"
+            ) from error
+        if summary["version"] != __version__:
+            raise InputError(
+                f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "
+                "differ; run the command again, or report it with that version"
+            )
+        return cls(path, summary, tuple(sorted(path.glob("*.png"))), kind)
+
+    def spec(self) -> Spec | None:
+        """Read the specification that the run kept; None for a command that keeps none.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
+        kind = SPECS.get(self.kind)
+        return None if kind is None else kind.read(self.path / SPEC_FILE)
+
+    @property
+    def arguments(self) -> list[str]:
+        """Arguments of the command."""
+        return [str(word) for word in self.summary["command"][2:]]
+
+    def totals(self) -> dict[tuple[Any, ...], float]:
+        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty without the file.
+
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+        return {episode_key(row): row["total_s"] for row in read_rows(self.path / "episodes.csv")}
+
+    def day_totals(self) -> dict[tuple[Any, ...], float]:
+        """Read the mean total time, s, of every day in `days.csv`, by `FleetExperiment.key`; empty without the file.
+
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+        return {TABLE.key(row): row["total_s"] for row in TABLE.read(self.path / TABLE.file)}
+
+    def sessions(self) -> list[Row]:
+        """Read the drives of a survey from `sessions.csv`, NaN as None; none without the file.
+
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+        rows: list[Row] = without_nan(read_sessions(self.path / "sessions.csv"))
+        return rows
+
+    def curve(self, seed: int) -> list[Row]:
+        """Read the evaluations of a training, NaN as None; none without their file.
+
+        Raises:
+            InputError: the file is damaged.
+        """
+        rows: list[Row] = without_nan(read_curve(self.path / f"seed_{seed}" / CURVE))
+        return rows

@@ -1,0 +1,289 @@
+"""The tables of a report: their columns, labels and number formats."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+from parkenv.studies.figures.picture_files import OPTIONAL_TIMES
+from parkenv.studies.results import Row
+
+Cell = float | int | str | bool | None | list[float | None]
+
+
+class Column(NamedTuple):
+    """Format of a column.
+
+    Attributes:
+        key: key in the summary.
+        label: heading.
+        unit: unit of the numbers; empty for none.
+        digits: number of decimals.
+        share: whether the value is a fraction, shown as a percentage.
+        signed: whether positive values get a plus sign.
+        help: explanation.
+    """
+
+    key: str
+    label: str
+    unit: str = ""
+    digits: int = 1
+    share: bool = False
+    signed: bool = False
+    help: str = ""
+
+
+_MINUS_OWN = "total time, minus that of all cars if nobody knows more than it observes, on the same days"
+_KNOWN = {
+    column.key: column
+    for column in (
+        Column("scenario", "scenario"),
+        Column("test_scenario", "tested on"),
+        Column("occupancy_level", "occupancy level", share=True, digits=0, help="Mean occupancy the lot was set to"),
+        Column("agent", "agent"),
+        Column("map", "map at first", help="fixed: right, does not learn; none: the agent uses no map"),
+        Column("day", "day", digits=0),
+        Column("days", "days", digits=0),
+        Column("courses", "drivers", digits=0),
+        Column("forecast_error", "forecast error", digits=3, help="Brier score of P(taken) at the arrival"),
+        Column("failure_cost_s", "failure cost", "s", 0, help="Time of a failed parking attempt"),
+        Column("v_walk_kmh", "walk", "km/h", 0),
+        Column("v_drive_kmh", "drive", "km/h", 0),
+        Column("episodes", "searches", digits=0),
+        Column("seed", "seed", digits=0),
+        Column("total_s", "total time", "s", help="Drive + failed attempts + walk + give-up penalty"),
+        Column("difference_s", "minus first agent", "s", signed=True, help="Paired by world; 95 % interval"),
+        Column("regret_s", "regret", "s", help="Difference to the clairvoyant lower bound"),
+        Column("drive_s", "drive", "s", help="Time driving, waits included"),
+        Column("failed_s", "failed attempts", "s", help="Time of failed parking attempts"),
+        Column("walk_s", "walk", "s"),
+        Column("parking_cost_s", "parking cost", "s", help="Cost of the slot, as time"),
+        Column("gave_up_s", "give-up penalty", "s", help="Charged where the lot is full or the search was truncated"),
+        Column("bound_s", "bound", "s", help="Clairvoyant lower bound: least time with full knowledge of the future"),
+        Column("parked_fraction", "parked", share=True, digits=0),
+        Column("failed_parks", "failed attempts", digits=2),
+        Column("replans", "replans", help="How often the agent replanned in a search"),
+        Column("driven_m", "driven", "m", 0),
+        Column("walked_m", "walked", "m", 0),
+        Column("slots_passed", "slots passed"),
+        Column("occupancy", "occupied", share=True, digits=0, help="Share of slots taken at the arrival"),
+        Column("decision_ms", "decision", "ms", 2, help="Median wall time of a decision"),
+        Column("decision_ms_p99", "p99", "ms", 2, help="99th percentile of the wall time of a decision"),
+        Column("gap_to_exact", "over exact", share=True, digits=2, signed=True),
+        Column("steps", "decisions in training", digits=0),
+        Column("steps_per_s", "decisions/s", digits=0),
+        Column("model", "model"),
+        Column("task", "task"),
+        Column("score", "score", share=True, help="Mean time of the clairvoyant bound over the agent's"),
+        Column("by", "submitted by"),
+        Column("parkenv", "parkenv", help="Version that made the result"),
+        Column("sessions", "drives", digits=0),
+        Column("slots", "slots", digits=0),
+        Column("car_detection_rate", "parked cars found", share=True, help="Detected at least once"),
+        Column("detection_precision", "detections that are cars", share=True),
+        Column("range_abs_error_m.median", "distance of a car, median error", "m", 3),
+        Column("range_abs_error_m.p95", "distance of a car, 95th percentile", "m", 2),
+        Column("pose_error_m.odometry", "position by odometry, error", "m", 2, help="Root mean square, of a drive"),
+        Column("pose_error_m.estimated", "position as estimated, error", "m", 2),
+        Column("pose_error_m.max", "position as estimated, greatest error", "m", 2),
+        Column("slot_accuracy", "slot accuracy", share=True, help="Slots never in view count as wrong"),
+        Column("slot_accuracy_seen", "slot accuracy, slots in view", share=True),
+        Column("unknown_fraction", "slots never in view", share=True),
+        Column("occupancy_mae", "map error", digits=3, help="Mean absolute error of P(taken)"),
+        Column("occupancy_mae_expected", "map error of raw counts", digits=3, help="Of as many drives at that hour"),
+        Column("seconds_per_frame", "perception time per frame", "s", 3),
+        Column("slots_found.precision", "discovered slots, precision", share=True),
+        Column("slots_found.recall", "discovered slots, recall", share=True),
+        Column("slots_found.error", "discovered slots, mean position error", "m", 2),
+        Column("slots_found.yaw_error", "discovered slots, mean heading error", "rad", 3),
+        Column("distance_m", "distance", "m", 0),
+        Column("rate", "share detected", share=True, help="In frames in which the car is not occluded"),
+        Column("in_frame", "cars in frames", digits=0),
+        Column("detected", "detected", digits=0),
+        Column("success", "successful parkings", share=True),
+        Column("parked", "parked", digits=0),
+        Column("found", "found", digits=0),
+        Column("detections", "detections", digits=0),
+        Column("right", "correct", digits=0),
+        Column("occupied_fraction", "occupied", share=True, digits=0),
+        Column("agents", "agents"),
+        Column("knows", "members know"),
+        Column("share", "members", share=True, digits=0),
+        Column("arrivals_per_hour", "cars an hour", digits=0),
+        Column("cars", "cars", digits=0),
+        Column("median_s", "median", "s", help="Median of the total times of a day's cars"),
+        Column("p95_s", "95 % quantile", "s", 0),
+        Column("gini", "Gini", digits=3, help="Inequality of total times: 0 if all are equal"),
+        Column("search_s", "search time", "s", help="From the entry to the end of the search"),
+        Column("queued_s", "in queues", "s", help="Behind cars that park, leave or stand; part of the search time"),
+        Column("failed_attempts", "failed attempts", digits=3),
+        Column("cruised_m", "cruised", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
+        Column("cruising_share", "traffic that cruises", share=True, digits=0),
+        Column("balked_fraction", "found no slot", share=True),
+        Column("members_s", "members", "s", help="Total time of members"),
+        Column("others_s", "others", "s", help="Total time of those who are no members"),
+        Column("members_difference_s", "members minus own", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
+        Column("others_difference_s", "others minus own", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
+        Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),
+        Column("clairvoyant_s", "clairvoyant bound", "s", help="Lower bound that knows all arrivals and stays"),
+        Column("price_over_bound", "over the bound", digits=3, help="Total time over the clairvoyant lower bound"),
+        Column("key", "drive"),
+        Column("weather", "weather"),
+        Column("rig", "rig"),
+    )
+}  # fmt: skip
+_ORDER = (
+    "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
+    "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "difference_s", "gap_to_exact",
+    "price_of_anarchy", "price_over_bound", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
+    "gave_up_s", "parked_fraction",
+)  # fmt: skip
+"""The first columns, in this order."""
+_OF_FLEETS = {
+    column.key: column
+    for column in (
+        Column("difference_s", "minus own", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
+        Column("bound_s", "alone", "s", help="Mean total time of a car alone in an empty lot that it knows"),
+        Column(
+            "occupancy", "occupied", share=True, digits=0, help="Mean share of slots taken while cars arrive"
+        ),
+    )
+}
+"""Columns that mean something else in the table of `parkenv fleet`."""
+_TABLES_OF_THEIR_OWN = ("by_weather",)
+_UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
+
+
+def column_of(key: str) -> Column:
+    """Return the format of a column; unknown columns are labelled by their key.
+
+    Examples:
+        >>> column_of("total_s").label, column_of("brake_distance_m")[:3]
+        ('total time', ('brake_distance_m', 'brake distance', 'm'))
+    """
+    if key in _KNOWN:
+        return _KNOWN[key]
+    for ending, unit in _UNITS:
+        if key.endswith(ending):
+            return Column(key, key.removesuffix(ending).replace("_", " ").replace(".", ", "), unit, 3)
+    return Column(key, key.replace("_", " ").replace(".", ", "), digits=3)
+
+
+def table_of(
+    name: str,
+    title: str,
+    rows: Sequence[Row],
+    *,
+    facts: bool = False,
+    columns: Mapping[str, Column] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Build a table of the page's data.
+
+    Intervals (`NAME_ci95`) are merged into the column of their value. Columns that are equal in all rows go to `same`,
+    which is printed above the table.
+
+    Args:
+        name: identifier of the table in the page.
+        title: title above the table.
+        rows: rows with mostly the same keys.
+        facts: whether to show a single row from top to bottom.
+        columns: formats of columns that differ from `column_of`.
+    """
+
+    def written(key: str) -> dict[str, Any]:
+        return described(columns.get(key) or column_of(key))
+
+    flat = [_flat(row) for row in rows]
+    keys = list(dict.fromkeys(key for row in flat for key in row))
+    keys = [k for k in _ORDER if k in keys] + [k for k in keys if k not in _ORDER]
+    values = {key: [row.get(key) for row in flat] for key in keys}
+    same = []
+    if len(rows) > 1:
+        same = [k for k in keys if len({repr(v) for v in values[k]}) == 1]
+        # Compared values stay in the table even if they are equal.
+        same = [
+            k
+            for k in same
+            if values[k][0] is None or k in _ORDER[:8] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
+        ]
+    shown = [k for k in keys if k not in same]
+    return {
+        "name": name,
+        "title": title,
+        "facts": facts,
+        "columns": [written(key) for key in shown],
+        "rows": [[values[key][i] for key in shown] for i in range(len(rows))],
+        "same": [{**written(key), "value": values[key][0]} for key in same if values[key][0] is not None],
+    }
+
+
+def described(column: Column) -> dict[str, Any]:
+    """Return a column for the page's data, without empty entries."""
+    return {k: v for k, v in column._asdict().items() if v != "" and v is not False}
+
+
+def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
+    """Flatten nested keys and merge intervals; skip lists of rows, which have their own tables."""
+    made: dict[str, Cell] = {}
+    for key, value in row.items():
+        name = prefix + key
+        if isinstance(value, Mapping):
+            if key not in _TABLES_OF_THEIR_OWN:
+                made |= _flat(value, f"{name}.")
+        elif key.endswith("_ci95"):
+            base = name.removesuffix("_ci95")
+            made[base] = [made.get(base), *value]  # type: ignore[list-item]
+        elif isinstance(value, (list, tuple)):
+            if len(value) == 2 and not any(isinstance(v, (Mapping, list)) for v in value):
+                made[name] = f"{value[0]:g} to {value[1]:g}"
+        else:
+            made[name] = value
+    return made
+
+
+def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) -> list[dict[str, Any]]:
+    """Build the tables of a command's summary.
+
+    Args:
+        kind: name of the command.
+        summary: summary of the command.
+        sessions: rows of `sessions.csv`, for a survey.
+    """
+    rows = summary["rows"]
+    surveyed = rows[0] if kind == "survey" and rows else summary.get("survey")
+    tables = []
+    if kind != "survey":
+        title = {"train": "Trained models", "demo": "Searches with simulated sensors"}.get(kind, "Results")
+        tables.append(table_of("rows", title, rows, columns=_OF_FLEETS if kind == "fleet" else {}))
+    if summary.get("transfer"):
+        tables.append(table_of("transfer", "Test in held-out worlds", summary["transfer"]))
+    if summary.get("planners"):
+        tables.append(table_of("planners", "Planners in the same worlds", summary["planners"]))
+    if summary.get("weeks"):
+        tables.append(table_of("weeks", "By five days", summary["weeks"]))
+    if summary.get("occupancy_rows"):
+        tables.append(table_of("occupancy_rows", "By occupancy level", summary["occupancy_rows"]))
+    if surveyed:
+        tables.append(table_of("survey", "The survey", [surveyed], facts=True))
+        if by_weather := surveyed.get("by_weather"):
+            its = [{"weather": _plain(w), **row} for w, row in by_weather.items()]
+            tables.append(table_of("by_weather", "By weather", its))
+        if found := surveyed.get("detection_by_distance"):
+            its = [{**row, "weather": _plain(row["weather"])} for row in found]
+            tables.append(table_of("detection_by_distance", "Detection rate by distance", its))
+    if sessions:
+        kept = [c for c in _SESSION if c in sessions[0]]
+        its = [{c: _plain(row[c]) if c == "weather" else row[c] for c in kept} for row in sessions]
+        tables.append(table_of("sessions", "Survey drives", its))
+    return tables
+
+
+_SESSION = (
+    "key", "weather", "occupied_fraction", "parked", "found", "detections", "right", "slot_accuracy",
+    "slot_accuracy_seen", "unknown_fraction", "place_error_m", "heading_error_deg", "seconds_per_frame",
+)  # fmt: skip
+
+
+def _plain(word: Any) -> str:
+    return str(word).replace("_", " ")

@@ -1,0 +1,1 @@
+"""Surveys, detector studies and fits of sensor models."""

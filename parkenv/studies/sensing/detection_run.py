@@ -1,0 +1,121 @@
+"""Detect cars in image files, videos and recorded drives, and draw them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import cv2
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.images import SUFFIXES as IMAGE_SUFFIXES
+from parkenv.files.images import files_in, images_in, read_image
+from parkenv.files.recordings import SUFFIXES as RECORDING_SUFFIXES
+from parkenv.files.recordings import Footage, footage_in, is_recording
+from parkenv.files.videos import VIDEO_SUFFIXES, Video, film
+from parkenv.perception.detector import Detections, Detector
+from parkenv.studies.figures.survey_pictures import draw_detections
+from sim_sensors.ground_truth import View
+
+Row = dict[str, Any]
+Film = Video | Footage
+
+BOX_COLUMNS = (
+    "file", "frame", "time_s", "left", "top", "right", "bottom", "probability", "view", "visible_fraction",
+)  # fmt: skip
+"""Columns of `boxes.csv`; frame (from 0) and time_s are empty for images, visible_fraction where the detector does not
+know it."""
+
+
+class VideoCars(NamedTuple):
+    """The cars in a video."""
+
+    row: Row  # of the video: file, frames, seconds, fps, boxes, most_cars
+    boxes: list[Row]  # rows of `boxes.csv`
+
+
+def require_readable(paths: Sequence[Path]) -> list[Path | Film]:
+    """Return the images, as their paths, and the videos that are named or in the named folders, in order.
+
+    Each camera of a recording is a video.
+
+    Raises:
+        InputError: a folder holds none of them, or a file cannot be read.
+    """
+    files: list[Path] = []
+    for path in paths:
+        if path.is_dir() and not is_recording(path):
+            files += files_in(path, IMAGE_SUFFIXES + VIDEO_SUFFIXES + RECORDING_SUFFIXES) or images_in(path)
+        else:
+            files.append(path)
+    found: list[Path | Film] = []
+    for file in dict.fromkeys(files):
+        if is_recording(file):
+            found += footage_in(file)
+        elif file.suffix.lower() in VIDEO_SUFFIXES:
+            found.append(Video.of(file))
+        else:
+            read_image(file)
+            found.append(file)
+    return found
+
+
+def detect_in_image(file: Path, detector: Detector, threshold: float, drawn: Path | None) -> list[Row]:
+    """Return the cars of at least a probability in an image, as rows of `boxes.csv`, and draw them into a PNG file."""
+    image = read_image(file)
+    found = _likely(detector.detect(image), threshold)
+    if drawn is not None:
+        colored = image if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+        picture = draw_detections(colored, found)
+        with atomic_write(drawn) as beside:
+            beside.write_bytes(cv2.imencode(".png", picture[..., ::-1])[1].tobytes())
+    return _rows(str(file), found)
+
+
+def detect_in_video(
+    video: Film,
+    detector: Detector,
+    threshold: float,
+    step: int = 1,
+    drawn: Path | None = None,
+    on_frame: Callable[[], None] = lambda: None,
+) -> VideoCars:
+    """Return the cars in every `step`-th frame of a video, and draw them into a film (MP4) of equal speed.
+
+    Raises:
+        InputError: the video has no frame that can be read, or the film cannot be written.
+    """
+    boxes: list[Row] = []
+    frames = most = 0
+    seconds = 0.0
+    with ExitStack() as stack:
+        made = None
+        if drawn is not None:
+            made = stack.enter_context(film(drawn, (video.width, video.height), video.fps / step))
+        for frame in video.read(step):
+            found = _likely(detector.detect(frame.image), threshold)
+            boxes += _rows(video.name, found, frame.number, frame.time)
+            frames, most, seconds = frames + 1, max(most, len(found)), frame.time
+            if made is not None:
+                made.add(draw_detections(frame.image, found))
+            on_frame()
+        if not frames:
+            raise InputError(f"{video.name}: has no frame that can be read")
+    row = {"file": video.name, "frames": frames, "seconds": round(seconds + 1.0 / video.fps, 3)}
+    return VideoCars(row | {"fps": video.fps, "boxes": len(boxes), "most_cars": most}, boxes)
+
+
+def _likely(found: Detections, threshold: float) -> Detections:
+    return found.select(found.probability >= threshold)
+
+
+def _rows(file: str, found: Detections, frame: int | None = None, time: float | None = None) -> list[Row]:
+    taken = None if time is None else round(time, 4)
+    views = [View(view).name.lower() for view in found.view]
+    visible = [None if math.isnan(v) else round(v, 4) for v in found.visible_fraction.tolist()]
+    cars = zip(found.boxes.tolist(), found.probability.tolist(), views, visible, strict=True)
+    return [dict(zip(BOX_COLUMNS, (file, frame, taken, *box, *of_car), strict=True)) for box, *of_car in cars]

@@ -1,0 +1,378 @@
+"""Compare detectors on whole survey drives: cars found, slots right and the map, and what the missed cars look like."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Collection, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.files.csv_writing import write_csv
+from parkenv.files.file_names import file_name
+from parkenv.files.typed_csv import NUMBER_OR_NAN, typed_records
+from parkenv.mapping.store import MapStore
+from parkenv.mapping.survey import SessionResult, Survey, SurveySettings, drive_together
+from parkenv.mapping.survey_score import CLEAR, DISTANCE_ENDS, SIGHTING
+from parkenv.studies.results import make_folder
+from parkenv.studies.sensing.detector_drives import DISTANCES, LEAST_HEIGHT, VISIBLE
+from parkenv.studies.sensing.surveys import MAP_FILE, map_error, store_session, stored_sessions
+from parkenv.studies.statistics import rate_interval
+from parkenv.studies.workers import HERE, Workers
+from parkenv.world.scenario import Scenario
+from sim_sensors.camera.weather import PRESETS
+from sim_sensors.ground_truth import View
+from sim_sensors.rig import SensorRig
+
+Row = dict[str, Any]
+BoolArray = NDArray[np.bool_]
+Sightings = NDArray[np.void]
+
+FAR = 12.0
+"""m, from which a car counts as far."""
+ALL_WEATHERS = "all weathers"
+CAUSES = {
+    "fills the picture": "reaches its upper or lower border, or both sides: the car is too near to fit",
+    "cut off": "reaches the picture's left or right border",
+    "hidden": "less than 90 % of it are visible",
+    "far": f"more than {FAR:g} m away",
+    "dusk": "at dusk",
+    "oblique": "seen between 30° and 60° from its axis",
+    "in plain view": "none of these",
+}
+"""Why a car may be hard to find in a picture; the first that holds, decided by the simulated truth alone."""
+MEASURES = ("cars", "in_pictures", "boxes", "slots")
+TABLE_COLUMNS = (
+    "rig", "detector", "group", "part",
+    *(f"{m}{c}" for m in MEASURES for c in ("", "_rate", "_low", "_high")), "place_error_m", "map_error",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class DetectorSurvey:
+    """A detector's survey with a rig, and where its sessions are stored."""
+
+    settings: SurveySettings
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        """Rig and detector, for tables and figures."""
+        return f"{self.settings.rig}, {self.settings.detector}"
+
+
+@dataclass(frozen=True, eq=False)
+class SurveyedDrive:
+    """What is kept of one session of a detector's survey."""
+
+    number: int  # of the session
+    row: Row  # of `sessions.csv`
+    sightings: Sightings
+
+
+def detector_surveys(
+    settings: SurveySettings, rigs: Sequence[str], detectors: Sequence[str], folder: Path
+) -> list[DetectorSurvey]:
+    """Return a survey for each rig and detector, each with a folder of its own.
+
+    Raises:
+        InputError: an unknown rig.
+    """
+    return [
+        DetectorSurvey(replace(settings, rig=rig, detector=name), folder / file_name(f"{rig}_{name}"))
+        for rig in rigs
+        for name in detectors
+    ]
+
+
+def run_detector_surveys(
+    scenario: Scenario,
+    surveys: Sequence[DetectorSurvey],
+    sessions: int,
+    *,
+    workers: Workers = HERE,
+    on_drive: Callable[[int], None] = lambda _: None,
+) -> list[list[SurveyedDrive]]:
+    """Drive the sessions that the folders do not hold yet; all detectors look at the same drives and pictures.
+
+    Args:
+        scenario: the scenario.
+        surveys: as `detector_surveys` returns them.
+        sessions: number of sessions of each.
+        workers: where the sessions run; results do not depend on it.
+        on_drive: called with the number of surveys that a drive was for, also if it was stored before.
+
+    Returns:
+        For each survey its drives, in order.
+
+    Raises:
+        InputError: an unknown detector, or an unusable folder.
+    """
+    made = [Survey(scenario, its.settings) for its in surveys]
+    keys = [[survey.key_of(k) for k in range(sessions)] for survey in made]
+    with ExitStack() as opened:
+        stores, rows = [], []
+        for its in surveys:
+            make_folder(its.folder / "sightings")
+            stores.append(opened.enter_context(MapStore(its.folder / MAP_FILE, scenario.lot)))
+            rows.append(stored_sessions(stores[-1], its.folder / "sessions.csv"))
+        tasks, of = [], []
+        # Rigs with the same route share their pictures.
+        for _, same_route in itertools.groupby(range(len(surveys)), lambda i: made[i].route.path.tobytes()):
+            group = list(same_route)
+            settings = [surveys[i].settings for i in group]
+            for k in range(sessions):
+                if all(keys[i][k] in rows[i] for i in group):
+                    on_drive(len(group))
+                else:
+                    tasks.append(partial(_drive_together, scenario, settings, k))
+                    of.append((k, group))
+        for (k, group), results in zip(of, workers.in_order(tasks), strict=True):
+            for i, result in zip(group, results, strict=True):
+                if keys[i][k] not in rows[i]:
+                    _write_sightings(_sightings_file(surveys[i], k), result.score.sightings)
+                    store_session(result, rows[i], stores[i], surveys[i].folder / "sessions.csv")
+            on_drive(len(group))
+    return [
+        [
+            SurveyedDrive(k, rows[i][key], _read_sightings(_sightings_file(its, k)))
+            for k, key in enumerate(keys[i])
+        ]
+        for i, its in enumerate(surveys)
+    ]
+
+
+def comparison_table(
+    scenario: Scenario, survey: DetectorSurvey, drives: Sequence[SurveyedDrive]
+) -> list[Row]:
+    """Return the rows of a survey in the comparison: all, by weather, distance, visible fraction, and cause.
+
+    Rates have 95 % intervals over drives (`rate_interval`). In pictures, parked cars count that are within 20 m, 16 px
+    high, and 30 % visible; boxes are those that are cars, by the car's distance, else by the measured one.
+
+    Returns:
+        Rows with `TABLE_COLUMNS`; a measure that a part does not have is None.
+    """
+    height, width = _picture_size(survey.settings.rig)
+    wanted = [is_wanted(d.sightings) for d in drives]
+    causes = [causes_of(d.sightings, d.row["weather"], width, height) for d in drives]
+    everything = [np.ones(len(d.sightings), dtype=np.bool_) for d in drives]
+
+    def in_pictures(parts: Sequence[BoolArray]) -> Row:
+        cars = [w & p for w, p in zip(wanted, parts, strict=True)]
+        found = [int((d.sightings["boxes"][c] > 0).sum()) for d, c in zip(drives, cars, strict=True)]
+        return _rate("in_pictures", found, [int(c.sum()) for c in cars])
+
+    def boxes(parts: Sequence[BoolArray]) -> Row:
+        counts = [
+            (
+                int(d.sightings["boxes"][p & (d.sightings["visible"] > 0)].sum()),
+                int(d.sightings["boxes"][p].sum()),
+            )
+            for d, p in zip(drives, parts, strict=True)
+        ]
+        return _rate("boxes", *zip(*counts, strict=True))
+
+    def drive_measures(which: Sequence[SurveyedDrive]) -> Row:
+        rows = [d.row for d in which]
+        slots = scenario.lot.n_slots
+        place = [r["place_error_m"] for r in rows if np.isfinite(r["place_error_m"])]
+        return (
+            _rate("cars", [r["found"] for r in rows], [r["parked"] for r in rows])
+            | _rate("boxes", [r["right"] for r in rows], [r["detections"] for r in rows])
+            | _rate("slots", [round(r["slot_accuracy"] * slots) for r in rows], [slots] * len(rows))
+            | {"place_error_m": float(np.mean(place)) if place else None}
+        )
+
+    with MapStore(survey.folder / MAP_FILE, scenario.lot, create=False) as store:
+        log = store.log({d.row["key"] for d in drives})
+    table = [("all", "all", drive_measures(drives) | in_pictures(everything))]
+    table[0][2]["map_error"] = map_error(scenario, survey.settings.windows, log)[0]
+    for weather in PRESETS:
+        which = [d for d in drives if d.row["weather"] == weather]
+        of_it = [np.full(len(d.sightings), d.row["weather"] == weather) for d in drives]
+        if which:
+            table.append(("weather", weather, drive_measures(which) | in_pictures(of_it)))
+    for low, high in itertools.pairwise(DISTANCES):
+        within = [(d.sightings["distance"] >= low) & (d.sightings["distance"] < high) for d in drives]
+        table.append(("distance", f"{low:g} to {high:g} m", in_pictures(within) | boxes(within)))
+    for low, high in itertools.pairwise(VISIBLE):
+        within = [(d.sightings["visible"] >= low) & (d.sightings["visible"] < high) for d in drives]
+        table.append(("visible", f"{low:.0%} to {high:.0%} visible", in_pictures(within)))
+    names = list(CAUSES)
+    never = [never_found(d, w, c) for d, w, c in zip(drives, wanted, causes, strict=True)]
+    for i, name in enumerate(names):
+        row = in_pictures([c == i for c in causes])
+        # `cars`: of those that were never found in a drive, those whose best picture is of this kind.
+        missed = sum(int((best == i).sum()) for best in never)
+        table.append(("cause", name, row | {"cars": missed}))
+    empty = dict.fromkeys(TABLE_COLUMNS)
+    head = {"rig": survey.settings.rig, "detector": survey.settings.detector}
+    return [empty | head | {"group": group, "part": part} | row for group, part, row in table]
+
+
+def reach_table(survey: DetectorSurvey, drives: Sequence[SurveyedDrive]) -> list[Row]:
+    """Return how often a car that is whole in a picture and mostly visible is found in it, by weather and distance.
+
+    Returns:
+        Rows with rig, detector, weather (the first are of all), distance_m (both ends of the bin), cars, and rate with
+        its 95 % interval (low, high), for every bin with a car.
+    """
+    height, width = _picture_size(survey.settings.rig)
+    clear = [
+        is_wanted(s) & (s["visible"] >= CLEAR) & (s["left"] > 0) & (s["top"] > 0)
+        & (s["right"] < width) & (s["bottom"] < height)
+        for s in (d.sightings for d in drives)
+    ]  # fmt: skip
+    head = {"rig": survey.settings.rig, "detector": survey.settings.detector}
+    table = []
+    for weather in (ALL_WEATHERS, *PRESETS):
+        its = [
+            d.sightings[c]
+            for d, c in zip(drives, clear, strict=True)
+            if weather in (ALL_WEATHERS, d.row["weather"])
+        ]
+        for low, high in itertools.pairwise((0.0, *DISTANCE_ENDS, DISTANCES[-1])):
+            within = [s[(s["distance"] >= low) & (s["distance"] < high)] for s in its]
+            cars = [len(s) for s in within]
+            if sum(cars):
+                found = [int((s["boxes"] > 0).sum()) for s in within]
+                interval = dict(zip(("rate", "low", "high"), rate_interval(found, cars), strict=True))
+                place = {"weather": weather, "distance_m": [low, high], "cars": sum(cars)}
+                table.append(head | place | interval)
+    return table
+
+
+def is_wanted(sightings: Sightings) -> BoolArray:
+    """Return which sightings are parked cars that should be found, as in `score_on_drives`."""
+    s = sightings
+    high = s["bottom"] - s["top"] >= LEAST_HEIGHT
+    wanted = (s["slot"] >= 0) & (s["visible"] >= VISIBLE[0]) & high & (s["distance"] < DISTANCES[-1])
+    return np.asarray(wanted)
+
+
+def causes_of(sightings: Sightings, weather: str, width: int, height: int) -> NDArray[np.int64]:
+    """Return the index in `CAUSES` of each sighting, in pictures of this size, px."""
+    s = sightings
+    left, right = s["left"] <= 0, s["right"] >= width
+    holds = [
+        (s["top"] <= 0) | (s["bottom"] >= height) | (left & right),
+        left | right,
+        s["visible"] < VISIBLE[-2],
+        s["distance"] > FAR,
+        np.full(len(s), weather == "dusk"),
+        s["view"] == View.OBLIQUE,
+        np.ones(len(s), dtype=np.bool_),
+    ]
+    return np.asarray(np.argmax(holds, axis=0), dtype=np.int64)
+
+
+def never_found(drive: SurveyedDrive, wanted: BoolArray, causes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return, for each car that stood in pictures but was never located in its slot, the cause of its best one."""
+    s = drive.sightings
+    there = np.unique(s["slot"][wanted])
+    missed = np.setdiff1d(there, s["slot"][(s["placed"] > 0) & (s["slot"] >= 0)])
+    return np.array([causes[wanted & (s["slot"] == slot)].max() for slot in missed], dtype=np.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Miss:
+    """A parked car in a picture that a detector missed."""
+
+    session: int
+    weather: str
+    cause: str  # one of `CAUSES`
+    sighting: np.void
+
+    @property
+    def picture(self) -> tuple[int, int, int]:
+        """Session, capture and camera."""
+        return self.session, int(self.sighting["capture"]), int(self.sighting["camera"])
+
+
+def choose_misses(
+    survey: DetectorSurvey, drives: Sequence[SurveyedDrive], number: int, seed: int = 0
+) -> list[Miss]:
+    """Choose missed cars at random, up to `number` of each cause, each car once in a drive."""
+    height, width = _picture_size(survey.settings.rig)
+    rng = np.random.default_rng(seed)
+    chosen = []
+    for i, cause in enumerate(CAUSES):
+        cars = {}
+        for drive in drives:
+            s, weather = drive.sightings, drive.row["weather"]
+            missed = is_wanted(s) & (s["boxes"] == 0) & (causes_of(s, weather, width, height) == i)
+            for row in rng.permutation(np.flatnonzero(missed)).tolist():
+                cars[drive.number, int(s["slot"][row])] = Miss(drive.number, weather, cause, s[row])
+        misses = list(cars.values())
+        chosen += [misses[k] for k in rng.permutation(len(misses))[:number].tolist()]
+    return chosen
+
+
+def pictures_of(
+    scenario: Scenario, settings: SurveySettings, pictures: Collection[tuple[int, int, int]]
+) -> dict[tuple[int, int, int], NDArray[np.uint8]]:
+    """Draw pictures of survey drives once more.
+
+    Args:
+        scenario: the scenario.
+        settings: settings of the survey.
+        pictures: session, capture and camera of each.
+    """
+    survey = Survey(scenario, settings)
+    drawn: dict[tuple[int, int, int], NDArray[np.uint8]] = {}
+    for session, of_session in itertools.groupby(sorted(pictures), lambda picture: picture[0]):
+        drive = survey.draw(session)
+        for i, of_capture in itertools.groupby(of_session, lambda picture: picture[1]):
+            _, capture = drive.capture(i)
+            frames = [*capture.images.values(), *(pair.left for pair in capture.pairs.values())]
+            drawn |= {picture: frames[picture[2]].image for picture in of_capture}
+    return drawn
+
+
+def _rate(measure: str, right: Sequence[int], total: Sequence[int]) -> Row:
+    rate, low, high = rate_interval(right, total)
+    values = (int(sum(total)), rate, low, high) if sum(total) else (0, None, None, None)
+    return dict(zip((measure, *(f"{measure}_{c}" for c in ("rate", "low", "high"))), values, strict=True))
+
+
+def _picture_size(rig: str) -> tuple[int, int]:
+    its = SensorRig.named(rig)
+    camera = [*(c for _, c, _ in its.cameras), *(pair.camera for _, pair, _ in its.stereo_cameras)][0]
+    return camera.height, camera.width
+
+
+def _drive_together(
+    scenario: Scenario, settings: Sequence[SurveySettings], number: int
+) -> list[SessionResult]:
+    return drive_together([Survey(scenario, its) for its in settings], number)
+
+
+def _sightings_file(survey: DetectorSurvey, number: int) -> Path:
+    return survey.folder / "sightings" / f"{number:05d}.csv"
+
+
+def _write_sightings(path: Path, sightings: Sightings) -> None:
+    names = SIGHTING.names or ()
+    write_csv(path, names, (dict(zip(names, row, strict=True)) for row in sightings.tolist()))
+
+
+def _read_sightings(path: Path) -> Sightings:
+    """Read the records of `_write_sightings`.
+
+    Raises:
+        InputError: the file is missing, damaged, or not of this version.
+    """
+    if not path.exists():
+        raise InputError(
+            f"{path}: is missing; delete the folder {path.parents[1]} to drive its sessions again"
+        )
+    names = SIGHTING.names or ()
+    rows = [tuple(row.values()) for _, row in typed_records(path, lambda _: NUMBER_OR_NAN, names)]
+    return np.array(rows, dtype=SIGHTING)

@@ -1,0 +1,175 @@
+"""Fit a surrogate sensor model to the errors of the perception pipeline in searches with simulated sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.errors import InputError
+from parkenv.studies.simulate import Observer, Step, simulate
+from parkenv.studies.workers import HERE, Workers
+from parkenv.world.scenario import Scenario
+from parkenv.world.sensor_model import SensorBand, SensorModel
+from planners.agent import make_agent
+
+IntArray = NDArray[np.int64]
+
+BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
+"""Ends of the bands of distance from the car to a slot's vertex, m; the first band is the slot at the car's vertex."""
+AGENTS = ("greedy-drive", "mdp", "first-free")
+"""Agents whose searches are counted, so that the observations are those of typical searches."""
+LEAST_OBSERVATIONS = 20
+"""Least number of observations in a band for rates of its own; otherwise those of all bands are used."""
+_ASSUMED = SensorModel(BAND_ENDS[-1], 0.98, 0.02)
+
+
+@dataclass(frozen=True, eq=False)
+class ObservationCounts:
+    """Counts of the slots in view after each step, by true and observed state."""
+
+    # (bands, 2, 2, 3) int64, by distance, by whether the slot lies beside the car, by whether it is taken, and by
+    # observed state: none, free, taken
+    counts: IntArray
+
+    @classmethod
+    def none(cls) -> ObservationCounts:
+        """Return zero counts."""
+        return cls(np.zeros((len(BAND_ENDS), 2, 2, 3), dtype=np.int64))
+
+    def __add__(self, other: ObservationCounts) -> ObservationCounts:
+        return ObservationCounts(self.counts + other.counts)
+
+    def fitted(self) -> SensorModel:
+        """Return the sensor model with these rates, with a Jeffreys prior of half an error in each band.
+
+        Raises:
+            InputError: too few observations.
+        """
+        reported = self.counts.sum(axis=(0, 1))[:, 1:]
+        if reported.sum(axis=1).min() < LEAST_OBSERVATIONS:
+            raise InputError(
+                f"{reported.sum(axis=1).tolist()} observations of free and of taken slots, want at least "
+                f"{LEAST_OBSERVATIONS} of each"
+            )
+        false_alarm, hit = _taken_rates(reported)
+        bands = []
+        for i, end in enumerate(BAND_ENDS):
+            for beside in (False, True):
+                counts = self.counts[i, int(beside)]
+                in_view, reported = counts.sum(), counts[:, 1:]
+                enough = reported.sum(axis=1).min() >= LEAST_OBSERVATIONS
+                rates = _taken_rates(reported) if enough else (false_alarm, hit)
+                seen = float(reported.sum() / in_view) if in_view else 0.0
+                bands.append(SensorBand(end, beside, round(seen, 4), round(rates[1], 4), round(rates[0], 4)))
+        return SensorModel(BAND_ENDS[-1], round(hit, 4), round(false_alarm, 4), tuple(bands))
+
+
+def _taken_rates(reported: IntArray) -> tuple[float, float]:
+    """Return the fraction observed as taken, for free slots and for taken slots."""
+    free, taken = (float((row[1] + 0.5) / (row.sum() + 1.0)) for row in reported)
+    return free, taken
+
+
+class _ObservationCounter(Observer):
+    """Counts what the perception pipeline reports after each step of a search, until the car is parked.
+
+    Args:
+        scenario: the scenario.
+    """
+
+    def __init__(self, scenario: Scenario) -> None:
+        self._starts, self._slots = scenario.slots_in_view
+        distance, beside = scenario.sight_lines
+        self._band = np.searchsorted(BAND_ENDS, distance)
+        self._beside = beside.astype(np.int64)
+        self.counts = ObservationCounts.none()
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Store the environment."""
+        del observation
+        self._env: Any = env.unwrapped
+
+    def on_step(self, step: Step) -> None:
+        """Compare the report with the true occupancy."""
+        if step.info["parked"]:
+            return
+        state, observed = self._env.state, self._env.perception.observation
+        rows = slice(self._starts[state.vertex], self._starts[state.vertex + 1])
+        near = self._slots[rows]
+        reported = np.zeros(len(near), dtype=np.int64)
+        reported[np.searchsorted(near, observed.slots)] = 1 + observed.taken
+        taken = state.world.occupied(near, state.time).astype(np.int64)
+        np.add.at(self.counts.counts, (self._band[rows], self._beside[rows], taken, reported), 1)
+
+
+def count_observations(
+    scenario: Scenario,
+    rig: str,
+    agent: str,
+    seeds: Sequence[int],
+    weather: str | None = None,
+    detector: str | None = None,
+) -> ObservationCounts:
+    """Search with simulated sensors, and compare the perception pipeline's reports with the true occupancy.
+
+    Args:
+        scenario: the scenario.
+        rig: `laser` or `stereo`.
+        agent: name of the agent that searches.
+        seeds: one seed per search.
+        weather: the weather; None to draw it for each search.
+        detector: the detector; None: the scenario's.
+
+    Raises:
+        InputError: an unknown rig.
+    """
+    scenario = scenario.replace(sensor_model=_ASSUMED)
+    env = gym.make(
+        "parkenv/SearchPerception-v2", scenario=scenario, rig=rig, weather=weather, detector=detector
+    )
+    searcher, counter = make_agent(agent, scenario), _ObservationCounter(scenario)
+    for seed in seeds:
+        simulate(env, searcher, seed, (counter,))
+    return counter.counts
+
+
+def measure_sensors(
+    scenarios: Sequence[Scenario],
+    rig: str,
+    searches: int,
+    *,
+    seed: int = 0,
+    weather: str | None = None,
+    detector: str | None = None,
+    workers: Workers = HERE,
+    on_progress: Callable[[], None] = lambda: None,
+) -> ObservationCounts:
+    """Sum `count_observations` over all agents of `AGENTS` and all scenarios.
+
+    Args:
+        scenarios: the scenarios.
+        rig: `laser` or `stereo`.
+        searches: number of searches per agent and scenario.
+        seed: seed of the first search.
+        weather: the weather; None to draw it for each search.
+        detector: the detector; None: the scenario's.
+        workers: where the searches run; results do not depend on it.
+        on_progress: called after each search.
+    """
+    tasks = [
+        partial(count_observations, scenario, rig, agent, [s], weather, detector)
+        for scenario in scenarios
+        for s in range(seed, seed + searches)
+        for agent in AGENTS
+    ]
+    counts = ObservationCounts.none()
+    for _, more in workers.results(tasks):
+        counts += more
+        on_progress()
+    return counts

@@ -1,0 +1,167 @@
+"""Simulate one episode: an agent acts in an environment until the episode ends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import MutableMapping, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+
+from parkenv.compiled.jit import seconds_spent
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.scan_observation import ScanObservation
+from parkenv.envs.sensors import SearchSensorsEnv
+from parkenv.errors import InputError
+from parkenv.world.scenario import Scenario
+from planners.agent import Agent, ClairvoyantAgent
+
+STEP_LIMIT = 2000
+"""Step limit of environments that are not made by `gymnasium.make`, the same as that of `parkenv/Search-v2`."""
+
+
+class Step(NamedTuple):
+    """One decision and its outcome."""
+
+    observation: Any  # observation before the decision
+    action: Any  # action chosen by the agent
+    memory: Any  # the agent's state after the decision; it may change with the next decision
+    reward: float  # reward of the step
+    next_observation: Any  # observation after the step
+    terminated: bool  # whether the episode reached a terminal state
+    truncated: bool  # whether the step limit ended the episode
+    info: dict[str, Any]  # `info` of the step
+
+
+@dataclass(frozen=True)
+class EpisodeResult:
+    """The outcome of one episode."""
+
+    seed: int  # seed of the world
+    # `info` of the last step. A truncated search is charged the give-up penalty, see `charge_truncation`.
+    info: dict[str, Any]
+    truncated: bool  # whether the step limit ended the episode
+    decision_s: list[float]  # wall time of each decision, s, excluding compiling and loading of compiled code
+    memory: Any  # the agent's state at the end
+
+    @property
+    def steps(self) -> int:
+        """Number of decisions."""
+        return len(self.decision_s)
+
+
+class Observer:
+    """Hooks into an episode; subclasses override what they need."""
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Called after the reset, before the first decision."""
+
+    def on_step(self, step: Step) -> None:
+        """Called after each step of the environment."""
+
+    def on_end(self, result: EpisodeResult) -> None:
+        """Called once the episode is over."""
+
+
+def simulate(
+    env: gym.Env[Any, Any], agent: Agent, seed: int, observers: Sequence[Observer] = ()
+) -> EpisodeResult:
+    """Run one episode from reset to its end.
+
+    Args:
+        env: the environment, with a step limit if the agent may never finish; see `adapt_to_agent`.
+        agent: the agent; an oracle gets the hidden occupancy first.
+        seed: seed of the world.
+        observers: called in this order at each hook.
+    """
+    observation, _ = env.reset(seed=seed)
+    _prepare(agent, env)
+    for observer in observers:
+        observer.on_reset(env, observation)
+    memory: Any = None
+    info: dict[str, Any] = {}
+    decision_s: list[float] = []
+    terminated = truncated = False
+    while not (terminated or truncated):
+        start, compiling = time.perf_counter(), seconds_spent()
+        action, memory = agent.predict(observation, memory)
+        # The first decision of a process may include compilation, which is not counted.
+        decision_s.append(time.perf_counter() - start - (seconds_spent() - compiling))
+        decided_on = observation
+        observation, reward, terminated, truncated, info = env.step(action)
+        step = Step(decided_on, action, memory, float(reward), observation, terminated, truncated, info)
+        for observer in observers:
+            observer.on_step(step)
+    truncated = truncated and not terminated
+    scenario = getattr(env.unwrapped, "scenario", None)
+    if truncated and scenario is not None:
+        info = dict(info)
+        charge_truncation(info, scenario.give_up_s)
+    result = EpisodeResult(seed, info, truncated, decision_s, memory)
+    for observer in observers:
+        observer.on_end(result)
+    return result
+
+
+def charge_truncation(metrics: MutableMapping[str, Any], give_up_s: Any, truncated: Any = 1.0) -> None:
+    """Charge truncated searches the give-up penalty, like searches that give up in a full lot.
+
+    Otherwise an agent that never parks would seem cheap.
+
+    Args:
+        metrics: metrics of a search, or arrays with one element per search; `gave_up_s` and `total_s` are increased.
+        give_up_s: the penalty of the scenario, or of each search's, s.
+        truncated: which searches were truncated, as a number or a bool array.
+    """
+    penalty = truncated * give_up_s
+    metrics["gave_up_s"] = metrics["gave_up_s"] + penalty
+    metrics["total_s"] = metrics["total_s"] + penalty
+
+
+def make_search(
+    scenario: Scenario, agent: Agent, rig: str | None = None, **options: Any
+) -> gym.Env[Any, Any]:
+    """Make the environment that gives an agent what it observes.
+
+    A model that observes scans searches in `parkenv/SearchSensors-v2`, any other agent in `parkenv/Search-v2`, or with
+    a rig in `parkenv/SearchPerception-v2`. Equal seeds give equal worlds in all three.
+
+    Args:
+        scenario: the scenario.
+        agent: the agent.
+        rig: sensor rig of the car, by name.
+        options: further arguments of `gymnasium.make`.
+    """
+    name = "parkenv/Search-v2" if rig is None else "parkenv/SearchPerception-v2"
+    if getattr(agent, "scans_k", None) is not None:
+        name = "parkenv/SearchSensors-v2"
+        options |= {"observation": "scan", "captures": 1}
+    if rig is not None:
+        options["rig"] = rig
+    # The environments are checked by their tests; checking each again takes as long as some searches.
+    env = gym.make(name, disable_env_checker=True, scenario=scenario, **options)
+    return adapt_to_agent(env, agent)
+
+
+def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
+    """Give the environment the agent's observation: trained models use `LocalObservation` or `ScanObservation`.
+
+    Raises:
+        InputError: the agent observes scans, and the environment has none.
+    """
+    if (k := getattr(agent, "scans_k", None)) is not None:
+        if not isinstance(env.unwrapped, SearchSensorsEnv):
+            raise InputError(
+                f"{getattr(agent, 'name', 'the agent')} observes laser scans, and there are none here"
+            )
+        return ScanObservation(env, k)
+    k = getattr(agent, "local_k", None)
+    return env if k is None else LocalObservation(env, k)
+
+
+def _prepare(agent: Agent, env: gym.Env[Any, Any]) -> None:
+    """Pass the hidden occupancy to agents that know it by definition, such as the oracle."""
+    if isinstance(agent, ClairvoyantAgent):
+        state = env.unwrapped.state  # type: ignore[attr-defined]
+        agent.prepare(state.world, state.time)

@@ -1,0 +1,1 @@
+"""Occupancy of slots over time."""

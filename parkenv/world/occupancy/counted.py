@@ -1,0 +1,193 @@
+"""Worlds that follow the hourly counts of a car park: its days, replayed on the slots of a lot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.special import expit, logit
+
+from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
+from parkenv.errors import InputError
+from parkenv.world.occupancy.day_error import DayError
+from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
+from parkenv.world.occupancy.log import weekday_of
+from parkenv.world.occupancy.process import (
+    DAY_NAMES,
+    MAX_RATE,
+    Arrival,
+    ArrivalWindow,
+    FloatArray,
+    Forecast,
+    OccupancyProcess,
+    ProcessWorld,
+)
+from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
+
+LEAST, MOST = 0.002, 0.998
+"""Bounds of the mean occupancy of a lot: beyond them, slots would be taken or free for ever."""
+_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_PASSES = 3  # over the day; the curve of a process is periodic
+
+
+@dataclass(frozen=True, eq=False)
+class CountedOccupancy:
+    """Replays days of a car park of which only the number of taken places is known.
+
+    Slot s is taken with the log-odds `attraction[s]` plus the level of the moment, such that the mean over the lot
+    follows the counts: the occupancy counted in hour h is that at its end. Within these means, slots are two-state
+    chains as in an `OccupancyProcess`, a process for each day. The forecast is made in the same way, from the curve
+    that a forecasting model predicts for the day.
+
+    Args:
+        days: (d,) ISO dates, ascending, of the days that can be replayed.
+        occupied: (d, 24) float64, fraction of the places that was taken in each hour of these days; NaN if unknown.
+        level: (d, 24) float64, logit, predicted mean of that fraction's logit.
+        level_sd: (d, 24) float64, logits, standard deviation of the prediction's error.
+        attraction: (n,) float64, logit, popularity of the lot's slots.
+        mean_stay_s: s, mean parking duration; shorter in hours in which the lot empties faster.
+        source: name of the counts in messages.
+
+    Raises:
+        InputError: a wrong shape, or no days.
+    """
+
+    days: tuple[str, ...]
+    occupied: FloatArray
+    level: FloatArray
+    level_sd: FloatArray
+    attraction: FloatArray
+    mean_stay_s: float = 2 * HOUR_S
+    source: str = "counts"
+    _worlds: dict[str, OccupancyProcess] = field(init=False, repr=False, default_factory=dict)
+    _forecasts: dict[str, OccupancyProcess] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        shape = (len(self.days), DAY_HOURS)
+        if not self.days:
+            raise InputError(f"{self.source}: no days to replay, want at least one")
+        for name in ("occupied", "level", "level_sd"):
+            array = np.asarray(getattr(self, name), float)
+            if array.shape != shape:
+                raise InputError(f"{self.source}: {name} has shape {array.shape}, want {shape}")
+            object.__setattr__(self, name, array)
+        object.__setattr__(self, "attraction", np.asarray(self.attraction, float))
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots of the lot."""
+        return int(self.attraction.size)
+
+    def days_in(self, window: ArrivalWindow) -> list[str]:
+        """Return the days on the window's weekdays that were counted in all of its hours.
+
+        Raises:
+            InputError: there are none.
+        """
+        first = int(window.start_s // HOUR_S)
+        end = max(math.ceil(window.end_s / HOUR_S), first + 1)
+        counted = np.flatnonzero(np.isfinite(self.occupied[:, first:end]).all(axis=1))
+        days = [self.days[i] for i in counted if weekday_of(self.days[i]) in window.weekdays]
+        if not days:
+            names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
+            raise InputError(
+                f"{self.source}: no day on {names} was counted from {first}:00 to {end}:00, want at least one"
+            )
+        return days
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """Draw a counted day on the window's weekdays, and a time of day, both uniform."""
+        days = self.days_in(window)
+        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
+        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
+
+    def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
+        """Return the world of the episode with this key, on the arrival's day."""
+        return ProcessWorld(self.process_of(arrival.day), key, arrival)
+
+    def process_of(self, day: str) -> OccupancyProcess:
+        """Return the process whose mean occupancy follows the counts of a day."""
+        if day not in self._worlds:
+            curve = _without_gaps(self.occupied[self._index(day)])
+            self._worlds[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
+        return self._worlds[day]
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Return the forecast: the mean over the days that are possible, and by how much their level differs."""
+        index, day = self._index(arrival.day), arrival.day
+        if day not in self._forecasts:
+            levels = self.level[index][:, None] + self.level_sd[index][:, None] * _NODES
+            curve = expit(levels) @ (_WEIGHTS / _WEIGHTS.sum())
+            self._forecasts[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
+        process = self._forecasts[day]
+        own = process.forecast(arrival)
+        hour = int(arrival.time % DAY_S // HOUR_S)
+        p = np.clip(own.p_occupied, MIN_PROBABILITY, MAX_PROBABILITY)
+        error = self._shift_of_slots(self.level[index, hour], self.level_sd[index, hour])
+        return Forecast(p, own.decay_rate, DayError(level=error))
+
+    def _shift_of_slots(self, level: float, level_sd: float) -> float:
+        """Return the shift of every slot's log-odds, logits, that shifts the lot's mean by `level_sd` logits."""
+        low, high = (
+            level_of_mean(self.attraction, float(expit(level + sign * level_sd))) for sign in (-1.0, 1.0)
+        )
+        return 0.5 * (high - low)
+
+    def _index(self, day: str) -> int:
+        try:
+            return self.days.index(day)
+        except ValueError:
+            raise InputError(f"Arrival.day: got {day!r}, wanted a counted day of {self.source}") from None
+
+
+def level_of_mean(attraction: FloatArray, mean: float) -> float:
+    """Return the level, logit, at which slots of these log-odds, (n,), are taken with this mean probability."""
+    mean = min(max(mean, LEAST), MOST)
+    reach = float(np.abs(attraction).max()) + abs(float(logit(mean))) + 1.0
+    return float(brentq(lambda x: float(expit(attraction + x).mean()) - mean, -reach, reach))
+
+
+def process_of_curve(attraction: FloatArray, curve: FloatArray, mean_stay_s: float) -> OccupancyProcess:
+    """Return the process whose mean occupancy is a given one at the end of every hour of the day, every day.
+
+    Within an hour rates are constant. Cars leave after `mean_stay_s` on average, and the arrival rate is chosen for
+    the curve; where the lot empties faster than that, no car arrives and the departure rate is chosen.
+
+    Args:
+        attraction: (n,) float64, logit, popularity of the slots.
+        curve: (24,) float64, mean occupancy at the end of each hour.
+        mean_stay_s: s.
+    """
+    curve = np.clip(curve, LEAST, MOST)
+    pull = np.exp(attraction - attraction.max())
+    fastest = math.log(0.9 * MAX_RATE)
+    usual = math.log(1.0 / mean_stay_s)
+    none = fastest - 60.0
+    arrivals, departures = np.full(DAY_HOURS, none), np.full(DAY_HOURS, usual)
+    p = expit(attraction + level_of_mean(attraction, float(curve[-1])))
+
+    def later(log_arrival: float, log_departure: float) -> FloatArray:
+        arrive, leave = pull * math.exp(log_arrival), math.exp(log_departure)
+        total = arrive + leave
+        equilibrium = arrive / total
+        return np.asarray(equilibrium + (p - equilibrium) * np.exp(-total * HOUR_S))
+
+    for _ in range(_PASSES):
+        for hour, mean in enumerate(curve):
+            arrivals[hour], departures[hour] = none, usual
+            if later(none, usual).mean() < mean:
+                arrivals[hour] = brentq(lambda x, m=mean: later(x, usual).mean() - m, none, fastest)
+            elif later(none, fastest).mean() < mean:
+                departures[hour] = brentq(lambda x, m=mean: later(none, x).mean() - m, usual, fastest)
+            p = later(arrivals[hour], departures[hour])
+    return OccupancyProcess(
+        pull, np.tile(np.exp(arrivals), 7), np.ones(pull.size), np.tile(np.exp(departures), 7)
+    )
+
+
+def _without_gaps(curve: FloatArray) -> FloatArray:
+    """Return a day's curve, (24,), with unknown hours interpolated."""
+    known = np.flatnonzero(np.isfinite(curve))
+    return np.interp(np.arange(DAY_HOURS), known, curve[known])

@@ -1,0 +1,482 @@
+"""Occupancy over time: the protocols of worlds and forecasts, and a process that generates worlds.
+
+Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
+"""
+
+import math
+import os
+import re
+from dataclasses import asdict, dataclass, field, fields, replace
+from typing import Any, Protocol, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import brentq
+
+from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
+from parkenv.compiled.memory import address_of
+from parkenv.errors import InputError
+from parkenv.files.versioned_json import JsonFormat
+from parkenv.world.occupancy import kernel as kernels
+from parkenv.world.occupancy.day_error import EXACT, DayError, centring_table, nearness
+from parkenv.world.occupancy.kernel import kernel
+from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, hour_of_week
+
+FloatArray = NDArray[np.float64]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+
+DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+DAY_GROUPS = {"weekdays": (0, 1, 2, 3, 4), "weekend": (5, 6), "all": (0, 1, 2, 3, 4, 5, 6)}
+
+MAX_RATE = 1e3
+_FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
+
+
+@dataclass(frozen=True)
+class ArrivalWindow:
+    """Weekdays and times of day at which searches begin.
+
+    Args:
+        weekdays: Monday = 0 ... Sunday = 6, without repeats.
+        start_s: first second of the day, in [0, 86400).
+        end_s: end of the window (exclusive), in [start_s, 86400]; if equal to start_s, all searches begin then.
+    """
+
+    weekdays: tuple[int, ...] = (0, 1, 2, 3, 4)
+    start_s: float = 8 * HOUR_S
+    end_s: float = 13 * HOUR_S
+
+    def __post_init__(self) -> None:
+        days = tuple(self.weekdays)
+        if not days or len(set(days)) != len(days) or not set(days) <= set(range(7)):
+            raise InputError(
+                f"ArrivalWindow.weekdays: got {days}, wanted different numbers from 0 (Mon) to 6 (Sun)"
+            )
+        if not 0 <= self.start_s < DAY_S:
+            raise InputError(f"ArrivalWindow.start_s: got {self.start_s}, wanted seconds in [0, 86400)")
+        if not self.start_s <= self.end_s <= DAY_S:
+            raise InputError(
+                f"ArrivalWindow.end_s: got {self.end_s}, wanted seconds in [start_s={self.start_s}, 86400]"
+            )
+        object.__setattr__(self, "weekdays", days)
+
+    @classmethod
+    def parse(cls, hours: str, days: str = "weekdays") -> Self:
+        """Parse a window as typed by a user.
+
+        >>> ArrivalWindow.parse("08:00-09:30", days="mon,sat")
+        ArrivalWindow(weekdays=(0, 5), start_s=28800.0, end_s=34200.0)
+
+        Args:
+            hours: `HH:MM-HH:MM`, with 24:00 allowed as the end.
+            days: `weekdays`, `weekend`, `all`, or names as in `mon,tue`.
+        """
+        match = re.fullmatch(r"\s*(\d{1,2}):([0-5]\d)\s*-\s*(\d{1,2}):([0-5]\d)\s*", hours)
+        if match is None:
+            raise InputError(f"arrival hours: got {hours!r}, wanted HH:MM-HH:MM, for example 08:00-13:00")
+        start_h, start_min, end_h, end_min = map(int, match.groups())
+        names = [name.strip() for name in days.lower().split(",")]
+        if days.lower() in DAY_GROUPS:
+            weekdays: tuple[int, ...] = DAY_GROUPS[days.lower()]
+        elif set(names) <= set(DAY_NAMES):
+            weekdays = tuple(DAY_NAMES.index(name) for name in names)
+        else:
+            wanted = f"{', '.join(DAY_GROUPS)}, or some of {','.join(DAY_NAMES)}"
+            raise InputError(f"arrival days: got {days!r}, wanted {wanted}")
+        return cls(weekdays, start_h * HOUR_S + start_min * 60.0, end_h * HOUR_S + end_min * 60.0)
+
+    def draw_second(self, key: np.uint64) -> float:
+        """Draw a second of the day, uniform in the window, from the world's key."""
+        return self.start_s + float(keyed_uniform(key, ARRIVAL_STREAM, 0, 1)) * (self.end_s - self.start_s)
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """The moment at which a search begins."""
+
+    time: float  # s since Monday 00:00
+    day: str = ""  # ISO date of the recorded day that the world replays; empty without a replay
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Occupancy forecast of a lot, before any observation."""
+
+    p_occupied: FloatArray  # (n,) float64, P(taken) at the arrival
+    # (n,) float64, 1/s, arrival rate plus departure rate: how fast an observation loses its value
+    decay_rate: FloatArray
+    day_error: DayError = EXACT  # by how much whole days differ from `p_occupied`
+
+
+class World(Protocol):
+    """The hidden occupancy of one episode; accepts any slots and times from the arrival on, in any order."""
+
+    def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
+        """(k,) bool, whether each of the slots (k,) is taken at `time`."""
+
+    def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
+        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
+
+    def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64, number of the current sojourn (period of constant state) of each slot; distinguishes cars."""
+
+
+class PriorModel(Protocol):
+    """Forecasts occupancy."""
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Return the forecast for the arrival; it does not depend on the world."""
+
+
+class OccupancyModel(PriorModel, Protocol):
+    """Draws arrivals and worlds, and forecasts occupancy."""
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """Draw the arrival of the episode with this key."""
+
+    def world(self, key: np.uint64, arrival: Arrival) -> World:
+        """Return the world of the episode with this key."""
+
+
+@kernel
+def _seek(
+    process: int,
+    world: int,
+    slots: IntArray,
+    time: float,
+    cursors: int,
+    occupied: BoolArray,
+    ends: FloatArray,
+) -> None:
+    """Write the state of each of `slots` at `time` and, if `ends` has room, when its sojourn ends."""
+    of_all, here = kernels.process_at(process, 0), kernels.world_at(world, 0)
+    for i in range(slots.size):
+        slot, cursor = slots[i], kernels.cursor_at(cursors, slots[i])
+        if time < cursor.since:
+            cursor.sojourn, cursor.valid_until = 0, 0.0
+        occupied[i] = kernels.process_state(of_all, here, slot, cursor, time)
+        if ends.size > 0:
+            kernels.find_sojourn_end(of_all, here, slot, cursor)
+            ends[i] = cursor.valid_until
+
+
+@kernel
+def _draw_day(process: int, world: int) -> None:
+    kernels.draw_day(kernels.process_at(process, 0), kernels.world_at(world, 0))
+
+
+@kernel
+def _marginals(process: int, hour: int, second: float, marginals: FloatArray) -> None:
+    for slot in range(marginals.size):
+        marginals[slot] = kernels.process_forecast(kernels.process_at(process, 0), hour, second, slot)[0]
+
+
+class ProcessWorld:
+    """One episode of an `OccupancyProcess`: a pure function of (process, key, arrival).
+
+    Evaluation is lazy: only queried slots cost time. A slot keeps a cursor on its latest sojourn; a query before the
+    cursor restarts that slot, so answers never depend on the order of the queries.
+    """
+
+    def __init__(self, process: "OccupancyProcess", key: np.uint64, arrival: Arrival) -> None:
+        if not math.isfinite(arrival.time):
+            raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
+        # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
+        self._cursors = np.zeros(process.n_slots, kernels.CURSOR)
+        self.process = process
+        self.key = np.uint64(key)
+        self.arrival = arrival
+        _, hour, second = hour_of_week(float(arrival.time))
+        self._record = np.array([(self.key, arrival.time, hour, second, 1.0, 0.0)], kernels.WORLD)
+        _draw_day(process.address, address_of(self._record, kernels.WORLD))
+
+    def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
+        """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
+        return self._seek(self._checked(slots), time, np.empty(0))
+
+    def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
+        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
+        slots = self._checked(slots)
+        ends = np.empty(slots.size)
+        return np.where(self._seek(slots, time, ends), ends, time)
+
+    def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64, number of sojourns (periods of constant state) that each slot has begun since the arrival."""
+        slots = self._checked(slots)
+        self._seek(slots, time, np.empty(0))
+        begun: IntArray = self._cursors["sojourn"][slots].astype(np.int64)
+        return begun
+
+    def _checked(self, slots: ArrayLike) -> IntArray:
+        slots = np.ascontiguousarray(slots, np.int64)
+        if slots.size and not (slots.min() >= 0 and slots.max() < len(self._cursors)):
+            raise IndexError("slot index out of range")
+        return slots
+
+    def _seek(self, slots: IntArray, time: float, ends: FloatArray) -> BoolArray:
+        arrival = float(self.arrival.time)
+        if not arrival <= time < math.inf:
+            raise InputError(f"time: got {time}, wanted finite seconds at or after the arrival at {arrival}")
+        occupied = np.empty(slots.size, np.bool_)
+        cursors = address_of(self._cursors, kernels.CURSOR)
+        world = address_of(self._record, kernels.WORLD)
+        _seek(self.process.address, world, slots, float(time), cursors, occupied, ends)
+        return occupied
+
+
+@dataclass(frozen=True, eq=False)
+class OccupancyProcess:
+    """Independent two-state continuous-time Markov chains, one per slot, with weekly periodic rates.
+
+    A free slot s is taken at the rate `arrival_factor[s] * arrival_profile[h]`, a taken one becomes free at the
+    rate `departure_factor[s] * departure_profile[h]`; h is the hour of the week, 0 = Monday 00:00 to 01:00.
+
+    With a day error, every episode draws the level L and the slope S of its day. The odds that a slot is taken at the
+    arrival are those of its forecast times c·exp(L + S·nearness), and its arrival rate is multiplied by the same factor
+    throughout the episode, so that its equilibrium moves along. The centring c makes the forecast the mean over days
+    (see `parkenv.world.occupancy.day_error`); in the arrival rate of an hour, it is that of the forecast when the hour
+    begins, or at the arrival if that is later.
+
+    Args:
+        arrival_factor: (n,) float64, no unit, >= 0.
+        arrival_profile: (168,) float64, 1/s, >= 0.
+        departure_factor: (n,) float64, no unit, >= 0.
+        departure_profile: (168,) float64, 1/s, >= 0.
+        day_error: how far days differ from the forecast.
+        nearness: (n,) float64, from -1 to 1, see `parkenv.world.occupancy.day_error.nearness`; needed for a slope only.
+
+    Attributes:
+        factors: (2, n) float64, read-only, the two factors stacked; row = the state before the change.
+        profiles: (2, 168) float64, 1/s, read-only, the two profiles stacked in the same way.
+        hazards: (2, 169) float64, read-only, integrals of the profiles from Monday 00:00 to full hours.
+        hourly_marginals: (168, n) float64, P(taken) at full hours, computed when first needed; 0 before.
+        record: (1,) of the dtype PROCESS, for compiled code.
+
+    Raises:
+        InputError: a wrong shape, a value that is negative or not finite, a rate above 1000/s, or a slope without
+            nearness.
+    """
+
+    arrival_factor: FloatArray
+    arrival_profile: FloatArray
+    departure_factor: FloatArray
+    departure_profile: FloatArray
+    day_error: DayError = EXACT
+    nearness: FloatArray | None = None
+    factors: FloatArray = field(init=False, repr=False)
+    profiles: FloatArray = field(init=False, repr=False)
+    hazards: FloatArray = field(init=False, repr=False)
+    hourly_marginals: FloatArray = field(init=False, repr=False)
+    record: NDArray[np.void] = field(init=False, repr=False)
+    _centring: FloatArray = field(init=False, repr=False)  # `record` holds its address
+
+    def __post_init__(self) -> None:
+        arrival = _checked("arrival_factor", self.arrival_factor)
+        factors = np.stack([arrival, _checked("departure_factor", self.departure_factor, arrival.size)])
+        names = ("arrival_profile", "departure_profile")
+        profiles = np.stack([_checked(name, getattr(self, name), WEEK_HOURS) for name in names])
+        with np.errstate(over="ignore"):
+            fastest = float((factors.max(axis=1) * profiles.max(axis=1)).max())
+        if not fastest <= MAX_RATE:
+            raise InputError(
+                f"OccupancyProcess: got a rate of {fastest:g}/s, wanted factor * profile <= {MAX_RATE:g}"
+            )
+        hazards = np.pad(np.cumsum(profiles * HOUR_S, axis=1), ((0, 0), (1, 0)))
+        for name, array in (("factors", factors), ("profiles", profiles), ("hazards", hazards)):
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        # Untouched memory costs nothing, so even a million slots can have a whole week.
+        marginals = np.zeros((WEEK_HOURS, arrival.size))
+        near, centring = self._checked_nearness(arrival.size), centring_table(self.day_error)
+        object.__setattr__(self, "hourly_marginals", marginals)
+        object.__setattr__(self, "nearness", near)
+        object.__setattr__(self, "_centring", centring)
+        addresses = [address_of(a, np.float64) for a in (factors, profiles, hazards, marginals, centring)]
+        near_at = 0 if near is None else address_of(near, np.float64)
+        sizes = self.day_error.level, self.day_error.slope
+        record = np.array([(arrival.size, *addresses, near_at, sizes)], kernels.PROCESS)
+        object.__setattr__(self, "record", record)
+        for name, row in zip(_RATES, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
+            object.__setattr__(self, name, row)
+
+    def _checked_nearness(self, n: int) -> FloatArray | None:
+        if self.nearness is None:
+            if self.day_error.slope > 0.0:
+                raise InputError("OccupancyProcess.nearness: got None, wanted numbers: its days have a slope")
+            return None
+        near = _numbers("nearness", self.nearness, n)
+        if not np.all(np.abs(near) <= 1.0):
+            raise InputError("OccupancyProcess.nearness: wanted numbers from -1 to 1")
+        near.flags.writeable = False
+        return near
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyProcess":
+        return self  # immutable: copies share it
+
+    @classmethod
+    def from_demand(cls, attraction: ArrayLike, demand: ArrayLike, mean_stay_s: float = 2 * HOUR_S) -> Self:
+        """Return a process whose equilibrium occupancy has the logit `attraction[s] + demand[h]`.
+
+        Args:
+            attraction: (n,) float64, logit, popularity of each slot.
+            demand: (168,) float64, logit, by hour of the week.
+            mean_stay_s: s, mean parking duration, the same for all slots and hours.
+        """
+        if not 0 < mean_stay_s < math.inf:
+            raise InputError(f"mean_stay_s: got {mean_stay_s}, wanted seconds > 0")
+        attraction, demand = np.asarray(attraction, float), np.asarray(demand, float)
+        for name, logits in (("attraction", attraction), ("demand", demand)):
+            # Beyond this, the exponential exceeds the floating-point range.
+            if not np.all(np.abs(logits) <= 300):
+                raise InputError(f"{name}: wanted finite logits between -300 and 300")
+        return cls(
+            np.exp(attraction),
+            np.exp(demand) / mean_stay_s,
+            np.ones(attraction.shape),
+            np.full(WEEK_HOURS, 1 / mean_stay_s),
+        )
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Self:
+        """Read a file written by `to_file`; InputError names the file and the problem."""
+        # A file of rates alone has no day error.
+        content = {"day_error": {}, "nearness": None, **_FORMAT.read(path)}
+        wanted = set(_FIELDS)
+        if content.keys() != wanted:
+            odd = ", ".join(sorted(content.keys() ^ wanted))
+            raise InputError(f"{path}: missing or unknown fields: {odd}; wanted {', '.join(sorted(wanted))}")
+        sizes = content.pop("day_error")
+        try:
+            if not isinstance(sizes, dict) or not sizes.keys() <= {"level", "slope"}:
+                raise InputError(f"day_error is {sizes!r:.60}, want an object with level and slope")
+            return cls(**content, day_error=DayError(**sizes))
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
+
+    def to_file(self, path: str | os.PathLike[str]) -> None:
+        """Write as JSON, replacing an existing file atomically."""
+        content: dict[str, Any] = {name: getattr(self, name).tolist() for name in _RATES}
+        content["day_error"] = asdict(self.day_error)
+        content["nearness"] = None if self.nearness is None else self.nearness.tolist()
+        _FORMAT.write(path, content)
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots."""
+        return int(self.factors.shape[1])
+
+    @property
+    def address(self) -> int:
+        """Address of the PROCESS record, for compiled code; valid while this process lives."""
+        return address_of(self.record, kernels.PROCESS)
+
+    def take(self, slots: ArrayLike) -> "OccupancyProcess":
+        """Return a process whose slot i has the rates of this process's slot `slots[i]`; (n,) int64."""
+        chosen = np.asarray(slots, np.int64)
+        arrival, departure = self.factors[:, chosen]
+        near = None if self.nearness is None else self.nearness[chosen]
+        return replace(self, arrival_factor=arrival, departure_factor=departure, nearness=near)
+
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> "OccupancyProcess":
+        """Return this process with days that differ from its forecast.
+
+        Args:
+            day_error: by how much.
+            walk: (n,) walk from each slot to the goal, for a slope; None keeps the nearness of the slots.
+        """
+        near = self.nearness if walk is None else nearness(walk)
+        return replace(self, day_error=day_error, nearness=near)
+
+    def mapped_to_lot(self, walk_m: ArrayLike) -> "OccupancyProcess":
+        """Map the process by rank to a lot of any size: the fullest slots go nearest to the goal.
+
+        Args:
+            walk_m: (n,) float64, m, walking distance from each slot of that lot to its goal. The slot of rank r gets
+                the rates of this process's slot of rank r * n_slots // n by mean occupancy over the week.
+        """
+        walk = np.asarray(walk_m, float)
+        mean = np.mean([self.marginal(hour * HOUR_S) for hour in range(WEEK_HOURS)], axis=0)
+        slots = np.empty(walk.size, np.int64)
+        ranks = np.arange(walk.size) * self.n_slots // walk.size
+        slots[np.argsort(walk, kind="stable")] = np.argsort(-mean, kind="stable")[ranks]
+        taken = self.take(slots)
+        return taken if self.nearness is None else taken.with_day_error(self.day_error, walk)
+
+    def at_mean_occupancy(self, target: float, time: float) -> "OccupancyProcess":
+        """Scale all arrival rates by one factor such that the lot's mean marginal at `time` is `target`.
+
+        Scaling the arrival rates shifts every slot's attraction by the same logit.
+        """
+        if not 0 < target < 1:
+            raise InputError(f"target mean occupancy: got {target}, wanted a number between 0 and 1")
+
+        def scaled(shift: float) -> OccupancyProcess:
+            return replace(self, arrival_factor=self.arrival_factor * math.exp(shift))
+
+        def excess(shift: float) -> float:
+            return float(scaled(shift).marginal(time).mean()) - target
+
+        fastest = float(self.arrival_factor.max() * self.arrival_profile.max())
+        low, high = -100.0, math.log(0.99 * MAX_RATE / fastest) if fastest > 0 else 0.0
+        if not excess(low) < 0 < excess(high):
+            raise InputError(
+                f"target mean occupancy: {target} cannot be reached by scaling the arrival rates"
+            )
+        return scaled(brentq(excess, low, high, xtol=1e-10))
+
+    def marginal(self, time: float) -> FloatArray:
+        """Return P(taken) at `time` before any observation, (n,) float64."""
+        _, hour, second = hour_of_week(float(time))
+        marginals = np.empty(self.n_slots)
+        _marginals(self.address, hour, second, marginals)
+        return marginals
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """Draw a weekday and a time of day, both uniform in the window."""
+        index = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(window.weekdays))
+        return Arrival(window.weekdays[index] * DAY_S + window.draw_second(key))
+
+    def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
+        """Return the world of the episode with this key; its initial state is drawn from the marginal on its day."""
+        return ProcessWorld(self, key, arrival)
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Return the marginal at the arrival, clipped to [0.001, 0.999], and the rates of that hour."""
+        _, hour, _ = hour_of_week(float(arrival.time))
+        rates = self.factors * self.profiles[:, hour, None]
+        return Forecast(
+            np.clip(self.marginal(arrival.time), kernels.MIN_PROBABILITY, kernels.MAX_PROBABILITY),
+            rates[0] + rates[1],
+            self.day_error,
+        )
+
+
+_FIELDS = tuple(f.name for f in fields(OccupancyProcess) if f.init)
+_RATES = _FIELDS[:4]
+
+
+def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:
+    array = _numbers(name, values, size)
+    for i in np.flatnonzero(~((array >= 0) & np.isfinite(array))):
+        raise InputError(f"OccupancyProcess.{name}[{i}]: got {array[i]}, wanted a finite number >= 0")
+    return array
+
+
+def _numbers(name: str, values: Any, size: int | None = None) -> FloatArray:
+    try:
+        array = np.array(values, float)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"OccupancyProcess.{name}: {error}, wanted numbers") from error
+    if array.ndim != 1 or not array.size or array.size != (size or array.size):
+        raise InputError(
+            f"OccupancyProcess.{name}: got shape {array.shape}, wanted ({size or 'n'},), not empty"
+        )
+    return array

@@ -1,0 +1,435 @@
+"""Worlds that replay the days of a log on the slots of a lot."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import logit
+
+from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
+from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
+from parkenv.errors import InputError
+from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
+from parkenv.files.limited_reading import csv_rows
+from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
+from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
+from parkenv.world.occupancy.fit import fit_hourly_decay_rates
+from parkenv.world.occupancy.kernel import (
+    MAX_PROBABILITY,
+    MIN_PROBABILITY,
+    RECORDED_DAY,
+    kernel,
+    recorded_day_at,
+    recorded_day_level,
+    recorded_forecast,
+    recorded_index,
+)
+from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
+from parkenv.world.occupancy.process import (
+    DAY_NAMES,
+    Arrival,
+    ArrivalWindow,
+    BoolArray,
+    FloatArray,
+    Forecast,
+    IntArray,
+)
+from parkenv.world.week import DAY_S
+
+
+def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
+    """Read the mapping from the slots of a lot to the slots of a log.
+
+    Args:
+        path: CSV file with the columns `slot_id` (of the lot) and `log_slot_id`, one line per slot.
+        lot_slot_ids: ids of the lot's slots, n.
+        log: the log.
+
+    Returns:
+        (n,) int64, indices into `log.slot_ids`, in the order of `lot_slot_ids`.
+
+    Raises:
+        InputError: an invalid file; the message names file, line and value.
+    """
+    path = Path(path)
+    log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
+    lot_index = {slot_id: i for i, slot_id in enumerate(lot_slot_ids)}
+    mapping = np.full(len(lot_slot_ids), -1, np.int64)
+    rows = csv_rows(path)
+    at_slot, at_log_slot = csv_columns(path, rows, ("slot_id", "log_slot_id"), ("slot_id", "log_slot_id"))
+    for line, row in rows:
+        slot_id, log_slot_id = row[at_slot], row[at_log_slot]
+        if slot_id not in lot_index:
+            raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
+        if mapping[lot_index[slot_id]] >= 0:
+            raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
+        if log_slot_id not in log_index:
+            raise InputError(
+                f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
+            )
+        mapping[lot_index[slot_id]] = log_index[log_slot_id]
+    missing = [slot_id for slot_id, i in lot_index.items() if mapping[i] < 0]
+    if missing:
+        raise InputError(
+            f"{path}: slot_id: {len(missing)} slots of the lot have no line, the first is {missing[0]!r}"
+        )
+    return mapping
+
+
+@kernel
+def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) -> None:
+    """Write whether each slot is taken at a second of the day."""
+    day = recorded_day_at(days, 0)
+    for i in range(slots.size):
+        occupied[i] = uint8s(day.occupied)[recorded_index(day, slots[i], second)] != 0
+
+
+@kernel
+def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray) -> None:
+    """Write the first second >= `second` at which each slot is free; inf if never."""
+    day = recorded_day_at(days, 0)
+    for i in range(slots.size):
+        k, end = recorded_index(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
+        free_from[i] = second
+        while k < end and uint8s(day.occupied)[k] != 0:
+            k += 1
+            free_from[i] = float64s(day.from_s)[k] if k < end else np.inf
+
+
+@kernel
+def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None:
+    """Write how often each slot's state has changed between its first observation and `second`."""
+    day = recorded_day_at(days, 0)
+    taken = uint8s(day.occupied)
+    for i in range(slots.size):
+        first = int64s(day.first)[int64s(day.record)[slots[i]]]
+        count[i] = 0
+        for k in range(first + 1, recorded_index(day, slots[i], second) + 1):
+            count[i] += taken[k] != taken[k - 1]
+
+
+@kernel
+def _forecast(days: int, second: float, p: FloatArray, decay_rate: FloatArray) -> None:
+    for slot in range(p.size):
+        p[slot], decay_rate[slot] = recorded_forecast(recorded_day_at(days, 0), slot, second)
+
+
+@kernel
+def _day_level(days: int, second: float) -> float:
+    return float(recorded_day_level(recorded_day_at(days, 0), second))
+
+
+class RecordedWorld:
+    """A replayed recorded day; after the end of the day its last state holds."""
+
+    def __init__(self, occupancy: RecordedOccupancy, arrival: Arrival) -> None:
+        self.arrival = arrival
+        self._occupancy = occupancy  # keeps the record's arrays alive
+        self._day = occupancy.day_records([arrival.day], forecast=False)
+        self._midnight = float(self._day["midnight"][0])
+
+    def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
+        """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
+        slots, second = self._checked(slots), self._second(time)
+        occupied = np.empty(slots.size, np.bool_)
+        _occupied(address_of(self._day, RECORDED_DAY), slots, second, occupied)
+        return occupied
+
+    def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
+        """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
+        slots, second = self._checked(slots), self._second(time)
+        free_from = np.empty(slots.size)
+        _next_free(address_of(self._day, RECORDED_DAY), slots, second, free_from)
+        return np.maximum(free_from + self._midnight, time)
+
+    def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
+        """(k,) int64, how often the state of each slot has changed since its first observation of the day."""
+        slots, second = self._checked(slots), self._second(time)
+        count = np.empty(slots.size, np.int64)
+        _changes(address_of(self._day, RECORDED_DAY), slots, second, count)
+        return count
+
+    def _checked(self, slots: ArrayLike) -> IntArray:
+        slots = np.ascontiguousarray(slots, np.int64)
+        if slots.size and not (slots.min() >= 0 and slots.max() < self._occupancy.n_slots):
+            raise IndexError("slot index out of range")
+        return slots
+
+    def _second(self, time: float) -> float:
+        """Second of the recorded day."""
+        if not self.arrival.time <= time < math.inf:
+            raise InputError(
+                f"time: got {time}, wanted finite seconds from the arrival at {self.arrival.time} on"
+            )
+        return float(time) - self._midnight
+
+
+class MappedLog(NamedTuple):
+    """The log mapped to the lot for one replayed day, independent of the time of arrival."""
+
+    log_slot: IntArray  # (n,)
+    record: IntArray  # (n,)
+    held_out: frozenset[int]  # days that the world replays; the forecast must not use them
+    known: IntArray  # (k,) days that it is made from
+    replayed: IntArray  # (n,) day that each slot replays
+
+
+class DayForecast(NamedTuple):
+    """Forecast of a replayed day."""
+
+    log_odds: FloatArray  # (n, 48) of P(taken), in the middles of the half-hours
+    day_level: FloatArray  # (48,) standard deviation of the error of the lot's level, logits
+    decay_rate: FloatArray  # (24,) 1/s, by hour
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedOccupancy:
+    """A log mapped to the n slots of a lot: every episode replays a recorded day.
+
+    The lot's slots, nearest to the goal first, get the log's m slots, fullest first (mean occupancy on the
+    days of the arrival's class, weekday or weekend): rank r gets log rank floor(r·m/n). If the lot is larger,
+    several lot slots share a log slot: the k-th copy replays the k-th next recorded day of the class on which the log
+    slot was observed, so no two slots share a record. After the last day follows the first one with `others`, else the
+    day before the arrival's, and so back. If it is smaller, the ranks are thinned evenly.
+
+    The days that a world replays are not used to map or forecast it; nor, unless with `others`, is any later day.
+
+    Args:
+        log: the recorded observations.
+        walk_m: (n,) float64, m, walking distance from each slot to the goal.
+        mapping: (n,) int64, log slot of each lot slot, instead of this rule (see `read_mapping`).
+        replay_from: first day that is replayed; all days by default.
+        forecast_from: the days of the arrival's class that the forecast and the ranks are made from: `others`, all
+            that the world does not replay; `rolling`, those before the earliest that the world replays; `past`, those
+            before `replay_from`. The last two need a `replay_from`.
+    """
+
+    log: OccupancyLog
+    walk_m: FloatArray
+    mapping: IntArray | None = None
+    replay_from: date | None = None
+    forecast_from: ForecastFrom = "others"
+    _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
+    _forecasts: dict[int, DayForecast] = field(init=False, repr=False, default_factory=dict)
+    _fitted: dict[tuple[int, ...], FittedSlotDays] = field(init=False, repr=False, default_factory=dict)
+
+    def __post_init__(self) -> None:
+        walk = np.array(self.walk_m, float)
+        if walk.ndim != 1 or not walk.size or not np.all((walk >= 0) & np.isfinite(walk)):
+            raise InputError(f"walk_m: got shape {walk.shape}, wanted (n,) finite metres >= 0")
+        object.__setattr__(self, "walk_m", walk)
+        if self.mapping is not None:
+            mapping = np.array(self.mapping, np.int64)
+            m = len(self.log.slot_ids)
+            if mapping.shape != walk.shape or mapping.min() < 0 or mapping.max() >= m:
+                raise InputError(f"mapping: wanted ({walk.size},) indices of log slots from 0 to {m - 1}")
+            object.__setattr__(self, "mapping", mapping)
+        if self.forecast_from not in FORECAST_FROM:
+            raise InputError(
+                f"forecast_from: got {self.forecast_from!r}, wanted one of {', '.join(FORECAST_FROM)}"
+            )
+        if self.replay_from is None and self.forecast_from != "others":
+            raise InputError(f"forecast_from is {self.forecast_from!r}, want replay_from with it")
+
+    @property
+    def n_slots(self) -> int:
+        """Number of slots of the lot."""
+        return int(self.walk_m.size)
+
+    def with_fixed_slots(self, window: ArrivalWindow) -> RecordedOccupancy:
+        """Return the same days with the log's slots at the same slots of the lot on every day.
+
+        The ranks are those over all days of the class of the window's first day: before `replay_from`, or all with
+        `others`. A mapping is kept.
+        """
+        if self.mapping is not None:
+            return self
+        log, day = self.log, self.days_in(window)[0]
+        same_class = np.flatnonzero(log.weekend == log.weekend[log.days.index(day)])
+        known = same_class if self.forecast_from == "others" else same_class[same_class < self._first]
+        return dataclasses.replace(self, mapping=self._assign(day, known))
+
+    @property
+    def _first(self) -> int:
+        """Index of the first day that can be replayed."""
+        first = "" if self.replay_from is None else self.replay_from.isoformat()
+        return int(np.searchsorted(self.log.days, first))
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """Draw a day to replay among those on the window's weekdays, and a time of day, both uniform."""
+        days = self.days_in(window)
+        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
+        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
+
+    def days_in(self, window: ArrivalWindow) -> list[str]:
+        """Return the days to replay on the window's weekdays; InputError if there are none."""
+        days = [day for day in self.log.days[self._first :] if weekday_of(day) in window.weekdays]
+        if not days:
+            names = ",".join(DAY_NAMES[weekday] for weekday in window.weekdays)
+            since = "" if self.replay_from is None else f" from {self.replay_from} on"
+            raise InputError(f"{self.log.source}: no recorded day{since} is one of {names}")
+        return days
+
+    def world(self, key: np.uint64, arrival: Arrival) -> RecordedWorld:  # noqa: ARG002 - the day decides all
+        """Return the replay of the arrival's day."""
+        self._second(arrival)
+        return RecordedWorld(self, arrival)
+
+    def forecast(self, arrival: Arrival) -> Forecast:
+        """Forecast the occupancy at the arrival by `parkenv.forecast.slot_days`, clipped to [0.001, 0.999].
+
+        The decay rates are those of the hour, fitted to all observations on the days that the forecast is made from.
+        The day error is that of the lot as a whole: where several days are replayed at once, their errors partly
+        cancel.
+        """
+        second = self._second(arrival)
+        day = self.day_records([arrival.day])
+        p, decay_rate = np.empty(self.n_slots), np.empty(self.n_slots)
+        address = address_of(day, RECORDED_DAY)
+        _forecast(address, second, p, decay_rate)
+        return Forecast(p, decay_rate, DayError(_day_level(address, second)))
+
+    def day_records(self, days: Sequence[str], forecast: bool = True) -> NDArray[np.void]:
+        """Return recorded days for compiled code, (k,) of the dtype RECORDED_DAY; valid while this object lives."""
+        log = self.log
+        records = np.zeros(len(days), RECORDED_DAY)
+        for record, day in zip(records, days, strict=True):
+            record["midnight"] = weekday_of(day) * DAY_S
+            record["record"] = address_of(self.mapped_log(day).record, np.int64)
+            record["first"], record["from_s"] = (
+                address_of(log.first, np.int64),
+                address_of(log.from_s, np.float64),
+            )
+            record["occupied"] = address_of(log.occupied, np.bool_)
+            if forecast:
+                for name, values in self.day_forecast(day)._asdict().items():
+                    record[name] = address_of(values, np.float64)
+        return records
+
+    def _second(self, arrival: Arrival) -> float:
+        if arrival.day not in self.log.days[self._first :]:
+            raise InputError(f"Arrival.day: got {arrival.day!r}, wanted a recorded day of {self.log.source}")
+        second = arrival.time - weekday_of(arrival.day) * DAY_S
+        if not 0 <= second < DAY_S:
+            raise InputError(f"Arrival.time: got {arrival.time}, wanted a second of {arrival.day}")
+        return second
+
+    def mapped_log(self, day: str) -> MappedLog:
+        """Return the log mapped to the lot for the replay of `day`, a day of the log."""
+        index = self.log.days.index(day)
+        if index not in self._mapped_logs:
+            self._mapped_logs[index] = self._map_log(index)
+        return self._mapped_logs[index]
+
+    def _map_log(self, day: int) -> MappedLog:
+        log = self.log
+        same_class = np.flatnonzero(log.weekend == log.weekend[day])
+        later, earlier = same_class[same_class >= max(day, self._first)], same_class[same_class < day]
+        earlier = earlier[earlier >= self._first]
+        replay_order = np.append(later, earlier if self.forecast_from == "others" else earlier[::-1])
+        held_out = {day}
+        while True:
+            known = self._known(same_class, held_out)
+            log_slot = self._assign(log.days[day], known) if self.mapping is None else self.mapping
+            days = self._replay_days(log_slot, replay_order)
+            # Replayed days must not affect the ranks: rank again without them.
+            if held_out.issuperset(days):
+                break
+            held_out.update(days)
+        return MappedLog(
+            log_slot,
+            days * len(log.slot_ids) + log_slot,
+            frozenset(held_out),
+            known,
+            days,
+        )
+
+    def day_forecast(self, day: str) -> DayForecast:
+        """Return the forecast of the lot for the replay of `day`, a day of the log."""
+        index = self.log.days.index(day)
+        if index not in self._forecasts:
+            self._forecasts[index] = self._forecast_day(index, self.mapped_log(day))
+        return self._forecasts[index]
+
+    def _known(self, same_class: IntArray, held_out: set[int]) -> IntArray:
+        """Return the days of the class that the forecast and the ranks are made from."""
+        log = self.log
+        if self.forecast_from == "others":
+            known, left = np.setdiff1d(same_class, list(held_out)), "one more"
+        else:
+            end = self._first if self.forecast_from == "past" else min(held_out)
+            known, left = same_class[same_class < end], f"one before {log.days[end]}"
+        if not known.size:
+            raise InputError(
+                f"{log.source}: a world of {self.n_slots} slots replays {len(held_out)} of {same_class.size} recorded"
+                f" {day_class(log.days[same_class[0]])} days, wanted at least {left} to forecast from"
+            )
+        return known
+
+    def _forecast_day(self, day: int, mapped: MappedLog) -> DayForecast:
+        log, known = self.log, mapped.known
+        rates = self._decay_rates(known)
+        days_away = np.abs(log.dates(known).number - log.dates([day]).number)
+        nearest = np.sort(known[np.argsort(days_away, kind="stable")[:MAX_DAYS]])
+        key = tuple(nearest.tolist())
+        if key not in self._fitted:
+            self._fitted[key] = fit_slot_days(log.slot_days(nearest))
+        replayed, which = np.unique(mapped.replayed, return_inverse=True)
+        found = self._fitted[key].forecast(log.dates(replayed))
+        share = np.bincount(which) / which.size
+        level = np.sqrt(np.einsum("j,pjk,k->p", share, found.level_covariance, share))
+        p = np.clip(found.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
+        return DayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
+
+    def _decay_rates(self, known: IntArray) -> FloatArray:
+        pairs = self.log.intervals(self.log.max_gap_s)
+        used = np.isin(pairs.day, known)
+        if not used.any():
+            raise InputError(
+                f"{self.log.source}: no two consecutive observations on the days that are left to forecast from"
+            )
+        return fit_hourly_decay_rates(
+            pairs.start[used], pairs.end[used], pairs.before[used], pairs.after[used]
+        )
+
+    def _assign(self, day: str, known: IntArray) -> IntArray:
+        """Return the log slot of each lot slot by rank, (n,)."""
+        n, m = self.n_slots, len(self.log.slot_ids)
+        mean = self.log.mean_occupancy(day_class(day), days=np.isin(np.arange(len(self.log.days)), known))
+        unknown = np.isnan(mean)
+        mean[unknown] = 0.0 if unknown.all() else mean[~unknown].mean()
+        log_slot = np.empty(n, np.int64)
+        log_slot[np.argsort(self.walk_m, kind="stable")] = np.argsort(-mean, kind="stable")[
+            np.arange(n) * m // n
+        ]
+        return log_slot
+
+    def _replay_days(self, log_slot: IntArray, replay_order: IntArray) -> IntArray:
+        """Return each lot slot's replay day, (n,): copies of a log slot, nearest first, in the days' order."""
+        recorded = self.log.recorded[:, replay_order]
+        since = "" if self.replay_from is None else f" from {self.replay_from} on"
+        days = np.empty(self.n_slots, np.int64)
+        left = {int(s): iter(replay_order[recorded[s]]) for s in np.unique(log_slot)}
+        for slot in np.argsort(self.walk_m, kind="stable"):
+            chosen = next(left[int(log_slot[slot])], None)
+            if chosen is None:
+                name = self.log.slot_ids[log_slot[slot]]
+                n_copies, n_days = (
+                    int((log_slot == log_slot[slot]).sum()),
+                    int(recorded[log_slot[slot]].sum()),
+                )
+                raise InputError(
+                    f"{self.log.source}: slot {name} would serve {n_copies} slots of the lot but was recorded"
+                    f" on {n_days} days of the class{since}; wanted a smaller lot or a longer log"
+                )
+            days[slot] = chosen
+        return days
