@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
@@ -18,9 +19,6 @@ from planners.belief.planning_graph import VIEW, PlanningGraph
 from planners.road_table import RoadTable
 from planners.thesis.label_setting import StoppingGraph, set_labels
 from planners.thesis.mdp import ParkingMDP
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MOST_VERTICES = 2000
 """Default maximum number of vertices of a subgraph. The table of drives grows with its square and takes 40 MB."""

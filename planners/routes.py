@@ -8,14 +8,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
 from planners.thesis.label_setting import edges_in
-
-FloatArray = NDArray[np.float64]
 
 _KEPT_TARGETS = 64
 _NONE = -1

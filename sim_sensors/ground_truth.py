@@ -9,12 +9,12 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.models import Drawable, Frame, PinholeCamera, checked_pose
 from sim_sensors.camera.projection import project
 from sim_sensors.camera.rasterizer import edge_slope, sorted_by_row
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 END_LIMIT = math.radians(30.0)

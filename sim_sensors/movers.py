@@ -8,13 +8,11 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Mesh
 from sim_sensors.scenery import GAITS, pedestrian_mesh
 from sim_sensors.surroundings import floats
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LOOKS = 12  # number of different pedestrians
 

@@ -10,13 +10,12 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.models import Drawable, Frame, PinholeCamera, StereoCamera, StereoFrame, camera_pose
 from sim_sensors.camera.weather import Weather
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
-
-FloatArray = NDArray[np.float64]
 
 RIGHT, LEFT = -math.pi / 2, math.pi / 2
 EYE_M = 1.3  # m, height of the rigs' cameras

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.mesh import Ground, Instances, Mesh, MeshPool
@@ -19,9 +20,6 @@ from sim_sensors.movers import LOOKS, Movers, people_meshes
 from sim_sensors.scenery import GAITS, pedestrian_footprint
 from sim_sensors.surroundings import Surroundings, floats
 from sim_sensors.vehicles.vehicle import COARSE, DETAILED, FOOTPRINT_CORNERS, VehicleModel
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NO_VEHICLE = -1
 

@@ -7,13 +7,12 @@ from enum import IntEnum
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material, Mesh
-
-FloatArray = NDArray[np.float64]
 
 TRUNK_M = 0.16  # radius of a tree's trunk at knee height, for a tree of 7 m
 LAMP_POST_M = 0.08  # radius of a lamp post at knee height

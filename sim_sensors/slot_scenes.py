@@ -7,15 +7,13 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.errors import SensorError
 from sim_sensors.scene import NO_VEHICLE, Fleet, Scene
 from sim_sensors.surroundings import Surroundings, floats
 from sim_sensors.vehicles.vehicle import VehicleModel
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LINE_M = 0.10  # width of painted slot lines
 LIBRARY_MODELS = 100  # number of vehicle models from which cars are drawn

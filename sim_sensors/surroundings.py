@@ -8,13 +8,12 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from sim_sensors import scenery
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Ground, Mesh
-
-FloatArray = NDArray[np.float64]
 
 TREE_KINDS = 8
 LOW_WALL_M = 0.5  # the laser passes over lower walls

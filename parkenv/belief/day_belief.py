@@ -16,11 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief, decay_to_prior
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.world.occupancy.day_error import DayError, centred_logits
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NEGLIGIBLE = 5e-4
 """Hypotheses with less weight are left out of a plan; they return if observations speak for them."""

@@ -10,13 +10,10 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.occupancy.decay import decay_factor
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
-
 
 _SURE = np.zeros(2)
 _SURE.flags.writeable = False

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-
-FloatArray = NDArray[np.float64]
 
 
 @compiled(error_model="numpy")

@@ -9,13 +9,11 @@ from typing import Any, Self
 
 import numpy as np
 import pymunk
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters
 from parkenv.errors import InputError
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 class ObstacleKind(IntEnum):

@@ -6,12 +6,10 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.drive_graph import SLOT_REACH, linestrings
 from parkenv.world.lot import ParkingLot, mouth_heading
-
-FloatArray = NDArray[np.float64]
 
 ROAD_HALF_WIDTH = 3.0  # from the centre line of a lane without slots to its kerbs, m
 HALF_WIDTHS = (2.0, 4.0)

@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import ParkingTask
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass

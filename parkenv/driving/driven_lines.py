@@ -8,13 +8,11 @@ from functools import cached_property
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.drive_graph import LANE_OFFSET, NODE_TOLERANCE
 from parkenv.world.lot import ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 KEPT_RIGHT_M = 1.0
 """Offset of a car from the centre of a two-way lane, m: less than that of the graph's vertices, for right turns."""

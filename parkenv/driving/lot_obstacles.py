@@ -7,16 +7,14 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import ObstacleKind, Obstacles
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.world.lot import Mouth
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
-
-FloatArray = NDArray[np.float64]
 
 REACH_M = 25.0  # distance, m along both axes, from the car beyond which obstacles are left out
 OVERHANG_M = 0.25  # distance, m, by which parked cars may protrude from their slots at the mouth

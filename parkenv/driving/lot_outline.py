@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.lot import ParkingLot, is_building
 
-FloatArray = NDArray[np.float64]
 Rings = tuple[FloatArray, ...]  # A polygon, m: its outer ring, (k, 2) closed, and its holes
 
 APRON = 0.25  # width of the asphalt beyond the kerbs, m

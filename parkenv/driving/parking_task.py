@@ -9,8 +9,9 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.drivable_area import DrivableArea
 from parkenv.driving.vehicle import STATE_SIZE, VehicleParameters, move_along, placed
@@ -19,8 +20,6 @@ from parkenv.world.drive_graph import LANE_OFFSET, linestrings
 from parkenv.world.lot import Mouth, ParkingLot
 from sim_sensors.slot_scenes import ParkingManners, SlotLot
 from sim_sensors.surroundings import Surroundings
-
-FloatArray = NDArray[np.float64]
 
 KINDS = ("perpendicular", "oblique", "parallel")  # orientation of a slot relative to its lane
 WAYS = ("nose-in", "back-in")

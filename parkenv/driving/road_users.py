@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.encounters import MOVES, encounter_times, to_car_frame
 from parkenv.driving.vehicle import VehicleParameters, placed
 from parkenv.driving.yielding_traffic import YieldingTraffic
@@ -14,7 +15,6 @@ from parkenv.driving.yielding_traffic import YieldingTraffic
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
-FloatArray = NDArray[np.float64]
 
 CLEAR_RADIUS_M = 12.0  # radius, m, around the car's centre within which hidden road users do not return
 

@@ -8,12 +8,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 PHYSICS_S = 0.05  # physics time step, s
 X, Y, YAW, SPEED, STEERING, ACCELERATION = range(6)

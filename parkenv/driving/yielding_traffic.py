@@ -8,6 +8,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.vehicle import placed
 from parkenv.world.lot import ParkingLot
@@ -18,7 +19,6 @@ from sim_sensors.slot_scenes import SlotLot
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
-FloatArray = NDArray[np.float64]
 
 LOOK_AHEAD_S = (0.1, 0.6, 1.2)
 """Times ahead, s, at which road users check their own positions for conflicts with the car."""

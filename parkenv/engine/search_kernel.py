@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
     ARRIVAL_STREAM,
     ENTRY_STREAM,
@@ -48,7 +49,6 @@ from parkenv.engine.shared_slots import is_slot_open
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy import kernel as worlds
 from parkenv.world.occupancy.kernel import inlined, kernel
-from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
 from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
 REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")

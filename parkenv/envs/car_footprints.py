@@ -12,12 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled import numpy_streams
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.laser.footprints import FAR, LANES, Cells, ScanPlane
 from sim_sensors.slot_scenes import NOSE_GAP_M, SlotLot
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 plain = compiled(error_model="numpy", _nrt=False)
 

@@ -13,6 +13,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
 from parkenv.driving.drive_state import DriveState
@@ -37,7 +38,6 @@ from sim_sensors.laser.scanner import LaserScanner
 if TYPE_CHECKING:
     from parkenv.show.drive_rendering import DriveRenderer
 
-FloatArray = NDArray[np.float64]
 
 SUBSTEPS = 2  # physics steps per action
 CONTROL_S = SUBSTEPS * PHYSICS_S  # control period, s

@@ -7,9 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-
-FloatArray = NDArray[np.float64]
 
 POSITION_TOLERANCE = 0.25  # largest distance, m, of a parked car's centre from the goal
 ANGLE_TOLERANCE = math.radians(5.0)  # largest angle, rad, between a parked car's yaw and the goal's

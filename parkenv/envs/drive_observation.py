@@ -9,14 +9,13 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.parking_task import REACH, ParkingTask
 from parkenv.driving.vehicle import VehicleParameters
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
-
-FloatArray = NDArray[np.float64]
 
 FAR = 1000.0  # coordinate, m, slot frame, that fills unused rows of the obstacle map
 MOST_CARS, MOST_LINES = 160, 320  # rows of the obstacle map

@@ -6,10 +6,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.lot_outline import LotOutline
 from parkenv.envs.fleet import CarPoses, Fleet
 from parkenv.show import drawing
-from parkenv.show.drawing import Color, FloatArray, Image
+from parkenv.show.drawing import Color
 from parkenv.show.rendering import (
     CAR,
     CAR_BODY,

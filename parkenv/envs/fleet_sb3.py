@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices
 
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import uint8s
 from parkenv.engine.fleet_kernel import act_at, advance_at, release_at
 from parkenv.engine.fleet_records import CAR, SEARCHING, TRUNCATED, car_at, fleet_at
@@ -26,7 +27,6 @@ from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import Demand
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import kernel
-from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
 
 LEARNERS = 0
 """The kind of drivers that learn."""

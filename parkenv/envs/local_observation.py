@@ -44,6 +44,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import float64s, in_one_block, int32s, int64s
 from parkenv.engine.search_kernel import add_column, decay_belief, forecast_of
@@ -64,8 +65,6 @@ from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
 from parkenv.world.occupancy.kernel import inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import SearchProblem
-
-FloatArray = NDArray[np.float64]
 
 MINUTE = 60.0
 MANY_SLOTS = 20.0

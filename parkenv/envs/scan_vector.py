@@ -14,6 +14,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 
 from parkenv.compiled import numpy_streams
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import address_of
 from parkenv.compiled.threads import in_threads
@@ -32,10 +33,6 @@ from parkenv.world.occupancy.kernel import CURSOR, cursor_at, kernel, process_at
 from sim_sensors.laser.kernel import BEAMS_PER_DRAW, scan_all
 from sim_sensors.laser.scanner import NOISE_TABLE_SIZE, LaserScanner, noise_table
 from sim_sensors.rig import SensorRig
-
-BoolArray = NDArray[np.bool_]
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 _WIDEST_CAR_M = 6.0
 _SENSOR_WORDS = 2  # the rig's word for lasers in the seed of their noise

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from parkenv.compiled.arrays import IntArray
 from parkenv.compiled.memory import int32s, int64s, prefetch
 from parkenv.engine.search_records import (
     EDGE,
@@ -22,7 +23,6 @@ from parkenv.engine.search_records import (
 )
 from parkenv.envs.local_observation import Surroundings
 from parkenv.world.occupancy.kernel import inlined, prefetch_forecast
-from parkenv.world.occupancy.process import IntArray
 
 _APART = 2  # searches between two stages
 _LINE = 64  # bytes of a cache line

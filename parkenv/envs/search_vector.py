@@ -12,6 +12,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, create_empty_array
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import seed_state
 from parkenv.compiled.memory import uint8s
 from parkenv.engine.search_kernel import (
@@ -32,7 +33,6 @@ from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.kernel import kernel
-from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
 
 OBSERVATIONS = ("full", "occupancy", "local")
 MAX_ENVS = 1_000_000

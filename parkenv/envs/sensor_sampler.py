@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.engine.search_state import SearchState
 from parkenv.errors import InputError
@@ -21,7 +22,6 @@ from sim_sensors.rig import RIG_NAMES, SensorRig
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
-FloatArray = NDArray[np.float64]
 
 PICTURE_WIDTH = 400
 """px; width of the pictures of a searching car's cameras. Those of a survey are 640 px wide."""

@@ -9,13 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_bytes
-
-Image = NDArray[np.uint8]
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".pgm", ".ppm", ".bmp", ".tif", ".tiff", ".webp")
 _FORMATS = ("PNG", "JPEG", "PPM", "BMP", "TIFF", "WEBP")

@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.files.images import decode_image
 from parkenv.files.videos import USUAL_FPS, VideoFrame
 
-Image = NDArray[np.uint8]
 Messages = Callable[[set[str]], Iterator[tuple[str, int, Any]]]
 
 SUFFIXES = (".mcap", ".db3", ".bag")

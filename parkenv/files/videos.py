@@ -12,14 +12,12 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.images import MAX_PIXELS
 from parkenv.files.limited_reading import open_limited
-
-Image = NDArray[np.uint8]
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".avi", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg")
 # FFmpeg reads it when it is first used; else it would write of damaged files to standard error.

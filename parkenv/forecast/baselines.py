@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import logit
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast.calibration import calibrated
-from parkenv.forecast.counts import HOURS, Counts, FloatArray
+from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import DIAGONAL, DayForecast, logits
 
 _WEEK = 7

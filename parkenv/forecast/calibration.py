@@ -15,7 +15,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import expit
 
-from parkenv.forecast.counts import HOURS, BoolArray, Counts, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import INTERVAL, DayForecast, draw_days
 
 MIN_HOURS = 12

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast import baselines
-from parkenv.forecast.counts import Counts, FloatArray
+from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_curves import CurveSettings, forecast_days
 from parkenv.forecast.day_forecast import DayForecast
 from parkenv.forecast.scores import Scores

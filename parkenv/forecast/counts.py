@@ -31,11 +31,9 @@ from zoneinfo import ZoneInfo
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, nearest
 from parkenv.files.limited_reading import csv_rows
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 HOURS = 24
 MAX_COUNT_BYTES = 512_000_000

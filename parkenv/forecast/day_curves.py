@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit, gammaln
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.forecast.calibration import calibrated
-from parkenv.forecast.counts import HOURS, BoolArray, Counts, FloatArray
+from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import DIAGONAL, FREEDOM, DayForecast, logits
 from parkenv.forecast.scores import log_losses
 from parkenv.forecast.special_days import SpecialDays

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from scipy.special import expit, ndtri
 from scipy.stats import chi2, qmc, t
 
-from parkenv.forecast.counts import HOURS, Counts, FloatArray
+from parkenv.compiled.arrays import FloatArray
+from parkenv.forecast.counts import HOURS, Counts
 
 FREEDOM = 6.0
 """Degrees of freedom of the t distributions: days that nothing announces are far off more often than normal ones."""

@@ -21,9 +21,8 @@ from functools import reduce
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 HOURS = 24
 N_HOUR_KNOTS = 2 * HOURS

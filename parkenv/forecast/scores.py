@@ -13,8 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.forecast.calibration import MIN_HOURS, day_means, holds
-from parkenv.forecast.counts import BoolArray, Counts, FloatArray
+from parkenv.forecast.counts import Counts
 from parkenv.forecast.day_forecast import INTERVAL, DayForecast, draw_days, quantiles_of_t
 
 BANDS = (0.0, 0.2, 0.5, 0.8, 0.95, 1.0)

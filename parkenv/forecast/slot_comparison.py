@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import expit, logit
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.forecast.day_forecast import INTERVAL
 from parkenv.forecast.scores import (
     Band,
@@ -18,7 +19,7 @@ from parkenv.forecast.scores import (
     ratio_of_sums,
     reliability,
 )
-from parkenv.forecast.slot_days import Days, FloatArray, IntArray, SlotDays, fit_slot_days
+from parkenv.forecast.slot_days import Days, SlotDays, fit_slot_days
 
 OURS = "slot-days"
 _DRAWS = 400

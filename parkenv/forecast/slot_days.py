@@ -25,12 +25,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import minimize
 from scipy.special import expit
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from parkenv.compiled.arrays import FloatArray, IntArray
 
 MAX_DAYS = 60
 """Days to fit a forecast to, those nearest in time: others say little more."""

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from parkenv.forecast.counts import Counts, FloatArray
+from parkenv.compiled.arrays import FloatArray
+from parkenv.forecast.counts import Counts
 
 LEVEL_SHARES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 """Shares of all car parks whose levels are reported."""

@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
 from parkenv.lots.geojson import write_lot
 from parkenv.world.lot import Lane, ParkingLot, corner_points
-
-FloatArray = NDArray[np.float64]
 
 PITCH = BAY_SIZE[1]
 AISLE = 6.0

@@ -11,12 +11,10 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError
 from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
 from parkenv.world.lot import Lane, Mouth, ParkingLot
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 BAY_SIZE = (5.0, 2.5)  # length and width, m, of a perpendicular or angled slot
 KERB_SIZE = (6.0, 2.1)  # length and width, m, of a kerbside slot

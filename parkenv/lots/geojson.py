@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.file_names import is_plain
@@ -35,8 +35,6 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_contents import KINDS, LotContents
 from parkenv.lots.provenance import Provenance
 from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, is_building
-
-FloatArray = NDArray[np.float64]
 
 LOT_VERSION = 1
 

@@ -10,14 +10,13 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.lots.generators import Slots
 from parkenv.lots.lot_contents import LotContents
 from parkenv.lots.slot_polygons import slots_from_polygons
 from parkenv.world.lot import FARTHEST, SLOT_SIDE, Mouth, corner_points
-
-FloatArray = NDArray[np.float64]
 
 SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}

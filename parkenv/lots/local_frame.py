@@ -7,14 +7,13 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from pyproj import Proj
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,13 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import Slots, bay_row
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.lot import Lane, mouth_points
-
-FloatArray = NDArray[np.float64]
 
 KINDS = {
     "slot": ("Polygon",),

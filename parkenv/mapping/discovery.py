@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import FARTHEST, ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 _TURN_M = 3.0  # m, distance equivalent to a quarter turn when cars are compared
 _WIDTH = 0.7  # standard deviation of the density kernel, as a fraction of the reach

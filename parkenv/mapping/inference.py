@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import beta
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast
 from parkenv.world.week import DAY_S, HOUR_S
-
-FloatArray = NDArray[np.float64]
 
 SLOT_WEIGHT, LOT_WEIGHT = 4.0, 6.0
 """Prior weights, in sessions, of the slot's mean and of the lot's mean at the same hour."""

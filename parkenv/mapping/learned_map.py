@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from itertools import groupby, product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
 from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
@@ -16,8 +17,6 @@ from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError, centred_logi
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
-
-FloatArray = NDArray[np.float64]
 
 MOST_SLOTS = 3_000
 """Largest lot: memory and time grow with the square of the slots."""

@@ -5,16 +5,13 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
-import numpy as np
-from numpy.typing import NDArray
-
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.scan_matching import ScanMatcher
 from parkenv.perception.range_scan import RangeScan
 from parkenv.world.lot import ParkingLot
 
-FloatArray = NDArray[np.float64]
 Located = FloatArray | Callable[[Sequence[RangeScan]], FloatArray]
 """A pose, or what `PerceptionPipeline.process` asks for it."""
 

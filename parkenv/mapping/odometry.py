@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 DRIFT_M = 100.0
 """Distance straight ahead, m, after which the error of drifting odometry is stated."""

@@ -22,6 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.limited_reading import parse_json
@@ -48,9 +49,6 @@ from sim_sensors.camera.models import Frame, StereoFrame
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 PAIR_S = 0.1
 """Longest time between a picture and what other sensors measured with it, s."""

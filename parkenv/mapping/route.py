@@ -9,10 +9,9 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 _MILLIMETRES = 1000.0
 

@@ -25,13 +25,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.mapping.odometry import between, moved
 from parkenv.perception.range_scan import RangeScan
 from parkenv.world.lot import Mouth, ParkingLot
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 REACH = 25.0  # m, farthest points used
 LEAST_POINTS = 20  # of a scan that is matched

@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.trips import Trip
 from parkenv.world.lot import FARTHEST, ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 APPLICATION_ID = 0x7061726B  # "park"
 VERSION = 2

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.files.known_names import LOCALISERS
@@ -29,9 +30,6 @@ from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, poses_along
 from sim_sensors.scene import Scene
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 _SEEDS = 1 << 31
 

@@ -8,15 +8,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.perception.pipeline import CameraView, PerceptionResult
 from parkenv.perception.ranging import LocatedCars
 from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Capture, SensorRig
 from sim_sensors.scene import Scene
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MATCH = 0.3  # intersection over union from which a detection matches a car
 DISTANCE_ENDS = (4.0, 6.0, 8.0, 10.0, 12.0, 15.0)

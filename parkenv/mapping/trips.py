@@ -8,11 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.occupancy.process import Forecast
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

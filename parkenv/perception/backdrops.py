@@ -12,7 +12,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Image = NDArray[np.uint8]
+from parkenv.compiled.arrays import Image
+
 Float32Array = NDArray[np.float32]
 
 _OCTAVES = (2.0, 4.0, 8.0, 16.0, 32.0)  # px

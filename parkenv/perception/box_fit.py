@@ -6,12 +6,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 CAR_LENGTH, CAR_WIDTH = 4.4, 1.8  # assumed length and width, m, of sides that are not visible
 LONG_SIDE = 2.3  # length, m, from which a side is a flank: no car is this wide

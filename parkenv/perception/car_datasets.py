@@ -7,16 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError
 from parkenv.files.archives import tar_members
 from parkenv.files.images import decode_image, images_in, natural_order, read_image
 from parkenv.files.limited_reading import read_text
 from parkenv.perception.hog_detector import as_grey
-
-Image = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 
 UIUC_SIZE = (100, 40)  # width and height, px, of UIUC's training crops and of its true boxes at scale 1
 UIUC_TESTS = {

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from parkenv.compiled.arrays import FloatArray
 
 SIDE_CAR = (0.08, 0.22, 0.92, 0.885)
 """Left, top, right, bottom of the car in a side view's region, as fractions; as in UIUC's crops."""

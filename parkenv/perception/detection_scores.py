@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
+from parkenv.compiled.arrays import FloatArray
 
 REACH = 0.25
 """Semi-axes of the ellipse around a true box, as fractions of its width and height (README of the UIUC set)."""

@@ -7,10 +7,10 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from sim_sensors.ground_truth import View
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 LEAST_PROBABILITY = 0.08

@@ -17,10 +17,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 CELL = 8  # pixels along each side of a cell

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError
 from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
 from parkenv.perception.detector import Detections, GroundBand
 from parkenv.perception.hog import CELL, Descriptor, correlate
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 LEAST_SCORED = 0.002

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError, nearest
 from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
@@ -22,8 +23,6 @@ from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.onnx_detector import CAR_NAMES
 from parkenv.perception.training import cut_out
 
-Image = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 Box = tuple[float, float, float, float]
 
 LEAST_WIDTH = 36

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.perception.car_datasets import Crops, LabelledImage
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 Box = tuple[int, int, int, int]  # left, top, right, bottom, px
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.files.onnx_file import OnnxFile, OnnxValue, read_onnx
 from parkenv.files.spec_file import Several, Spec
@@ -30,7 +31,6 @@ from parkenv.perception.onnx_outputs import (
 )
 from parkenv.perception.onnx_trial import require_runs
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 SIDECARS = (".toml", ".json")

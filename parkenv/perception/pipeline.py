@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
@@ -30,8 +31,6 @@ from parkenv.perception.slot_filter import SlotFilter, SlotObservation
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Capture, Mount, SensorRig
-
-FloatArray = NDArray[np.float64]
 
 PROBABILITY = 0.25  # least probability of a detection; a located one needs only `LEAST_PROBABILITY`
 

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.perception.backdrops import with_backdrop
 from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
@@ -18,9 +19,6 @@ from parkenv.perception.simulated_streets import LongLens, Street
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
-
-Image = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 
 _CLEAR = 0.8  # visible fraction from which a car is a positive
 _NEGLIGIBLE = 0.25  # visible fraction below which a car may be missed

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError
 from parkenv.files.archives import read_arrays
 from parkenv.perception.hog_detector import as_grey
@@ -23,8 +24,6 @@ from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import vehicle_boxes
 
-Image = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 FRAMES = 20

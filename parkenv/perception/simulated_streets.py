@@ -9,12 +9,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.scene import Fleet, Scene
 from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
-
-FloatArray = NDArray[np.float64]
 
 BODY_SHARE = {"hatchback": 0.26, "sedan": 0.34, "estate": 0.14, "suv": 0.14, "van": 0.09, "pickup": 0.03}
 """Frequency of each body type; flatter than in a European lot, as photographs come from all regions and decades."""

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.perception.range_scan import RangeScan
 from parkenv.perception.ranging import LocatedCars
 from parkenv.world.lot import Mouth, ParkingLot
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 P_FREE, P_OCCUPIED, P_PRIOR = 0.45, 0.95, 0.5  # the observation model of eq. 3.9.
 CORE = (0.8, 0.45)  # half the length and width, m, of the core of a slot, which every parked car covers

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, best_boxes
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 Progress = Callable[[str], None]
 

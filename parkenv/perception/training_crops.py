@@ -14,12 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.files.images import decode_image
 from parkenv.perception.backdrops import random_texture
 from parkenv.perception.simulated_scenes import DEPTH_STEPS, SimulatedScene
 from sim_sensors.ground_truth import View
 
-Image = NDArray[np.uint8]
 Float32Array = NDArray[np.float32]
 
 SIZES = ((320, 256), (256, 192), (480, 320))

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-FloatArray = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from parkenv.compiled.arrays import FloatArray, Image
+
 Color = tuple[int, int, int]
 
 SUBPIXEL_BITS = 4

@@ -8,8 +8,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.drive_state import DriveState
 from parkenv.driving.lot_outline import LotOutline
@@ -18,7 +18,6 @@ from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, placed
 from parkenv.show.drawing import (
     SUBPIXEL_BITS,
     Color,
-    Image,
     fill_polygon,
     fixed_point,
     mixed_color,
@@ -46,8 +45,6 @@ from parkenv.show.rendering import (
 )
 from parkenv.show.window import Window
 from parkenv.world.lot import ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 LARGEST_SCALE = 26.0  # px/m
 FREE: Color = BELIEF_ANCHORS[0]

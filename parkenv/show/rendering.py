@@ -10,11 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.compiled.jit import compiled
 from parkenv.driving.lot_outline import APRON, LotOutline
 from parkenv.engine.search_state import SearchState
 from parkenv.show import drawing
-from parkenv.show.drawing import Color, FloatArray, Image
+from parkenv.show.drawing import Color
 from parkenv.show.window import Window
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.process import DAY_NAMES

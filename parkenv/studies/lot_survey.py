@@ -16,15 +16,13 @@ import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 
+from parkenv.compiled.arrays import IntArray
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.lots.lot_contents import LotProblem
 from parkenv.lots.provenance import Doubt, combined
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.lot import Mouth, ParkingLot, corner_points, is_building, mouth_heading
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 CAR_ROOM = 1.0  # half the width, m, that a car needs on a lane: 1.8 m and the mirrors
 WIDEST = 8.0  # width of an aisle, m, from which more makes no difference

@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 from scipy.stats import poisson
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
     ENTRY_STREAM,
     GOAL_STREAM,
@@ -30,9 +31,6 @@ from parkenv.compiled.keyed_random import (
 from parkenv.errors import InputError
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MAX_CARS = 1_000_000
 """Maximum number of cars of a world."""

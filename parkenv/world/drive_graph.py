@@ -19,6 +19,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 
 LANE_OFFSET = 1.5
@@ -29,9 +30,6 @@ VERTEX_SPACING = 1.0
 """Least distance, m, between two slot vertices of one chain, so that every move takes time."""
 CROSSING_REACH = 3.0  # greatest distance, m along the lane, of a move across to a slot on the other side
 NODE_TOLERANCE = 1e-3  # lane points closer than this, m, are one node
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

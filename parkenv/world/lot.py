@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
@@ -16,7 +17,6 @@ from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-FloatArray = NDArray[np.float64]
 
 MOVES = ("up", "down", "left", "right")
 """The names of the four columns of `ParkingLot.neighbors`, in order (eq. 3.13)."""

@@ -8,16 +8,14 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.lot import Mouth, ParkingLot, is_building
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 from parkenv.world.traffic import LotTraffic
 from sim_sensors.scene import Scene
 from sim_sensors.slot_scenes import SlotLot, slot_surroundings
-
-FloatArray = NDArray[np.float64]
 
 WALL_HEIGHT = 1.8  # height, m, of walls given as open lines; closed lines are buildings
 

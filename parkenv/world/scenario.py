@@ -12,13 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.process import Arrival, ArrivalWindow, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
 from parkenv.world.traffic import Traffic
-
-FloatArray = NDArray[np.float64]
 
 KMH = 1 / 3.6  # 1 km/h in m/s
 

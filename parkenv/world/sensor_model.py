@@ -11,10 +11,9 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
-
-FloatArray = NDArray[np.float64]
 
 SENSOR_MODEL_NAMES = ("laser", "stereo")  # rigs with a packaged fitted sensor model
 _FOLDER = Path(__file__).parent / "sensor_models"

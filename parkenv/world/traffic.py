@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import ParkingLot
 
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
     from sim_sensors.movers import Movers
     from sim_sensors.slot_scenes import SlotLot
 
-FloatArray = NDArray[np.float64]
 
 CAR_SPEEDS = (2.0, 4.0)  # range of car speeds, m/s
 WALK_SPEEDS = (0.9, 1.5)  # range of walking speeds, m/s

@@ -12,24 +12,16 @@ from numpy.typing import NDArray
 
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, SlotBelief
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
-from planners.belief.planning_graph import (
-    SLOT,
-    BeliefSnapshot,
-    IntArray,
-    PathBuffers,
-    path_buffers,
-    set_slots,
-)
+from planners.belief.planning_graph import SLOT, BeliefSnapshot, PathBuffers, path_buffers, set_slots
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
-
-FloatArray = NDArray[np.float64]
 
 FAILURE_COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0)
 """s, failure costs of the thesis's planner for the initial paths of the search."""

@@ -8,13 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from planners.belief.path_evaluation import evaluate_path, expected_cost_to_slot, options_at_hand
 from planners.belief.path_rollout import is_worth_an_attempt, rollout_path
 from planners.belief.planning_graph import (
     BeliefSnapshot,
-    FloatArray,
-    IntArray,
     PathBuffer,
     PathBuffers,
     PlanningGraph,

@@ -13,12 +13,11 @@ from __future__ import annotations
 import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from planners.belief.path_rollout import p_free_when_first_observed
 from planners.belief.planning_graph import (
     BeliefSnapshot,
-    FloatArray,
-    IntArray,
     PathBuffer,
     PlanningGraph,
     copy_weights,

@@ -9,11 +9,10 @@ from __future__ import annotations
 import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from planners.belief.planning_graph import (
     BeliefSnapshot,
-    FloatArray,
-    IntArray,
     PathBuffer,
     PlanningGraph,
     copy_weights,

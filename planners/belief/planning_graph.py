@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 Records = NDArray[Any]
 """A structured array. One array of records compiles several times faster than one array per field."""
 

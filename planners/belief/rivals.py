@@ -17,13 +17,12 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
 from planners.belief.agent import BeliefAgent
 from planners.neighborhood import MOST_VERTICES, Neighborhood
-
-FloatArray = NDArray[np.float64]
 
 PASSED = 3.0
 """Mean number of free slots that a rival passes, or drives on from to the next, before it takes one."""

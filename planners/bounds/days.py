@@ -5,11 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.occupancy.day_error import DayError, centred_logits, nearness
-
-FloatArray = NDArray[np.float64]
 
 LEVELS, SLOPES = 13, 7  # numbers of levels and slopes of the grid, from -3.6 to 3.6 standard deviations
 _MOST_DEVIATIONS = 3.6

@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
@@ -35,9 +36,6 @@ from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, SearchAgent
 from planners.bounds.days import Days
 from planners.road_table import RoadTable
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 MOST_SLOTS = 25  # maximum number of slots; the key of a belief state has room for no more
 MOST_STATES = 8_000_000  # default maximum number of belief states: about 200 MB, and twice that while solving

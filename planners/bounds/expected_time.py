@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import EXACT, DayError
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Agent
-from planners.bounds.days import Days, FloatArray
+from planners.bounds.days import Days
 
 MOST_STEPS = 2000  # decisions after which a search is truncated at a cost of `give_up_s`, as in comparisons
 

@@ -6,11 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.vehicle import move_along
-
-FloatArray = NDArray[np.float64]
 
 SHORTEST_ARC = 1e-6  # arcs shorter than this, m, are ignored
 

@@ -9,11 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 CELL_M = 0.1  # cell of the distance field, m
 DISCS = 4  # number of discs in a row that cover the footprint

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from planners.driving.clearance import CELL_M, Clearance
-
-FloatArray = NDArray[np.float64]
 
 GRID_CELLS = 2  # cells of the distance field per cell of the grid
 

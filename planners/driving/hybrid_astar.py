@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters, move_along
@@ -24,9 +24,6 @@ from planners.driving.grid_distances import GRID_CELLS, grid_distances
 from planners.driving.path_shortening import shorten_path
 from planners.driving.reeds_shepp import PIECES, Words, distance_between, words_buffer
 from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 WINDOW_M = 9.0
 """Margin, m, around start and target within which the car may drive."""

@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.vehicle import VehicleParameters
 from planners.driving.car_path import CarPath
 from planners.driving.path_tracking import PathTracker, TrackingSettings
-
-FloatArray = NDArray[np.float64]
 
 _STRAIGHT = 1e-5  # rad
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
@@ -18,7 +19,6 @@ from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
-FloatArray = NDArray[np.float64]
 Observation = Mapping[str, Any]
 
 MOST_PLANS = 12

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import move_along
 from planners.driving.car_path import SHORTEST_ARC
 from planners.driving.clearance import Clearance
 from planners.driving.reeds_shepp import Words, words_buffer
 from planners.driving.reeds_shepp_shots import DriveCosts, cheapest_shot
-
-FloatArray = NDArray[np.float64]
 
 
 @compiled(error_model="numpy")

@@ -11,14 +11,12 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
 from planners.driving.car_path import CarPath
-
-FloatArray = NDArray[np.float64]
 
 SAMPLE_M = 0.05
 """Distance between samples of a path, m."""

@@ -14,12 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STEERING, YAW, VehicleParameters
 
-FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
 
 INTERFACE = "drive-1"
 """Version of the layout of observation and action; models of another version are refused."""

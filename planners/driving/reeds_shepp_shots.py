@@ -5,15 +5,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-from numpy.typing import NDArray
-
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import move_along
 from planners.driving.clearance import Clearance, is_collision_free
 from planners.driving.reeds_shepp import Words, word_cost, words_between
-
-FloatArray = NDArray[np.float64]
 
 CHECK_M = 0.15  # maximum distance, m, between checked poses
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
@@ -19,8 +20,6 @@ from planners.neighborhood import MOST_VERTICES, Neighborhood
 from planners.network.features import FAILURE_COSTS, PARKING, WAITING, Features, Situation, observe
 from planners.network.lookahead import Scratch
 from planners.network.policy import SHIPPED, NetworkPolicy
-
-FloatArray = NDArray[np.float64]
 
 CIRCLING = 0.1
 """Penalty of an action, in time scales, for each visit of its end since something new was observed."""

@@ -11,10 +11,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import push
 from parkenv.compiled.jit import compiled
 from planners.thesis import label_setting
-from planners.thesis.label_setting import FloatArray, Labels, StoppingGraph
+from planners.thesis.label_setting import Labels, StoppingGraph
 
 REACH = 0.1  # fraction of the lot's vertices that a repair may change; above it the plan is made from scratch
 _LEAST_REACH = 64

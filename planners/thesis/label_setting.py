@@ -31,13 +31,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
 from parkenv.world.lot import PARK
 from planners.thesis.mdp import ParkingMDP
 from planners.thesis.policy_iteration import Solution, policy_iteration
-
-FloatArray = NDArray[np.float64]
 
 STOP = PARK  # the move of a vertex at which to stay: to park, or because nothing is reachable
 TIE_S = 1e-7  # s: actions whose values differ by less are equally good; solvers agree to well within it

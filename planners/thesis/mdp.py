@@ -8,12 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, MOVES, PARK
 from parkenv.world.scenario import SearchProblem
-
-FloatArray = NDArray[np.float64]
-
 
 USUAL_DISCOUNT = 0.9999
 """The thesis's discount per decision."""

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from planners.thesis.mdp import ParkingMDP
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

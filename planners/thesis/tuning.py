@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
 from parkenv.errors import InputError
@@ -27,8 +28,6 @@ from planners.belief.planning_graph import PlanningGraph
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 from planners.thesis.replanning import Plan, ReplanningAgent
-
-FloatArray = NDArray[np.float64]
 
 COSTS = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0, 64.0, 128.0)
 """s, failure costs to choose from; each is twice the previous one."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from planners.thesis.mdp import ParkingMDP
 from planners.thesis.policy_iteration import Solution
-
-FloatArray = NDArray[np.float64]
 
 
 def value_iteration(mdp: ParkingMDP, *, tolerance: float = 1e-9, max_iterations: int = 2_000_000) -> Solution:

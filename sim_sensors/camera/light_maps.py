@@ -8,11 +8,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import VECTOR_LEAF, Single, mix, mix_quad
 from sim_sensors.mesh import MeshPool
 
-FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
 
 

@@ -15,12 +15,12 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF
 from sim_sensors.mesh import Instances, Material, MeshPool
 
 Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 NEAR = 0.05  # m; nothing nearer is drawn

@@ -14,13 +14,13 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.textures import FAST, LEAF
 from sim_sensors.mesh import Material
 
 Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 FAR = 1000.0  # m, the ground ends there

@@ -10,6 +10,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import (
     BATCH_FIELDS,
@@ -46,7 +47,6 @@ from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single, Tile, cloud_t
 from sim_sensors.camera.weather import Weather
 
 Float32Array = NDArray[np.float32]
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int32]
 
 _BATCH = 512  # pixels of a kind that are collected before they are shaded; their data stay in the first-level cache

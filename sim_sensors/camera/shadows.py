@@ -18,15 +18,14 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
 from sim_sensors.camera.textures import quads
 from sim_sensors.camera.weather import Weather
 from sim_sensors.mesh import Instances, Material, MeshPool
 
-FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
-Image = NDArray[np.uint8]
 IntArray = NDArray[np.int32]
 
 _WINDOW = 72.0  # m, side of the square that the maps cover

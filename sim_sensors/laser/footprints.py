@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import IntArray
 from sim_sensors.errors import SensorError
 
 Float64Array = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 NO_RETURN = -1
 WALL = -2

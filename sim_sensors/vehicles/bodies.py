@@ -15,11 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.vehicles.forms import Form
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 
 class Finish(IntEnum):

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.camera.surfaces import ShapeBuilder
 from sim_sensors.vehicles.bodies import Finish, Skin
 from sim_sensors.vehicles.forms import Form
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 CURL = (0.055, 0.050)  # m inwards and upwards by which the roof's edge curves above the panes
 BASE = 0.012  # m by which the glasshouse extends below the shoulder

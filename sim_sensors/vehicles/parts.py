@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.surfaces import Shape, ShapeBuilder
 from sim_sensors.vehicles.bodies import LAMP_INNER, ROUND, ROWS, Finish, Skin
 from sim_sensors.vehicles.cabins import Glasshouse
 from sim_sensors.vehicles.forms import Form
-
-FloatArray = NDArray[np.float64]
 
 PLATE_M = (0.52, 0.11)
 TO_LEFT = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])

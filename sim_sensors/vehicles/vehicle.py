@@ -8,6 +8,7 @@ from functools import cached_property, lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from sim_sensors.camera.surfaces import Shape, ShapeBuilder
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Material, Mesh
@@ -16,8 +17,6 @@ from sim_sensors.vehicles.bodies import Finish, Skin
 from sim_sensors.vehicles.cabins import Glasshouse, add_cabin, add_seats
 from sim_sensors.vehicles.classes import BODIES, draw_body, draw_paint, draw_size
 from sim_sensors.vehicles.forms import Form, draw_form
-
-FloatArray = NDArray[np.float64]
 
 KNEE_M = 0.5  # height of the laser plane above ground, m (T §3.3.2)
 FOOTPRINT_CORNERS = 24  # maximum number of corners of a footprint

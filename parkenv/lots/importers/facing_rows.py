@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.importers.slot_rows import PARALLEL_ROWS, STRAIGHT, AmbiguousLayoutError, Row
-
-FloatArray = NDArray[np.float64]
 
 AISLE = (2.8, 10.0)  # least and greatest width, m, of an aisle between two rows
 

@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.local_frame import LocalFrame
-
-FloatArray = NDArray[np.float64]
 
 NEAR_ON_GLOBE = 1.0
 """Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""

@@ -5,17 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.provenance import Doubt
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import Lane, ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -30,6 +30,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
 from parkenv.lots.importers import osm_network as network
@@ -49,8 +50,6 @@ from parkenv.lots.outlines.outline_import import outline_draft
 from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import mouth_points
-
-FloatArray = NDArray[np.float64]
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
 """Values of `parking` for slots that are not in the open at ground level."""

@@ -9,13 +9,12 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import Slots
 from parkenv.lots.importers.osm_elements import OsmElement
 from parkenv.lots.importers.osm_roads import Road
 from parkenv.lots.importers.osm_rows import boxes_of
 from parkenv.lots.local_frame import LocalFrame
-
-FloatArray = NDArray[np.float64]
 
 ENTRANCE_REACH = 100.0  # largest distance, m, from the nearest slot of a building entrance that is a goal
 BUILDING_REACH = 200.0  # the same for the nearest building if there is no entrance

@@ -5,12 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import MOVES, Lane
-
-FloatArray = NDArray[np.float64]
 
 JOIN_DISTANCE = 4.0
 """Distance from the junction, m, at which an excess lane joins its neighbour; half the length of a shorter one."""

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import KERB_SIZE, Slots
 from parkenv.lots.importers.osm_roads import Rank, Road, metres, whole_number
 from parkenv.lots.importers.osm_rows import (
@@ -25,8 +26,6 @@ from parkenv.lots.importers.osm_rows import (
     row_at,
 )
 from parkenv.world.drive_graph import node_labels
-
-FloatArray = NDArray[np.float64]
 
 PARKED = ("lane", "street_side", "on_kerb", "half_on_kerb", "shoulder", "yes")
 FORBIDDEN = (

@@ -11,12 +11,11 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import Slots
 from parkenv.lots.importers.osm_roads import Rank, Road
 from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import Lane, mouth_points
-
-FloatArray = NDArray[np.float64]
 
 
 def lanes_of(roads: Sequence[Road]) -> list[Lane]:

@@ -24,8 +24,6 @@ from parkenv.lots.importers.osm_rows import (
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import mouth_heading, mouth_points
 
-FloatArray = NDArray[np.float64]
-
 OUTLINE_TOLERANCE = 0.4  # largest overhang, m, of a slot beyond the outline: the accuracy of mapped outlines
 PHASES = (0.0, 0.25, 0.5, 0.75)
 """Trial offsets of a row along its aisle, as fractions of a slot's width; the one with the most slots is used."""

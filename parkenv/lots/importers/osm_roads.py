@@ -8,11 +8,9 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH
-
-FloatArray = NDArray[np.float64]
 
 STREET_WIDTH = {
     "trunk": 7.5,

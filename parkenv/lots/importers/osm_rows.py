@@ -9,10 +9,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots, bay_row
 from parkenv.world.lot import Mouth, corner_points
 
-FloatArray = NDArray[np.float64]
 Side = Literal["left", "right"]
 
 

@@ -9,12 +9,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import TWO_WAY_HALF_WIDTH
 from parkenv.lots.importers.facing_rows import FacingRows, opens_toward
 from parkenv.lots.importers.slot_rows import PARALLEL_ROWS, SAME_WAY, STRAIGHT, AmbiguousLayoutError, Row
 from parkenv.world.lot import Lane
-
-FloatArray = NDArray[np.float64]
 
 OPEN_AISLE = TWO_WAY_HALF_WIDTH
 """Distance from a row without a facing row to the middle of its aisle, and from an aisle's last slot to its end, m."""

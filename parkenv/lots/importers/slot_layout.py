@@ -21,8 +21,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import Slots
 from parkenv.lots.importers.facing_rows import FacingRows, open_sides
 from parkenv.lots.importers.slot_aisles import extended_aisle, find_aisles, lanes_through
@@ -34,8 +34,6 @@ from parkenv.lots.importers.slot_rows import (
     with_arrangement,
 )
 from parkenv.world.lot import Lane, corner_points, mouth_points
-
-FloatArray = NDArray[np.float64]
 
 MOST_STRAYS = 0.1  # largest allowed fraction of slots in no row
 

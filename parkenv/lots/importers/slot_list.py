@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
 from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
@@ -16,8 +16,6 @@ from parkenv.lots.importers.osm_rows import NO_SLOTS
 from parkenv.lots.importers.slot_layout import infer_layout
 from parkenv.lots.importers.slot_rows import AmbiguousLayoutError
 from parkenv.lots.local_frame import LocalFrame
-
-FloatArray = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")
 SAME_PLACE = 0.1  # distance, m, within which two slot centres are one slot listed twice

@@ -6,17 +6,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots
 from parkenv.world.lot import Mouth
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 SPACING = (1.8, 8.0)  # least and greatest distance, m, from a slot to the next in its row
 SAME_SPACING = 1.3

@@ -10,10 +10,9 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.outlines.network import STREET, Line, largest_part
 from parkenv.world.drive_graph import node_labels
-
-FloatArray = NDArray[np.float64]
 
 WAY_OUT = 8.0  # length, m, of the road from the edge of the car park to the entry
 LONGEST_WAY_OUT = 30.0  # m, from a lane to the edge

@@ -12,11 +12,9 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.outlines.openings import WIDEST_SHARED, OpenRow, is_on_road
 from parkenv.lots.outlines.spaces import Spaces
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 HALF_WIDTH = 3.0  # distance, m, of the centre line from a row that no other row faces
 NARROW_HALF_WIDTH = 2.2  # the same for oblique and kerbside rows

@@ -8,12 +8,9 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.outlines.free_space import FreeSpace
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 WIDE, DETOUR_WIDE, DETOUR_ENDS, DETOUR_MIDWAY = 2.2, 1.8, 2.2, 4.0
 """Clearance, m, of a wide connection, and the longest drive between the ends of a possible connection without it, as a

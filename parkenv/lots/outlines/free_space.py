@@ -6,13 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
+from parkenv.compiled.arrays import FloatArray, IntArray
 
 LEAST_CLEARANCE = 1.4  # half the width of a one-way road, m
 COMFORTABLE = 2.9  # clearance, m, from which more is worth nothing

@@ -19,6 +19,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
 from parkenv.lots.importers.osm_roads import Rank, Road
@@ -33,9 +34,6 @@ from parkenv.lots.outlines.spaces import Spaces
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Lane, Mouth, corner_points, mouth_heading, mouth_points
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LONGEST_CONNECTION = 120.0  # m
 NARROWEST, KERB_LENGTH = 1.95, 4.8

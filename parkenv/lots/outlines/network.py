@@ -8,14 +8,11 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.importers.osm_junctions import limit_junctions
 from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import Lane
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 STREET = -2  # source of a public street
 GRID = 0.01  # precision, m, of crossings

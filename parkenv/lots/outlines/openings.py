@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.outlines.rows import Row
 from parkenv.lots.outlines.spaces import Spaces
 from parkenv.world.drive_graph import SLOT_REACH
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
 WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share

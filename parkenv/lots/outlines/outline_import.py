@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.importers.import_options import ImportOptions, points_in_frame
 from parkenv.lots.importers.lot_draft import LeftOut, LotDraft
@@ -22,8 +22,6 @@ from parkenv.lots.outlines.openings import least_aisle
 from parkenv.lots.outlines.spaces import Spaces, rectangle_corners, refuse_areas, spaces_from_outlines
 from parkenv.lots.provenance import Doubt
 from parkenv.world.drive_graph import SLOT_REACH
-
-FloatArray = NDArray[np.float64]
 
 MOST_SPACES = 20_000
 """Maximum number of spaces of one lot."""

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.outlines.spaces import Spaces
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 TOUCHING = 0.7  # widest gap, m, between neighbours in a row
 SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours

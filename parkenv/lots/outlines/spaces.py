@@ -9,12 +9,10 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.importers.osm_spaces import squared
 from parkenv.world.lot import corner_points
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
 
 LEAST_AREA, GREATEST_AREA = 4.0, 250.0
 """Areas, m², outside which an outline is a mistake of drawing."""

@@ -8,18 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.importers.import_options import ImportOptions
 from parkenv.lots.importers.lot_draft import LotDraft
 from parkenv.lots.importers.osm import draft_of_elements, map_frame
 from parkenv.lots.importers.osm_elements import OsmElement
 from parkenv.lots.importers.osm_files import read_map
-
-FloatArray = NDArray[np.float64]
 
 SAME_CAR_PARK = 22.0
 """Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles."""

@@ -16,6 +16,7 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.envs.scan_vector import ScanSearchVectorEnv
 from parkenv.envs.sensor_sampler import PICTURE_WIDTH
@@ -35,7 +36,6 @@ from sim_sensors.rig import WIDE
 from sim_sensors.scene import Scene
 from sim_sensors.slot_scenes import scene_of_slots
 
-FloatArray = NDArray[np.float64]
 Scans = Callable[[FloatArray], NDArray[Any]]  # maps poses, (n, 3), to ranges, (n, n_beams), m
 
 SLOT_WIDTH, SLOT_LENGTH, MODULE, MARGIN = 2.5, 5.0, 16.0, 6.0

@@ -11,14 +11,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.mapping.survey_score import SIDES
 from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
 from parkenv.studies.sensing.detector_surveys import CAUSES, Miss
 
 Row = Mapping[str, Any]
-Image = NDArray[np.uint8]
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 LINES = ("-", "--", ":")

@@ -14,8 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast.comparison import Compared
-from parkenv.forecast.counts import HOURS, Counts, FloatArray
+from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import draw_days
 from parkenv.forecast.scores import Band, mean_where
 from parkenv.forecast.slot_comparison import SlotScores

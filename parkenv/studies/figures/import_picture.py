@@ -11,15 +11,13 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.importers.lot_draft import LotDraft
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.studies.figures.lot_picture import ENTRY, GOAL, GROUND, INK, draw_walls
 from parkenv.studies.figures.picture_files import save_picture
 from parkenv.world.lot import Lane, corner_points, is_building, mouth_points
-
-FloatArray = NDArray[np.float64]
 
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"

@@ -15,16 +15,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch, PathPatch, Polygon, Rectangle
 from matplotlib.path import Path as Outline
 from matplotlib.typing import ColorType
-from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.lot_outline import LotOutline, Rings
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.show.rendering import BELIEF_ANCHORS
 from parkenv.world.lot import ParkingLot
-
-FloatArray = NDArray[np.float64]
 
 GROUND = "#e7eae0"
 ASPHALT = "#5f646a"

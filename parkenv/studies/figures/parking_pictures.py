@@ -6,15 +6,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image as PillowImage
 
+from parkenv.compiled.arrays import Image
 from parkenv.driving.drive_state import DriveState
 from parkenv.files.atomic_write import atomic_write
 from parkenv.show.drive_rendering import DriveRenderer
 from parkenv.world.lot import ParkingLot
-
-Image = NDArray[np.uint8]
 
 COLUMNS = 2
 GAP = 6

@@ -10,11 +10,11 @@ from typing import Any
 import cv2
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.engine.search_state import SearchState
 from parkenv.envs.perception import SearchPerceptionEnv
-from parkenv.show.drawing import SUBPIXEL_BITS, Image, draw_dashes, fill_disc, fixed_point, write_text
+from parkenv.show.drawing import SUBPIXEL_BITS, draw_dashes, fill_disc, fixed_point, write_text
 from parkenv.show.rendering import (
     CAR,
     GLASS,
@@ -35,8 +35,6 @@ from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
-
-FloatArray = NDArray[np.float64]
 
 FPS = 10.0
 DRIVE_SPEEDUP, WALK_SPEEDUP = 3.0, 12.0

@@ -17,8 +17,8 @@ from matplotlib.path import Path as MplPath
 from matplotlib.patheffects import Normal, Stroke
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.episodes import SearchTrace
@@ -28,8 +28,6 @@ from parkenv.studies.figures.registry import ComparisonResults, Drawn, Setting
 from parkenv.studies.results import SETTING_AXES
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
-
-FloatArray = NDArray[np.float64]
 
 PATH, WALK = "#ffd000", "#1852ba"
 PICTURED = ("belief", "oracle", "first-free", "greedy-goal")

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.perception.range_scan import disparity
 from parkenv.show.drawing import write_tag
 from parkenv.studies.figures.lot_picture import draw_lot
@@ -19,9 +19,6 @@ from parkenv.studies.figures.picture_files import STYLE, save_picture
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig
-
-Image = NDArray[np.uint8]
-FloatArray = NDArray[np.float64]
 
 NEAREST, FARTHEST = 2.0, 30.0
 """Limits of the depth colour scale, m."""

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
 from parkenv.mapping.inference import Prediction
 from parkenv.mapping.odometry import between, moved
@@ -27,8 +28,6 @@ from parkenv.studies.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import View
-
-FloatArray = NDArray[np.float64]
 
 SIDE_COLOR, OBLIQUE_COLOR, END_COLOR = (255, 208, 0), (120, 200, 80), (86, 180, 233)
 UNRANGED_COLOR = (200, 200, 200)

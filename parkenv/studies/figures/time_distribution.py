@@ -9,8 +9,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.studies.figures.picture_files import INK, STYLE
 from parkenv.studies.figures.registry import ComparisonResults, Drawn, Setting
@@ -18,7 +18,6 @@ from parkenv.studies.figures.time_figures import AGENT_COLORS, OTHER_AGENT
 from parkenv.studies.plurals import plural
 from parkenv.studies.results import SETTING_AXES
 
-FloatArray = NDArray[np.float64]
 Totals = Mapping[str, FloatArray]
 """Total times of each agent, (n_episodes,) s, by name."""
 

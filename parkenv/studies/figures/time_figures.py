@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.studies.compare.cases import BLIND, against_occupancy
 from parkenv.studies.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
@@ -20,7 +20,6 @@ from parkenv.studies.figures.registry import ComparisonResults, Drawn
 from parkenv.studies.plurals import plural
 from parkenv.studies.results import SETTING_AXES
 
-FloatArray = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 AGENT_COLORS = {

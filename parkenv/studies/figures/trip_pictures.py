@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.vehicle import SPEED
 from parkenv.engine.search_state import SearchState
-from parkenv.show.drawing import SUBPIXEL_BITS, Image, fill_disc, fixed_point, mixed_color, write_text
+from parkenv.show.drawing import SUBPIXEL_BITS, fill_disc, fixed_point, mixed_color, write_text
 from parkenv.show.drive_rendering import draw_car, draw_movers
 from parkenv.show.rendering import (
     ASPHALT,
@@ -28,8 +28,6 @@ from parkenv.show.rendering import (
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip
 from parkenv.studies.trips.lot_driver import LotDriver
 from parkenv.world.scenario import Scenario
-
-FloatArray = NDArray[np.float64]
 
 SPEEDUP = 5
 """Playback speed relative to real time."""

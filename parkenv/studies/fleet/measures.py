@@ -8,12 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.envs.fleet import Fleet, total_s
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
 from parkenv.world.scenario import SearchProblem
-
-FloatArray = NDArray[np.float64]
-BoolArray = NDArray[np.bool_]
 
 MEANS = (
     "total_s", "median_s", "p95_s", "gini", "search_s", "queued_s", "failed_attempts", "driven_m", "cruised_m",

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet_records import LEFT, PARKED
 from parkenv.engine.shared_slots import NO_CAR
 from parkenv.envs.fleet import Fleet, total_s
@@ -25,7 +26,6 @@ STRAIGHT_M = 0.1
 AGREES_S = 1e-6
 
 Recording = dict[str, Any]
-FloatArray = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

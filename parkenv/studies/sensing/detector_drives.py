@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.mapping.route import survey_route
 from parkenv.perception.boxes import overlaps
@@ -21,7 +22,6 @@ from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
 from sim_sensors.rig import SensorRig, poses_along
 
 Row = dict[str, Any]
-FloatArray = NDArray[np.float64]
 
 DISTANCES = (0.0, 6.0, 9.0, 12.0, 20.0)  # m, limits of the bins
 VISIBLE = (0.3, 0.6, 0.9, 1.0001)  # limits of the bins of the visible fraction

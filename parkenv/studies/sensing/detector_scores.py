@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
 from parkenv.perception.car_model import CarModel
@@ -23,8 +24,6 @@ from parkenv.perception.detection_scores import RecallPrecision, recall_precisio
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.hog_detector import HogDetector
 from parkenv.studies.figures.picture_files import STYLE, save_picture
-
-Image = NDArray[np.uint8]
 
 _SMALLEST = {"single": 0.85, "multi": 0.8}
 _LARGEST = {"single": 1.2, "multi": 2.6}

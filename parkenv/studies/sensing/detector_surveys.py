@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import BoolArray
 from parkenv.errors import InputError
 from parkenv.files.csv_writing import write_csv
 from parkenv.files.file_names import file_name
@@ -31,7 +32,6 @@ from sim_sensors.ground_truth import View
 from sim_sensors.rig import SensorRig
 
 Row = dict[str, Any]
-BoolArray = NDArray[np.bool_]
 Sightings = NDArray[np.void]
 
 FAR = 12.0

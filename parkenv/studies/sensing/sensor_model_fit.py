@@ -9,16 +9,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import IntArray
 from parkenv.errors import InputError
 from parkenv.studies.simulate import Observer, Step, simulate
 from parkenv.studies.workers import HERE, Workers
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorBand, SensorModel
 from planners.agent import make_agent
-
-IntArray = NDArray[np.int64]
 
 BAND_ENDS = (0.5, 3.5, 6.5, 9.5, 12.5, 16.0)
 """Ends of the bands of distance from the car to a slot's vertex, m; the first band is the slot at the car's vertex."""

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.csv_writing import write_csv
 from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE, Kind, typed_records, wholes
@@ -33,7 +34,6 @@ from parkenv.world.week import DAY_S
 
 MAP_FILE = "map.sqlite"
 """Map of the sessions in the folder of a survey or a demo."""
-FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 Recorder = Callable[[Survey, int, int], tuple[SessionResult, Any]]
 """Drives a session, given its number and the number of perception results to keep, and records it."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
@@ -22,9 +23,7 @@ from parkenv.envs.drive_observation import MOST_CARS, MOST_LINES, obstacle_map
 from planners.driving import policy_interface as interface
 from planners.driving.policy_interface import Outlines, PolicyInterface
 
-FloatArray = NDArray[np.float64]
 Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int64]
 
 RUNNING, PARKED, CONTACT, LEFT_AREA = range(4)  # status of a drive
 

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import SPEED, VehicleParameters
 from parkenv.envs.drive import CONTROL_S
@@ -23,7 +24,6 @@ from parkenv.world.lot import ParkingLot
 from planners.driving.hybrid_astar import plan_path
 from planners.driving.policy_interface import ACTION_REPEAT, OBSERVATION_SIZE
 
-FloatArray = NDArray[np.float64]
 Observations = dict[str, NDArray[np.float32]]
 
 DECISION_S = ACTION_REPEAT * CONTROL_S  # time between decisions, s

@@ -20,8 +20,6 @@ from planners.network.agent import NetworkAgent, NetworkSearch
 from planners.network.features import ACTION_COUNT, FAILURE_COSTS, LEAST_SCALE, WAITING, Features
 from planners.network.policy import NetworkPolicy
 
-FloatArray = NDArray[np.float64]
-
 LONGEST = 200
 """Number of decisions after which a search of the training data ends: longer ones drive in circles in a full lot."""
 MOST_VALUE = 6.0  # largest value of a label, in time scales

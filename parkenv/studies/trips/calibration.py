@@ -17,10 +17,10 @@ from typing import Any, Self
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 from pydantic import TypeAdapter
 from scipy import stats
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write
@@ -36,7 +36,6 @@ from parkenv.studies.trips.lot_driver import DrivingStyle
 from parkenv.studies.workers import HERE, Workers
 from parkenv.world.scenario import KMH, Scenario
 
-FloatArray = NDArray[np.float64]
 Row = dict[str, Any]
 
 OBSERVED, UNOBSERVED = "observed", "unobserved"  # whether the agent observes slots from the lane

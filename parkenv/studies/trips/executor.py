@@ -5,14 +5,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.occupancy.process import World
 
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
-FloatArray = NDArray[np.float64]
 
 ALONG, TURN, ROUND, ACROSS = "along", "turn", "round", "across"
 EDGE_KINDS = (ALONG, TURN, ROUND, ACROSS)

@@ -11,6 +11,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
 from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
@@ -35,7 +36,6 @@ from planners.driving.path_tracking import PathTracker, TrackingSettings
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers
 
-FloatArray = NDArray[np.float64]
 
 RESCUE_S = 60.0  # time until a stuck car is back on the lane, s
 PATIENCE_S = 3.0  # time for which the car and a waiting road user both stand until the other gives way, s

@@ -15,6 +15,7 @@ from gymnasium.wrappers import TimeLimit
 from matplotlib import colormaps
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.studies.simulate import STEP_LIMIT, Observer, Step, simulate
@@ -31,7 +32,6 @@ if TYPE_CHECKING:
     from planners.agent import Agent
     from sim_sensors.rig import SensorRig
 
-FloatArray = NDArray[np.float64]
 
 TIMELINE = "drive"  # seconds since the first drive began
 PAUSE_S = 5.0  # pause between two drives, s

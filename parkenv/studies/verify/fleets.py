@@ -7,14 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet_rules import Rule
 from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.studies.verify.line import THESIS_SPEEDS, Line
 from parkenv.world.demand import Demand, Duration, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import HOUR_S
-
-FloatArray = NDArray[np.float64]
 
 STAY_S = HOUR_S  # mean stay, s: loads are arrivals an hour
 

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
+from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import KERB_SIZE, ONE_WAY_HALF_WIDTH, Slots, kerb_rows
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.verify.rows import Row, Task, certain_row, mean_row
@@ -29,8 +30,6 @@ from parkenv.world.scenario import KMH, Scenario, SearchProblem
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import WEEK_HOURS
 from planners.agent import Agent, make_agent
-
-FloatArray = NDArray[np.float64]
 
 SOURCE = "MacQueen & Miller 1960, DeGroot 1970"
 THESIS = "T §3.4, own derivation"

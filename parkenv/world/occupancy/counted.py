@@ -9,6 +9,7 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.errors import InputError
 from parkenv.world.occupancy.day_error import DayError
@@ -19,7 +20,6 @@ from parkenv.world.occupancy.process import (
     MAX_RATE,
     Arrival,
     ArrivalWindow,
-    FloatArray,
     Forecast,
     OccupancyProcess,
     ProcessWorld,

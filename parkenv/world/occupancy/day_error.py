@@ -12,12 +12,11 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
-
-FloatArray = NDArray[np.float64]
 
 MAX_LOGITS = 5.0
 """Largest standard deviation of a level or slope; days then are almost empty or almost full."""

@@ -8,7 +8,8 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
-from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError, FloatArray
+from parkenv.compiled.arrays import FloatArray
+from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.week import DAY_S, HOUR_S

@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike
 from scipy.optimize import brentq, minimize
 from scipy.special import expit
 
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.occupancy.day_error_fit import fit_day_error
-from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray, OccupancyProcess
+from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:

@@ -16,11 +16,11 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import Days, SlotDays
-from parkenv.world.occupancy.process import BoolArray, FloatArray, IntArray
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
 
 DayClass = Literal["weekday", "weekend"]

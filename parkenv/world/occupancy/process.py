@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError
@@ -21,10 +22,6 @@ from parkenv.world.occupancy import kernel as kernels
 from parkenv.world.occupancy.day_error import EXACT, DayError, centring_table, nearness
 from parkenv.world.occupancy.kernel import kernel
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, hour_of_week
-
-FloatArray = NDArray[np.float64]
-IntArray = NDArray[np.int64]
-BoolArray = NDArray[np.bool_]
 
 DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 DAY_GROUPS = {"weekdays": (0, 1, 2, 3, 4), "weekend": (5, 6), "all": (0, 1, 2, 3, 4, 5, 6)}

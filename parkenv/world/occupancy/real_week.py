@@ -16,9 +16,10 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.forecast.typical_week_fit import LEVEL_SHARES
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy.process import FloatArray, OccupancyProcess
+from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.occupancy.typical_week import attraction
 from parkenv.world.week import HOUR_S, WEEK_HOURS
 

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logit
 
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
 from parkenv.errors import InputError
@@ -34,15 +35,7 @@ from parkenv.world.occupancy.kernel import (
     recorded_index,
 )
 from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
-from parkenv.world.occupancy.process import (
-    DAY_NAMES,
-    Arrival,
-    ArrivalWindow,
-    BoolArray,
-    FloatArray,
-    Forecast,
-    IntArray,
-)
+from parkenv.world.occupancy.process import DAY_NAMES, Arrival, ArrivalWindow, Forecast
 from parkenv.world.week import DAY_S
 
 

@@ -6,8 +6,9 @@ import dataclasses
 
 import numpy as np
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy.process import FloatArray, OccupancyProcess
+from parkenv.world.occupancy.process import OccupancyProcess
 
 # Logit of the demand in each hour of a weekday; the shape is that of a campus lot: empty at night, full from
 # mid-morning to mid-afternoon.
