@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 PACKAGES = ("sim_sensors", "parkenv", "planners")
-MAY_SEE_PLANNERS = ("parkenv/studies/", "parkenv/cli/")
+MAY_SEE_PLANNERS = ("studies", "cli")
 # A package imports the packages before it only.
 LAYERS = (
     "errors",
@@ -57,8 +57,11 @@ def import_statements(path):
 
 
 def imports(path):
-    """Every module that a file imports from."""
-    return {module for module, _ in import_statements(path)}
+    """Every module that a file imports from; what is imported from `parkenv` itself by its full name."""
+    return {
+        f"{module}.{name}" if module == "parkenv" and name else module
+        for module, name in import_statements(path)
+    }
 
 
 # What reads a file of any size and depth, by the modules that may do so within limits.
@@ -111,37 +114,56 @@ def sources(package):
     return sorted((ROOT / package).rglob("*.py"))
 
 
-@pytest.mark.parametrize("path", sources("sim_sensors"), ids=str)
-def test_sensors_know_nothing_of_parking(path):
-    above = [m for m in imports(path) if m.split(".")[0] in ("parkenv", "planners")]
-    assert not [m for m in above if not m.startswith("parkenv.compiled")]
+def offenders(package, refused):
+    """The imports of a package's modules that a rule refuses: `refused(path below the package, module)`."""
+    return [
+        f"{path.relative_to(ROOT)}: {module}"
+        for path in sources(package)
+        for module in sorted(imports(path))
+        if refused(path.relative_to(ROOT / package).with_suffix(""), module)
+    ]
 
 
-@pytest.mark.parametrize("path", sources("planners"), ids=lambda p: p.name)
-def test_planners_see_the_lot_the_belief_and_the_problem_only(path):
-    seen = {*import_statements(path)} - {("parkenv", "__version__")}
-    assert not [m for m, _ in seen if m.split(".")[0] == "parkenv" and not m.startswith(PLANNERS_MAY_SEE)]
+def within(module, packages):
+    """Whether a module is one of the packages, or in one of them."""
+    return any(module == package or module.startswith(f"{package}.") for package in packages)
 
 
-@pytest.mark.parametrize("path", sources("parkenv"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_the_world_never_imports_a_planner(path):
-    if not path.relative_to(ROOT).as_posix().startswith(MAY_SEE_PLANNERS):
-        assert not [m for m in imports(path) if m.split(".")[0] == "planners"]
+def test_sensors_know_nothing_of_parking():
+    assert not offenders(
+        "sim_sensors",
+        lambda _, module: (
+            within(module, ("parkenv", "planners")) and not within(module, ("parkenv.compiled",))
+        ),
+    )
 
 
-@pytest.mark.parametrize("path", sources("parkenv"), ids=lambda p: str(p.relative_to(ROOT)))
-def test_packages_import_those_below_them_only(path):
-    here = path.relative_to(ROOT / "parkenv").with_suffix("").parts[0]
-    if here in ("__init__", "__main__"):
-        return
-    here = "envs" if here == "lot_v0" else here  # named as PettingZoo's environments are
-    above = LAYERS[LAYERS.index(here) + 1 :]
-    assert not [m for m in imports(path) if m.startswith("parkenv.") and m.split(".")[1] in above]
+def test_planners_see_the_lot_the_belief_and_the_problem_only():
+    allowed = (*PLANNERS_MAY_SEE, "parkenv.__version__")
+    assert not offenders(
+        "planners", lambda _, module: within(module, ("parkenv",)) and not within(module, allowed)
+    )
 
 
-@pytest.mark.parametrize("package", PACKAGES)
-def test_files_are_read_within_limits(package):
-    for path in sources(package):
+def test_the_world_never_imports_a_planner():
+    assert not offenders(
+        "parkenv",
+        lambda path, module: within(module, ("planners",)) and path.parts[0] not in MAY_SEE_PLANNERS,
+    )
+
+
+def test_packages_import_those_below_them_only():
+    def points_up(path, module):
+        here = {"lot_v0": "envs"}.get(path.parts[0], path.parts[0])  # named as PettingZoo's environments are
+        if here not in LAYERS or not module.startswith("parkenv."):
+            return False
+        return module.split(".")[1] in LAYERS[LAYERS.index(here) + 1 :]
+
+    assert not offenders("parkenv", points_up)
+
+
+def test_files_are_read_within_limits():
+    for path in (path for package in PACKAGES for path in sources(package)):
         name = path.relative_to(ROOT).as_posix()
         calls = {
             ast.unparse(n.func) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)
@@ -202,10 +224,8 @@ def test_a_laser_alone_loads_no_camera():
     assert loaded.strip() == "[]"
 
 
-@pytest.mark.parametrize(
-    "package", ["sim_sensors", "sim_sensors.camera", "sim_sensors.laser", "sim_sensors.vehicles"]
-)
-def test_every_name_that_a_package_lists_can_be_imported(package):
-    module = importlib.import_module(package)
-    for name in module.__all__:
-        assert getattr(module, name).__name__ == name
+def test_every_name_that_a_package_lists_can_be_imported():
+    for package in ("sim_sensors", "sim_sensors.camera", "sim_sensors.laser", "sim_sensors.vehicles"):
+        module = importlib.import_module(package)
+        for name in module.__all__:
+            assert getattr(module, name).__name__ == name
