@@ -291,7 +291,7 @@ def test_uiuc_is_read_as_published_trained_on_and_judged(tmp_path):
             lambda f: (f / "TestImages/test-0.pgm").write_bytes(
                 (f / "TestImages/test-0.pgm").read_bytes()[:900]
             ),
-            "test-0.pgm: is no image that can be read whole",
+            "test-0.pgm: is not a complete image",
         ),
     ],
 )
@@ -313,7 +313,7 @@ def test_images_of_all_kinds(tmp_path):
     np.testing.assert_array_equal(read_image(tmp_path / "rgba.png"), color)
     for name, message in (
         ("deep.png", "has more than 8 bits a channel"),
-        ("torn.png", "is no image that can be read whole"),
+        ("torn.png", "is not a complete image"),
         ("none.png", "No such file"),
     ):
         with pytest.raises(InputError, match=message):
@@ -388,7 +388,7 @@ def test_a_damaged_image_is_refused_before_any_is_searched(tmp_path):
     (photos / "b.png").write_bytes(whole[:40])
     refused = parkenv("detect", photos, "--out", out)
     assert (refused.returncode, refused.stdout, out.exists()) == (2, "", False)
-    assert f"{photos / 'b.png'}: is no image that can be read whole" in refused.stderr
+    assert f"{photos / 'b.png'}: is not a complete image" in refused.stderr
 
 
 def grey_image(path):

@@ -102,5 +102,5 @@ def test_what_it_cannot_solve_is_refused():
     with pytest.raises(InputError, match="memory_steps 1"):
         ChangingSolution(scenario.public(), np.full(3, 0.5), np.ones(3), 2.0, 1)
     blind = scenario.replace(sensor_model=SensorModel(hit_rate=0.9))
-    with pytest.raises(InputError, match="never errs"):
+    with pytest.raises(InputError, match="without errors"):
         ChangingSolution(blind.public(), np.full(3, 0.5), np.ones(3), 2.0, 4)

@@ -125,7 +125,7 @@ def test_pipes_and_devices_are_refused_and_not_waited_for(tmp_path):
     for name in ("pipe", "link", *devices):
         with pytest.raises(InputError, match=r"is a pipe or a device, want a file|No such"):
             read_bytes(tmp_path / name)
-    with pytest.raises(InputError, match="is no file"):
+    with pytest.raises(InputError, match="is not a file"):
         MapStore(tmp_path / "pipe", packaged_lot("mini"), create=False)
 
 
@@ -209,11 +209,11 @@ def test_an_array_is_as_large_as_its_header_says(member):
         (png(100_000, 100_000), "is too large .* want at most 100,000,000 pixels"),
         (png(11_000, 10_000), "is too large .11000×10000 px."),
         (b"P5 100000 100000 255\n", "is too large"),
-        (b"P5 10000000000 1 255\n", "is no image"),
-        (b"P5 10 10 255\n" + bytes(99), "is no image that can be read whole"),
-        (png(10, 10, bytes(110))[:44], "is no image that can be read whole"),
-        (b"\xff\xd8\xff\xe0\x00\x10JFIF", "is no image that can be read whole"),
-        (b"", "is no image that can be read whole"),
+        (b"P5 10000000000 1 255\n", "is not a complete image"),
+        (b"P5 10 10 255\n" + bytes(99), "is not a complete image"),
+        (png(10, 10, bytes(110))[:44], "is not a complete image"),
+        (b"\xff\xd8\xff\xe0\x00\x10JFIF", "is not a complete image"),
+        (b"", "is not a complete image"),
     ],
 )
 def test_an_image_is_measured_before_it_is_decoded(data, message):

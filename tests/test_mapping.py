@@ -384,7 +384,7 @@ def test_a_strangers_journal_removes_no_file(mini, tmp_path):
     (tmp_path / "link").symlink_to(path)
     for opened in (path, tmp_path / "link"):
         for create in (False, True):
-            with pytest.raises(InputError, match=r"map\.sqlite-journal: is no journal of a map"):
+            with pytest.raises(InputError, match=r"map\.sqlite-journal: is not the journal of a map"):
                 MapStore(opened, mini, create=create)
     assert mine.read_text() == "mine"
 

@@ -86,7 +86,7 @@ def test_a_video_without_frames_is_refused_in_a_line_before_any_work(folder, tmp
     (folder / "z.mp4").write_bytes(whole[:200] if content is None else content)
     done = parkenv("detect", folder, "--detector", BRIGHT, "--out", tmp_path / "out")
     assert done.returncode == 2
-    assert "z.mp4: is no video with frames that can be read; want .mp4, .mov" in " ".join(done.stderr.split())
+    assert "z.mp4: is not a video with readable frames, want .mp4, .mov" in " ".join(done.stderr.split())
     assert done.stderr.count("\n") == 1
     assert not (tmp_path / "out").exists()
     assert not capfd.readouterr().err

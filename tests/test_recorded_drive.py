@@ -301,15 +301,15 @@ def test_damaged_recordings_are_refused_in_a_line(tmp_path):
     for content in (b"", b"I am text", whole[:100], whole[: len(whole) // 2], whole[:-20]):
         file.write_bytes(content)
         with pytest.raises(
-            InputError, match=r"bad\.mcap: is no whole recording \(.*\); want \.mcap"
+            InputError, match=r"bad\.mcap: is not a complete recording \(.*\); want \.mcap"
         ) as caught:
             list(RecordedDrive(file, calibration).captures())
         assert "\n" not in str(caught.value)
     file.write_bytes(whole)
     for path, given, message in (
-        (file, None, "is no recording of parkenv survey --record; describe its sensors"),
+        (file, None, "was not made by parkenv survey --record; describe its sensors"),
         (tmp_path / "none.mcap", None, "none.mcap: No such file"),
-        (tmp_path / "car.toml", None, "car.toml: is no whole recording"),
+        (tmp_path / "car.toml", None, "car.toml: is not a complete recording"),
     ):
         with pytest.raises(InputError, match=message):
             RecordedDrive(path, given)

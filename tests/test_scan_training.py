@@ -173,7 +173,7 @@ def test_a_model_needs_scans(tmp_path):
         agent.predict(ScanObservation(scan_env(), k=2).reset(seed=0)[0])
     with pytest.raises(InputError, match="observes laser scans, which the cars of a fleet do not have"):
         driver_of(AgentSpec(name=name), MINI)
-    with pytest.raises(InputError, match="observes laser scans, and there are none here"):
+    with pytest.raises(InputError, match="observes laser scans, this environment has none"):
         DrivenSearch(MINI, name)
     with pytest.raises(InputError, match='observation is "scan", want a rig with a laser'):
         Case(MINI, name, rig="stereo").run([0])

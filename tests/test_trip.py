@@ -34,8 +34,8 @@ from parkenv.studies.trips.calibration import (
 )
 from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
 from parkenv.studies.trips.executor import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, ParkingAttempt
-from parkenv.studies.trips.lot_driver import DrivingStyle, LotDriver
 from parkenv.studies.trips.sensor_log import record_trip
+from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.traffic import Traffic
@@ -104,7 +104,7 @@ class GraphExecutor:
 def started(name, seed=0, **kinds):
     """A driver in the world of a seed, at the entry, and the world."""
     scenario = make_scenario(name)
-    driver = LotDriver(scenario, **kinds)
+    driver = VehicleController(scenario, **kinds)
     key = world_key(seed, 0)
     arrival = scenario.occupancy.draw_arrival(scenario.arrival, key)
     world = scenario.occupancy.world(key, arrival)

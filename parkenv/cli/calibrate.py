@@ -63,7 +63,7 @@ def calibrate(
     from parkenv.studies.compare.experiment import agent_fingerprints, fingerprints, flat_tables
     from parkenv.studies.trips import calibration
     from parkenv.studies.trips.driven_search import DrivenSearch
-    from parkenv.studies.trips.lot_driver import DrivingStyle
+    from parkenv.studies.trips.vehicle_controller import DrivingStyle
     from parkenv.world.scenario import KMH
 
     spec = traffic.on(world.spec(scenario))
@@ -153,8 +153,8 @@ def trip(
     from parkenv.studies.figures.trip_pictures import COLORS, FPS, film_trip
     from parkenv.studies.results import make_folder
     from parkenv.studies.trips.driven_search import DrivenSearch
-    from parkenv.studies.trips.lot_driver import DrivingStyle
     from parkenv.studies.trips.sensor_log import record_trip, require_viewer, sensor_log
+    from parkenv.studies.trips.vehicle_controller import DrivingStyle
     from parkenv.world.scenario import KMH
 
     if out.suffix.lower() != ".gif":

@@ -54,7 +54,7 @@ def decode_image(data: bytes, name: str) -> Image:
         raise InputError(f"{name}: is too large ({error}), want at most {MAX_PIXELS:,} pixels") from error
     # Pillow raises these for damaged files.
     except (OSError, SyntaxError, ValueError, LookupError, ArithmeticError, TypeError, struct.error) as error:
-        raise InputError(f"{name}: is no image that can be read whole; want {', '.join(SUFFIXES)}") from error
+        raise InputError(f"{name}: is not a complete image, want {', '.join(SUFFIXES)}") from error
 
 
 def image_text(path: Path, key: str) -> str | None:

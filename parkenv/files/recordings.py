@@ -92,7 +92,7 @@ def _in_words(path: Path) -> Iterator[None]:
     except Exception as error:
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(
-            f"{path}: is no whole recording ({reason:.200}); want {', '.join(SUFFIXES)} or a rosbag's folder"
+            f"{path}: is not a complete recording ({reason:.200}); want {', '.join(SUFFIXES)} or a rosbag's folder"
         ) from error
 
 

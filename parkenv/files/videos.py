@@ -72,7 +72,7 @@ class Video:
             there, first = capture.read()
             if not there or first is None:
                 raise InputError(
-                    f"{path}: is no video with frames that can be read; want {', '.join(VIDEO_SUFFIXES)}"
+                    f"{path}: is not a video with readable frames, want {', '.join(VIDEO_SUFFIXES)}"
                 )
             fps, count = (capture.get(key) for key in (cv2.CAP_PROP_FPS, cv2.CAP_PROP_FRAME_COUNT))
             height, width = first.shape[:2]

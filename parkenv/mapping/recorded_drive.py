@@ -266,7 +266,7 @@ class RecordedDrive:
         if self.calibration is None:
             if HEAD not in topics:
                 raise InputError(
-                    f"{self.path}: is no recording of parkenv survey --record; describe its sensors: --calibration"
+                    f"{self.path}: was not made by parkenv survey --record; describe its sensors: --calibration"
                 )
             for topic, kind in topics.items():
                 name, _, what = topic[1:].partition("/")

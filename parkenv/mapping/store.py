@@ -118,12 +118,14 @@ class MapStore:
         if not path.exists() and not create:
             raise InputError(f"{path}: no such map file; parkenv survey makes one")
         if path.exists() and not path.is_file():
-            raise InputError(f"{path}: is no file")  # SQLite would wait for the writer of a pipe
+            raise InputError(f"{path}: is not a file")  # SQLite would wait for the writer of a pipe
         if path.exists() and path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: has more than {MAX_BYTES:,} bytes, the most that is read")
         journal = Path(f"{os.path.realpath(path)}-journal")
         if journal.exists() and (not journal.is_file() or _names_another_file(journal)):
-            raise InputError(f"{journal}: is no journal of a map; SQLite might remove another file for it")
+            raise InputError(
+                f"{journal}: is not the journal of a map; SQLite might delete another file instead"
+            )
         # The journal of a writer that was killed is rolled back before reading, which takes writing.
         mode = "rwc" if create else "rw" if journal.exists() else "ro"
         address = f"{path.absolute().as_uri()}?mode={mode}"
@@ -337,7 +339,7 @@ class MapStore:
         ).fetchone()
         lot = tables == (len(wanted),) and self._db.execute("SELECT name, digest FROM lot").fetchone()
         if not lot:
-            raise InputError(f"{self.path}: is no whole map file: a table is missing or empty")
+            raise InputError(f"{self.path}: is not a complete map file: a table is missing or empty")
         name, digest = lot
         if digest != lot_digest(self._lot):
             raise InputError(

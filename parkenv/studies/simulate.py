@@ -153,7 +153,7 @@ def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
     if (k := getattr(agent, "scans_k", None)) is not None:
         if not isinstance(env.unwrapped, SearchSensorsEnv):
             raise InputError(
-                f"{getattr(agent, 'name', 'the agent')} observes laser scans, and there are none here"
+                f"{getattr(agent, 'name', 'the agent')} observes laser scans, this environment has none"
             )
         return ScanObservation(env, k)
     k = getattr(agent, "local_k", None)

@@ -153,5 +153,6 @@ def _require_rates(hit_rate: float, false_alarm_rate: float) -> None:
             raise InputError(f"{name} is {rate}, want a probability")
     if hit_rate <= false_alarm_rate:
         raise InputError(
-            f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: observations would say nothing"
+            f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: "
+            "observations would carry no information"
         )

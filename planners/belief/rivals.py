@@ -29,8 +29,8 @@ PASSED = 3.0
 CROWD = 2.5
 """Expected rate of rivals as a multiple of the usual rate of arrivals, where it is not known.
 
-To expect too few costs more than to expect too many: who expects few drives to the best slots, with all the others,
-and circles there; who expects many stops early, and walks a little further.
+Underestimating rivals costs more than overestimating them: with too few, the car heads for the best slots with
+everyone else and circles there; with too many, it stops early and the driver walks a little further.
 """
 
 
@@ -46,13 +46,13 @@ class BeliefRivalsAgent(BeliefAgent):
     Args:
         problem: lot, goal, speeds and costs.
         arrivals_per_hour: rivals an hour; None: not known, see above. With 0 the agent is `belief`, action for action.
-        budget_ms: as of `belief`.
-        day: as of `belief`.
-        most_vertices: as of `belief`.
-        explore: as of `belief`.
+        budget_ms: see `belief`.
+        day: see `belief`.
+        most_vertices: see `belief`.
+        explore: see `belief`.
 
     Raises:
-        InputError: as of `belief`; `arrivals_per_hour` is negative or not finite.
+        InputError: see `belief`; `arrivals_per_hour` is negative or not finite.
     """
 
     name: ClassVar[str] = "belief-rivals"

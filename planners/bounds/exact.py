@@ -183,7 +183,7 @@ def require_small(problem: SearchProblem) -> None:
             f"{MOST_SLOTS} slots and {1 << _POSITION_BITS} vertices"
         )
     if not problem.sensor_model.perfect:
-        raise InputError("the exact planner wants a sensor model that never errs")
+        raise InputError("the exact planner requires a sensor model without errors")
 
 
 def bits_of(slots: NDArray[np.bool_]) -> int:

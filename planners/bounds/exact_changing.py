@@ -73,7 +73,7 @@ class ChangingSolution:
                 f"step_s is {step_s} and memory_steps {memory_steps}, want seconds above 0 and at least 2"
             )
         if not problem.sensor_model.perfect:
-            raise InputError("the exact planner wants a sensor model that never errs")
+            raise InputError("the exact planner requires a sensor model without errors")
         codes = 2 * memory_steps + 1
         if codes**n * lot.n_vertices > MOST_STATES:
             raise InputError(

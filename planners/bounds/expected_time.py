@@ -56,7 +56,7 @@ def expected_time(
     if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
         raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
     if not problem.sensor_model.perfect:
-        raise InputError("expected_time wants a sensor model that never errs")
+        raise InputError("expected_time requires a sensor model without errors")
     days = Days.of(p, problem.walk_s, day_error)
     belief = SlotBelief.of_forecast(p, np.zeros(n), (day_error.level, day_error.slope))
     return _Histories(agent, problem, days.p_free).mean(vertex, belief, days.chance, 0, None)

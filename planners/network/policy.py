@@ -1,6 +1,6 @@
 """The network's weights: their file, and the network itself.
 
-The file is a model file as of `planners.model_file`; it is read without PyTorch and the library of safetensors.
+The file is a model file (see `planners.model_file`); it is read without PyTorch and the library of safetensors.
 """
 
 from __future__ import annotations

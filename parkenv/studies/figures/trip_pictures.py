@@ -26,7 +26,7 @@ from parkenv.show.rendering import (
     clock,
 )
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip
-from parkenv.studies.trips.lot_driver import LotDriver
+from parkenv.studies.trips.vehicle_controller import VehicleController
 from parkenv.world.scenario import Scenario
 
 SPEEDUP = 5
@@ -51,7 +51,7 @@ class TripRenderer(SearchRenderer):
         near: whether to show the car's surroundings instead of the whole lot.
     """
 
-    def __init__(self, scenario: Scenario, driver: LotDriver, *, near: bool) -> None:
+    def __init__(self, scenario: Scenario, driver: VehicleController, *, near: bool) -> None:
         super().__init__(scenario)
         self._driver, self._near = driver, near
         self.trail: list[FloatArray] = []

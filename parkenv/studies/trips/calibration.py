@@ -32,7 +32,7 @@ from parkenv.studies.results import require_same_settings, write_settings
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip
 from parkenv.studies.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
-from parkenv.studies.trips.lot_driver import DrivingStyle
+from parkenv.studies.trips.vehicle_controller import DrivingStyle
 from parkenv.studies.workers import HERE, Workers
 from parkenv.world.scenario import KMH, Scenario
 

@@ -18,7 +18,7 @@ from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.studies.trips.executor import Leg, MotionExecutor, ParkingAttempt
-from parkenv.studies.trips.lot_driver import DrivingStyle, LotDriver
+from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent, make_agent
@@ -183,7 +183,7 @@ class DrivenSearch:
         self.agent = agent
         spec = AgentSpec.of(agent)
         self._agent: Agent = make_agent(spec.name, self.scenario, **spec.options)
-        self.driver = LotDriver(self.scenario, vehicle, style)
+        self.driver = VehicleController(self.scenario, vehicle, style)
         self.env = DrivenSearchEnv(self.scenario, self.driver, perception)
         self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
 

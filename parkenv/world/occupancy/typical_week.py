@@ -48,7 +48,7 @@ def typical_occupancy(
 
 
 def attraction(lot: ParkingLot, goal: int, pull: float, unevenness: float) -> FloatArray:
-    """Return the popularity of the slots, (n_slots,) logits; arguments as of `typical_occupancy`."""
+    """Return the popularity of the slots, (n_slots,) logits; arguments: see `typical_occupancy`."""
     walk = lot.walk_m(goal)
     span = float(np.ptp(walk)) or 1.0
     nearness = 1.0 - 2.0 * (walk - walk.min()) / span

@@ -44,13 +44,13 @@ TURN_IN_M = 9.0  # distance from the rear axle to the middle of a junction at wh
 
 _LEAD_M = 1.5
 _LANE = SearchSettings(change_m=8.0, attempts=((0.25, 0.5), (0.15, 0.5), (0.08, 0.5), (0.03, 0.25)))
-_WIDE = (0.6, 0.3, 0.06)  # margins by which turns are widened if there is room
-_ONTO = (4.0, 6.5, 9.0, 12.0)  # m after a junction at which a turn into the lane may end
-_BACK = (0.0, 3.0, 6.0, 9.0)  # m after a slot or the place where the car turns round
+TURN_MARGINS = (0.6, 0.3, 0.06)  # margins by which turns are widened if there is room
+MERGE_DISTANCES_M = (4.0, 6.5, 9.0, 12.0)  # m after a junction at which a turn into the lane may end
+RETURN_DISTANCES_M = (0.0, 3.0, 6.0, 9.0)  # m after a slot or the place where the car turns round
 _CHANGE_S = 3.0  # s, approximate time of a change of direction
-_PACE = 1.5  # m/s, approximate speed between changes of direction
+TYPICAL_SPEED = 1.5  # m/s, approximate speed between changes of direction
 _NEAR_M, _ALIGNED = 0.4, math.radians(10.0)
-_AROUND = math.radians(150.0)
+U_TURN_ANGLE = math.radians(150.0)
 _STRAYED_M = 1.0
 _MOST_PLANS = 6
 _NOTICE_STEP = 0.2
@@ -109,7 +109,7 @@ class DriveLog:
     waited_s: float = 0.0  # time spent braking and standing for other road users, s
 
 
-class LotDriver:
+class VehicleController:
     """Drives a kinematic bicycle model among pymunk bodies, by lane keeping and planned manoeuvres.
 
     Paths along lanes are straights and arcs. Paths between lanes are planned as if all slots were taken, so they can be
@@ -280,7 +280,7 @@ class LotDriver:
                 points = np.concatenate([first, line.between(max(edge.start, 0.1), line.length)])
                 self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
                 return executor.ALONG
-            if _askew(here.pose(at), joint) < _AROUND:
+            if _askew(here.pose(at), joint) < U_TURN_ANGLE:
                 turn = self._turn(before or 0, edge, at)
                 if turn is not None:
                     self._keeper = LaneKeeper(self.vehicle, turn, self._on_lane)
@@ -303,7 +303,9 @@ class LotDriver:
         key = before, edge.line, round(10 * leave), round(10 * edge.start)
         if key not in self._turns:
             there = self._around.worst_case(here.pose(at)[:2])
-            path = self._planned_onto(here.pose(leave), line, edge.start, _ONTO, there, _WIDE)
+            path = self._planned_onto(
+                here.pose(leave), line, edge.start, MERGE_DISTANCES_M, there, TURN_MARGINS
+            )
             if path is not None:
                 ends = line.station_of(path.sampled()[0][-1, :2])
                 if line.length - ends > 0.5:
@@ -323,8 +325,8 @@ class LotDriver:
             askew = max(askew, _askew(line.pose(now), self.state[:3]))
             there = self._standing(self.state[:2])
             self._enter(there)
-            onward = _ONTO if askew < _AROUND else _BACK
-            path = self._planned_onto(self.state[:3], line, now, onward, there, _WIDE[-1:])
+            onward = MERGE_DISTANCES_M if askew < U_TURN_ANGLE else RETURN_DISTANCES_M
+            path = self._planned_onto(self.state[:3], line, now, onward, there, TURN_MARGINS[-1:])
             if path is None:
                 break
             tracker = PathTracker(self.vehicle, path)
@@ -335,7 +337,7 @@ class LotDriver:
         if not self._is_on(line):
             self._rescue(line)
         self._follow_line(line)
-        return executor.TURN if askew < _AROUND else executor.ROUND
+        return executor.TURN if askew < U_TURN_ANGLE else executor.ROUND
 
     def _planned_onto(
         self,
@@ -353,7 +355,7 @@ class LotDriver:
                 change_m=_LANE.change_m,
                 reserve=reserve,
                 attempts=_LANE.attempts,
-                most_expansions=4000 if reserve > _WIDE[-1] else _LANE.most_expansions,
+                most_expansions=4000 if reserve > TURN_MARGINS[-1] else _LANE.most_expansions,
             )
             for ahead in onward:
                 station = min(at + ahead, line.length - 0.3)
@@ -362,7 +364,7 @@ class LotDriver:
                 )
                 if path is None:
                     continue
-                cost = _seconds_of(path) - ahead / _PACE
+                cost = _seconds_of(path) - ahead / TYPICAL_SPEED
                 if best is None or cost < best[0]:
                     best = cost, path
                 if path.length.min() > 0.0:
@@ -479,7 +481,7 @@ class LotDriver:
             best: tuple[float, CarPath, int] | None = None
             for index, station in ways:
                 line = self._lines.lines[index]
-                for onward in _BACK:
+                for onward in RETURN_DISTANCES_M:
                     pose = line.pose(min(station + onward, line.length) - self.vehicle.middle)
                     path = plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], pose)
                     if path is not None and (best is None or _seconds_of(path) < best[0]):
@@ -603,7 +605,7 @@ def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
 def _seconds_of(path: CarPath) -> float:
     """Estimate the time of a manoeuvre along a path, s."""
     changes = path.direction_changes + (len(path.length) > 0 and path.length[0] < 0.0)
-    return path.driven_m / _PACE + _CHANGE_S * changes
+    return path.driven_m / TYPICAL_SPEED + _CHANGE_S * changes
 
 
 def _away(a: FloatArray, b: FloatArray) -> float:
