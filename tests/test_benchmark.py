@@ -12,7 +12,7 @@ from command_line import parkenv
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot, read_lot, write_lot
 from parkenv.lots.lot_files import PLACES
-from parkenv.lots.provenance import combined, read_provenance
+from parkenv.lots.quality import combined_error_probability, read_provenance
 from parkenv.scenarios.places import lot_share
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.agent_spec import AgentSpec
@@ -161,7 +161,7 @@ def test_the_places_are_sure_real_lots_of_stated_kinds():
         path = PLACES / f"{task.scenario}.geojson"
         lot, origin = read_lot(path), read_provenance(path)
         assert origin.source.startswith("zuid-holland_")
-        assert combined(origin.doubts) <= 0.3
+        assert combined_error_probability(origin.issues) <= 0.3
         assert lot.slot_ids[0].startswith(("way/", "relation/"))
         assert suite_lots()[lot_share(lot)] == task.name
         counts = slots_by_kind(lot)

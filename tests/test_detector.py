@@ -12,15 +12,15 @@ from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.files.images import images_in, read_image
-from parkenv.perception.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.cross_validation import cross_validated
-from parkenv.perception.detection_scores import matches, recall_at, recall_precision
 from parkenv.perception.detector import GroundBand
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
-from parkenv.perception.made_photos import made_photos
-from parkenv.perception.training import TrainingSettings, train
+from parkenv.perception.lab.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
+from parkenv.perception.lab.cross_validation import cross_validated
+from parkenv.perception.lab.detection_scores import matches, recall_at, recall_precision
+from parkenv.perception.lab.made_photos import made_photos
+from parkenv.perception.lab.training import TrainingSettings, train
 
 
 def toy_car(rng, size=(100, 40)):
@@ -363,7 +363,7 @@ def test_a_model_wants_weights_of_its_window():
 
 
 def test_held_out_blocks_are_judged_once_each(crops, monkeypatch):
-    monkeypatch.setattr("parkenv.perception.cross_validation.MADE_PHOTOS", 5)
+    monkeypatch.setattr("parkenv.perception.lab.cross_validation.MADE_PHOTOS", 5)
     scores = cross_validated(Crops(*crops), folds=3, seed=1, settings=TrainingSettings(rounds=0, jitter=0))
     assert sum(s.n_cars for s in scores) == len(crops[0])
     assert sum(s.n_others for s in scores) == len(crops[1])

@@ -23,10 +23,10 @@ from parkenv.errors import InputError
 from parkenv.files.images import read_image
 from parkenv.files.onnx_file import read_onnx
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
-from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.lots.draft import ImportOptions
 from parkenv.mapping.store import MapStore, Session
-from parkenv.perception.car_datasets import read_uiuc_test
 from parkenv.perception.car_model import CarModel
+from parkenv.perception.lab.car_datasets import read_uiuc_test
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.compare.benchmark import Suite, check_result

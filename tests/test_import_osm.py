@@ -20,9 +20,9 @@ from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.lots import packaged_lot, read_lot, write_lot
 from parkenv.lots.checks import check_lot
-from parkenv.lots.importers.import_options import ImportOptions
-from parkenv.lots.importers.lot_import import import_lot
+from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.figures.import_picture import save_import_picture

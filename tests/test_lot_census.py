@@ -11,7 +11,7 @@ from made_outlines import document, double_row, kerb, row, write
 
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot, import_lot, packaged_lot, write_lot
-from parkenv.lots.importers.import_options import ImportOptions
+from parkenv.lots.draft import ImportOptions
 from parkenv.scenarios.build import largest_lots
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.lot_census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files

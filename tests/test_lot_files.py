@@ -17,7 +17,7 @@ from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
-from parkenv.lots.build import LOTS, build
+from parkenv.lots.builders.packaged import LOTS, build
 from parkenv.lots.checks import check_lot
 from parkenv.studies.figures.lot_picture import save_lot_picture
 from parkenv.world.lot import Lane, Mouth, ParkingLot

@@ -17,11 +17,11 @@ from made_outlines import document, double_row, kerb, row, town, write
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
-from parkenv.lots.importers.import_options import ImportOptions
-from parkenv.lots.outlines.infer import infer_lot
-from parkenv.lots.outlines.spaces import spaces_from_outlines
-from parkenv.lots.provenance import Provenance, read_provenance
-from parkenv.studies.lot_survey import ManoeuvreKind, can_park, survey_lot
+from parkenv.lots.draft import ImportOptions
+from parkenv.lots.infer.layout import infer_lot
+from parkenv.lots.infer.spaces import spaces_from_outlines
+from parkenv.lots.quality import Provenance, read_provenance
+from parkenv.studies.drivability import ManoeuvreKind, can_park, check_drivability
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)
@@ -44,7 +44,7 @@ def clean(lot, tmp_path):
     path = tmp_path / "lot.geojson"
     write_lot(lot, path)
     return [p.message for p in check_lot(path)] + [
-        p.message for p in survey_lot(read_lot(path)).problems
+        p.message for p in check_drivability(read_lot(path)).problems
     ] == []
 
 
@@ -187,13 +187,13 @@ class TestGuesses:
             guess.startswith("entry") for guess in imported(tmp_path, double_row(), options).guesses
         )
 
-    def test_the_file_keeps_guesses_and_doubts(self, tmp_path):
+    def test_the_file_keeps_guesses_and_issues(self, tmp_path):
         draft = imported(tmp_path, double_row())
         path = tmp_path / "lot.geojson"
-        write_lot(draft.lot(), path, Provenance("made.geojson", draft.guesses, draft.doubts))
+        write_lot(draft.lot(), path, Provenance("made.geojson", draft.guesses, draft.issues))
         kept = read_provenance(path)
         assert kept.guesses == draft.guesses
-        assert [doubt.reason for doubt in kept.doubts] == [doubt.reason for doubt in draft.doubts]
+        assert [issue.reason for issue in kept.issues] == [issue.reason for issue in draft.issues]
         assert read_lot(path) == draft.lot()
 
     def test_damaged_guesses_are_refused(self, tmp_path):
@@ -286,7 +286,7 @@ class TestFaults:
         assert not out.exists()
 
     def test_too_many_spaces(self, monkeypatch, tmp_path):
-        monkeypatch.setattr("parkenv.lots.outlines.outline_import.MOST_SPACES", 10)
+        monkeypatch.setattr("parkenv.lots.osm.outline_draft.MOST_SPACES", 10)
         with pytest.raises(InputError, match="32 parking spaces, want at most 10 in one lot"):
             imported(tmp_path, double_row())
 
@@ -352,23 +352,23 @@ class TestSurvey:
 
     @pytest.mark.parametrize("name", ["mini", "campus", "street"])
     def test_packaged_lots_are_clean(self, name):
-        survey = survey_lot(packaged_lot(name))
+        survey = check_drivability(packaged_lot(name))
         assert survey.problems == ()
-        assert survey.doubt == 0.0
+        assert survey.error_probability == 0.0
         assert survey.planned == survey.kinds
 
     def test_one_way_lanes_without_a_loop(self):
         mini = packaged_lot("mini")
         lot = ParkingLot(**{**columns(mini), "lanes": (Lane(mini.lanes[0].points, oneway=True),)})
-        assert any("form no loop" in p.message for p in survey_lot(lot, drive=False).problems)
+        assert any("form no loop" in p.message for p in check_drivability(lot, drive=False).problems)
 
     def test_a_lane_over_a_slot(self):
         mini = packaged_lot("mini")
         over = Lane(np.array([mini.lanes[0].points[1], mini.slot_xy[0]]))
         lot = ParkingLot(**{**columns(mini), "lanes": (*mini.lanes, over)})
-        survey = survey_lot(lot, drive=False)
+        survey = check_drivability(lot, drive=False)
         assert any("leaves less than 1 m to the slot" in p.message for p in survey.problems)
-        assert survey.doubt >= 0.5
+        assert survey.error_probability >= 0.5
 
     def test_a_slot_too_narrow_to_drive_into_is_named(self, tmp_path):
         mini = packaged_lot("mini")
@@ -380,7 +380,7 @@ class TestSurvey:
         said = parkenv("lot", "check", path).stdout
         assert "the car gets into no slots of 5 × 1.7 m at 90°" in said
         assert f"1 slots ('{mini.slot_ids[3]}')" in said
-        assert "doubt 0.2" in said
+        assert "error probability 0.2" in said
         undriven = parkenv("lot", "check", path, "--no-drive")
         assert (undriven.returncode, "gets into no" in undriven.stdout) == (0, False)
 

@@ -14,13 +14,13 @@ from onnx import numpy_helper
 
 from parkenv import InputError
 from parkenv.files.onnx_file import read_onnx
-from parkenv.perception.car_datasets import Crops, LabelledImage
 from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
+from parkenv.perception.lab.car_datasets import Crops, LabelledImage
+from parkenv.perception.lab.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
+from parkenv.perception.lab.training_crops import SIZES, ExampleMaker
 from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
 from parkenv.perception.onnx_outputs import class_columns, decode_centers, guess_layout
-from parkenv.perception.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
-from parkenv.perception.training_crops import SIZES, ExampleMaker
 from parkenv.studies.sensing.detector_drives import DrivePicture, score_on_drives
 from parkenv.studies.sensing.detector_scores import recall_on_crops, score_on
 from sim_sensors.camera.models import PinholeCamera, camera_pose
@@ -359,8 +359,8 @@ def test_a_training_that_cannot_be_is_refused_in_one_line(tmp_path, words, messa
 @pytest.mark.slow
 def test_a_short_training_repeats_and_its_file_gives_the_same(tmp_path):
     torch = pytest.importorskip("torch")
-    from parkenv.perception.center_network import INPUT, CenterNetwork, to_onnx
-    from parkenv.perception.center_training import CenterTrainingSettings, as_input, train_centers
+    from parkenv.perception.lab.center_network import INPUT, CenterNetwork, to_onnx
+    from parkenv.perception.lab.center_training import CenterTrainingSettings, as_input, train_centers
 
     scenes = [*simulated_scenes(1, 0, tmp_path)]
     assert len(scenes) == FRAMES

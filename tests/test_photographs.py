@@ -12,7 +12,7 @@ from parkenv import InputError
 from parkenv.files.videos import Video, film
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import Detections
-from parkenv.perception.labelled_folders import crops_of, read_labels
+from parkenv.perception.lab.labelled_folders import crops_of, read_labels
 
 SIZE = (160, 120)
 

@@ -7,11 +7,11 @@ import cv2
 import numpy as np
 import pytest
 
-from parkenv.perception.car_datasets import LabelledImage, read_crop_folder, read_uiuc_training
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.cross_validation import FALSE_POSITIVES, cross_validated, score_on_crops
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.training import TrainingSettings
+from parkenv.perception.lab.car_datasets import LabelledImage, read_crop_folder, read_uiuc_training
+from parkenv.perception.lab.cross_validation import FALSE_POSITIVES, cross_validated, score_on_crops
+from parkenv.perception.lab.training import TrainingSettings
 from parkenv.studies.sensing.detector_scores import score_on
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

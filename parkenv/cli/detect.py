@@ -18,10 +18,10 @@ from parkenv.studies.plurals import plural
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from parkenv.perception.car_datasets import LabelledImage
     from parkenv.perception.car_model import CarModel
-    from parkenv.perception.cross_validation import CropScore
     from parkenv.perception.detector import Detector
+    from parkenv.perception.lab.car_datasets import LabelledImage
+    from parkenv.perception.lab.cross_validation import CropScore
 
 
 def detect(
@@ -208,12 +208,12 @@ def train_detector(
             [default: none]
     """
     from parkenv.files.atomic_write import check_writable
-    from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
     from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
-    from parkenv.perception.cross_validation import cross_validated
     from parkenv.perception.hog import Descriptor
-    from parkenv.perception.labelled_folders import crops_of, read_labels
-    from parkenv.perception.training import TrainingSettings, train
+    from parkenv.perception.lab.car_datasets import read_crop_folder, read_uiuc_training
+    from parkenv.perception.lab.cross_validation import cross_validated
+    from parkenv.perception.lab.labelled_folders import crops_of, read_labels
+    from parkenv.perception.lab.training import TrainingSettings, train
 
     if sum(source is not None for source in (uiuc, crops, labels, simulated)) != 1:
         raise InputError("give one of --uiuc FOLDER, --crops FOLDER, --labels FILE|FOLDER and --simulated N")
@@ -273,7 +273,7 @@ def _train_network(out: Path, streets: int, steps: int, seed: int, pictures: Pat
         raise InputError(f"--out {out}: want a name that ends in .onnx for a network")
     check_writable(out)
     try:
-        from parkenv.perception.center_training import CenterTrainingSettings, build_network
+        from parkenv.perception.lab.center_training import CenterTrainingSettings, build_network
     except ImportError as error:
         raise InputError(
             f"--simulated needs {error.name}, which is not installed: pip install 'parkenv[detector]'"
@@ -291,7 +291,7 @@ def _train_network(out: Path, streets: int, steps: int, seed: int, pictures: Pat
 
 
 def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
-    from parkenv.perception.cross_validation import FALSE_POSITIVES
+    from parkenv.perception.lab.cross_validation import FALSE_POSITIVES
 
     def cells(part: str, cars: str, others: str, values: Sequence[float]) -> tuple[str, ...]:
         return part, cars, others, *(f"{v:.4f}" for v in values)
@@ -444,7 +444,7 @@ def _model_or_detector(model: str, detector: str | None) -> CarModel | Detector:
 
 
 def _evaluate_on_crops(folder: Path, model: str, detector: str | None, out: Path) -> None:
-    from parkenv.perception.car_datasets import read_crop_folder
+    from parkenv.perception.lab.car_datasets import read_crop_folder
     from parkenv.studies.results import make_folder
     from parkenv.studies.sensing.detector_scores import recall_on_crops
 

@@ -19,8 +19,8 @@ AUTO = "auto"
 """Value of `--entry` and `--goal` that allows a guess."""
 
 if TYPE_CHECKING:
-    from parkenv.lots.importers.import_options import ImportOptions
-    from parkenv.lots.provenance import Provenance
+    from parkenv.lots.draft import ImportOptions
+    from parkenv.lots.quality import Provenance
     from parkenv.world.lot import ParkingLot
 
 
@@ -53,8 +53,8 @@ def show(lot: str, /, graph: bool = False, out: Path | None = None) -> None:
 def check(place: Path, /, drive: bool | None = None) -> None:
     """List all errors and warnings of a lot file, by feature number (from 0), and summarise a valid lot.
 
-    A lot is surveyed: can a car reach every slot, drive into it and get back, and are the lanes clear? A score of
-    doubt from 0 (sure) to 1 sums up the reasons why an imported lot may differ from the place.
+    The drivability of a lot is checked: can a car reach every slot, drive into it and get back, and are the lanes
+    clear? The error probability, 0 to 1, sums up the reasons why an imported lot may differ from the place.
 
     The exit code is 2 if there are errors, else 0. Of a file to import it lists what an import would lack.
 
@@ -68,19 +68,19 @@ def check(place: Path, /, drive: bool | None = None) -> None:
         drive: Plan how the car drives into each kind of slot.  [default: drive]
     """
     from parkenv.lots import check_lot, read_lot
-    from parkenv.lots.file_formats import lot_format
-    from parkenv.studies.lot_survey import survey_lot
+    from parkenv.lots.formats.recognition import lot_format
+    from parkenv.studies.drivability import check_drivability
 
     console = make_console(soft_wrap=True)
     problems = check_lot(place)
     form = lot_format(place)
-    survey = None
+    drivability = None
     if form is not None and form.is_complete and not any(p.severity == "error" for p in problems):
         origin = _provenance(place)
-        survey = survey_lot(
-            read_lot(place), origin.doubts if origin is not None else (), drive=drive is not False
+        drivability = check_drivability(
+            read_lot(place), origin.issues if origin is not None else (), drive=drive is not False
         )
-        problems += survey.problems
+        problems += drivability.problems
     for problem in problems:
         feature = "" if problem.feature is None else f"feature {problem.feature}: "
         console.print(
@@ -96,12 +96,15 @@ def check(place: Path, /, drive: bool | None = None) -> None:
         console.print(f"{place}: " + ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts))
     if errors:
         raise Exit(2)
-    if survey is not None:
+    if drivability is not None:
         console.print(_summary(read_lot(place)))
         if drive is not False:
-            console.print(f"{survey.planned} of {survey.kinds} kinds of manoeuvres planned")
-        reasons = "; ".join(map(str, survey.doubts))
-        console.print(f"doubt {survey.doubt:.2f}" + (f": {reasons}" if reasons else ""), markup=False)
+            console.print(f"{drivability.planned} of {drivability.kinds} kinds of manoeuvres planned")
+        reasons = "; ".join(map(str, drivability.issues))
+        console.print(
+            f"error probability {drivability.error_probability:.2f}" + (f": {reasons}" if reasons else ""),
+            markup=False,
+        )
 
 
 def import_place(
@@ -146,9 +149,9 @@ def import_place(
     """
     from parkenv.files.atomic_write import check_writable
     from parkenv.lots import import_lot, write_lot
-    from parkenv.lots.geojson import check_lot_output
-    from parkenv.lots.importers.import_options import ImportOptions
-    from parkenv.lots.provenance import Provenance
+    from parkenv.lots.draft import ImportOptions
+    from parkenv.lots.formats.geojson import check_lot_output
+    from parkenv.lots.quality import Provenance
 
     corners = None if bounds is None else args.numbers("--bounds", bounds, 4)
     options = ImportOptions(
@@ -189,7 +192,7 @@ def import_place(
         lot = draft.lot()
     except InputError as error:
         raise InputError(f"{place}: {error}") from error
-    provenance = Provenance(place.name, draft.guesses, draft.doubts) if draft.guesses else None
+    provenance = Provenance(place.name, draft.guesses, draft.issues) if draft.guesses else None
     write_lot(lot, out, provenance)
     console.print(f"Wrote {out}. {_summary(lot)}")
 
@@ -197,10 +200,10 @@ def import_place(
 def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> None:
     """Write every car park of a town, a table of what became of each, and contact sheets."""
     from parkenv.lots import write_lot
-    from parkenv.lots.outlines.town import import_town
-    from parkenv.lots.provenance import Provenance
+    from parkenv.lots.osm.town import import_town
+    from parkenv.lots.quality import Provenance
+    from parkenv.studies.drivability import check_drivability
     from parkenv.studies.figures.contact_sheet import save_contact_sheets
-    from parkenv.studies.lot_survey import survey_lot
 
     rows: list[dict[str, object]] = []
     lots = []
@@ -212,36 +215,42 @@ def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> 
             bar.advance(task)
             row: dict[str, object] = {"lot": park.name, "spaces": park.spaces, "slots": 0, "lanes": 0}
             if park.draft is None:
-                row |= {"result": "refused", "doubt": None, "reason": park.reason}
+                row |= {"result": "refused", "error_probability": None, "reason": park.reason}
             else:
                 lot = park.draft.lot()
-                survey = survey_lot(lot, park.draft.doubts)
+                drivability = check_drivability(lot, park.draft.issues)
                 left = "; ".join(map(str, park.draft.left_out))
-                problems = "; ".join(problem.message for problem in survey.problems)
+                problems = "; ".join(problem.message for problem in drivability.problems)
                 row |= {
                     "slots": lot.n_slots,
                     "lanes": len(lot.lanes),
-                    "result": "doubtful" if survey.problems else "clean",
-                    "doubt": round(survey.doubt, 3),
+                    "result": "warnings" if drivability.problems else "clean",
+                    "error_probability": round(drivability.error_probability, 3),
                     "reason": problems or (f"left out: {left}" if left else ""),
                 }
-                lots.append((lot, Provenance(place.name, park.draft.guesses, survey.doubts), survey.doubt))
+                lots.append(
+                    (
+                        lot,
+                        Provenance(place.name, park.draft.guesses, drivability.issues),
+                        drivability.error_probability,
+                    )
+                )
             rows.append(row)
     for lot, provenance, _ in lots:
         write_lot(lot, out / f"{lot.name}.geojson", provenance)
-    drawn = [(f"{lot.name}\n{lot.n_slots} slots, doubt {doubt:.2f}", lot) for lot, _, doubt in lots]
+    drawn = [(f"{lot.name}\n{lot.n_slots} slots, error probability {p:.2f}", lot) for lot, _, p in lots]
     sheets = save_contact_sheets(drawn, out)
     save_summary(out, None, rows)
-    headings = ("car park", "spaces", "slots", "lanes", "doubt", "result", "reason")
+    headings = ("car park", "spaces", "slots", "lanes", "p(error)", "result", "reason")
     table = make_table(None, headings)
     for column in table.columns[-2:]:
         column.justify, column.no_wrap = "left", False
     for row in rows:
-        doubt = "" if row["doubt"] is None else f"{row['doubt']:.2f}"
-        cells = (row["lot"], row["spaces"], row["slots"], row["lanes"], doubt, row["result"], row["reason"])
+        p = "" if row["error_probability"] is None else f"{row['error_probability']:.2f}"
+        cells = (row["lot"], row["spaces"], row["slots"], row["lanes"], p, row["result"], row["reason"])
         table.add_row(*map(str, cells))
     make_console().print(table)
-    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "doubtful", "refused")}
+    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "warnings", "refused")}
     listed = ", ".join(f"{count} {name}" for name, count in became.items())
     pictures = f" Pictures: {', '.join(map(str, sheets))}" if sheets else ""
     console.print(
@@ -260,7 +269,7 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
 
     A slot is perpendicular, oblique or kerbside by the angle between its lane and the parked car; a lot is of the kind
     of nine in ten of its slots, else mixed. It is small below 80 slots, large from 200 on. The drive time is that from
-    an entry to the slot farthest from it, at 10 km/h. The doubt is that of `parkenv lot check`, with the reasons.
+    an entry to the slot farthest from it, at 10 km/h. The error probability is that of `parkenv lot check`.
 
     The exit code is 2 if a file holds no lot; the others are counted all the same.
 
@@ -285,7 +294,7 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
     console = make_console(soft_wrap=True)
     counted = []
     with progress_bar(console, "lots") as bar:
-        task = bar.add_task("Surveying", total=len(files))
+        task = bar.add_task("Checking", total=len(files))
         for file in files:
             counted.append(count_lot(file, drive=drive is not False))
             bar.advance(task)
@@ -298,9 +307,24 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
     if lots:
         pictures = [out / "census.png"]
         save_census([row for row, _ in lots], pictures[0])
-        drawn = [(f"{row['lot']}\n{row['slots']} slots, doubt {row['doubt']:.2f}", lot) for row, lot in lots]
+        drawn = [
+            (f"{row['lot']}\n{row['slots']} slots, error probability {row['error_probability']:.2f}", lot)
+            for row, lot in lots
+        ]
         pictures += save_contact_sheets(drawn, out)
-    headings = ("lot", "slots", "kind", "perp.", "obl.", "kerb", "m", "drive s", "doubt", "result", "reason")
+    headings = (
+        "lot",
+        "slots",
+        "kind",
+        "perp.",
+        "obl.",
+        "kerb",
+        "m",
+        "drive s",
+        "p(error)",
+        "result",
+        "reason",
+    )
     table = make_table(None, headings)
     for column in table.columns[-2:]:
         column.justify, column.no_wrap = "left", False
@@ -309,10 +333,17 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
         values = [
             row.get(name, "") for name in ("lot", "slots", "kind", "perpendicular", "oblique", "kerbside")
         ]
-        shown = (*values, extent, row.get("drive_s", ""), row.get("doubt", ""), row["result"], row["reason"])
+        shown = (
+            *values,
+            extent,
+            row.get("drive_s", ""),
+            row.get("error_probability", ""),
+            row["result"],
+            row["reason"],
+        )
         table.add_row(*map(str, shown))
     make_console().print(table)
-    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "doubtful", "invalid")}
+    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "warnings", "invalid")}
     listed = ", ".join(f"{count} {name}" for name, count in became.items() if count)
     slots = sum(row["slots"] for row, _ in lots)
     console.print(f"{len(rows)} lots, {slots:,} slots: {listed}. Table and pictures are in {out}")
@@ -338,7 +369,7 @@ def convert(lot: str, /, out: Path) -> None:
 
 def _provenance(path: Path) -> Provenance | None:
     """Return what a lot file says of its import; None for a packaged lot or another format."""
-    from parkenv.lots.provenance import read_provenance
+    from parkenv.lots.quality import read_provenance
 
     is_json = path.suffix.lower() in (".json", ".geojson") and path.exists()
     return read_provenance(path) if is_json else None

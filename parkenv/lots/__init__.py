@@ -5,11 +5,11 @@
 
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots.checks import check_lot
+from parkenv.lots.formats.contents import LotProblem
+from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import city_lot, grid_lot
-from parkenv.lots.geojson import write_lot
-from parkenv.lots.importers.lot_import import import_lot
-from parkenv.lots.lot_contents import LotProblem
 from parkenv.lots.lot_files import load_lot, packaged_lot, read_lot
+from parkenv.lots.lot_import import import_lot
 
 __all__ = [
     "PACKAGED_LOTS",

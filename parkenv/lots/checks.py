@@ -10,11 +10,11 @@ import shapely
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from parkenv.errors import InputError
-from parkenv.lots.dragon_lake import dragon_lake_lot
-from parkenv.lots.file_formats import LotFormat, lot_format
-from parkenv.lots.geojson import read_contents
-from parkenv.lots.importers.lot_import import import_lot
-from parkenv.lots.lot_contents import LotContents, LotProblem, graph_errors
+from parkenv.lots.formats.contents import LotContents, LotProblem, graph_errors
+from parkenv.lots.formats.dragon_lake import dragon_lake_lot
+from parkenv.lots.formats.geojson import read_contents
+from parkenv.lots.formats.recognition import LotFormat, lot_format
+from parkenv.lots.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points

@@ -8,10 +8,10 @@ from pathlib import Path
 from parkenv.errors import InputError
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.files.limited_reading import is_there
-from parkenv.lots.dragon_lake import dragon_lake_lot
-from parkenv.lots.file_formats import LotFormat, lot_format
-from parkenv.lots.geojson import read_contents
-from parkenv.lots.lot_contents import graph_errors
+from parkenv.lots.formats.contents import graph_errors
+from parkenv.lots.formats.dragon_lake import dragon_lake_lot
+from parkenv.lots.formats.geojson import read_contents
+from parkenv.lots.formats.recognition import LotFormat, lot_format
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
 

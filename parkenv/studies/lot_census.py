@@ -10,8 +10,8 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
 from parkenv.lots import read_lot
-from parkenv.lots.provenance import Doubt, read_provenance
-from parkenv.studies.lot_survey import manoeuvre_kinds, survey_lot
+from parkenv.lots.quality import QualityIssue, read_provenance
+from parkenv.studies.drivability import check_drivability, manoeuvre_kinds
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import KMH
 
@@ -28,7 +28,7 @@ SIZES = (("small", 80), ("medium", 200), ("large", np.inf))
 V_DRIVE = 10.0 * KMH  # m/s, of the drive time
 COLUMNS = (
     "lot", "file", "slots", "size", "kind", *KINDS, "extent_x_m", "extent_y_m", "lanes", "one_way_lanes", "entries",
-    "goals", "drive_s", "doubt", "result", "reason",
+    "goals", "drive_s", "error_probability", "result", "reason",
 )  # fmt: skip
 """Columns of a census."""
 
@@ -64,19 +64,19 @@ def count_lot(path: Path, *, drive: bool = True) -> tuple[Row, ParkingLot | None
         reason = str(error).removeprefix(f"{path}: ")
         return {"lot": path.stem, "file": str(path), "result": "invalid", "reason": reason}, None
     row = {"lot": lot.name, "file": str(path)}
-    return row | lot_columns(lot, origin.doubts if origin is not None else (), drive=drive), lot
+    return row | lot_columns(lot, origin.issues if origin is not None else (), drive=drive), lot
 
 
-def lot_columns(lot: ParkingLot, doubts: tuple[Doubt, ...] = (), *, drive: bool = True) -> Row:
+def lot_columns(lot: ParkingLot, issues: tuple[QualityIssue, ...] = (), *, drive: bool = True) -> Row:
     """Return the columns of a lot in a census.
 
     Args:
         lot: the lot.
-        doubts: reasons to doubt it that are known from its import.
+        issues: what may be wrong with it, as its import knows.
         drive: plan manoeuvres, as `parkenv lot check` does.
     """
     counts = slots_by_kind(lot)
-    survey = survey_lot(lot, doubts, drive=drive)
+    drivability = check_drivability(lot, issues, drive=drive)
     low_x, low_y, high_x, high_y = lot.bounds()
     return {
         "slots": lot.n_slots,
@@ -90,9 +90,9 @@ def lot_columns(lot: ParkingLot, doubts: tuple[Doubt, ...] = (), *, drive: bool 
         "entries": len(lot.entries),
         "goals": len(lot.goals),
         "drive_s": round(longest_drive_m(lot) / V_DRIVE, 1),
-        "doubt": round(survey.doubt, 3),
-        "result": "doubtful" if survey.problems else "clean",
-        "reason": "; ".join(problem.message for problem in survey.problems),
+        "error_probability": round(drivability.error_probability, 3),
+        "result": "warnings" if drivability.problems else "clean",
+        "reason": "; ".join(problem.message for problem in drivability.problems),
     }
 
 

@@ -1,8 +1,8 @@
 """Choose the places of suite v2: `python -m parkenv.studies.compare.choose_places DIR OUT`.
 
 DIR holds the outlines of parking spaces of car parks, a file of each. A place is sure: it is imported without a
-warning of `parkenv lot check`, with a doubt of at most 0.3. Of the sure ones, each stratum gives those with the
-smallest `lot_share`, a hash of their slots, so that nobody picks them.
+warning of `parkenv lot check`, with an error probability of at most 0.3. Of the sure ones, each stratum gives those
+with the smallest `lot_share`, a hash of their slots, so that nobody picks them.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from typing import Any
 
 from parkenv.errors import InputError
 from parkenv.lots import import_lot, write_lot
-from parkenv.lots.importers.import_options import ImportOptions
-from parkenv.lots.provenance import Provenance
+from parkenv.lots.draft import ImportOptions
+from parkenv.lots.quality import Provenance
 from parkenv.scenarios.places import lot_share
 from parkenv.studies.lot_census import lot_columns
 
 LEAST_SURE = 0.3
-"""Largest doubt of a place."""
+"""Largest error probability of a place."""
 STRATA = (
     ("perpendicular", "small", 4), ("perpendicular", "medium", 4), ("perpendicular", "large", 4),
     ("oblique", None, 2), ("kerbside", None, 4), ("mixed", None, 6),
@@ -38,9 +38,9 @@ def choose_places(outlines: Iterable[Path], out: Path) -> list[dict[str, Any]]:
             lot = draft.lot()
         except InputError:
             continue
-        row = lot_columns(lot, draft.doubts)
-        if row["result"] == "clean" and row["doubt"] <= LEAST_SURE:
-            sure.append((lot_share(lot), row, lot, Provenance(path.name, draft.guesses, draft.doubts)))
+        row = lot_columns(lot, draft.issues)
+        if row["result"] == "clean" and row["error_probability"] <= LEAST_SURE:
+            sure.append((lot_share(lot), row, lot, Provenance(path.name, draft.guesses, draft.issues)))
     sure.sort(key=lambda one: one[0])
     rows: list[dict[str, Any]] = []
     for kind, size, count in STRATA:

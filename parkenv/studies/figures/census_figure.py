@@ -1,4 +1,4 @@
-"""Picture of a census of lots: sizes, kinds of slots, drive times and doubt."""
+"""Picture of a census of lots: sizes, kinds of slots, drive times and error probabilities."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
     edges = 2.0 ** np.arange(low, high + 1e-9, 1 / _EDGES_AN_OCTAVE)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(10.5, 3.4), layout="constrained")
-        size, kind, drive, doubt = figure.subplots(1, 4, width_ratios=(1.2, 0.9, 1.3, 0.9))
+        size, kind, drive, error = figure.subplots(1, 4, width_ratios=(1.2, 0.9, 1.3, 0.9))
         size.hist(by_kind("slots"), edges, stacked=True, color=colors, edgecolor="white", linewidth=0.4)
         size.set_xscale("log", base=2)
         size.set(xlabel="slots", ylabel="lots", title=f"{len(rows)} lots by size")
@@ -55,19 +55,23 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
         drive.set_xticks(ticks, [f"{tick:.0f}" for tick in ticks])
         drive.minorticks_off()
         drive.set(xlabel="slots", ylabel="s, at 10 km/h", title="Drive to the farthest slot", ylim=(0, None))
-        edges_of_doubt = np.arange(0.0, max(row["doubt"] for row in rows) + 0.1, 0.1)
-        doubt.hist(
-            by_kind("doubt"),
-            edges_of_doubt,
+        edges = np.arange(0.0, max(row["error_probability"] for row in rows) + 0.1, 0.1)
+        error.hist(
+            by_kind("error_probability"),
+            edges,
             stacked=True,
             color=colors,
             edgecolor="white",
             linewidth=0.4,
         )
         clean = sum(row["result"] == "clean" for row in rows)
-        doubt.set(xlabel="doubt", ylabel="lots", title=f"{clean} without a warning")
+        error.set(xlabel="error probability", ylabel="lots", title=f"{clean} without a warning")
         handles = [Patch(color=KIND_COLORS[name], label=name) for name in present]
         figure.legend(handles=handles, title="lots that are", loc="outside lower center", ncols=len(handles))
-        for ax in (size, drive, doubt):
+        for ax in (size, drive, error):
             ax.grid(visible=True, axis="y")
-        save_picture(figure, path, f"{len(rows)} lots: sizes, kinds of slots, drive times at 10 km/h, doubt.")
+        save_picture(
+            figure,
+            path,
+            f"{len(rows)} lots: sizes, kinds of slots, drive times at 10 km/h, error probabilities.",
+        )

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.importers.lot_draft import LotDraft
+from parkenv.lots.draft import LotDraft
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.studies.figures.lot_picture import ENTRY, GOAL, GROUND, INK, draw_walls
 from parkenv.studies.figures.picture_files import save_picture

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
-from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.car_regions import END_WIDEST
-from parkenv.perception.cross_validation import BLOCKS, scores_of
-from parkenv.perception.detection_scores import RecallPrecision, recall_precision
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.hog_detector import HogDetector
+from parkenv.perception.lab.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
+from parkenv.perception.lab.cross_validation import BLOCKS, scores_of
+from parkenv.perception.lab.detection_scores import RecallPrecision, recall_precision
 from parkenv.studies.figures.picture_files import STYLE, save_picture
 
 _SMALLEST = {"single": 0.85, "multi": 0.8}

@@ -1,0 +1,1 @@
+"""Programs that developers run to make the packaged data."""

@@ -1,0 +1,166 @@
+"""Options and result of an import: a lot, or an incomplete lot with a list of what is missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError
+from parkenv.lots.generators import Slots
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.quality import QualityIssue
+from parkenv.world.drive_graph import GraphError
+from parkenv.world.lot import Lane, ParkingLot
+
+NEAR_ON_GLOBE = 1.0
+"""Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """Goals, entries and bounds that complete or replace those of a file.
+
+    Raises:
+        InputError: a pair that is not two finite numbers.
+    """
+
+    # walking destinations as pairs of numbers: metres east and north in the lot's frame or, for a file with latitudes
+    # and longitudes, a latitude and a longitude (any pair within a degree of the lot)
+    goals: tuple[tuple[float, float], ...] = ()
+    entries: tuple[tuple[float, float], ...] = ()  # places where cars enter, in the same form
+    # two corners, in the same form; elements outside are not read
+    bounds: tuple[tuple[float, float], tuple[float, float]] | None = None
+    guess_entry: bool = False  # whether an entry that the file does not show may be guessed
+    guess_goal: bool = False  # the same for goals
+    with_disabled: bool = False  # whether slots for disabled drivers count as slots
+
+    def __post_init__(self) -> None:
+        for what, points in (("goal", self.goals), ("entry", self.entries), ("bounds", self.bounds or ())):
+            for point in points:
+                if len(point) != 2 or not np.isfinite(point).all():
+                    raise InputError(f"{what} is {point!r}, want two finite numbers")
+
+    def box(self, frame: LocalFrame | None) -> tuple[float, float, float, float] | None:
+        """Return the bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds.
+
+        Raises:
+            InputError: bounds without an area.
+        """
+        if self.bounds is None:
+            return None
+        corners = points_in_frame(frame, self.bounds)
+        (x0, y0), (x1, y1) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
+        if x1 - x0 < 1.0 or y1 - y0 < 1.0:
+            raise InputError(f"bounds are {x1 - x0:.2f} × {y1 - y0:.2f} m, want an area")
+        return x0, y0, x1, y1
+
+
+def points_in_frame(frame: LocalFrame | None, pairs: tuple[tuple[float, float], ...]) -> FloatArray:
+    """Convert pairs of numbers to metres, (n, 2), in the lot's frame.
+
+    A pair within a degree of the frame's origin is a latitude and a longitude; any other pair is metres.
+    """
+    points = np.array(pairs, dtype=np.float64).reshape(-1, 2)
+    if frame is None or not len(points):
+        return points
+    on_globe = np.all(np.abs(points - [frame.lat, frame.lon]) <= NEAR_ON_GLOBE, axis=1, keepdims=True)
+    return np.where(on_globe, frame.to_xy(points[:, ::-1]), points)
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """Elements that an import did not use: the reason, and their ids in the file."""
+
+    reason: str
+    ids: tuple[str, ...]
+
+    def __str__(self) -> str:
+        shown = ", ".join(self.ids[:5]) + (", ..." if len(self.ids) > 5 else "")
+        return f"{self.reason}: {len(self.ids)} ({shown})"
+
+
+@dataclass(frozen=True, eq=False)
+class LotDraft:
+    """Slots, lanes, entries and goals found in a file; any may be missing."""
+
+    name: str  # the lot's name
+    slot_ids: tuple[str, ...]  # n_slots names
+    slots: Slots  # their geometry, lot frame
+    slot_source: tuple[str, ...]  # n_slots names of the source of each slot
+    lanes: tuple[Lane, ...]  # centre lines
+    entries: FloatArray  # (n_entries, 2) m
+    goals: FloatArray  # (n_goals, 2) m
+    walls: tuple[FloatArray, ...] = ()  # (k, 2) m each
+    outlines: tuple[FloatArray, ...] = ()  # (k, 2) m each, parking areas in the file; for figures
+    found: tuple[str, ...] = ()  # one line per finding
+    guesses: tuple[str, ...] = ()  # one sentence per thing that the file does not say
+    issues: tuple[QualityIssue, ...] = ()  # what may be wrong with the result
+    left_out: tuple[LeftOut, ...] = ()  # elements that were not used
+    missing: tuple[str, ...] = ()  # one sentence per missing part that a search needs, with how to provide it
+    frame: LocalFrame | None = None  # geographic frame of the lot; None if the file has none
+    # (k, 2) m, centres of slots whose shape is unknown; for figures
+    loose: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+
+    @classmethod
+    def of_lot(cls, lot: ParkingLot) -> LotDraft:
+        """Return the draft of a complete lot."""
+        return cls(
+            name=lot.name,
+            slot_ids=lot.slot_ids,
+            slots=Slots.of_lot(lot),
+            slot_source=("the lot file",) * lot.n_slots,
+            lanes=lot.lanes,
+            entries=lot.entries,
+            goals=lot.goals,
+            walls=lot.walls,
+            found=(f"{lot.n_slots} slots and {len(lot.lanes)} lanes of a lot file",),
+        )
+
+    def lot(self) -> ParkingLot:
+        """Create the lot.
+
+        Raises:
+            InputError: something is missing or the parts do not fit together; the message gives details.
+        """
+        if self.missing:
+            raise InputError("; ".join(self.missing))
+        try:
+            return ParkingLot(
+                name=self.name,
+                slot_ids=self.slot_ids,
+                **self.slots.columns(),
+                lanes=self.lanes,
+                entries=self.entries,
+                goals=self.goals,
+                walls=self.walls,
+            )
+        except GraphError as error:
+            problem = error.problems[0]
+            what = f"slot {self.slot_ids[problem.index]!r}" if problem.kind == "slot" else problem.kind
+            raise InputError(f"{what} {problem.message}") from error
+
+    def searchable(self) -> LotDraft:
+        """Return the draft without slots that cannot be reached from an entry; they are listed in `left_out`.
+
+        An incomplete draft is returned unchanged.
+        """
+        try:
+            lot = self.lot()
+        except InputError:
+            return self
+        far = ~np.isfinite(dijkstra(lot.drive_matrix(), indices=lot.entry_vertices, min_only=True))
+        lost = far[: lot.n_slots]
+        if not lost.any() or lost.all():
+            return self
+        kept = np.flatnonzero(~lost)
+        ids = tuple(self.slot_ids[i] for i in np.flatnonzero(lost))
+        return replace(
+            self,
+            slot_ids=tuple(self.slot_ids[i] for i in kept),
+            slots=self.slots[kept],
+            slot_source=tuple(self.slot_source[i] for i in kept),
+            left_out=(*self.left_out, LeftOut("slots that cannot be reached from an entry", ids)),
+        )

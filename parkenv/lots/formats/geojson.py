@@ -1,0 +1,257 @@
+"""Read and write native lot files (GeoJSON), and collect all errors of a file.
+
+The native file is a GeoJSON FeatureCollection with the additional members
+`"parkenv": {"format": "lot", "version": 1}`, `"name"` and `"frame": "local"` (metres). Without
+`frame`, positions are longitude and latitude (RFC 7946), and are projected to metres east and north of the
+centre of the features. `properties.kind` is the kind of a feature:
+
+| kind | geometry | properties |
+|---|---|---|
+| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; all or none of `center`, `yaw`, `length`, `width`, \
+`mouth` (rear, left, right) |
+| `lane` | LineString | `oneway`, false if absent |
+| `entry`, `goal` | Point | |
+| `wall` | LineString or Polygon | |
+
+A file made by an import may have the member `import`: its source, what was guessed, and what may be wrong with it.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write, check_writable
+from parkenv.files.file_names import is_plain
+from parkenv.files.limited_reading import read_json
+from parkenv.lots.formats.contents import KINDS, LotContents
+from parkenv.lots.formats.geojson_slots import SLOT_SHAPE, RawFeature, is_coordinate, read_slots
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.quality import Provenance
+from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, is_building
+
+LOT_VERSION = 1
+
+
+def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None = None) -> None:
+    """Write a lot as native GeoJSON, atomically; `read_lot` restores it exactly.
+
+    Args:
+        lot: the lot.
+        path: the file.
+        provenance: what an import guessed, kept in the member `import`.
+
+    Raises:
+        InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
+    """
+    path = Path(path)
+    _check_suffix(path)
+    head: dict[str, Any] = {
+        "type": "FeatureCollection",
+        "name": lot.name,
+        "parkenv": {"format": "lot", "version": LOT_VERSION},
+        "frame": "local",
+    }
+    if provenance is not None:
+        head["import"] = provenance.document()
+    features = ",\n".join(json.dumps(feature) for feature in _features(lot))
+    text = f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n'
+    with atomic_write(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
+def check_lot_output(path: Path) -> None:
+    """Check that `write_lot` can write a file, before any work.
+
+    Raises:
+        InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
+    """
+    _check_suffix(path)
+    check_writable(path)
+
+
+def _check_suffix(path: Path) -> None:
+    if path.suffix.lower() not in (".geojson", ".json"):
+        raise InputError(f"{path}: a lot is written as .geojson or .json")
+
+
+def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
+    def feature(geometry: str, coordinates: object, **properties: object) -> dict[str, Any]:
+        shape = {"type": geometry, "coordinates": coordinates}
+        return {"type": "Feature", "properties": properties, "geometry": shape}
+
+    rings = np.round(lot.slot_corners()[:, [0, 1, 2, 3, 0]], 3).tolist()
+    shapes = zip(
+        lot.slot_xy.tolist(),
+        lot.slot_yaw.tolist(),
+        lot.slot_length.tolist(),
+        lot.slot_width.tolist(),
+        (Mouth(mouth).name.lower() for mouth in lot.slot_mouth),
+        strict=True,
+    )
+    costs = lot.slot_parking_cost_s.tolist()
+    for slot_id, ring, shape, cost in zip(lot.slot_ids, rings, shapes, costs, strict=True):
+        exact = dict(zip(SLOT_SHAPE, shape, strict=True))
+        priced = {"parking_cost_s": cost} if cost else {}
+        yield feature("Polygon", [ring], kind="slot", id=slot_id, **priced, **exact)
+    for lane in lot.lanes:
+        yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway)
+    for kind, points in (("entry", lot.entries), ("goal", lot.goals)):
+        for xy in points.tolist():
+            yield feature("Point", xy, kind=kind)
+    for wall in lot.walls:
+        if is_building(wall):
+            yield feature("Polygon", [wall.tolist()], kind="wall")
+        else:
+            yield feature("LineString", wall.tolist(), kind="wall")
+
+
+# ---- reading: all errors are collected, so nothing below raises out of `read_contents` ----
+
+
+def read_contents(path: Path) -> LotContents:
+    """Read all valid features of a file, and record all errors. Does not raise."""
+    contents = LotContents(path.stem)
+    try:
+        document = _load(path)
+        contents.name, local = _check_head(document, path.stem)
+    except InputError as error:
+        contents.error(None, str(error))
+        return contents
+
+    raw: list[RawFeature] = []
+    positions: list[tuple[float, float]] = []
+    kinds_seen: set[object] = set()
+    for number, feature in enumerate(document["features"]):
+        mark = len(positions)
+        try:
+            raw.append(_check_feature(number, feature, positions, kinds_seen))
+        except InputError as error:
+            del positions[mark:]
+            contents.error(number, str(error))
+    for kind in ("slot", "lane", "entry", "goal"):
+        if kind not in kinds_seen:
+            contents.error(None, f"no {kind}: an empty lot, want at least one feature of kind {kind!r}")
+
+    xy = np.array(positions, dtype=np.float64).reshape(-1, 2)
+    if not local:
+        off_globe = np.flatnonzero((np.abs(xy) > (180.0, 90.0)).any(axis=1))
+        if len(off_globe):
+            number = next(f.number for f in raw if any(p.stop > off_globe[0] for p in f.parts))
+            lon, lat = xy[off_globe[0]].tolist()
+            contents.error(
+                number,
+                f"position [{lon:g}, {lat:g}] is no longitude and latitude; "
+                'for metres, the file needs the member "frame": "local"',
+            )
+            return contents
+        xy = LocalFrame.around(xy).to_xy(xy) if len(xy) else xy
+
+    for feature in raw:
+        if feature.kind != "slot":
+            _add_feature(contents, feature, [xy[part] for part in feature.parts])
+    read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=local)
+    contents.errors.sort(key=lambda problem: -1 if problem.feature is None else problem.feature)
+    return contents
+
+
+def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatArray]) -> None:
+    """Add a lane, an entry, a goal, or a wall with one part per ring."""
+    if feature.kind == "lane":
+        try:
+            contents.lanes.append(Lane(parts[0], feature.properties.get("oneway", False)))
+        except InputError as error:
+            contents.error(feature.number, str(error))
+            return
+    elif feature.kind == "wall":
+        contents.walls += parts
+    else:
+        points = contents.entries if feature.kind == "entry" else contents.goals
+        points.append(parts[0][0])
+    contents.numbers[feature.kind].append(feature.number)
+
+
+def _load(path: Path) -> Any:
+    if path.suffix.lower() not in (".geojson", ".json"):
+        raise InputError(f"unknown kind of file {path.suffix!r}, want .geojson, .json or a Dragon Lake .yml")
+    try:
+        return read_json(path)
+    except InputError as error:
+        raise InputError(str(error).removeprefix(f"{path}: ")) from error
+
+
+def _check_head(document: Any, stem: str) -> tuple[str, bool]:
+    """Validate the top-level members; return the lot's name, and whether positions are metres in a local frame."""
+    if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
+        kind = document.get("type") if isinstance(document, dict) else type(document).__name__
+        raise InputError(f"type is {kind!r:.40}, want a GeoJSON 'FeatureCollection'")
+    if not isinstance(document.get("features"), list):
+        raise InputError(f"features is {document.get('features')!r:.40}, want a list of features")
+    header = document.get("parkenv", {"format": "lot", "version": LOT_VERSION})
+    if not isinstance(header, dict) or header.get("format") != "lot":
+        raise InputError(f'parkenv is {header!r:.60}, want {{"format": "lot", "version": {LOT_VERSION}}}')
+    version = header.get("version")
+    if type(version) is not int or version < 1:
+        raise InputError(f"parkenv.version is {version!r:.40}, want {LOT_VERSION}")
+    if version > LOT_VERSION:
+        raise InputError(f"parkenv.version is {version}, want {LOT_VERSION}: made by a newer parkenv")
+    name = document.get("name", stem)
+    if not isinstance(name, str) or not is_plain(name):
+        raise InputError(f"name is {name!a:.40}, want a text without control characters")
+    if document.get("frame", "local") != "local":
+        raise InputError(f"frame is {document['frame']!r:.40}, want 'local', or no frame for lon/lat")
+    return name, "frame" in document
+
+
+def _check_feature(
+    number: int, feature: Any, positions: list[tuple[float, float]], kinds_seen: set[object]
+) -> RawFeature:
+    """Validate a feature and append its positions to `positions`."""
+    if not isinstance(feature, dict) or feature.get("type") != "Feature":
+        raise InputError("want a GeoJSON object of type 'Feature'")
+    properties, geometry = (
+        part if isinstance(part := feature.get(name), dict) else {} for name in ("properties", "geometry")
+    )
+    kind, shape = properties.get("kind"), geometry.get("type")
+    if not isinstance(kind, str) or kind not in KINDS:
+        raise InputError(f"kind is {kind!r:.40}, want one of {', '.join(KINDS)}")
+    kinds_seen.add(kind)
+    if shape not in KINDS[kind]:
+        raise InputError(f"{kind}: geometry is {shape!r:.40}, want {' or '.join(KINDS[kind])}")
+    if kind == "lane" and not isinstance(properties.get("oneway", False), bool):
+        raise InputError(f"lane: oneway is {properties['oneway']!r:.40}, want true or false")
+
+    coordinates = geometry.get("coordinates")
+    lines: Any
+    if shape == "Point":
+        lines, least = [[coordinates]], 1
+    elif shape == "LineString":
+        lines, least = [coordinates], 2
+    else:
+        lines, least = coordinates, 4
+    if not isinstance(lines, list) or not lines:
+        raise InputError(f"{kind}: coordinates are {lines!r:.40}, want a list of rings")
+    if kind == "slot" and len(lines) > 1:
+        raise InputError(f"slot: the polygon has {len(lines)} rings, want 1")
+    parts = []
+    for line in lines:
+        if not isinstance(line, list) or len(line) < least:
+            raise InputError(f"{kind}: coordinates are {line!r:.40}, want at least {least} positions")
+        start = len(positions)
+        positions += [_position(kind, position) for position in line]
+        if shape == "Polygon" and positions[start] != positions[-1]:
+            raise InputError(f"{kind}: the polygon's ring is open, want its first position again at the end")
+        parts.append(slice(start, len(positions)))
+    return RawFeature(number, kind, properties, parts, properties.get("id", feature.get("id")))
+
+
+def _position(kind: str, position: Any) -> tuple[float, float]:
+    if isinstance(position, list) and len(position) >= 2 and all(map(is_coordinate, position)):
+        return float(position[0]), float(position[1])
+    raise InputError(f"{kind}: position {position!r:.60}, want two finite numbers, at most {FARTHEST:.0e}")

@@ -1,0 +1,1 @@
+"""Infer rows, aisles, lanes and entries from the rectangles of parking spaces."""

@@ -1,0 +1,212 @@
+"""Infer a lot from its parking spaces: rows, the sides that they open to, aisles, connections, entry and goal.
+
+1. Spaces side by side, or end to end along a kerb, are rows (`rows`).
+2. A row opens to free ground; of two free sides to the one where it shares an aisle with a facing row (`openings`).
+3. Aisles are lines before the open sides of rows, in the middle between facing ones (`aisles`).
+4. The shortest ways through free ground connect the aisles (`connections`).
+5. Aisles along oblique rows are one-way by the slant, if all lanes stay connected (`network`).
+6. Cars enter where a lane can be continued to the edge with short drives to the spaces (`access`).
+
+Roads of the map are lanes as they are: rows that they reach need no aisle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.errors import InputError
+from parkenv.lots.generators import Slots
+from parkenv.lots.infer.access import Entry, entries_from_streets, goal_beyond, guess_entry
+from parkenv.lots.infer.aisles import Aisle, find_aisles
+from parkenv.lots.infer.connections import Connection, connect
+from parkenv.lots.infer.free_space import FreeSpace
+from parkenv.lots.infer.network import Line, directed, lanes_of, largest_part, noded, without_stubs
+from parkenv.lots.infer.openings import OpenRow, View, open_rows
+from parkenv.lots.infer.rows import find_rows
+from parkenv.lots.infer.spaces import Spaces
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.world.drive_graph import SLOT_REACH
+from parkenv.world.lot import Lane, Mouth, corner_points, mouth_heading, mouth_points
+
+LONGEST_CONNECTION = 120.0  # m
+NARROWEST, KERB_LENGTH = 1.95, 4.8
+"""Least width, m, of a slot across which cars park, and least length of one along which they park."""
+FACING = 0.5  # least cosine of the angle between a slot's open side and the way to its lane
+CAR_ROOM = 1.0  # half the width, m, that a car needs on a lane
+KERB_WIDTH = 2.0
+"""Least width, m, of a kerbside slot; narrower outlines are widened towards the lane, since cars stand out of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class InferredLot:
+    """Everything inferred from outlines."""
+
+    index: IntArray  # (n,) which spaces became slots
+    slots: Slots
+    lanes: tuple[Lane, ...]
+    entries: FloatArray  # (k, 2) m
+    goal: FloatArray  # (1, 2) m, on the side of the entry
+    rows: tuple[OpenRow, ...]
+    aisles: tuple[Aisle, ...]
+    connections: tuple[Connection, ...]
+    entry: Entry | None
+    two_way: tuple[int, ...]  # aisles that stay two-way against the slant of their spaces
+    widened: int  # number of kerbside slots wider than their outlines
+    left_out: dict[str, list[int]] = field(default_factory=dict)  # reason: spaces
+
+
+def infer_lot(
+    spaces: Spaces,
+    obstacles: Sequence[shapely.Geometry] = (),
+    roads: Sequence[Line] = (),
+    entries: FloatArray | None = None,
+) -> InferredLot:
+    """Infer the lanes and the entry of a car park from its spaces.
+
+    Args:
+        spaces: the parking spaces.
+        obstacles: buildings and other polygons that no car drives over, m.
+        roads: roads of the map, service roads and public streets (source `STREET`).
+        entries: (k, 2) m, entries if known.
+
+    Raises:
+        InputError: no aisle, or no way in, was found.
+    """
+    blocked = [*spaces.boxes(), *obstacles]
+    rows, lost = open_rows(spaces, find_rows(spaces), obstacles, [road.points for road in roads])
+    left_out = {"spaces that only another space leads to": lost.tolist()}
+    rows, small = _large_enough(spaces, rows)
+    left_out.update(small)
+    aisles = find_aisles(spaces, rows, blocked, [road.points for road in roads])
+    if not aisles and not roads:
+        reasons = "; ".join(f"{len(members)} {reason}" for reason, members in left_out.items() if members)
+        raise InputError(f"no aisle serves any of {len(spaces)} spaces: {reasons}")
+    lines = [
+        Line(aisle.points if aisle.one_way >= 0 else aisle.points[::-1], aisle.one_way != 0, a)
+        for a, aisle in enumerate(aisles)
+    ]
+    connections = connect([line.points for line in (*lines, *roads)], FreeSpace(blocked), LONGEST_CONNECTION)
+    lines = noded(noded([*lines, *roads, *(Line(connection.points) for connection in connections)]))
+    index, slots, widened = _slots(spaces, rows)
+    mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    main = [lines[k] for k in largest_part(lines)[0]]
+    lines = without_stubs(main, lambda some: int(_is_served(slots, some).sum()))
+    wanted = {
+        a: int(sum(len(rows[r].row) for r in aisle.rows)) for a, aisle in enumerate(aisles) if aisle.one_way
+    }
+    lines, two_way = directed(lines, wanted)
+
+    entry = None
+    if entries is None or not len(entries):
+        on_street = entries_from_streets(lines, mouths)
+        if on_street is not None:
+            lines, entries, entry = on_street
+        else:
+            entry = guess_entry(lines, mouths, blocked)
+            lines = noded([*lines, Line(entry.points)])
+            entries = entry.points[1:]
+    served, clear = _is_served(slots, lines), _is_clear(slots, lines)
+    left_out["spaces that no aisle passes in front"] = index[~served].tolist()
+    left_out["spaces beside which the only way is too narrow"] = index[served & ~clear].tolist()
+    served &= clear
+    return InferredLot(
+        index=index[served],
+        slots=slots[served],
+        lanes=tuple(lanes_of(lines)),
+        entries=entries,
+        goal=goal_beyond(entries[0], _lane_before(entry, entries[0], lines)),
+        rows=tuple(rows),
+        aisles=tuple(aisles),
+        connections=tuple(connections),
+        entry=entry,
+        two_way=tuple(two_way),
+        widened=widened,
+        left_out={reason: members for reason, members in left_out.items() if members},
+    )
+
+
+def _large_enough(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[list[OpenRow], dict[str, list[int]]]:
+    """Return the rows without spaces that a car does not fit into, and those spaces by reason."""
+    kept: list[OpenRow] = []
+    small: dict[str, list[int]] = {}
+    for part in rows:
+        members = part.row.members
+        if part.row.kerbside:
+            fits, reason = (
+                spaces.length[members] >= KERB_LENGTH,
+                f"kerbside spaces shorter than {KERB_LENGTH:g} m",
+            )
+        else:
+            fits, reason = spaces.width[members] >= NARROWEST, f"spaces narrower than {NARROWEST:g} m"
+        small.setdefault(reason, []).extend(members[~fits].tolist())
+        if fits.any():
+            index = np.flatnonzero(fits)
+            view = View(part.view.clear[index], part.view.hit[index])
+            kept.append(OpenRow(part.row.part(index), part.side, view, part.certainty))
+    return kept, small
+
+
+def _lane_before(entry: Entry | None, xy: FloatArray, lines: Sequence[Line]) -> FloatArray:
+    """Return a point, (2,) m, of the network that cars come by from the entry."""
+    if entry is not None:
+        return np.asarray(entry.points[0])
+    corners = np.concatenate([line.points for line in lines])
+    away = np.hypot(*(corners - xy).T)
+    return np.asarray(corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))])
+
+
+def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
+    """Whether the lane nearest to each slot's mouth, (n,), is before it and within reach."""
+    mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    to_lane = nearest_on_lanes([Lane(line.points) for line in lines], mouth)[0] - mouth
+    heading = mouth_heading(slots.yaw, slots.mouth)
+    ahead = to_lane[:, 0] * np.cos(heading) + to_lane[:, 1] * np.sin(heading)
+    distance = np.hypot(to_lane[:, 0], to_lane[:, 1])
+    return np.asarray((ahead >= FACING * distance) & (distance <= SLOT_REACH - 0.05))
+
+
+def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
+    """Whether no lane, (n,), leads closer past a slot than a car can drive."""
+    corners = corner_points(slots.xy, slots.yaw, slots.length - 0.2, slots.width - 0.2)
+    tree = shapely.STRtree([shapely.LineString(line.points) for line in lines])
+    hit = tree.query(
+        np.atleast_1d(np.asarray(shapely.polygons(corners))), predicate="dwithin", distance=CAR_ROOM
+    )[0]
+    clear = np.ones(len(slots), dtype=bool)
+    clear[hit] = False
+    return clear
+
+
+def _slots(spaces: Spaces, rows: Sequence[OpenRow]) -> tuple[IntArray, Slots, int]:
+    """Return the indices of the spaces in rows, their slots, and how many are wider than their outlines."""
+    parts, members, widened = [], [], 0
+    for part in rows:
+        row, side = part.row, part.side
+        outward = row.outward(side)
+        index = row.members
+        wider = np.maximum(KERB_WIDTH - spaces.width[index], 0.0) * row.kerbside
+        if row.kerbside:
+            # The lane is on the left of a car that keeps to the right.
+            heading = np.stack([outward[:, 1], -outward[:, 0]], axis=1)
+            mouth = Mouth.LEFT
+        else:
+            heading, mouth = -outward, Mouth.REAR
+        parts.append(
+            Slots(
+                xy=spaces.xy[index] + wider[:, None] / 2 * outward,
+                yaw=np.arctan2(heading[:, 1], heading[:, 0]),
+                length=spaces.length[index],
+                width=spaces.width[index] + wider,
+                mouth=np.full(len(index), int(mouth), dtype=np.int8),
+            )
+        )
+        members.append(index)
+        widened += int((wider > 0.0).sum())
+    order = np.argsort(np.concatenate(members), kind="stable")
+    return np.concatenate(members)[order], Slots.joined(parts)[order], widened

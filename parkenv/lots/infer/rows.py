@@ -1,0 +1,191 @@
+"""Rows of parking spaces: chains of spaces side by side, or end to end along a kerb."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.lots.infer.spaces import Spaces
+
+TOUCHING = 0.7  # widest gap, m, between neighbours in a row
+SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours
+STEP = 0.62
+"""Largest offset of neighbours along their axes, as a fraction of their length: 45° rows have 0.5."""
+SLIM, KERB_LENGTH, KERB_SHAPE = 1.6, 4.9, 1.9
+"""Least ratio of length to width of spaces end to end along a kerb; of just two of them, least length, m, and ratio."""
+SQUARE = np.radians(12.0)  # largest deviation from a right angle of a perpendicular row
+RIGHT = np.pi / 2
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """Spaces in a chain, in order; they may open to `out` (side 0) or against it (side 1)."""
+
+    members: IntArray  # (k,) indices of spaces
+    kerbside: bool  # whether cars park along the row
+    along: FloatArray  # (k, 2) unit vectors, direction of the row at each space
+    out: FloatArray  # (k, 2) unit vectors from the centres to the mouths of side 0
+    half: FloatArray  # (k,) m, from the centres to the mouths
+    pitch: FloatArray  # (k,) m, extent of each space along the row
+
+    def __len__(self) -> int:
+        return len(self.members)
+
+    def part(self, index: IntArray) -> Row:
+        """Return the row of some of the spaces."""
+        columns = {name: getattr(self, name)[index] for name in ("members", "along", "out", "half", "pitch")}
+        return replace(self, **columns)
+
+    def normal(self, side: int) -> FloatArray:
+        """Unit vectors, (k, 2), across the row toward a side."""
+        left = np.stack([-self.along[:, 1], self.along[:, 0]], axis=1)
+        sign = np.sign((left * self.out).sum(axis=1)) * (1.0 - 2.0 * side)
+        return np.asarray(left * sign[:, None])
+
+    def outward(self, side: int) -> FloatArray:
+        """Unit vectors, (k, 2), from the centres to the mouths of a side."""
+        return self.out * (1.0 - 2.0 * side)
+
+    def mouths(self, spaces: Spaces, side: int) -> FloatArray:
+        """Middles of the mouths, (k, 2) m."""
+        return spaces.xy[self.members] + self.half[:, None] * self.outward(side)
+
+    @property
+    def slant(self) -> float:
+        """Mean angle between row and cars, rad, 0 (kerbside) to π/2."""
+        if self.kerbside:
+            return 0.0
+        cosine = np.abs((self.along * self.out).sum(axis=1))
+        return float(np.arccos(np.clip(np.median(cosine), 0.0, 1.0)))
+
+
+def find_rows(spaces: Spaces) -> list[Row]:
+    """Return the rows; every space is in exactly one, a single space in a row of its own."""
+    boxes = spaces.boxes()
+    one, other = shapely.STRtree(boxes).query(boxes, predicate="dwithin", distance=TOUCHING)
+    pair = one != other
+    one, other = one[pair], other[pair]
+    away = spaces.xy[other] - spaces.xy[one]
+    axis, across = spaces.axis[one], spaces.across[one]
+    u, v = (away * axis).sum(axis=1), (away * across).sum(axis=1)
+    parallel = np.abs((axis * spaces.axis[other]).sum(axis=1)) > SAME_AXIS
+    width = (spaces.width[one] + spaces.width[other]) / 2
+    length = (spaces.length[one] + spaces.length[other]) / 2
+    beside = (
+        parallel
+        & (np.abs(v) > 0.55 * width)
+        & (np.abs(v) < width + TOUCHING + 0.3)
+        & (np.abs(u) < STEP * length)
+    )
+    links = _mutual(one[beside], other[beside], v[beside] > 0, np.abs(u[beside]) + np.abs(v[beside]))
+    has_beside = np.zeros(len(spaces), dtype=bool)
+    has_beside[links.ravel()] = True
+
+    slim = (spaces.length > SLIM * spaces.width) & ~has_beside
+    behind = parallel & (np.abs(v) < 0.5 * width) & (np.abs(u) < length + TOUCHING + 0.6)
+    behind &= (np.abs(u) > 0.7 * length) & slim[one] & slim[other]
+    kerb = _mutual(one[behind], other[behind], u[behind] > 0, np.abs(u[behind]) + np.abs(v[behind]))
+    rows = [_chain(spaces, order, kerbside=False) for order in _chains(links, len(spaces), has_beside)]
+    in_line = np.zeros(len(spaces), dtype=bool)
+    in_line[kerb.ravel()] = True
+    at_kerb = np.zeros(len(spaces), dtype=bool)
+    long = (spaces.length > KERB_LENGTH) & (spaces.length > KERB_SHAPE * spaces.width)
+    for order in _chains(kerb, len(spaces), in_line):
+        # Two spaces end to end may also stand back to back.
+        if len(order) > 2 or long[order].all():
+            rows.append(_chain(spaces, order, kerbside=True))
+            at_kerb[order] = True
+    single = np.flatnonzero(~has_beside & ~at_kerb)
+    return rows + [_chain(spaces, np.array([i]), kerbside=False) for i in single.tolist()]
+
+
+def as_kerbside(spaces: Spaces, row: Row) -> Row:
+    """Return a single space as a kerbside row."""
+    return _chain(spaces, row.members, kerbside=True)
+
+
+def _mutual(one: IntArray, other: IntArray, positive: NDArray[np.bool_], cost: FloatArray) -> IntArray:
+    """Return pairs, (m, 2), of spaces that are each other's nearest neighbour on that side."""
+    if not len(one):
+        return np.empty((0, 2), dtype=np.int64)
+    side = 2 * one + positive
+    order = np.lexsort((cost, side))
+    best = order[np.r_[True, np.diff(side[order]) > 0]]
+    chosen = set(zip(one[best].tolist(), other[best].tolist(), strict=True))
+    pairs = sorted({(i, j) for i, j in chosen if i < j and (j, i) in chosen})
+    return np.array(pairs, dtype=np.int64).reshape(-1, 2)
+
+
+def _chains(links: IntArray, n: int, used: NDArray[np.bool_]) -> list[IntArray]:
+    """Return the spaces of each chain of links in order; a closed chain is cut at its first space."""
+    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
+    _, label = connected_components(graph, directed=False)
+    near: dict[int, list[int]] = {}
+    for i, j in links.tolist():
+        near.setdefault(i, []).append(j)
+        near.setdefault(j, []).append(i)
+    chains = []
+    for part in np.unique(label[used]).tolist():
+        members = np.flatnonzero(label == part).tolist()
+        ends = [i for i in members if len(near[i]) == 1]
+        order: list[int] = []
+        at, before = (ends or members)[0], -1
+        while at >= 0 and (not order or at != order[0]):
+            order.append(at)
+            before, at = at, next((j for j in near[at] if j not in (before, *order[-2:])), -1)
+        chains.append(np.array(order))
+    return chains
+
+
+def _chain(spaces: Spaces, order: IntArray, *, kerbside: bool) -> Row:
+    xy = spaces.xy[order]
+    axis, across = spaces.axis[order], spaces.across[order]
+    to_mouth = across if kerbside else axis
+    if len(order) == 1:
+        along = axis if kerbside else across
+    else:
+        step = np.gradient(xy, axis=0)
+        axis = axis * _one_way(axis)[:, None]
+        if kerbside:
+            along = axis * np.sign((axis * step).sum(axis=1))[:, None]
+        else:
+            # One angle between row and cars for the whole row, so that a step in it does not turn its front.
+            turn = np.angle(np.exp(1j * (_bearing(step) - _bearing(axis))).sum())
+            turn = np.round(turn / RIGHT) * RIGHT if abs(abs(turn) - np.pi / 2) < SQUARE else turn
+            along = _turned(axis, float(turn))
+        across = np.stack([-axis[:, 1], axis[:, 0]], axis=1)
+        to_mouth = across if kerbside else axis
+    # Mouths of one side lie on the same side of the row.
+    left = np.stack([-along[:, 1], along[:, 0]], axis=1)
+    out = to_mouth * np.where((left * to_mouth).sum(axis=1) < 0.0, -1.0, 1.0)[:, None]
+    length, width = spaces.length[order], spaces.width[order]
+    slope = np.maximum(np.abs((left * out).sum(axis=1)), 0.3)
+    return Row(
+        members=order,
+        kerbside=kerbside,
+        along=along,
+        out=out,
+        half=(width if kerbside else length) / 2,
+        pitch=length if kerbside else width / slope,
+    )
+
+
+def _one_way(vectors: FloatArray) -> FloatArray:
+    """Signs, (k,), that make every vector point the way of its predecessor."""
+    turns = np.sign((vectors[1:] * vectors[:-1]).sum(axis=1))
+    return np.asarray(np.cumprod(np.r_[1.0, np.where(turns == 0.0, 1.0, turns)]), dtype=np.float64)
+
+
+def _bearing(vectors: FloatArray) -> FloatArray:
+    return np.asarray(np.arctan2(vectors[:, 1], vectors[:, 0]))
+
+
+def _turned(vectors: FloatArray, angle: float) -> FloatArray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return np.asarray(vectors @ np.array([[cos, sin], [-sin, cos]]))

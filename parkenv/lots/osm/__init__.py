@@ -1,0 +1,1 @@
+"""Import lots from OpenStreetMap."""

@@ -1,0 +1,497 @@
+"""Import lots from OpenStreetMap.
+
+Slots come from:
+
+- `amenity=parking_space` areas, by their outlines; one with a `capacity` is split into that many along its road;
+- `amenity=parking` areas without such spaces, filled by the rule of `fill_outline`;
+- kerbside parking tagged on streets, see `osm_kerbs`.
+
+The import leaves out, and lists, spaces for disabled drivers (unless requested; they are subtracted from a tagged
+capacity), private and closed parking, parking underground or on a deck, and spaces for other vehicles.
+
+Lanes come from `highway=service` ways. If slots open to a public street, or the service roads are not connected, the
+public streets within 60 m of the slots are lanes too. Roads that serve no slot and lead nowhere are dropped. A slot
+prefers a parking aisle to another service road, and a service road to a street.
+
+Entries are the points where service roads meet a public street or, if streets are lanes, where the streets leave the
+map: at its edge, or otherwise at ends not tagged as dead ends. Goals are the building entrances (`entrance`) near the
+slots, main entrances first, or the centre of the nearest building. Buildings block the view. Traffic keeps to the
+right, as everywhere in parkenv: in a country with left-hand traffic, slots and lanes are correct, but the sides are
+not.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import shapely
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError
+from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
+from parkenv.lots.generators import Slots
+from parkenv.lots.infer.network import limit_junctions
+from parkenv.lots.infer.spaces import to_rectangle
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm import network as network
+from parkenv.lots.osm.buildings import BUILDING_REACH, ENTRANCE_REACH, Area, find_goals, split_walls
+from parkenv.lots.osm.elements import OsmElement
+from parkenv.lots.osm.files import read_map
+from parkenv.lots.osm.kerbs import Junctions, kerb_of, kerb_slots
+from parkenv.lots.osm.outline_draft import outline_draft
+from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
+from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
+from parkenv.lots.osm.rows import ARRANGEMENTS, NO_SLOTS, boxes_of, without_overlaps
+from parkenv.lots.osm.spaces import split_space, why_no_slot
+from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
+from parkenv.world.drive_graph import SLOT_REACH
+from parkenv.world.lot import mouth_points
+
+OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
+"""Values of `parking` for slots that are not in the open at ground level."""
+FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
+STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
+NO_AISLE = f"slots that no aisle reaches within {SLOT_REACH:g} m"  # reason for leaving out
+MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
+"""Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule."""
+
+
+def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
+    """Draft a lot from an OpenStreetMap file; see the module for the rules.
+
+    Args:
+        path: `.osm`, `.xml`, or the JSON and GeoJSON of Overpass.
+        options: goals, entries and bounds given by the user.
+
+    Raises:
+        InputError: the file is incomplete, has another format or contains no parking, an outline crosses itself, or
+            the elements are too far apart.
+    """
+    return draft_of_elements(Path(path), read_map(Path(path)), options or ImportOptions())
+
+
+def draft_of_elements(path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> LotDraft:
+    """Draft a lot from elements that were read from a file; see `osm_draft`.
+
+    Without a road for cars among them, the lanes are inferred from the spaces' outlines; the same holds if guesses are
+    allowed and the roads do not reach all spaces or lack an entry.
+    """
+    has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
+    if has_spaces and not any(_may_be_lane(e) for e in elements):
+        return outline_draft(path, elements, [], map_frame(path, elements), options)
+    importer = _OsmImporter(path, elements, options)
+    importer.read_spaces()
+    importer.fill_outlines()
+    importer.line_kerbs()
+    draft = importer.draft()
+    incomplete = bool(draft.missing) or any(left.reason == NO_AISLE for left in draft.left_out)
+    if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
+        edge = importer._edge(draft.slots)
+        roads = [part for road in importer.roads for part in network.clipped_road(road, edge)]
+        return outline_draft(path, elements, roads, importer.frame, options)
+    return draft
+
+
+def map_frame(path: Path, elements: Sequence[OsmElement]) -> LocalFrame:
+    """Return the frame around the parking of a map.
+
+    Raises:
+        InputError: the elements are too far apart for one plane.
+    """
+    parking = [e for e in elements if _is_parking(e)]
+    _refuse_far_away(path, parking)
+    return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
+
+
+def _may_be_lane(element: OsmElement) -> bool:
+    """Whether an element is a road for cars."""
+    if element.is_node or "highway" not in element.tags:
+        return False
+    return isinstance(road_of(element.id, element.tags, element.lines[0] * 1e5), Road)
+
+
+@dataclass(eq=False)
+class _Group:
+    """Slots from one kind of source, and the rank of the road that each opens to."""
+
+    source: str
+    ids: list[str] = field(default_factory=list)
+    owners: list[str] = field(default_factory=list)
+    slots: list[Slots] = field(default_factory=list)
+    ranks: list[int] = field(default_factory=list)
+
+    def add(self, owners: Sequence[str], ids: Sequence[str], slots: Slots, ranks: Sequence[int]) -> None:
+        self.owners += owners
+        self.ids += ids
+        self.slots.append(slots)
+        self.ranks += ranks
+
+    def add_row(self, owner: str, start: str, slots: Slots, rank: Rank) -> None:
+        """Add the slots of one element, numbered from 1."""
+        n = len(slots)
+        self.add([owner] * n, [f"{start}-{k + 1}" for k in range(n)], slots, [int(rank)] * n)
+
+
+class _OsmImporter:
+    """The state of an import: roads, areas, slots, and elements left out."""
+
+    def __init__(self, path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> None:
+        self.path = path
+        self.options = options
+        self.left_out: dict[str, list[str]] = {}
+        self.notes: list[str] = []
+        parking = [e for e in elements if _is_parking(e)]
+        if not parking:
+            raise InputError(
+                f"{path}: no parking in it: no amenity=parking_space, no amenity=parking, no street with "
+                "parking:left, parking:right or parking:both"
+            )
+        _refuse_far_away(path, [e for e in elements if _is_parking(e) or "highway" in e.tags])
+        self.frame = LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
+        self.box = options.box(self.frame)
+        box = None if self.box is None else shapely.box(*self.box)
+        self.nodes = [e for e in elements if e.is_node]
+        self.roads = self._roads(elements, box)
+
+        def areas(wanted: Callable[[OsmElement], bool]) -> list[Area]:
+            found = [
+                Area(e, self._polygon(e))
+                for e in elements
+                if wanted(e) and e.lines and e.is_closed and not e.is_node
+            ]
+            for flat in (a.element for a in found if not shapely.area(a.polygon)):
+                self._leave_out("outlines without an area", flat.id)
+            return [
+                a
+                for a in found
+                if shapely.area(a.polygon)
+                and (box is None or shapely.contains(box, shapely.point_on_surface(a.polygon)))
+            ]
+
+        self.outlines = areas(lambda e: e.tags.get("amenity") == "parking")
+        self.spaces = areas(lambda e: e.tags.get("amenity") == "parking_space")
+        self.buildings = areas(lambda e: e.tags.get("building", "no") != "no")
+        for e in parking:
+            kind = e.tags.get("amenity", "")
+            if kind.startswith("parking") and not (e.lines and e.is_closed):
+                self._leave_out(f"amenity={kind} without an outline", e.id)
+        self.mapped = _Group("amenity=parking_space")
+        self.filled = _Group("amenity=parking, rows by rule")
+        self.kerbside = _Group("kerbside parking")
+        self.blocked: list[shapely.Geometry] = [a.polygon for a in self.buildings]
+
+    def _leave_out(self, reason: str, name: str) -> None:
+        self.left_out.setdefault(reason, []).append(name)
+
+    def _roads(self, elements: Sequence[OsmElement], box: shapely.Geometry | None) -> list[Road]:
+        roads: list[Road] = []
+        for element in elements:
+            if element.is_node or "highway" not in element.tags:
+                continue
+            road = road_of(element.id, element.tags, self.frame.to_xy(element.lines[0]))
+            if isinstance(road, str):
+                self._leave_out(road, element.id)
+            elif road is not None:
+                roads += [road] if box is None else network.clipped_road(road, box)
+        return roads
+
+    def _polygon(self, element: OsmElement) -> shapely.Geometry:
+        outer, inner = (
+            [shapely.Polygon(self.frame.to_xy(line)) for line in lines]
+            for lines in (element.lines, element.holes)
+        )
+        is_building = "building" in element.tags and "amenity" not in element.tags
+        for polygon in outer + inner:
+            if not polygon.is_valid and not is_building:
+                reason = shapely.is_valid_reason(polygon).split("[")[0]
+                raise InputError(f"{self.path}: {element.id}: its outline is not a simple one: {reason}")
+        whole = [shapely.union_all([shapely.make_valid(p) for p in part]) for part in (outer, inner)]
+        return whole[0].difference(whole[1])
+
+    # ---- slots ----
+
+    def read_spaces(self) -> None:
+        """Create slots from mapped spaces."""
+        private = [a.polygon for a in self.outlines if closed_to_cars(a.element.tags)]
+        kept: list[Area] = []
+        for area in self.spaces:
+            reason = why_no_slot(
+                area.element.tags, area.polygon, private, with_disabled=self.options.with_disabled
+            )
+            if reason is None:
+                kept.append(area)
+            else:
+                self._leave_out(reason, area.element.id)
+                self.blocked.append(area.polygon)
+        if not kept:
+            return
+        owners: list[str] = []
+        names: list[str] = []
+        polygons: list[shapely.Geometry] = []
+        lanes = network.lanes_of(self.roads)
+        for area in kept:
+            capacity = whole_number(area.element.tags.get("capacity")) or 1
+            parts = split_space(to_rectangle(area.polygon), capacity, lanes)
+            names += (
+                [area.element.id]
+                if capacity == 1
+                else [f"{area.element.id}-{k + 1}" for k in range(capacity)]
+            )
+            polygons += parts
+            owners += [area.element.id] * len(parts)
+        self.blocked += [area.polygon for area in kept]
+
+        # Prefer an aisle to another service road, and that to a street, even if these are nearer.
+        left = np.arange(len(polygons))
+        array = np.array(polygons, dtype=np.object_)
+        for rank in Rank:
+            near = network.lanes_of([road for road in self.roads if road.rank <= rank])
+            if not len(left) or not near:
+                continue
+            slots = slots_from_polygons(array[left], near)
+            mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+            to_lane = nearest_on_lanes(near, mouth)[0] - mouth
+            reached = np.hypot(to_lane[:, 0], to_lane[:, 1]) <= SLOT_REACH
+            found = np.flatnonzero(reached)
+            reached_ids = left[found]
+            self.mapped.add(
+                [owners[i] for i in reached_ids],
+                [names[i] for i in reached_ids],
+                slots[found],
+                [int(rank)] * len(found),
+            )
+            left = left[~reached]
+        for i in left:
+            self._leave_out(NO_AISLE, names[i])
+
+    def fill_outlines(self) -> None:
+        """Fill the parking areas without mapped spaces with rows of slots by rule."""
+        centers = shapely.points(
+            np.concatenate([s.xy for s in self.mapped.slots]) if self.mapped.slots else np.empty((0, 2))
+        )
+        tree = shapely.STRtree([shapely.LineString(road.points) for road in self.roads])
+        for area in self.outlines:
+            tags, name = area.element.tags, area.element.id
+            kind = tags.get("parking", "surface")
+            reason = closed_to_cars(tags) or off_the_ground(tags)
+            if kind in OTHER_FLOORS:
+                reason = f"parking={kind}"
+            if reason is not None:
+                self._leave_out(f"parking areas with {reason}", name)
+                continue
+            if shapely.contains(area.polygon, centers).any():
+                continue
+            orientation = tags.get("orientation", tags.get("parking:orientation"))
+            capacity = whole_number(tags.get("capacity"))
+            if capacity is not None and not self.options.with_disabled:
+                capacity = max(capacity - (whole_number(tags.get("capacity:disabled")) or 0), 0)
+            near = np.sort(tree.query(area.polygon, predicate="dwithin", distance=SLOT_REACH)).tolist()
+            on_it = np.flatnonzero(shapely.dwithin(np.array(self.blocked, dtype=object), area.polygon, 1.0))
+            slots, rank = NO_SLOTS, Rank.SERVICE
+            for rank in (Rank.SERVICE, Rank.STREET):
+                slots = fill_outline(
+                    area.polygon,
+                    [self.roads[k] for k in near if self.roads[k].rank <= rank],
+                    [self.blocked[k] for k in on_it],
+                    orientation if orientation in ARRANGEMENTS else None,
+                    capacity,
+                )
+                if len(slots):
+                    break
+            if not len(slots):
+                self._leave_out("parking areas without a road along which a slot fits", name)
+                continue
+            self.filled.add_row(name, name, slots, rank)
+            self.blocked += list(boxes_of(slots, shrink=0.02))
+            if capacity is not None and len(slots) < capacity:
+                self.notes.append(f"{name}: {len(slots)} of the tagged {capacity} slots fit by the rule")
+
+    def line_kerbs(self) -> None:
+        """Create slots along streets."""
+        crossings = [e.lines[0] for e in self.nodes if e.tags.get("highway") == "crossing"]
+        if not any(road.has_kerb_parking for road in self.roads):
+            return
+        junctions = Junctions(self.roads, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *crossings])))
+        corridors = shapely.union_all(
+            [
+                shapely.LineString(road.points).buffer(CORRIDOR * road.half_width, cap_style="flat")
+                for road in self.roads
+            ]
+        )
+        shapely.prepare(corridors)
+        for k, road in enumerate(self.roads):
+            for side in ("left", "right"):
+                tagged = side
+                if road.turned:
+                    tagged = "left" if side == "right" else "right"
+                kerb = kerb_of(road.tags, tagged)  # type: ignore[arg-type]
+                if isinstance(kerb, str):
+                    self._leave_out(kerb, f"{road.id}-{tagged}")
+                if kerb is None or isinstance(kerb, str):
+                    continue
+                slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
+                clear = np.flatnonzero(~shapely.intersects(corridors, boxes_of(slots, shrink=0.05)))
+                slots = slots[clear]
+                self.kerbside.add_row(road.id, f"{road.id}-{tagged}", slots, road.rank)
+                if kerb.capacity is not None and len(slots) < kerb.capacity:
+                    self.notes.append(
+                        f"{road.id}: {len(slots)} of the tagged {kerb.capacity} slots fit on the {tagged}"
+                    )
+
+    # ---- the lot ----
+
+    def draft(self) -> LotDraft:
+        """Assemble slots, lanes, entries, goals and walls, and list what is missing."""
+        names, sources, slots, ranks = self._all_slots()
+        lanes_of_streets = bool((ranks == Rank.STREET).any())
+        roads = self.roads
+        if len(slots) and not lanes_of_streets:
+            service = [road for road in roads if road.rank < Rank.STREET]
+            lanes_of_streets = len(network.components_with_slots(service, slots)) > 1
+        streets = [road for road in roads if road.rank is Rank.STREET]
+        edge = None
+        if lanes_of_streets:
+            edge = self._edge(slots)
+            roads = [part for road in roads for part in network.clipped_road(road, edge)]
+            lanes_around: list[Road] = []
+        else:
+            roads = [road for road in roads if road.rank < Rank.STREET]
+            lanes_around = streets
+        roads = network.used_roads(roads, lanes_around, slots)
+        entries = points_in_frame(self.frame, self.options.entries)
+        if not len(entries) and roads:
+            entries = (
+                network.street_junctions(roads, streets) if edge is None else self._open_ends(roads, edge)
+            )
+        goals, goal_note = points_in_frame(self.frame, self.options.goals), None
+        if not len(goals):
+            goals, goal_note = find_goals(slots, self.nodes, self.buildings, self.frame)
+        walls, passages = split_walls(slots, roads, self.buildings)
+        for name in passages:
+            self._leave_out("buildings over slots or lanes, which are no walls", name)
+
+        lanes = limit_junctions(network.lanes_of(roads))
+        draft = LotDraft(
+            name=self.path.stem,
+            slot_ids=tuple(names),
+            slots=slots,
+            slot_source=tuple(sources),
+            lanes=tuple(lanes),
+            entries=entries,
+            goals=goals,
+            walls=tuple(walls),
+            outlines=tuple(
+                shapely.get_coordinates(shapely.get_exterior_ring(part))
+                for a in self.outlines
+                for part in shapely.get_parts(a.polygon)
+            ),
+            missing=tuple(self._missing(slots, roads, entries, goals)),
+            frame=self.frame,
+        ).searchable()
+        left_out = [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items()]
+        return replace(
+            draft, found=tuple(self._found(draft, roads, goal_note)), left_out=(*left_out, *draft.left_out)
+        )
+
+    def _all_slots(self) -> tuple[list[str], list[str], Slots, NDArray[np.int64]]:
+        groups = [g for g in (self.mapped, self.filled, self.kerbside) if g.ids]
+        if not groups:
+            return [], [], NO_SLOTS, np.empty(0, dtype=np.int64)
+        names = [name for g in groups for name in g.ids]
+        sources = [g.source for g in groups for _ in g.ids]
+        slots = Slots.joined([part for g in groups for part in g.slots])
+        ranks = np.array([rank for g in groups for rank in g.ranks], dtype=np.int64)
+        is_mapped = np.array([source == self.mapped.source for source in sources])
+        shrink = np.where(is_mapped, MAPPED_OVERLAP, RULE_OVERLAP)
+        boxes = boxes_of(replace(slots, length=slots.length - shrink, width=slots.width - shrink))
+        kept = without_overlaps(boxes)
+        for i in np.flatnonzero(~kept):
+            self._leave_out("slots that overlap others", names[i])
+        index = np.flatnonzero(kept)
+        return [names[i] for i in index], [sources[i] for i in index], slots[index], ranks[index]
+
+    def _edge(self, slots: Slots) -> shapely.Geometry:
+        """Return the box within which streets are lanes."""
+        if self.box is not None:
+            return shapely.Polygon(shapely.box(*self.box))
+        low, high = slots.xy.min(axis=0) - STREETS_AROUND, slots.xy.max(axis=0) + STREETS_AROUND
+        return shapely.Polygon(shapely.box(*low, *high))
+
+    def _open_ends(self, roads: Sequence[Road], edge: shapely.Geometry) -> FloatArray:
+        blind = [e.lines[0] for e in self.nodes if _is_blind_end(e)]
+        return network.open_ends(roads, edge, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *blind])))
+
+    def _missing(
+        self, slots: Slots, roads: Sequence[Road], entries: FloatArray, goals: FloatArray
+    ) -> Iterable[str]:
+        if not self.roads:
+            yield "no lane: the file holds no road that cars may drive; export highway=service and streets too"
+        elif not len(slots):
+            yield "no slot: nothing that the file calls parking could be used"
+        if len(slots) and roads and not len(entries):
+            ends = self.frame.to_lonlat(network.dead_ends(roads))[:3, ::-1].tolist()
+            where = (
+                "; lanes end at " + " and ".join(f"{lat:.6f},{lon:.6f}" for lat, lon in ends) if ends else ""
+            )
+            yield (
+                "no entry: the lanes meet no public street in this file, nor do they leave it; give one by "
+                f"--entry LAT,LON{where}"
+            )
+        if len(slots) and not len(goals):
+            yield (
+                f"no goal: no building entrance within {ENTRANCE_REACH:g} m of a slot and no building within "
+                f"{BUILDING_REACH:g} m; give the place that people walk to by --goal LAT,LON"
+            )
+
+    def _found(self, draft: LotDraft, roads: Sequence[Road], goal_note: str | None) -> Iterable[str]:
+        for group in (self.mapped, self.filled, self.kerbside):
+            owner_of = dict(zip(group.ids, group.owners, strict=True))
+            owners = [owner_of[name] for name in draft.slot_ids if name in owner_of]
+            if owners:
+                yield f"{len(owners)} slots from {group.source} ({len(set(owners))} elements)"
+        aisles, service = (sum(road.rank is rank for road in roads) for rank in (Rank.AISLE, Rank.SERVICE))
+        yield (
+            f"{len(roads)} lanes: {aisles} parking aisles, {service} other service roads, "
+            f"{len(roads) - aisles - service} streets; {sum(road.oneway for road in roads)} one-way"
+        )
+        how = "as given" if self.options.entries else "where the lanes are left or meet a public street"
+        if len(draft.entries):
+            yield f"{len(draft.entries)} entries {how}"
+        if len(draft.goals):
+            yield f"{len(draft.goals)} goals: {goal_note or 'as given'}"
+        yield from self.notes
+        yield f"frame: metres east and north of {self.frame.lat:.7f}, {self.frame.lon:.7f}"
+
+
+def _is_parking(element: OsmElement) -> bool:
+    tags = element.tags
+    return tags.get("amenity") in ("parking", "parking_space") or (
+        "highway" in tags and any(key.startswith(("parking:", "parking:lane:")) for key in tags)
+    )
+
+
+def _refuse_far_away(path: Path, elements: Sequence[OsmElement]) -> None:
+    """Raise an error for a map of more than one place: a plane cannot preserve distances across a continent."""
+    positions = np.concatenate([line for e in elements for line in e.lines])
+    order = len(positions) // 2
+    lon, lat = (float(np.partition(degrees, order)[order]) for degrees in positions.T)
+    frame = LocalFrame(lon, lat)
+    for element in elements:
+        for line in element.lines:
+            away = np.hypot(*frame.to_xy(line).T)
+            if away.max() > FARTHEST:
+                there_lon, there_lat = line[away.argmax()]
+                raise InputError(
+                    f"{path}: {element.id} is at {there_lat:.4f}, {there_lon:.4f} and most of the map "
+                    f"{away.max() / 1e3:,.0f} km away at {lat:.4f}, {lon:.4f}, want a map no larger than "
+                    f"{FARTHEST / 1e3:.0f} km around its middle (are latitude and longitude swapped?)"
+                )
+
+
+def _is_blind_end(element: OsmElement) -> bool:
+    tags = element.tags
+    return tags.get("noexit") == "yes" or tags.get("highway") in ("turning_circle", "turning_loop")

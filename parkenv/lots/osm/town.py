@@ -1,0 +1,111 @@
+"""Find the car parks of a town: groups of parking spaces, each with the roads and buildings around it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError
+from parkenv.lots.draft import ImportOptions, LotDraft
+from parkenv.lots.osm.draft import draft_of_elements, map_frame
+from parkenv.lots.osm.elements import OsmElement
+from parkenv.lots.osm.files import read_map
+
+SAME_CAR_PARK = 22.0
+"""Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles."""
+AROUND = 60.0  # distance, m, from the spaces of a car park within which roads and buildings belong to it
+LEAST_SPACES = 10  # number of spaces of the smallest car park, by default
+MOST_IN_TOWN = 300_000
+"""Maximum number of spaces in one file."""
+
+
+@dataclass(frozen=True, eq=False)
+class CarPark:
+    """What became of one car park of a town."""
+
+    name: str
+    spaces: int  # number of outlines
+    draft: LotDraft | None  # its lot
+    reason: str = ""  # why there is none
+
+
+def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPACES) -> Iterator[CarPark]:
+    """Yield the car parks of a town, the largest first.
+
+    Args:
+        path: an OpenStreetMap file with outlines of parking spaces.
+        options: whether entries and goals may be guessed, and which spaces count.
+        least: number of spaces below which a group of spaces is no car park.
+
+    Raises:
+        InputError: the file cannot be read, has no parking spaces or an outline that is none.
+    """
+    path = Path(path)
+    elements = read_map(path)
+    for name, part in split_town(path, elements, least):
+        count = sum(_is_space(e) for e in part)
+        try:
+            draft = draft_of_elements(Path(name), part, options)
+            draft.lot()
+        except InputError as error:
+            yield CarPark(name, count, None, str(error).removeprefix(f"{name}: "))
+        else:
+            yield CarPark(name, count, draft)
+
+
+def split_town(
+    path: Path, elements: Sequence[OsmElement], least: int
+) -> Iterator[tuple[str, list[OsmElement]]]:
+    """Yield the name and the elements of each group of at least `least` spaces, the largest first.
+
+    Raises:
+        InputError: no parking spaces, or too many.
+    """
+    spaces = [e for e in elements if _is_space(e)]
+    if not spaces:
+        raise InputError(f"{path}: no amenity=parking_space in it, want their outlines to find car parks")
+    if len(spaces) > MOST_IN_TOWN:
+        raise InputError(f"{path}: {len(spaces):,} parking spaces, want at most {MOST_IN_TOWN:,} in one file")
+    frame = map_frame(path, spaces)
+    shapes = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in spaces], dtype=object)
+    one, other = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=SAME_CAR_PARK)
+    _, label = connected_components(
+        coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(len(spaces),) * 2), directed=False
+    )
+    size = np.bincount(label)
+    first = np.array([int(np.flatnonzero(label == k)[0]) for k in range(len(size))])
+    chosen = [k for k in np.lexsort((first, -size)).tolist() if size[k] >= least]
+    if not chosen:
+        raise InputError(
+            f"{path}: {len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"
+        )
+    others = [e for e in elements if not _is_space(e)]
+    around = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in others], dtype=object)
+    tree = shapely.STRtree(around)
+    digits = len(str(len(chosen)))
+    for number, k in enumerate(chosen, start=1):
+        members = np.flatnonzero(label == k)
+        ground = shapely.union_all(shapes[members])
+        near: list[int] = np.sort(tree.query(ground, predicate="dwithin", distance=AROUND)).tolist()
+        yield (
+            f"{path.stem}-{number:0{digits}d}",
+            [spaces[i] for i in members.tolist()] + [others[i] for i in near],
+        )
+
+
+def _is_space(element: OsmElement) -> bool:
+    return element.tags.get("amenity") == "parking_space" and not element.is_node
+
+
+def _hull(element: OsmElement, xy: FloatArray) -> shapely.Geometry:
+    """Return a shape that is valid for every element."""
+    if element.tags.get("highway") and not element.is_node:
+        return shapely.LineString(xy)
+    return shapely.convex_hull(shapely.MultiPoint(xy))

@@ -1,0 +1,305 @@
+"""Photographs with labelled boxes, in the formats of COCO and YOLO, and crops of their cars for training."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.errors import InputError, nearest
+from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
+from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
+from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
+from parkenv.perception.hog_detector import as_grey
+from parkenv.perception.lab.car_datasets import Crops, LabelledImage
+from parkenv.perception.lab.training import cut_out
+from parkenv.perception.onnx_detector import CAR_NAMES
+
+Box = tuple[float, float, float, float]
+
+LEAST_WIDTH = 36
+"""Least width of a car that is trained on, px."""
+END_BELOW = 1.8
+"""Width over height of a box below which it shows a front or rear."""
+LEAST_CARS = 20
+_WINDOWS = 3  # windows without cars from each picture
+_TOLERANCE = 2.0  # px that a box may reach outside its picture, by rounding
+_NO_LABELS = re.compile(r"classes|names|readme.*|requirements|train|val|test|license.*", re.IGNORECASE)
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledPhoto:
+    """A picture and the boxes of its cars."""
+
+    labelled: LabelledImage  # the grey picture, with the boxes of all cars
+    single: NDArray[np.bool_]  # (n,) bool, whether a box is one car, not a crowd of them
+
+
+def read_labels(path: Path, images: Path | None = None, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
+    """Read labelled photographs: a COCO file (`.json`), or a folder in YOLO's format.
+
+    Args:
+        path: the file or folder.
+        images: of COCO, the folder of the pictures; None: that of the file.
+        classes: names of the classes that are cars; empty: those whose names say so (car, van, truck, bus, ...).
+
+    Raises:
+        InputError: see `read_coco` and `read_yolo`; or no picture shows a car.
+    """
+    if path.is_dir() and images is not None:
+        raise InputError(
+            f"{path}: is a folder in YOLO's format, which has its pictures; --images goes with COCO"
+        )
+    photos = read_yolo(path, classes) if path.is_dir() else read_coco(path, images or path.parent, classes)
+    if not any(len(photo.single) for photo in photos):
+        raise InputError(f"{path}: none of its {len(photos)} pictures has a label of a car")
+    return photos
+
+
+def read_coco(path: Path, images: Path, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
+    """Read a COCO file of object detections and its pictures; see `read_labels`.
+
+    Raises:
+        InputError: the file is of another format; it names an unknown class or picture, a picture that is missing, or a
+            box outside its picture.
+    """
+    content = read_json(path, finite=True)
+    tables = content if isinstance(content, dict) else {}
+    pictures, labels, categories = (
+        _tables(tables.get(name), f"{path}: {name}") for name in ("images", "annotations", "categories")
+    )
+    names = {
+        _key(c, "id", f"{path}: categories[{i}]"): str(c.get("name", "")) for i, c in enumerate(categories)
+    }
+    cars = _cars(names, classes, path)
+    boxes: dict[Any, list[tuple[str, Box, bool]]] = defaultdict(list)
+    known = {_key(picture, "id", f"{path}: images[{i}]") for i, picture in enumerate(pictures)}
+    for i, label in enumerate(labels):
+        where = f"{path}: annotations[{i}]"
+        category, its_picture = (_key(label, name, where) for name in ("category_id", "image_id"))
+        if category not in names:
+            raise InputError(f"{where}: category_id is {category!r}, want one of {_listed(map(str, names))}")
+        if its_picture not in known:
+            raise InputError(f"{where}: image_id is {its_picture!r}, which no entry of images has")
+        if category in cars:
+            left, top, width, height = _four(label.get("bbox"), where)
+            box = (left, top, left + width, top + height)
+            boxes[its_picture].append((where, box, not label.get("iscrowd")))
+    photos = []
+    for i, picture in enumerate(pictures):
+        name = picture.get("file_name")
+        if (
+            not isinstance(name, str)
+            or PurePosixPath(name).is_absolute()
+            or ".." in PurePosixPath(name).parts
+        ):
+            raise InputError(f"{path}: images[{i}]: file_name is {name!r:.80}, want a file below {images}")
+        photos.append(_photo(images / name, boxes[picture["id"]], f"{path}: images[{i}]"))
+    return photos
+
+
+def read_yolo(folder: Path, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
+    """Read a folder in YOLO's format; see `read_labels`.
+
+    Pictures are at any depth. Labels are in text files of the same names, in `labels/` in place of `images/`, or beside
+    the pictures; a picture without one shows nothing. A line has the class and a box (centre, width, height) or a
+    polygon, as fractions of the picture. The classes' names are in `data.yaml` (`names`) or `classes.txt`.
+
+    Raises:
+        InputError: there are no names; a line is of another format; it has an unknown class or a box outside its
+            picture; or a label has no picture.
+    """
+    names = _yolo_names(folder)
+    cars = _cars(names, classes, folder)
+    pictures = {_label_of(file): file for file in images_in(folder)}
+    for label in files_in(folder, (".txt",)):
+        if label not in pictures and not _NO_LABELS.fullmatch(label.stem):
+            raise InputError(f"{label}: labels a picture that is missing; want one of {', '.join(SUFFIXES)}")
+    photos = []
+    for label, file in pictures.items():
+        image = as_grey(read_image(file))
+        size = np.array([image.shape[1], image.shape[0]], dtype=np.float64)
+        lines = list(_yolo_lines(label, names)) if label.is_file() else []
+        boxes = [(where, _box(points * size), True) for where, its, points in lines if its in cars]
+        photos.append(_photo(file, boxes, str(file), image))
+    return photos
+
+
+def crops_of(
+    photos: Sequence[LabelledPhoto], *, end_on: bool, seed: int = 0
+) -> tuple[Crops, list[LabelledImage]]:
+    """Cut cars and windows without cars out of labelled photographs.
+
+    Cars seen from the side are boxes at least `END_BELOW` times as wide as high, fronts and rears are narrower ones;
+    those of the other kind, cut off by the picture's border, or less than `LEAST_WIDTH` px wide are left out.
+
+    Args:
+        photos: the photographs.
+        end_on: whether to cut out fronts and rears.
+        seed: seed of the windows' places.
+
+    Returns:
+        The crops, aligned as those of the packaged models; and all pictures, to mine false positives from.
+
+    Raises:
+        InputError: fewer than 20 cars are left.
+    """
+    aspect, car = (END_ASPECT, END_CAR) if end_on else (SIDE_ASPECT, SIDE_CAR)
+    rng = np.random.default_rng(seed)
+    positives: list[Image] = []
+    negatives: list[Image] = []
+    for photo in photos:
+        image, boxes = photo.labelled.image, photo.labelled.boxes
+        height, width = image.shape
+        for box in boxes[photo.single]:
+            size = box[2:] - box[:2]
+            inside = (box[:2] > 1.0).all() and box[2] < width - 1.0 and box[3] < height - 1.0
+            if inside and size[0] >= LEAST_WIDTH and (size[0] < END_BELOW * size[1]) == end_on:
+                region = region_of(box, car, aspect)
+                shape = (max(round(region[2] - region[0]), 8), max(round(region[3] - region[1]), 8))
+                positives.append(cut_out(image, region, shape))
+        for _ in range(_WINDOWS):
+            window = rng.uniform(0.15, 0.6) * min(height, width / aspect)
+            window_size = np.array([aspect * window, window])
+            at = rng.uniform(0.0, 1.0, 2) * (np.array([width, height]) - window_size)
+            low, high = boxes[:, :2] - at, boxes[:, 2:] - at
+            if window >= 16.0 and not ((low < window_size) & (high > 0.0)).all(axis=1).any():
+                region = np.concatenate([at, at + window_size])
+                negatives.append(cut_out(image, region, (round(window_size[0]), round(window))))
+    if len(positives) < LEAST_CARS or not negatives:
+        seen = "from the front or rear" if end_on else "from the side"
+        raise InputError(
+            f"the labels have {len(positives)} whole cars seen {seen} of at least {LEAST_WIDTH} px, and "
+            f"{len(negatives)} windows without cars; want at least {LEAST_CARS} and 1"
+        )
+    return Crops(positives, negatives), [photo.labelled for photo in photos]
+
+
+def _photo(
+    file: Path, boxes: Sequence[tuple[str, Box, bool]], where: str, image: Image | None = None
+) -> LabelledPhoto:
+    if image is None:
+        if not (is_there(file) and file.is_file()):
+            raise InputError(f"{where}: there is no picture at {file}")
+        image = as_grey(read_image(file))
+    height, width = image.shape
+    for label, (left, top, right, bottom), _ in boxes:
+        inside = (
+            min(left, top) >= -_TOLERANCE and right <= width + _TOLERANCE and bottom <= height + _TOLERANCE
+        )
+        if not (inside and left < right and top < bottom):
+            raise InputError(
+                f"{label}: box {left:.6g}, {top:.6g} to {right:.6g}, {bottom:.6g} is not inside {file.name} of "
+                f"{width}×{height} px"
+            )
+    found = np.array([box for _, box, _ in boxes], dtype=np.float64).reshape(-1, 4)
+    found = np.clip(found, 0.0, [width, height, width, height])
+    single = np.array([alone for *_, alone in boxes], dtype=np.bool_)
+    return LabelledPhoto(LabelledImage(file.name, image, found), single)
+
+
+def _cars(names: dict[Any, str], classes: Sequence[str], source: Path) -> set[Any]:
+    """Return the classes that are cars."""
+    for wanted in classes:
+        if wanted not in names.values():
+            raise InputError(f"{source}: has no class {wanted!r}; {nearest(wanted, names.values())}")
+    cars = {k for k, name in names.items() if (name in classes if classes else name.lower() in CAR_NAMES)}
+    if not cars:
+        raise InputError(
+            f"{source}: of its classes ({_listed(names.values())}) none is known as a car; name some by --classes"
+        )
+    return cars
+
+
+def _listed(names: Any) -> str:
+    some = [str(name) for name in names]
+    return ", ".join(some[:10]) + (", ..." if len(some) > 10 else "")
+
+
+def _key(table: dict[str, Any], name: str, where: str) -> int | str:
+    value = table.get(name)
+    if isinstance(value, int | str) and not isinstance(value, bool):
+        return value
+    raise InputError(f"{where}: {name} is {value!r:.60}, want a whole number")
+
+
+def _tables(value: Any, where: str) -> list[dict[str, Any]]:
+    if isinstance(value, list) and all(isinstance(table, dict) for table in value):
+        return value
+    raise InputError(f"{where} is {value!r:.60}, want a list of tables as in COCO")
+
+
+def _four(value: Any, where: str) -> list[float]:
+    if (
+        isinstance(value, list)
+        and len(value) == 4
+        and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
+    ):
+        return [float(v) for v in value]
+    raise InputError(f"{where}: bbox is {value!r:.80}, want [left, top, width, height] in px")
+
+
+def _yolo_names(folder: Path) -> dict[Any, str]:
+    """Return the names of the classes of a folder in YOLO's format."""
+    for file in (folder / "data.yaml", folder / "data.yml", folder / "dataset.yaml"):
+        if file.is_file():
+            content = read_yaml(file)
+            names = content.get("names") if isinstance(content, dict) else None
+            listed = dict(enumerate(names)) if isinstance(names, list) else names
+            if (
+                not isinstance(listed, dict)
+                or not listed
+                or not all(isinstance(k, int) and isinstance(v, str) for k, v in listed.items())
+            ):
+                raise InputError(f"{file}: names is {names!r:.60}, want a list of the classes' names")
+            return listed
+    for file in (folder / "classes.txt", folder / "labels" / "classes.txt"):
+        if file.is_file():
+            return dict(enumerate(line.strip() for line in read_text(file).splitlines() if line.strip()))
+    raise InputError(f"{folder}: has neither data.yaml with names nor classes.txt, want YOLO's format")
+
+
+def _label_of(picture: Path) -> Path:
+    """Return the label file of a picture: in `labels` in place of the last `images`, else beside it."""
+    parts = list(picture.with_suffix(".txt").parts)
+    for k in range(len(parts) - 2, -1, -1):
+        if parts[k] == "images":
+            there = Path(*parts[:k], "labels", *parts[k + 1 :])
+            return there if there.is_file() or not picture.with_suffix(".txt").is_file() else Path(*parts)
+    return Path(*parts)
+
+
+def _yolo_lines(label: Path, names: dict[Any, str]) -> Iterator[tuple[str, int, FloatArray]]:
+    """Yield where a line stands, its class, and the corners of its box or polygon, (k, 2), as fractions."""
+    for number, line in enumerate(read_text(label).splitlines(), start=1):
+        words = line.split()
+        if not words:
+            continue
+        where = f"{label}: line {number}"
+        try:
+            its, values = int(words[0]), np.array([float(word) for word in words[1:]])
+        except ValueError:
+            its, values = -1, np.zeros(0)
+        if len(values) not in (4, *range(6, 20_000, 2)) or not np.isfinite(values).all():
+            raise InputError(f"{where}: {line!r:.60}, want class, x, y, width and height as fractions")
+        if its not in names:
+            known = _listed(f"{k} {v}" for k, v in names.items())
+            raise InputError(f"{where}: class is {words[0]}, want one of {known}")
+        if len(values) == 4:
+            middle, half = values[:2], 0.5 * values[2:]
+            yield where, its, np.stack([middle - half, middle + half])
+        else:
+            yield where, its, values.reshape(-1, 2)
+
+
+def _box(points: FloatArray) -> Box:
+    (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+    return left, top, right, bottom

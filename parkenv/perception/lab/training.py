@@ -1,0 +1,287 @@
+"""Train a car model from aligned crops of cars, images without cars, and mined hard negatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import Image
+from parkenv.errors import InputError
+from parkenv.perception.car_model import CarModel
+from parkenv.perception.hog import Descriptor
+from parkenv.perception.hog_detector import HogDetector, best_boxes
+from parkenv.perception.lab.car_datasets import LabelledImage
+
+Float32Array = NDArray[np.float32]
+Progress = Callable[[str], None]
+
+CAR_OVERLAP = 0.25
+_LEAST = 20
+_FOLDS = 5
+_NO_CARS = np.empty((0, 4))
+
+
+@dataclass(frozen=True)
+class TrainingSettings:
+    """Parameters of the training."""
+
+    penalty: float = 0.03  # C of the support vector machine
+    rounds: int = 3  # rounds of hard-negative mining, each on another part of the images
+    jitter: int = 4  # number of shifted and scaled copies of each positive
+    shift: float = 0.015  # largest shift of a copy, as a fraction of the window
+    resize: float = 0.025  # largest change of a copy's size, as a fraction
+    misaligned: int = 2  # number of misaligned crops of each positive that become negatives
+    per_image: int = 5  # largest number of hard negatives from one image per round
+    enlarged: float = (
+        2.0  # without photographs, crops enlarged so much take their place in the mining; 0: none do
+    )
+    positives_weight: float = 1.0  # weight of a positive relative to a negative
+    seed: int = 0  # seed of the jitter and the solver
+
+    def __post_init__(self) -> None:
+        for name in ("penalty", "positives_weight"):
+            if not getattr(self, name) > 0.0:
+                raise InputError(f"{name} is {getattr(self, name)}, want a number above 0")
+        for name in ("rounds", "jitter", "misaligned", "per_image", "seed"):
+            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 0):
+                raise InputError(f"{name} is {getattr(self, name)!r}, want a whole number of at least 0")
+        if not (self.enlarged == 0.0 or 1.0 <= self.enlarged <= 8.0):
+            raise InputError(f"enlarged is {self.enlarged}, want 0 or 1 to 8")
+        for name in ("shift", "resize"):
+            if not 0.0 <= getattr(self, name) < 0.5:
+                raise InputError(f"{name} is {getattr(self, name)}, want a share below 0.5")
+
+
+def train(
+    positives: Sequence[Image],
+    negatives: Sequence[Image],
+    *,
+    photos: Sequence[LabelledImage] = (),
+    descriptor: Descriptor | None = None,
+    region_aspect: float | None = None,
+    car: tuple[float, float, float, float] = (0.0, 0.0, 1.0, 1.0),
+    end_on: bool = False,
+    settings: TrainingSettings | None = None,
+    trained_on: str = "",
+    progress: Progress = lambda _: None,
+) -> CarModel:
+    """Train a model; equal arguments give bitwise equal weights on one machine.
+
+    All crops are mirrored, and positives are jittered; windows with half a car are negatives from the start. In each
+    following round the model scans the negative images, and its false positives join the negatives (Dalal and Triggs
+    2005): so do those in the photographs, or, where there are none, in the enlarged crops of cars and of others, for a
+    model that has only seen whole cars finds small ones in the parts of a large one. Probabilities are calibrated on
+    cross-validated scores (Platt 1999).
+
+    Args:
+        positives: aligned grey crops of cars, uint8; resized to the window.
+        negatives: grey images of any size without cars.
+        photos: images with all cars labelled; false positives beside and within the cars are mined, too.
+        descriptor: None: 128×64, for side views.
+        region_aspect: width over height of the crops; None: that of the first crop.
+        car: left, top, right, bottom of the car in the crops, as fractions.
+        end_on: whether the crops show fronts and rears rather than sides.
+        settings: None: the defaults.
+        trained_on: one line that describes the training data.
+        progress: called with one line for each stage.
+
+    Raises:
+        InputError: fewer than 20 positives, or no negatives.
+    """
+    if len(positives) < _LEAST or not negatives:
+        raise InputError(
+            f"{len(positives)} positives and {len(negatives)} negatives, want at least {_LEAST} and 1"
+        )
+    settings = settings or TrainingSettings()
+    descriptor = descriptor or Descriptor()
+    aspect = region_aspect or positives[0].shape[1] / positives[0].shape[0]
+    rng = np.random.default_rng(settings.seed)
+    size = (descriptor.width, descriptor.height)
+
+    progress(f"describing {len(positives)} positives")
+    jittered = [_moved(p, size, rng, settings) for p in positives for _ in range(settings.jitter)]
+    cars = [cv2.resize(p, size, interpolation=_how(p, size)) for p in positives] + jittered
+    cars += [np.ascontiguousarray(c[:, ::-1]) for c in cars]
+    beside = [_beside(p, size, rng) for p in positives for _ in range(settings.misaligned)]
+    plain = [cv2.resize(n, size, interpolation=_how(n, size)) for n in negatives]
+    yes = np.stack([descriptor.describe(c) for c in cars])
+    others = beside + plain
+    others += [np.ascontiguousarray(c[:, ::-1]) for c in others]
+    no = np.stack([descriptor.describe(c) for c in others])
+
+    model = CarModel(
+        descriptor, np.zeros(descriptor.shape, np.float32), 0.0, aspect, car, (1.0, 0.0), end_on, trained_on
+    )
+    images = [LabelledImage("", n, _NO_CARS) for n in negatives]
+    images += photos or _enlarged(positives, negatives, car, settings.enlarged)
+    for round_number in range(settings.rounds + 1):
+        progress(f"round {round_number}: {len(yes)} positives, {len(no)} negatives")
+        model = _fitted(model, yes, no, settings)
+        if round_number == settings.rounds:
+            break
+        hard = mined(model, images[round_number :: settings.rounds], settings.per_image)
+        if not len(hard):
+            progress(f"round {round_number}: no false positives are left")
+            break
+        no = np.concatenate([no, hard])
+    progress("calibrating scores")
+    return replace(model, calibration=_calibration(yes, no, settings))
+
+
+def _enlarged(
+    positives: Sequence[Image],
+    negatives: Sequence[Image],
+    car: tuple[float, float, float, float],
+    by: float,
+) -> list[LabelledImage]:
+    """Return images without cars and crops with one, enlarged."""
+    if not by:
+        return []
+
+    def larger(image: Image) -> Image:
+        return np.asarray(cv2.resize(image, None, fx=by, fy=by, interpolation=cv2.INTER_CUBIC))
+
+    others = [LabelledImage("", larger(n), _NO_CARS) for n in negatives]
+    for crop in positives:
+        image = larger(crop)
+        height, width = image.shape
+        box = np.array([car]) * [width, height, width, height]
+        others.append(LabelledImage("", image, box))
+    return others
+
+
+def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> Float32Array:
+    """Mine hard negatives: descriptors, (n, size), of the false positives with the highest scores in each image.
+
+    Windows that overlap a labelled car by more than `CAR_OVERLAP` are skipped.
+    """
+    window = model.descriptor
+    size = (window.width, window.height)
+    found = [np.empty((0, window.size), dtype=np.float32)]
+    for labelled in images:
+        image = labelled.image
+        least = min(image.shape[0], image.shape[1] / model.region_aspect, 40.0)
+        scan = HogDetector(
+            (model,), least_height=max(8.0, 0.8 * least), scale_step=1.15, threshold=0.4, margin=0.1
+        )
+        seen = scan.scan(model, image)
+        seen = seen.select(np.argsort(-seen.score, kind="stable")[: 40 * per_image])
+        seen = seen.select(~_overlap_any(seen.boxes, labelled.boxes))
+        seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:per_image])
+        cuts = [_cut(image, (r[0], r[1]), (r[2], r[3]), size) for r in seen.regions.tolist()]
+        found += [window.describe(cut)[None] for cut in cuts]
+    return np.concatenate(found)
+
+
+def _overlap_any(boxes: Float32Array, cars: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Return which boxes overlap any of the cars by more than `CAR_OVERLAP`, intersection over union."""
+    hit = np.zeros(len(boxes), dtype=np.bool_)
+    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
+    for car in cars:
+        inner = np.minimum(boxes[:, 2:], car[2:]) - np.maximum(boxes[:, :2], car[:2])
+        common = np.clip(inner, 0.0, None).prod(axis=1)
+        own = (car[2] - car[0]) * (car[3] - car[1])
+        hit |= common > CAR_OVERLAP * (area + own - common)
+    return hit
+
+
+def _fitted(model: CarModel, yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> CarModel:
+    weights, bias = _svm(yes, no, settings)
+    return replace(model, weights=weights.reshape(model.descriptor.shape), bias=bias)
+
+
+def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[Float32Array, float]:
+    from sklearn.svm import LinearSVC
+    from threadpoolctl import threadpool_limits
+
+    machine = LinearSVC(
+        C=settings.penalty,
+        loss="hinge",
+        class_weight={1: settings.positives_weight, 0: 1.0},
+        random_state=settings.seed,
+        max_iter=3_000,
+        tol=1e-3,
+    )
+    x = np.concatenate([yes, no]).astype(np.float64)
+    with threadpool_limits(1):
+        machine.fit(x, np.r_[np.ones(len(yes)), np.zeros(len(no))])
+    return machine.coef_[0].astype(np.float32), float(machine.intercept_[0])
+
+
+def _calibration(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[float, float]:
+    """Return slope and offset of the probability, from scores of held-out samples."""
+    from sklearn.linear_model import LogisticRegression
+
+    # Copies of a car are a fixed number of rows apart; blocks keep most of them together.
+    scores, labels = [], []
+    for fold in range(_FOLDS):
+        in_yes, in_no = (np.arange(len(x)) * _FOLDS // len(x) == fold for x in (yes, no))
+        weights, bias = _svm(yes[~in_yes], no[~in_no], settings)
+        for x, label in ((yes[in_yes], 1), (no[in_no], 0)):
+            scores.append(x @ weights + bias)
+            labels.append(np.full(len(x), label))
+    fit = LogisticRegression(C=1e3).fit(np.concatenate(scores)[:, None], np.concatenate(labels))
+    # The last digits depend on the number of threads; rounding gives equal files for equal training.
+    return round(float(fit.coef_[0, 0]), 6), round(float(fit.intercept_[0]), 6)
+
+
+def _how(image: Image, size: tuple[int, int]) -> int:
+    return int(cv2.INTER_AREA if image.shape[1] > size[0] and image.shape[0] > size[1] else cv2.INTER_LINEAR)
+
+
+def _cut(
+    image: Image, left_top: tuple[float, float], right_bottom: tuple[float, float], size: tuple[int, int]
+) -> Image:
+    """Cut out a part of an image, px, and resize it; the border is replicated outside."""
+    (left, top), (right, bottom) = left_top, right_bottom
+    scale_x, scale_y = (right - left) / size[0], (bottom - top) / size[1]
+    moved = np.array([[scale_x, 0.0, left + 0.5 * scale_x - 0.5], [0.0, scale_y, top + 0.5 * scale_y - 0.5]])
+    if scale_x > 1.0 and scale_y > 1.0:
+        # When shrinking, average first: fine texture would alias to false gradients.
+        image = np.asarray(
+            cv2.resize(image, None, fx=1.0 / scale_x, fy=1.0 / scale_y, interpolation=cv2.INTER_AREA)
+        )
+        moved = np.array([[1.0, 0.0, left / scale_x], [0.0, 1.0, top / scale_y]])
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    return np.asarray(cv2.warpAffine(image, moved, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
+
+
+def cut_out(image: Image, region: NDArray[np.float64], size: tuple[int, int]) -> Image:
+    """Cut a region, (4,) px, left, top, right, bottom, out of an image, and resize it to (width, height)."""
+    left, top, right, bottom = region.tolist()
+    return _cut(image, (left, top), (right, bottom), size)
+
+
+def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator, settings: TrainingSettings) -> Image:
+    """Return a slightly shifted and scaled copy."""
+    height, width = crop.shape
+    dx, dy = rng.uniform(-settings.shift, settings.shift, 2)
+    grow = rng.uniform(-settings.resize, settings.resize) / 2.0
+    return _cut(
+        crop,
+        ((dx - grow) * width, (dy - grow) * height),
+        ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height),
+        size,
+    )
+
+
+def _beside(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:
+    """Return a window with part of the car, or with the car too large or too small: a negative."""
+    height, width = crop.shape
+    kind = rng.integers(3)
+    if kind == 0:
+        grow, (dx, dy) = 0.0, rng.uniform(0.22, 0.6, 2) * rng.choice([-1.0, 1.0], 2) * [1.0, rng.random()]
+    elif kind == 1:
+        grow, (dx, dy) = -rng.uniform(0.25, 0.35), rng.uniform(-0.3, 0.3, 2)
+    else:
+        grow, (dx, dy) = rng.uniform(0.25, 0.5), rng.uniform(-0.2, 0.2, 2)
+    return _cut(
+        crop,
+        ((dx - grow) * width, (dy - grow) * height),
+        ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height),
+        size,
+    )
