@@ -7,7 +7,7 @@ from sb3_contrib import MaskablePPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 import parkenv
-from parkenv.envs.search_sb3 import SearchVecEnv
+from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.studies.statistics import mean_interval
 from planners import make_agent
 from planners.model_file import save_model

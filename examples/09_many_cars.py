@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
+from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet, total_s
-from parkenv.envs.fleet_rendering import FleetRenderer
+from parkenv.show.fleet_rendering import FleetRenderer
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 

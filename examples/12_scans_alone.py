@@ -11,7 +11,7 @@ import tempfile
 from sb3_contrib import MaskablePPO
 
 import parkenv
-from parkenv.envs.search_sb3 import SearchVecEnv
+from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.studies.simulate import make_search, simulate
 from parkenv.studies.statistics import mean_interval
 from planners import make_agent

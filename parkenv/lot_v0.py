@@ -21,10 +21,10 @@ except ImportError as error:
         'parkenv.lot_v0 needs pettingzoo, which is not installed: pip install "parkenv[multi]"'
     ) from error
 
-from parkenv.engine.fleet_records import SEARCHING, TRUNCATED
-from parkenv.envs.fleet import Fleet
+from parkenv.engine.fleet import Fleet
+from parkenv.engine.records import SEARCHING, TRUNCATED
+from parkenv.engine.spaces import action_number
 from parkenv.envs.fleet_agents import MAX_CYCLES, METADATA, FleetAgents, Observation, car_of
-from parkenv.envs.search import action_number
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource
 from parkenv.world.demand import Demand
@@ -100,7 +100,7 @@ class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo 
     - `manoeuvre_s`: above 0, cars that park, leave or stand block their lane, and queues form.
     - `leaving_soon_s`: above 0, cars show for that time that they leave, in a further key of the observation,
       `leaving`, and a car that stands before such a slot holds it.
-    - `sees_cars`: whether observations have the key `cars`: the other cars in view. `parkenv.envs.fleet.Fleet`
+    - `sees_cars`: whether observations have the key `cars`: the other cars in view. `parkenv.engine.fleet.Fleet`
       describes these options and keys.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.
 

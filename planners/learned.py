@@ -20,7 +20,7 @@ _WRAPPERS = {
 
 
 class LearnedAgent:
-    """A trained model as an agent: on `parkenv.envs.local_observation`, or on `parkenv.envs.scan_observation`.
+    """A trained model as an agent: on `parkenv.engine.local_observation`, or on `parkenv.envs.scan_observation`.
 
     Args:
         problem: lot, goal, speeds and costs.

@@ -29,7 +29,7 @@ from planners.names import ALGORITHMS
 
 SUFFIX = ".safetensors"
 OBSERVATION = "local-1"
-"""Version of the layout of `parkenv.envs.local_observation`, which search models observe."""
+"""Version of the layout of `parkenv.engine.local_observation`, which search models observe."""
 FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
 """Size of that observation: for k slots, 46 + 8k numbers."""
 SCANS_OBSERVATION = "scan-1"
@@ -190,7 +190,7 @@ def save_model(
     """Write a model of stable-baselines3 or sb3-contrib to a model file, atomically.
 
     Args:
-        model: trained on `parkenv.envs.search_sb3.SearchVecEnv`, or another environment of the `local` or the `scan`
+        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local` or the `scan`
             observation; or on the driving observation of `planners.driving.policy_interface`.
         path: file to write; its name should end in `.safetensors`.
         scenarios: names of the training scenarios; for driving, of the lots.

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from parkenv import make_scenario
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.studies.bench import sumo
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from parkenv.envs.fleet import total_s
+from parkenv.engine.fleet import total_s
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.experiment import FleetExperiment

@@ -17,9 +17,9 @@ from small_lots import small_lot
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
-from parkenv.engine.fleet_records import DUE, LEFT, PARKED, SEARCHING
+from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -37,11 +37,11 @@ GREEDY = DriverKind(rule=RULES["greedy-drive"])
 
 
 def test_no_function_for_a_record_is_compiled_for_one_that_merely_begins_like_it():
-    from parkenv.engine import fleet_records, search_records, shared_slots
+    from parkenv.engine import records
     from parkenv.world.occupancy import kernel as occupancy_kernel
 
-    modules = (occupancy_kernel, shared_slots, search_records, fleet_records)
-    records = {
+    modules = (occupancy_kernel, records)
+    types = {
         name: numba.from_dtype(value)
         for module in modules
         for name, value in vars(module).items()
@@ -50,7 +50,7 @@ def test_no_function_for_a_record_is_compiled_for_one_that_merely_begins_like_it
     taken_for = set()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", numba.errors.NumbaExperimentalFeatureWarning)
-        for (name, one), (other_name, other) in itertools.permutations(records.items(), 2):
+        for (name, one), (other_name, other) in itertools.permutations(types.items(), 2):
             if one != other and one.can_convert_to(None, other) is not None:
                 taken_for.add((name, other_name))
     # Functions of shared slots take the address of the record of the fleet.
@@ -375,7 +375,7 @@ def test_a_forecast_computed_in_python_reaches_every_car():
 @pytest.mark.slow
 def test_another_process_gives_the_same_run():
     program = (
-        "from parkenv.envs.fleet import *; from parkenv.engine.fleet_rules import *;"
+        "from parkenv.engine.fleet import *; from parkenv.engine.fleet_rules import *;"
         "from parkenv.world.demand import *;"
         "f = Fleet('campus', Demand(Headways(40)), drivers=[DriverKind(rule=RULES['greedy-drive'])]);"
         "f.reset(5); f.run(); print(f.cars['slot'].tolist(), f.cars['ended_at'].tolist())"

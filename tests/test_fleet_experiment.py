@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from command_line import parkenv
 
-from parkenv.envs.fleet import total_s
+from parkenv.engine.fleet import total_s
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario

@@ -5,9 +5,9 @@ import pytest
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, lot_v0
-from parkenv.engine.fleet_records import SEARCHING
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet
+from parkenv.engine.records import SEARCHING
 from parkenv.lots import grid_lot
 from parkenv.world.demand import (
     ConstantTime,

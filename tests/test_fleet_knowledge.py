@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import parkenv
+from parkenv.engine.fleet import DriverKind, Fleet, drive_times, total_s
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet, drive_times, total_s
 from parkenv.world.demand import (
     ConstantTime,
     Demand,

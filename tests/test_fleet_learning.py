@@ -14,11 +14,11 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.engine.fleet_records import SEARCHING
+from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet, total_s
-from parkenv.envs.fleet_network import NetworkRule
-from parkenv.envs.fleet_sb3 import FleetVecEnv, ShareNetwork, layers_of, network_rule
+from parkenv.engine.network import NetworkRule
+from parkenv.engine.records import SEARCHING
+from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_rule
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, driver_of

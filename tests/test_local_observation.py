@@ -10,7 +10,8 @@ from gymnasium.utils.env_checker import check_env
 
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
-from parkenv.envs.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR, LocalObservation
+from parkenv.engine.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR
+from parkenv.envs.local_observation import LocalObservation
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
 from parkenv.world.lot import MOVES, PARK

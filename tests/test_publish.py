@@ -9,7 +9,7 @@ from command_line import parkenv
 from PIL import Image
 from sb3_contrib import MaskablePPO
 
-from parkenv.envs.search_sb3 import SearchVecEnv
+from parkenv.envs.sb3 import SearchVecEnv
 from planners.model_file import ModelCard, save_model
 
 

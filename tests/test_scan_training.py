@@ -13,9 +13,9 @@ from sb3_contrib import MaskablePPO
 
 from parkenv import InputError, make_scenario
 from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.scan_observation import FIXED, PER_SCAN, SCANS, WAVELENGTHS_M, ScanObservation, scans_space
 from parkenv.envs.scan_vector import StackedScanVectorEnv
-from parkenv.envs.search_sb3 import SearchVecEnv
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.fleet.drivers import driver_of

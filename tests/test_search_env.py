@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.engine.search_kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
+from parkenv.engine.kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot

@@ -14,7 +14,7 @@ from gymnasium.utils.env_checker import data_equivalence
 
 import parkenv  # noqa: F401
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
-from parkenv.envs.sensor_sampler import PICTURE_WIDTH, SensorSampler
+from parkenv.engine.sensor_sampler import PICTURE_WIDTH, SensorSampler
 from parkenv.lots import grid_lot
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.traffic import LotTraffic, _Loops

@@ -26,8 +26,9 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.envs.local_observation import LocalObservation, local_space
-from parkenv.envs.search_sb3 import SearchVecEnv
+from parkenv.engine.local_observation import local_space
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.spec import scenario_spec

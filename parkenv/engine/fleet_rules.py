@@ -16,11 +16,18 @@ import numpy as np
 
 from parkenv.compiled.keyed_random import RULE_STREAM, keyed_uniform
 from parkenv.compiled.memory import call_address, float64s, int32s, int64s, uint8s
-from parkenv.engine.fleet_kernel import LEAVE, TAKE_SLOT
-from parkenv.engine.fleet_records import car_at, fleet_at
-from parkenv.engine.search_kernel import belief_now
-from parkenv.engine.search_records import N_ACTIONS, SENTINEL, edge_at, scenario_at, search_at, slot_at
-from parkenv.engine.shared_slots import is_slot_open
+from parkenv.engine.events import LEAVE, TAKE_SLOT
+from parkenv.engine.kernel import belief_now, is_slot_open
+from parkenv.engine.records import (
+    N_ACTIONS,
+    SENTINEL,
+    car_at,
+    edge_at,
+    fleet_at,
+    scenario_at,
+    search_at,
+    slot_at,
+)
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy.kernel import inlined, kernel
 

@@ -10,14 +10,14 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.envs.fleet import MAX_STEPS, DriverKind, Fleet
+from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import MAX_CARS, Demand, Headways
 from parkenv.world.lot import ACTIONS
 
 if TYPE_CHECKING:
-    from parkenv.envs.fleet_rendering import FleetRenderer
+    from parkenv.show.fleet_rendering import FleetRenderer
 
 Observation = Mapping[str, Any]
 MAX_CYCLES = MAX_STEPS
@@ -37,11 +37,11 @@ class FleetAgents:
         scenario: as of `parkenv.make_scenario`.
         cars: number of cars, if there is no `demand`.
         demand: when cars arrive, how long they stay.
-        background: as of `parkenv.envs.fleet.Fleet`.
+        background: as of `parkenv.engine.fleet.Fleet`.
         max_cycles: limit of a car's decisions.
         tick_s: as of `Fleet`.
         render_mode: `human`, `rgb_array` or None.
-        knows: what all cars know, as of `parkenv.envs.fleet.DriverKind`; with `shared`, all share.
+        knows: what all cars know, as of `parkenv.engine.fleet.DriverKind`; with `shared`, all share.
         changes: fields of the scenario to replace, and further options of `Fleet`: `delay_s`, `leave_full_lot`,
             `manoeuvre_s`, `leaving_soon_s`, `sees_cars`.
 
@@ -131,7 +131,7 @@ class FleetAgents:
             gym.logger.warn('render() does nothing without a render_mode, e.g. env(render_mode="rgb_array")')
             return None
         if self._renderer is None:
-            from parkenv.envs.fleet_rendering import FleetRenderer
+            from parkenv.show.fleet_rendering import FleetRenderer
 
             self._renderer = FleetRenderer(self.fleet)
         frame = self._renderer.frame()

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.engine.search_kernel import act_at, apply_observations_at, finish_step_at
-from parkenv.envs.sensor_sampler import SensorSampler, make_rig
+from parkenv.engine.kernel import act_at, apply_observations_at, finish_step_at
+from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import SensingSearchEnv
 from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector

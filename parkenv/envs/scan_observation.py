@@ -26,7 +26,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.engine.search_records import N_ACTIONS
+from parkenv.engine.records import N_ACTIONS
 from parkenv.envs.sensors import SearchSensorsEnv
 from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import kernel

@@ -18,13 +18,13 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import address_of
 from parkenv.compiled.threads import in_threads
-from parkenv.engine.search_kernel import take_step
-from parkenv.engine.search_records import PROCESS_KIND, search_at
+from parkenv.engine.kernel import take_step
+from parkenv.engine.records import PROCESS_KIND, search_at
+from parkenv.engine.sensor_sampler import SensorSampler, make_rig
+from parkenv.engine.spaces import LATEST
 from parkenv.envs.car_footprints import CarLibrary, Scratch, draw_car, put_car, remove_car
 from parkenv.envs.scan_observation import SCANS, ScanHistory, goal_of, observe_scans, scans_space
-from parkenv.envs.search import LATEST
 from parkenv.envs.search_vector import ParkSearchVectorEnv, Steps, report_step
-from parkenv.envs.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import FARTHEST
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
@@ -431,7 +431,7 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
 class StackedScanVectorEnv(ScanSearchVectorEnv):
     """A batch of searches that observe their last k scans, as `parkenv.envs.scan_observation.ScanObservation` does.
 
-    There is one scan for each decision. `parkenv.envs.search_sb3.SearchVecEnv` makes it.
+    There is one scan for each decision. `parkenv.envs.sb3.SearchVecEnv` makes it.
 
     Args:
         num_envs, scenario, max_episode_steps, autoreset_mode: as in `ScanSearchVectorEnv`.

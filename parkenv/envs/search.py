@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from operator import index
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
@@ -12,25 +10,23 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from parkenv.compiled.keyed_random import seed_state
-from parkenv.engine.search_kernel import (
+from parkenv.engine.kernel import (
     begin_search_at,
     init_external_forecast_at,
     step_exact_at,
     step_noisy_at,
 )
-from parkenv.engine.search_records import NEVER_OBSERVED, ScenarioRecords, Searches
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.records import ScenarioRecords, Searches
+from parkenv.engine.spaces import action_number, space_of
+from parkenv.engine.state import SearchState
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
-from parkenv.world.lot import ACTIONS, PARK
-from parkenv.world.occupancy.day_error import MAX_LOGITS
-from parkenv.world.scenario import Scenario, SearchProblem
+from parkenv.world.lot import ACTIONS
+from parkenv.world.scenario import Scenario
 
 if TYPE_CHECKING:
     from parkenv.show.rendering import SearchRenderer
 
-LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
-MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 _REBUILT = {
     "searches", "scenario", "_state", "_address", "_copies", "_place", "_step", "_copy_mask", "_copy_masks",
     "_seeded_with", "_begun", "_over",
@@ -159,7 +155,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     ```python
     from sb3_contrib import MaskablePPO
-    from parkenv.envs.search_sb3 import SearchVecEnv
+    from parkenv.envs.sb3 import SearchVecEnv
 
     envs = SearchVecEnv(64, "campus", reward_scale=0.01)
     model = MaskablePPO("MultiInputPolicy", envs, 1e-3, n_steps=64, batch_size=1024, gamma=0.999)
@@ -319,7 +315,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return self._observation(vertex), reward, over, False, info
 
     def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act, observe, and return the numbers named by `parkenv.engine.search_kernel.STEP_RESULT`."""
+        """Act, observe, and return the numbers named by `parkenv.engine.kernel.STEP_RESULT`."""
         result: tuple[Any, ...] = self._step(self._address, action)
         return result
 
@@ -374,44 +370,3 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "day_error": day_error(),
             "action_mask": self._copy_mask[vertex](),
         }
-
-
-def space_of(scenarios: Sequence[SearchProblem]) -> spaces.Dict:
-    """The observation space that fits the lots of all scenarios."""
-    lots = [one.lot for one in scenarios]
-    return search_space(max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots))
-
-
-def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
-    """The observation space for a lot of the given size; see `SearchEnv`."""
-    # Bounds of forecast, decay_rate, p_observed, observed_at.
-    low, high = (
-        np.repeat(np.array(bounds, np.float32), n_slots)
-        for bounds in ([0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST])
-    )
-    return spaces.Dict(
-        {
-            "vertex": spaces.Discrete(n_vertices),
-            "time": spaces.Box(0.0, LATEST, (2,), np.float32),
-            "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
-            "belief": spaces.Box(low, high, dtype=np.float32),
-            "day_error": spaces.Box(0.0, MAX_LOGITS, (2,), np.float32),
-            "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
-        }
-    )
-
-
-def action_number(action: Any) -> int:
-    """Return the number of an action, which may be an array of one as models return it.
-
-    Raises:
-        InputError: none of the five actions.
-    """
-    try:
-        number = index(action)
-    except TypeError:
-        array = np.asarray(action)
-        number = int(array.item()) if array.size == 1 and np.issubdtype(array.dtype, np.integer) else -1
-    if not 0 <= number <= PARK:
-        raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
-    return number

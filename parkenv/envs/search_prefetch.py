@@ -11,7 +11,8 @@ import numpy as np
 
 from parkenv.compiled.arrays import IntArray
 from parkenv.compiled.memory import int32s, int64s, prefetch
-from parkenv.engine.search_records import (
+from parkenv.engine.local_observation import Surroundings
+from parkenv.engine.records import (
     EDGE,
     N_ACTIONS,
     PROCESS_KIND,
@@ -21,7 +22,6 @@ from parkenv.engine.search_records import (
     scenario_at,
     search_at,
 )
-from parkenv.envs.local_observation import Surroundings
 from parkenv.world.occupancy.kernel import inlined, prefetch_forecast
 
 _APART = 2  # searches between two stages

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import seed_state
 from parkenv.compiled.memory import uint8s
-from parkenv.engine.search_kernel import (
+from parkenv.engine.kernel import (
     COUNT_METRICS,
     REWARD_TERMS,
     TIME_METRICS,
@@ -25,9 +25,9 @@ from parkenv.engine.search_kernel import (
     take_step,
     write_clock,
 )
-from parkenv.engine.search_records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
-from parkenv.envs.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.envs.search import space_of
+from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
+from parkenv.engine.records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
+from parkenv.engine.spaces import space_of
 from parkenv.envs.search_prefetch import prefetch_searches
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
@@ -183,7 +183,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ## Observation space
     - `observation="full"`: the `Dict` of `parkenv/Search-v2`, with a row for each search.
     - `observation="occupancy"`: the same without `belief`, which saves copying it.
-    - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.envs.local_observation`. Its size and
+    - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.engine.local_observation`. Its size and
       cost are the same on every lot.
 
     ## Rewards

@@ -10,9 +10,10 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from parkenv.engine.search_state import SearchState
-from parkenv.envs.search import LATEST, SearchEnv
-from parkenv.envs.sensor_sampler import SensorSampler, make_rig
+from parkenv.engine.sensor_sampler import SensorSampler, make_rig
+from parkenv.engine.spaces import LATEST
+from parkenv.engine.state import SearchState
+from parkenv.envs.search import SearchEnv
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
 from parkenv.scenarios.build import ScenarioSource, make_scenario

@@ -25,7 +25,7 @@ MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
 MAP_NAMES: tuple[MapName, ...] = get_args(MapName)
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
-"""What the cars of a fleet know; see `parkenv.envs.fleet.DriverKind`."""
+"""What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]

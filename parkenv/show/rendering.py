@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.compiled.jit import compiled
 from parkenv.driving.lot_outline import APRON, LotOutline
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.state import SearchState
 from parkenv.show import drawing
 from parkenv.show.drawing import Color
 from parkenv.show.window import Window

@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.state import SearchState
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent

@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from parkenv.engine.search_records import DECAY_RATE, FORECAST, OBSERVED_AT, P_OBSERVED
+from parkenv.engine.records import DECAY_RATE, FORECAST, OBSERVED_AT, P_OBSERVED
 from parkenv.mapping.trips import Trip
 from parkenv.studies.simulate import Observer, Step
 from parkenv.world.lot import PARK

@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.bench.rows import BenchRow, duration, rate

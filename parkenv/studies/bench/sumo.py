@@ -21,8 +21,8 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet, drive_times
 from parkenv.errors import InputError
 from parkenv.studies.bench.rows import BenchRow, absent, duration
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals

@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.state import SearchState
 from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.show.drawing import SUBPIXEL_BITS, draw_dashes, fill_disc, fixed_point, write_text
 from parkenv.show.rendering import (

@@ -7,7 +7,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.vehicle import SPEED
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.state import SearchState
 from parkenv.show.drawing import SUBPIXEL_BITS, fill_disc, fixed_point, mixed_color, write_text
 from parkenv.show.drive_rendering import draw_car, draw_movers
 from parkenv.show.rendering import (

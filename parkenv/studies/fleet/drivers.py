@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.engine.fleet_rules import RULES, Rule
-from parkenv.envs.fleet import DriverKind, Fleet, total_s
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.statistics import mean_interval
@@ -50,7 +50,7 @@ def driver_of(
                 f"agent {spec.label!r} observes laser scans, which the cars of a fleet do not have"
             )
         if agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
-            from parkenv.envs.fleet_sb3 import network_rule
+            from parkenv.envs.sb3 import network_rule
 
             sampled = agent.card.algorithm != "dqn"
             return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from parkenv import __version__
-from parkenv.envs.fleet import DriverKind, Fleet
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.scenarios.build import build

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.envs.fleet import Fleet, total_s
+from parkenv.engine.fleet import Fleet, total_s
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
 from parkenv.world.scenario import SearchProblem
 

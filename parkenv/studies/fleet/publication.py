@@ -10,9 +10,9 @@ from typing import Self
 
 import numpy as np
 
-from parkenv.envs.fleet_rendering import FleetRenderer
 from parkenv.errors import InputError
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.fleet_rendering import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.figures.picture_files import save_film
 from parkenv.studies.fleet.experiment import FleetExperiment, summarize_days
@@ -137,7 +137,7 @@ class FleetPublication(Publication):
     def usage(self) -> str:
         """See `Publication`."""
         return f"""import parkenv
-from parkenv.envs.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import demand_in, driver_of
 

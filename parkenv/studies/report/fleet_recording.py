@@ -10,9 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.engine.fleet_records import LEFT, PARKED
-from parkenv.engine.shared_slots import NO_CAR
-from parkenv.envs.fleet import Fleet, total_s
+from parkenv.engine.fleet import Fleet, total_s
+from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.studies.fleet.experiment import FleetExperiment, Setting
 from parkenv.studies.report.lot_data import describe_lot
 from parkenv.world.scenario import Scenario

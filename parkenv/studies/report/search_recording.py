@@ -10,7 +10,7 @@ import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.state import SearchState
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.figures.picture_files import TIME_COLORS
 from parkenv.studies.report.lot_data import describe_lot

@@ -16,7 +16,7 @@ from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import SPEED, VehicleParameters
 from parkenv.envs.drive import CONTROL_S
 from parkenv.envs.drive_goals import STANDING, goal_errors
-from parkenv.envs.shared_vec_env import SharedVecEnv
+from parkenv.envs.sb3 import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.studies.training.configs import WAY_IN, DriveTrainingConfig
 from parkenv.studies.training.drive_batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask

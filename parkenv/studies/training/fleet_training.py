@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv.envs.fleet import DriverKind
-from parkenv.envs.fleet_sb3 import FleetVecEnv, network_rule
+from parkenv.engine.fleet import DriverKind
+from parkenv.envs.sb3 import FleetVecEnv, network_rule
 from parkenv.studies.fleet.drivers import MixedFleet, driver_of
 from parkenv.studies.training.configs import (
     FLEET_CONFIGS,

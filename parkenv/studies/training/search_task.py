@@ -10,8 +10,8 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.envs.sb3 import search_batch
 from parkenv.envs.scan_observation import SCANS
-from parkenv.envs.search_sb3 import search_batch
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.scenarios.places import lot_share, place_of_episode, require_different_names, split_places

@@ -11,7 +11,7 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv.envs.search_sb3 import SearchVecEnv, search_batch
+from parkenv.envs.sb3 import SearchVecEnv, search_batch
 from parkenv.scenarios.places import by_size, open_places
 from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval

@@ -10,10 +10,10 @@ import numpy as np
 from gymnasium.wrappers import TimeLimit
 
 from parkenv.driving.vehicle import VehicleParameters
-from parkenv.engine import search_kernel as kernel
+from parkenv.engine import kernel as kernel
+from parkenv.engine.sensor_sampler import Station
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
-from parkenv.envs.sensor_sampler import Station
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate

@@ -10,8 +10,8 @@ from functools import partial
 
 import numpy as np
 
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.verify.rows import Row, Task, certain_row
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals

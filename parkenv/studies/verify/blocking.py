@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from functools import partial
 
-from parkenv.engine.fleet_records import LEFT, PARKED
 from parkenv.engine.fleet_rules import RULES
+from parkenv.engine.records import LEFT, PARKED
 from parkenv.lots.generators import grid_lot
 from parkenv.studies.verify.fleets import STAY_S, erlang_b, independent_runs, lane, loaded_fleet
 from parkenv.studies.verify.rows import Row, Task, mean_row

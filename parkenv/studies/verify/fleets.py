@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import Rule
-from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.studies.verify.line import THESIS_SPEEDS, Line
 from parkenv.world.demand import Demand, Duration, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from functools import partial
 
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.fleet import DriverKind, Fleet
 from parkenv.lots.generators import Slots, grid_lot
 from parkenv.studies.verify.fleets import lane
 from parkenv.studies.verify.rows import Row, Task, certain_row

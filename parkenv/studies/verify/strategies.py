@@ -20,10 +20,10 @@ from functools import partial
 from typing import Any
 
 from parkenv.compiled.memory import int64s
-from parkenv.engine.fleet_kernel import LEAVE, TAKE_SLOT
-from parkenv.engine.fleet_records import car_at, fleet_at
+from parkenv.engine.events import LEAVE, TAKE_SLOT
 from parkenv.engine.fleet_rules import Rule
-from parkenv.engine.shared_slots import is_shared_slot_taken
+from parkenv.engine.kernel import is_shared_slot_taken
+from parkenv.engine.records import car_at, fleet_at
 from parkenv.studies.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
 from parkenv.studies.verify.rows import Row, Task, mean_row
 from parkenv.world.occupancy.kernel import inlined, kernel

@@ -24,10 +24,8 @@ from parkenv.compiled.memory import (
     record_at,
     uint8s,
 )
-from parkenv.engine.fleet_records import car_at, fleet_at
 from parkenv.engine.fleet_rules import Rule
-from parkenv.engine.search_records import N_ACTIONS, N_REGIONS, scenario_at, search_at
-from parkenv.envs.local_observation import (
+from parkenv.engine.local_observation import (
     FIRST_NEAR,
     N_MOVES,
     PER_NEAR,
@@ -35,6 +33,7 @@ from parkenv.envs.local_observation import (
     Surroundings,
     observe_surroundings,
 )
+from parkenv.engine.records import N_ACTIONS, N_REGIONS, car_at, fleet_at, scenario_at, search_at
 from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.scenario import SearchProblem

@@ -12,25 +12,22 @@ import numpy as np
 
 from parkenv.belief.slot_belief import decay_to_prior
 from parkenv.compiled.memory import float32s, int32s, int64s
-from parkenv.engine.fleet_records import (
-    FULL_KNOWLEDGE,
-    RESERVE_KNOWLEDGE,
-    SHARED_KNOWLEDGE,
-    car_at,
-    live_slot_at,
-    report_at,
-)
-from parkenv.engine.search_kernel import column_of, set_belief_of
-from parkenv.engine.search_records import (
+from parkenv.engine.kernel import column_of, is_slot_open, set_belief_of
+from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
     DECAY_RATE,
+    FULL_KNOWLEDGE,
+    RESERVE_KNOWLEDGE,
+    SHARED_KNOWLEDGE,
     block_at,
+    car_at,
+    live_slot_at,
+    report_at,
     scenario_at,
     search_at,
     slot_at,
 )
-from parkenv.engine.shared_slots import is_slot_open
 from parkenv.world.occupancy.kernel import inlined, kernel
 
 _HALF_LIFE = 0.6931471805599453

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
-from parkenv.engine.search_state import SearchState
+from parkenv.engine.state import SearchState
 from parkenv.errors import InputError
 from parkenv.perception.capture import TimedCapture
 from parkenv.world.lot_scene import LotScenes, slot_lot

@@ -1,10 +1,14 @@
 """The compiled engine of a world with many cars: events in continuous time.
 
-A car of the fleet is a search of `parkenv.engine.search_kernel`, with the same steps and the same belief; only the
-slots are shared. At each moment the engine first carries out what is over by then: departures, arrivals, and steps,
+A car of the fleet is a search of `parkenv.engine.kernel`, with the same steps and the same belief; only the slots
+are shared. At each moment the engine first carries out what is over by then: departures, arrivals, and steps,
 after which cars observe. Then the cars that have to decide do so one after another, in the order in which their steps
 ended. A decision acts at once: of two cars before the same slot the first gets it, the second has a failed attempt.
 The next moment is that of the next event.
+
+A car that manoeuvres, or stands, blocks the vertex where it is. A car that would reach a blocked vertex waits before
+it, and blocks the vertex that it comes from, so queues grow backwards. Cars that leave soon show it by their lights; a
+car that stands before such a slot holds it against others, until it drives on.
 """
 
 from __future__ import annotations
@@ -15,42 +19,44 @@ from typing import Any
 import numpy as np
 
 from parkenv.compiled.keyed_random import car_key
-from parkenv.compiled.memory import call_at, int64s
-from parkenv.engine.event_queue import ARRIVAL, DEPARTURE, REACH, event_at, pop_event, push_event
-from parkenv.engine.fleet_interactions import (
-    block_lane,
-    blocked_until,
-    clear_lanes,
-    hold_slot,
-    release_slot,
-)
-from parkenv.engine.fleet_knowledge import clear_live_map, inform, report_slot, report_view
-from parkenv.engine.fleet_records import (
-    BALKED,
-    GAVE_UP,
-    LEFT,
-    OWN_KNOWLEDGE,
-    PARKED,
-    RESERVE_KNOWLEDGE,
-    SEARCHING,
-    TRUNCATED,
-    car_at,
-    fleet_at,
-    step_at,
-)
-from parkenv.engine.search_kernel import (
+from parkenv.compiled.memory import call_at, float64s, int64s
+from parkenv.engine.kernel import (
     SCENARIO_BYTES,
     drive_or_park,
+    empty_shared_slots,
     enter,
     finish_step,
     give_up,
     init_prior,
+    leaves_soon,
     observe,
     refresh_belief,
     write_clock,
 )
-from parkenv.engine.search_records import EXTERNAL_KIND, N_ACTIONS, scenario_at, search_at
-from parkenv.engine.shared_slots import NO_CAR, empty_shared_slots, shared_slot_at
+from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report_view
+from parkenv.engine.records import (
+    ARRIVAL,
+    BALKED,
+    DEPARTURE,
+    EXTERNAL_KIND,
+    GAVE_UP,
+    LEFT,
+    N_ACTIONS,
+    NO_CAR,
+    OWN_KNOWLEDGE,
+    PARKED,
+    REACH,
+    RESERVE_KNOWLEDGE,
+    SEARCHING,
+    TRUNCATED,
+    car_at,
+    event_at,
+    fleet_at,
+    scenario_at,
+    search_at,
+    shared_slot_at,
+    step_at,
+)
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import inlined, kernel
 
@@ -435,3 +441,110 @@ def _free_search(fleet: Any, car: Any) -> None:
     int64s(fleet.free_moves)[fleet.n_free] = car.moves
     fleet.n_free += 1
     car.search = 0
+
+
+# ---- how cars get in each other's way
+
+
+@kernel
+def clear_lanes(fleet: Any) -> None:
+    """Begin a world: no lane is blocked."""
+    until, by = float64s(fleet.blocked_until), int64s(fleet.blocked_by)
+    for vertex in range(fleet.n_vertices):
+        until[vertex], by[vertex] = -np.inf, NO_CAR
+
+
+@inlined
+def block_lane(fleet: Any, vertex: int, until: float, number: int) -> None:
+    """Block a vertex for other cars until a time, s, if cars block lanes."""
+    if fleet.manoeuvre_s > 0.0 and until > float64s(fleet.blocked_until)[vertex]:
+        float64s(fleet.blocked_until)[vertex] = until
+        int64s(fleet.blocked_by)[vertex] = number
+
+
+@inlined
+def blocked_until(fleet: Any, car: Any, number: int) -> float:
+    """Return until when another car blocks the vertex that a car has driven to; in the past if none does."""
+    if fleet.manoeuvre_s == 0.0 or car.stands or int64s(fleet.blocked_by)[car.vertex] == number:
+        return -np.inf
+    return float(float64s(fleet.blocked_until)[car.vertex])
+
+
+@inlined
+def hold_slot(fleet: Any, car: Any, number: int) -> None:
+    """Let a standing car hold the slot before it if the car in it shows that it leaves, and nobody else holds it."""
+    slot = car.vertex
+    if fleet.leaving_soon_s > 0.0 and slot < fleet.n_slots:
+        shared = shared_slot_at(fleet.slots, slot)
+        if shared.held_by == NO_CAR and leaves_soon(fleet, slot, fleet.time, fleet.leaving_soon_s):
+            shared.held_by, car.holds = number, slot
+
+
+@inlined
+def release_slot(fleet: Any, car: Any) -> None:
+    """Let a car no longer hold a slot."""
+    if car.holds != NO_CAR:
+        shared_slot_at(fleet.slots, car.holds).held_by = NO_CAR
+        car.holds = NO_CAR
+
+
+# ---- the queue of events, a binary heap
+
+
+@inlined
+def is_before(one: Any, other: Any) -> bool:
+    """Return whether an event happens before another one."""
+    if one.time != other.time:
+        return bool(one.time < other.time)
+    if one.kind != other.kind:
+        return bool(one.kind < other.kind)
+    return bool(one.number < other.number)
+
+
+@inlined
+def _copy(to: Any, event: Any) -> None:
+    to.time, to.kind, to.number, to.car = event.time, event.kind, event.number, event.car
+
+
+@kernel
+def push_event(queue: Any, time: float, kind: int, car: int) -> None:
+    """Add an event to the queue of a record with `QUEUE_FIELDS`."""
+    events, at = queue.events, queue.n_events
+    new = event_at(events, at)
+    new.time, new.kind, new.number, new.car = time, kind, queue.event_number, car
+    queue.n_events += 1
+    queue.event_number += 1
+    number = new.number
+    while at > 0:
+        parent = event_at(events, (at - 1) >> 1)
+        here = event_at(events, at)
+        if parent.time < time or (
+            parent.time == time and (parent.kind < kind or (parent.kind == kind and parent.number < number))
+        ):
+            break
+        _copy(here, parent)
+        at = (at - 1) >> 1
+        up = event_at(events, at)
+        up.time, up.kind, up.number, up.car = time, kind, number, car
+
+
+@kernel
+def pop_event(queue: Any) -> int:
+    """Remove the first event, at least one must be there; returns its car."""
+    events = queue.events
+    car: int = event_at(events, 0).car
+    queue.n_events -= 1
+    n, at = queue.n_events, 0
+    last = event_at(events, n)
+    while True:
+        child = 2 * at + 1
+        if child >= n:
+            break
+        if child + 1 < n and is_before(event_at(events, child + 1), event_at(events, child)):
+            child += 1
+        if not is_before(event_at(events, child), last):
+            break
+        _copy(event_at(events, at), event_at(events, child))
+        at = child
+    _copy(event_at(events, at), last)
+    return car

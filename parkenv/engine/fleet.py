@@ -16,8 +16,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform, world_key
 from parkenv.compiled.memory import address_of
-from parkenv.engine.event_queue import EVENT
-from parkenv.engine.fleet_kernel import (
+from parkenv.engine.events import (
     FINISHED,
     NEEDS_FORECAST,
     NEEDS_REPORTS,
@@ -33,34 +32,37 @@ from parkenv.engine.fleet_kernel import (
     init_forecast_at,
     release_at,
 )
-from parkenv.engine.fleet_records import (
-    CAR,
-    DUE,
-    FLEET,
-    LIVE_SLOT,
-    REPORT,
-    SEARCHING,
-    STATES,
-    STEP,
-)
 from parkenv.engine.fleet_rules import Rule
-from parkenv.engine.search_kernel import (
+from parkenv.engine.kernel import (
     COUNT_METRICS,
     REWARD_TERMS,
     STEP_RESULT,
     TIME_METRICS,
+    shared_slots_taken_at,
     step_result_at,
 )
-from parkenv.engine.search_records import LOG_KIND, SEARCH, SHARED_KIND, ScenarioRecords, Searches
-from parkenv.engine.shared_slots import BACKGROUNDS, NO_CAR, SHARED_SLOT, shared_slots_taken_at
-from parkenv.envs.fleet_network import NetworkRule
-from parkenv.envs.local_observation import (
-    FIRST_NEAR,
-    PER_NEAR,
-    Surroundings,
-    observe_surroundings_at,
+from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings_at
+from parkenv.engine.network import NetworkRule
+from parkenv.engine.records import (
+    BACKGROUNDS,
+    CAR,
+    DUE,
+    EVENT,
+    FLEET,
+    LIVE_SLOT,
+    LOG_KIND,
+    NO_CAR,
+    REPORT,
+    SEARCH,
+    SEARCHING,
+    SHARED_KIND,
+    SHARED_SLOT,
+    STATES,
+    STEP,
+    ScenarioRecords,
+    Searches,
 )
-from parkenv.envs.search import action_number, space_of
+from parkenv.engine.spaces import action_number, space_of
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
@@ -572,7 +574,7 @@ class Fleet:
     def local_observation(self, car: int, k: int = 5) -> dict[str, Any]:
         """Return the `local` observation of a searching car, with k slots; to be called once at each of its decisions.
 
-        `parkenv.envs.local_observation` describes it.
+        `parkenv.engine.local_observation` describes it.
         """
         searches, row = self._search_of(car)
         if k not in self._surroundings:
@@ -631,7 +633,7 @@ class Fleet:
         return self._cars
 
     def state_names(self) -> list[str]:
-        """Return the state of each car by name; see `parkenv.engine.fleet_records.STATES`."""
+        """Return the state of each car by name; see `parkenv.engine.records.STATES`."""
         return [STATES[state] for state in self._cars["state"]]
 
     def poses(self) -> CarPoses:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.engine.search_kernel import read_belief_at
-from parkenv.engine.search_records import Searches, arrival_of
+from parkenv.engine.kernel import read_belief_at
+from parkenv.engine.records import Searches, arrival_of
 from parkenv.world.occupancy.process import Arrival, World
 from parkenv.world.scenario import Scenario
 

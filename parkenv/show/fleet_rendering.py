@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.lot_outline import LotOutline
-from parkenv.envs.fleet import CarPoses, Fleet
+from parkenv.engine.fleet import CarPoses, Fleet
 from parkenv.show import drawing
 from parkenv.show.drawing import Color
 from parkenv.show.rendering import (

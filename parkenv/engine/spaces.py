@@ -1,0 +1,60 @@
+"""The spaces of a search: its observations and actions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from operator import index
+from typing import Any
+
+import numpy as np
+from gymnasium import spaces
+
+from parkenv.engine.records import NEVER_OBSERVED
+from parkenv.errors import InputError
+from parkenv.world.lot import ACTIONS, PARK
+from parkenv.world.occupancy.day_error import MAX_LOGITS
+from parkenv.world.scenario import SearchProblem
+
+LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
+MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
+
+
+def space_of(scenarios: Sequence[SearchProblem]) -> spaces.Dict:
+    """The observation space that fits the lots of all scenarios."""
+    lots = [one.lot for one in scenarios]
+    return search_space(max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots))
+
+
+def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
+    """The observation space for a lot of the given size; see `parkenv.envs.search.SearchEnv`."""
+    # Bounds of forecast, decay_rate, p_observed, observed_at.
+    low, high = (
+        np.repeat(np.array(bounds, np.float32), n_slots)
+        for bounds in ([0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST])
+    )
+    return spaces.Dict(
+        {
+            "vertex": spaces.Discrete(n_vertices),
+            "time": spaces.Box(0.0, LATEST, (2,), np.float32),
+            "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
+            "belief": spaces.Box(low, high, dtype=np.float32),
+            "day_error": spaces.Box(0.0, MAX_LOGITS, (2,), np.float32),
+            "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
+        }
+    )
+
+
+def action_number(action: Any) -> int:
+    """Return the number of an action, which may be an array of one as models return it.
+
+    Raises:
+        InputError: none of the five actions.
+    """
+    try:
+        number = index(action)
+    except TypeError:
+        array = np.asarray(action)
+        number = int(array.item()) if array.size == 1 and np.issubdtype(array.dtype, np.integer) else -1
+    if not 0 <= number <= PARK:
+        raise InputError(f"action is {action!r}, want a whole number from 0 to {PARK} ({', '.join(ACTIONS)})")
+    return number
