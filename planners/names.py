@@ -30,6 +30,8 @@ ALGORITHMS = {
 """Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
 NETWORK = "network"
 """The agent whose weights can be another file: `network:FILE`."""
+PARKING_PLANNER = "planner"
+"""The agent that plans how to drive into a slot."""
 FILE_AGENTS = (*ALGORITHMS, NETWORK)
 """Names before the colon of `NAME:FILE`."""
 WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "first-free", "random", "oracle")

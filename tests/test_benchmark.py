@@ -22,8 +22,8 @@ from parkenv.studies.compare.cases import run_cases
 from parkenv.studies.lot_census import slots_by_kind
 from parkenv.studies.report.page import SCHEMA
 from parkenv.studies.results import ResultFolder, write_summary
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.search_task import SearchTask
+from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival
 
@@ -204,10 +204,12 @@ def test_no_agent_is_trained_on_a_place_of_the_suite(tmp_path):
     shutil.copy(PLACES / "place-15.geojson", tmp_path / "mine.geojson")
     specs = tuple(scenario_specs(tmp_path))
     with pytest.raises(InputError, match="scenario 'mine' is place-15 of benchmark suite v2, which no agent"):
-        SearchTask(TrainingSpec(scenarios=specs)).check()
-    split = SearchTask(TrainingSpec(scenarios=specs, held_out=0.001))
+        SearchTask(SearchTrainingSpec(scenarios=specs)).check()
+    split = SearchTask(SearchTrainingSpec(scenarios=specs, held_out=0.001))
     assert [scenario.name for scenario in split.held_out] == ["mine"]
-    assert SearchTask(TrainingSpec(scenarios=specs[:3], evaluate_on=specs[3:])).held_out[0].name == "mine"
+    assert (
+        SearchTask(SearchTrainingSpec(scenarios=specs[:3], evaluate_on=specs[3:])).held_out[0].name == "mine"
+    )
 
 
 def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):

@@ -22,11 +22,11 @@ from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_rule
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, driver_of
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.fleet_task import FleetTask
 from parkenv.studies.training.fleet_training import FleetTraining
 from parkenv.studies.training.rl_training import train_one
+from parkenv.studies.training.spec import TrainingSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 from planners.model_file import save_model
@@ -277,7 +277,7 @@ def test_specifications_that_make_no_sense_are_refused(fields, wanted):
     [
         ({"scenarios": ["mini", "campus"]}, "want one with --env fleet"),
         ({"among": "belief"}, "want a compiled driver"),
-        ({"algorithm": "dqn"}, "ALGORITHM is 'dqn', want one of ppo, maskable-ppo for fleet"),
+        ({"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with env fleet"),
         ({"agents": ["oracle"]}, "knows the future"),
     ],
 )

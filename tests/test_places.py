@@ -18,10 +18,11 @@ from parkenv.lots import write_lot
 from parkenv.scenarios.places import by_size, lot_share, open_places, place_of_episode, split_places
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.bench.env import grids
-from parkenv.studies.spec import ExperimentSpec, TrainingSpec
+from parkenv.studies.spec import ExperimentSpec
 from parkenv.studies.training.cloning import clone
 from parkenv.studies.training.search_task import SearchTask
 from parkenv.studies.training.search_training import SearchTraining, episode_times
+from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week import DAY_ERROR, real_week_occupancy
 from parkenv.world.occupancy.typical_week import typical_occupancy
@@ -398,7 +399,7 @@ def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
 
 def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     specs = tuple(scenario_specs(folder))
-    task = SearchTask(TrainingSpec().changed(scenarios=specs, held_out=0.5))
+    task = SearchTask(SearchTrainingSpec().changed(scenarios=specs, held_out=0.5))
     names = {one.name for one in task.worlds}, {one.name for one in task.held_out}
     assert names[0] | names[1] == {spec.title for spec in specs}
     assert not names[0] & names[1]
@@ -411,7 +412,7 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
         (specs[1:2], "scenarios has 'lot0' twice, want places of different names"),
     ):
         with pytest.raises(InputError, match=message):
-            SearchTask(TrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
+            SearchTask(SearchTrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
 
 
 @pytest.mark.parametrize(
@@ -419,7 +420,10 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     [
         (["--held-out", "0"], "held_out is 0.0, want a number above 0"),
         (["--held-out", "0.5", "--evaluate-on", "mini"], "at most one of held_out, evaluate_on"),
-        (["--held-out", "0.2", "--env", "drive"], "held_out goes with env search"),
+        (
+            ["--held-out", "0.2", "--env", "drive"],
+            "held_out goes with env search or algorithm network, not",
+        ),
         (["--curriculum", "age"], "--curriculum: 'age' is not one of"),
         (["--evaluate-on", "nowhere"], "unknown scenario 'nowhere'"),
     ],

@@ -186,11 +186,14 @@ def test_a_model_needs_scans(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (["dqn"], "ALGORITHM is 'dqn', want one of ppo, maskable-ppo for searches on scans"),
-        (["network"], "observation does not go with network, which has one of its own"),
+        (["dqn"], "algorithm is 'dqn', want one of ppo, maskable-ppo with observation scan"),
+        (["network"], "observation goes with env search or observation scan, not with algorithm network"),
         (["--env", "fleet"], "observation goes with env search"),
-        (["--clone", "mdp"], "clone does not go with observation scan"),
-        (["--held-out", "0.5"], "held_out does not go with observation scan"),
+        (["--clone", "mdp"], "clone goes with env search, not with observation scan"),
+        (
+            ["--held-out", "0.5"],
+            "held_out goes with env search or algorithm network, not with observation scan",
+        ),
         (["--scenario", "mini,campus"], "there are 2 scenarios, want one for searches that observe scans"),
         (["--k", "101"], "k is 101, want a whole number of scans from 1 to 100"),
         (["--observation", "smell"], "'smell' is not one of"),

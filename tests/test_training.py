@@ -16,6 +16,7 @@ import time
 import zipfile
 
 import gymnasium as gym
+import jsonschema
 import numpy as np
 import pytest
 import torch
@@ -26,15 +27,16 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
+from parkenv.cli.schema import schemas
 from parkenv.engine.local_observation import local_space
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
+from parkenv.files.spec_file import read_tables
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
@@ -42,6 +44,14 @@ from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.rl_training import TRAINING_SEEDS, train_one
 from parkenv.studies.training.search_task import SearchTask
 from parkenv.studies.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.studies.training.spec import (
+    DriveTrainingSpec,
+    FleetTrainingSpec,
+    NetworkTrainingSpec,
+    ScanTrainingSpec,
+    SearchTrainingSpec,
+    TrainingSpec,
+)
 from parkenv.studies.training.training_task import curves_beside
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
@@ -573,7 +583,7 @@ def training_in(folder, **changed):
 
 def course_of(algorithm="ppo"):
     return SearchTask(
-        TrainingSpec(
+        SearchTrainingSpec(
             algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
             evaluation_episodes=16, agents=(),
         )
@@ -589,6 +599,42 @@ def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
     beside = curves_beside(folders, tmp_path / "own", course_of())
     assert list(beside) == ["dqn", f"ppo ({folders[1]})", "ppo after cloning mdp"]
     assert beside["dqn"] == [[{"steps": 0, "total_s": 300.0}, {"steps": 10, "total_s": 90.0}]]
+
+
+@pytest.mark.parametrize(
+    ("tables", "kind"),
+    [
+        ({}, SearchTrainingSpec),
+        ({"algorithm": "network", "scenarios": ["mini"]}, NetworkTrainingSpec),
+        ({"observation": "scan", "k": 3}, ScanTrainingSpec),
+        ({"env": "fleet", "arrivals_per_hour": 120}, FleetTrainingSpec),
+        ({"env": "drive", "algorithm": "sac", "agents": ["planner"]}, DriveTrainingSpec),
+    ],
+)
+def test_a_file_chooses_the_kind_of_training_and_its_copy_is_the_same(tables, kind, tmp_path):
+    spec = TrainingSpec.parse({"kind": "train", **tables}, "file")
+    assert type(spec) is kind
+    spec.write(tmp_path / "experiment.json")
+    assert TrainingSpec.read(tmp_path / "experiment.json") == spec
+    jsonschema.validate(read_tables(tmp_path / "experiment.json"), schemas()["train"])
+    with pytest.raises(InputError, match="file: unknown key 'step'; did you mean 'steps'"):
+        TrainingSpec.parse({**tables, "step": 3}, "file")
+
+
+@pytest.mark.parametrize(
+    ("tables", "message"),
+    [
+        ({"env": "fly"}, "env is 'fly', want one of search, fleet, drive"),
+        ({"observation": "smell"}, "observation is 'smell', want one of local, scan"),
+        (
+            {"env": "drive", "k": 3},
+            "k goes with env search or observation scan or env fleet, not with env drive",
+        ),
+    ],
+)
+def test_a_field_of_another_kind_of_training_is_refused(tables, message):
+    with pytest.raises(InputError, match=message):
+        TrainingSpec.parse(tables, "file")
 
 
 def torn_settings(folder):
@@ -664,12 +710,12 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (["sarsa"], "ALGORITHM is 'sarsa', want one of"),
+        (["sarsa"], "algorithm is 'sarsa', want one of"),
         (
             ["sac"],
-            "ALGORITHM is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn, network for search",
+            "algorithm is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn with env search",
         ),
-        (["dqn", "--env", "drive"], "ALGORITHM is 'dqn', want one of ppo, sac, tqc for drive"),
+        (["dqn", "--env", "drive"], "algorithm is 'dqn', want one of ppo, sac, tqc with env drive"),
         (["ppo", "--env", "fly"], "--env: 'fly' is not one of"),
         (["ppo", "--env", "drive", "--clone", "mdp"], "clone goes with env search"),
         (
@@ -680,18 +726,24 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
             ["sac", "--env", "drive", "--lot", "nowhere.geojson"],
             "--lot is 'nowhere.geojson', want a file; there is",
         ),
-        (["sac", "--env", "drive", "--agents", "mdp"], "--agents names other agents than planner"),
+        (
+            ["sac", "--env", "drive", "--agents", "mdp"],
+            "agents has 'mdp', want planner or none with env drive",
+        ),
         (["ppo", "--resume"], "holds no training to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
-        (["network", "--clone", "mdp"], "clone does not go with network, which clones belief"),
-        (["network", "--evaluate-every", "9"], "evaluate_every does not go with network, which is evaluated"),
-        (["network", "--tensorboard"], "tensorboard does not go with network"),
+        (["network", "--clone", "mdp"], "clone goes with env search, not with algorithm network"),
+        (["network", "--evaluate-every", "9"], "evaluate_every goes with env search or"),
+        (["network", "--tensorboard"], "not with algorithm network"),
         (["network", "--without", "legs"], "without.0 is 'legs', want 'lookahead'"),
         (["ppo", "--without", "day"], "without goes with algorithm network"),
         (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
-        (["ppo", "--env", "drive", "--demonstrations", "5"], "demonstrations goes with env search"),
+        (
+            ["ppo", "--env", "drive", "--demonstrations", "5"],
+            "demonstrations goes with env search, not with env drive",
+        ),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):

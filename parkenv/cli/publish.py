@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from parkenv.scenarios.spec import ScenarioSpec
-    from parkenv.studies.spec import TrainingSpec
+    from parkenv.studies.training.spec import TrainingSpec
 
 
 def publish(
@@ -56,6 +56,7 @@ def publish(
     from parkenv.studies.fleet.publication import FleetPublication
     from parkenv.studies.publication import CARD, FILM, MODEL, Publication
     from parkenv.studies.results import make_folder, write_summary
+    from parkenv.studies.training.spec import FleetTrainingSpec
     from parkenv.studies.training.training_task import FIGURE, TEST_SEED
     from planners.model_file import ModelCard
 
@@ -71,7 +72,7 @@ def publish(
     named = {_file_of(spec): spec for spec in (tested or _trained_on(model, card.scenarios))}
     published = (
         FleetPublication.of_training(spec, model, named, episodes or 16, seed)
-        if spec is not None and spec.env == "fleet"
+        if isinstance(spec, FleetTrainingSpec)
         else Publication(model, {name: build(each) for name, each in named.items()}, episodes or 500, seed)
     )
     make_folder(out)
@@ -104,8 +105,8 @@ def _best(folder: Path, trust: bool) -> tuple[TrainingSpec, Path, Sequence[Scena
         InputError: the folder holds no finished training.
     """
     from parkenv.studies.report.run_folder import RunFolder
-    from parkenv.studies.spec import TrainingSpec
     from parkenv.studies.training.rl_training import MODEL
+    from parkenv.studies.training.spec import PlacesTrainingSpec, TrainingSpec
 
     run = RunFolder.read(folder)
     spec = run.spec()
@@ -115,10 +116,10 @@ def _best(folder: Path, trust: bool) -> tuple[TrainingSpec, Path, Sequence[Scena
     rows = run.summary["rows"]
     key, better = ("success", max) if spec.env == "drive" else ("total_s", min)
     best = better(rows, key=lambda row: float(row[key]))
-    tested = spec.test_on or spec.evaluate_on or spec.scenarios
-    if spec.test_on is None and spec.held_out is not None and spec.scenarios is not None:
+    tested = spec.tested
+    if isinstance(spec, PlacesTrainingSpec) and spec.test_on is None and spec.held_out is not None:
         kept = set(run.summary["settings"]["held_out"])
-        tested = tuple(each for each in spec.scenarios if each.title in kept)
+        tested = tuple(each for each in spec.scenarios or () if each.title in kept)
     return spec, folder / f"seed_{int(best['seed'])}" / MODEL, tested
 
 

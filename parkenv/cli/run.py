@@ -53,18 +53,19 @@ def run(
         out, -o (DIR): Folder for the results.  [default: results/NAME of the file]
     """
     from parkenv.files.spec_file import read_tables
-    from parkenv.studies import spec as specs
+    from parkenv.studies.kinds import SPECS
+    from parkenv.studies.spec import SPEC_FILE
 
     file = experiment
     if file.is_dir():
         if out is not None:
             raise InputError(f"{file} is the folder of a run, which goes on there; leave out --out")
-        file, out = file / specs.SPEC_FILE, file
+        file, out = file / SPEC_FILE, file
     tables = read_tables(file)
     name = tables.get("kind", "compare")
     if not isinstance(name, str) or name not in KINDS:
         raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
-    spec = specs.SPECS[name].parse(tables, str(file), file.parent)
+    spec = SPECS[name].parse(tables, str(file), file.parent)
     require_trust(spec, experiment, trust)
     out = out or Path("results") / file.stem
     with writing_into(out, f"parkenv run {out} --resume"):

@@ -4,35 +4,26 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from typer import echo
 
 from parkenv.errors import InputError, nearest
-
-if TYPE_CHECKING:
-    from pydantic import BaseModel
 
 KINDS = ("scenario", "compare", "commute", "fleet", "benchmark", "survey", "demo", "train")
 
 
 def schemas() -> dict[str, dict[str, Any]]:
     """Return the schema of each kind of file, made from the models that validate it."""
-    from parkenv.scenarios.spec import ScenarioSpec
-    from parkenv.studies import spec as specs
+    from pydantic import TypeAdapter
 
-    models: tuple[type[BaseModel], ...] = (
-        ScenarioSpec,
-        specs.ExperimentSpec,
-        specs.CommuteSpec,
-        specs.FleetSpec,
-        specs.BenchmarkSpec,
-        specs.SurveySpec,
-        specs.DemoSpec,
-        specs.TrainingSpec,
-    )
+    from parkenv.scenarios.spec import ScenarioSpec
+    from parkenv.studies.kinds import SPECS
+    from parkenv.studies.training.spec import AnyTrainingSpec
+
+    models: dict[str, Any] = {"scenario": ScenarioSpec, **SPECS, "train": AnyTrainingSpec}
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return {kind: draft | model.model_json_schema() for kind, model in zip(KINDS, models, strict=True)}
+    return {kind: draft | TypeAdapter(models[kind]).json_schema() for kind in KINDS}
 
 
 def schema(kind: str | None = None, /, out: Path | None = None) -> None:

@@ -19,8 +19,8 @@ from parkenv.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.spec import TrainingSpec
     from parkenv.studies.training.rl_training import AnyTraining
+    from parkenv.studies.training.spec import TrainingSpec
     from parkenv.studies.training.training_task import Row, TrainingTask
     from parkenv.studies.workers import Workers
 
@@ -137,27 +137,25 @@ def train(
         resume: Continue from the checkpoints in --out; the models equal those of an unbroken training.
         tensorboard: Keep logs for TensorBoard in --out.
     """
-    from parkenv.studies.spec import TrainingSpec
+    from parkenv.studies.training.spec import TrainingSpec
 
     if day_error and not (scenario or lot):
         raise InputError("--day-error goes with --scenario or --lot")
     world, days = args.World(lot=lot, day_error=day_error), args.World(day_error=day_error)
     given = {
+        "env": env, "algorithm": algorithm, "steps": steps, "trainings": trainings, "seed": seed,
         "scenarios": tuple(world.specs(scenario)) if scenario or lot else None,
         "evaluate_on": tuple(days.specs(evaluate_on)) if evaluate_on else None,
         "test_on": tuple(days.specs(test_on)) if test_on else None,
-        "without": args.words("--without", without) if without else None,
-        "agents": _agents(agents),
-        "test_among": _agents(test_among),
-        "among": among,
-    }
-    spec = TrainingSpec().changed(
-        env=env, algorithm=algorithm, steps=steps, trainings=trainings, seed=seed, clone=clone,
-        demonstrations=demonstrations, k=k, observation=observation, held_out=held_out, curriculum=curriculum,
-        evaluate_every=evaluate_every, evaluation_episodes=evaluation_episodes, arrivals_per_hour=arrivals_per_hour,
-        stay_s=_seconds(stay_min), patience_s=_seconds(patience_min), knows=knows, learners=learners,
-        tensorboard=tensorboard, **given, **machines.given,
-    )  # fmt: skip
+        "clone": clone, "demonstrations": demonstrations, "k": k, "observation": observation,
+        "held_out": held_out, "curriculum": curriculum, "evaluate_every": evaluate_every,
+        "evaluation_episodes": evaluation_episodes, "arrivals_per_hour": arrivals_per_hour,
+        "stay_s": _seconds(stay_min), "patience_s": _seconds(patience_min), "knows": knows,
+        "learners": learners, "without": args.words("--without", without) if without else None,
+        "agents": _agents(agents), "test_among": _agents(test_among), "among": among,
+        "tensorboard": tensorboard or None, **machines.given,
+    }  # fmt: skip
+    spec = TrainingSpec.parse({name: value for name, value in given.items() if value is not None}, "")
     out = out or Path("results") / _task_of(spec).folder
     with writing_into(out, "the same command with --resume"):
         run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
@@ -174,18 +172,27 @@ def _agents(text: str | None) -> list[str] | None:
 
 
 def _task_of(spec: TrainingSpec) -> TrainingTask:
-    from parkenv.studies.training.drive_task import DriveTask
-    from parkenv.studies.training.search_task import SearchTask
+    from parkenv.studies.training import spec as specs
 
-    if spec.env == "search" and spec.algorithm == "network":
-        from parkenv.studies.training.network_task import NetworkTask
+    # These load torch.
+    match spec:
+        case specs.FleetTrainingSpec():
+            from parkenv.studies.training.fleet_task import FleetTask
 
-        return NetworkTask(spec)
-    if spec.env == "fleet":
-        from parkenv.studies.training.fleet_task import FleetTask
+            return FleetTask(spec)
+        case specs.DriveTrainingSpec():
+            from parkenv.studies.training.drive_task import DriveTask
 
-        return FleetTask(spec)
-    return DriveTask(spec) if spec.env == "drive" else SearchTask(spec)
+            return DriveTask(spec)
+        case specs.NetworkTrainingSpec():
+            from parkenv.studies.training.network_task import NetworkTask
+
+            return NetworkTask(spec)
+        case specs.SearchTrainingSpec() | specs.ScanTrainingSpec():
+            from parkenv.studies.training.search_task import SearchTask
+
+            return SearchTask(spec)
+    raise TypeError(f"{type(spec).__name__} is no kind of training")
 
 
 def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside: Sequence[str] = ()) -> None:
@@ -211,7 +218,9 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside
         _claim(out, settings, folder.overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.trainings)
-        curves = _train_all(console, task, training, numbers, out, workers, spec.tensorboard)
+        curves = _train_all(
+            console, task, training, numbers, out, workers, getattr(spec, "tensorboard", False)
+        )
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
         outcome, table = task.report(console.status, workers, Trained(curves, models, others), out / FIGURE)
     console.print(make_table(*table))

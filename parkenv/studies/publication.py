@@ -23,8 +23,9 @@ from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once,
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
-from planners.driving.parking_agents import PLANNER, make_parking_agent
+from planners.driving.parking_agents import make_parking_agent
 from planners.model_file import SCANS_OBSERVATION, ModelCard
+from planners.names import PARKING_PLANNER
 
 MODEL, FILM, CARD = "model.safetensors", "replay.gif", "README.md"
 BESIDE = ("mdp", "belief", "first-free")
@@ -67,7 +68,7 @@ class Publication:
     @property
     def command(self) -> list[str]:
         """Command line that repeats the evaluation, in the folder."""
-        command, beside = ("compare", BESIDE) if self.card.task == "search" else ("park", (PLANNER,))
+        command, beside = ("compare", BESIDE) if self.card.task == "search" else ("park", (PARKING_PLANNER,))
         return [
             "parkenv", command, "--scenario", ",".join(self.scenarios), "--agents", ",".join((*beside, self.name)),
             "--episodes", str(self.episodes), "--seed", str(self.seed),
@@ -83,7 +84,7 @@ class Publication:
                 agents = [AgentSpec(name=name) for name in (*BESIDE, self._source)]
                 rows += rows_of(agents, scenario, seeds, workers)
             else:
-                for agent in (PLANNER, self._source):
+                for agent in (PARKING_PLANNER, self._source):
                     some = park_all([ParkingCase(scenario.lot)], seeds, workers, agent)
                     total = parking_table([p.row for part in some for p in part])[-1]
                     rows.append({"scenario": scenario.name, "agent": agent, **total})

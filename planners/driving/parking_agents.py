@@ -8,8 +8,7 @@ from typing import Any
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from planners.agent import Agent
-
-PLANNER = "planner"
+from planners.names import PARKING_PLANNER
 
 
 def make_parking_agent(name: str, vehicle: VehicleParameters | None = None) -> Agent:
@@ -29,11 +28,12 @@ def make_parking_agent(name: str, vehicle: VehicleParameters | None = None) -> A
         agent: Any = import_module("planners.driving.learned_parking").LearnedParkingAgent(
             algorithm, file, vehicle
         )
-    elif name == PLANNER:
+    elif name == PARKING_PLANNER:
         agent = import_module("planners.driving.parking").ParkingAgent(vehicle)
     else:
         raise InputError(
-            f"unknown agent {name!r}; known: {PLANNER}, and ALGORITHM:FILE for a model of `parkenv train --env drive`"
+            f"unknown agent {name!r}; known: {PARKING_PLANNER}, and ALGORITHM:FILE for a model of "
+            "`parkenv train --env drive`"
         )
     result: Agent = agent
     return result

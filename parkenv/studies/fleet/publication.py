@@ -17,7 +17,8 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.figures.picture_files import save_film
 from parkenv.studies.fleet.experiment import FleetExperiment, summarize_days
 from parkenv.studies.publication import MODEL, Publication, Row
-from parkenv.studies.spec import FleetSpec, TrainingSpec
+from parkenv.studies.spec import FleetSpec
+from parkenv.studies.training.spec import FleetTrainingSpec
 from parkenv.studies.workers import Workers
 
 BESIDE = ("greedy-drive", "first-free")
@@ -37,7 +38,7 @@ class FleetPublication(Publication):
 
     @classmethod
     def of_training(
-        cls, spec: TrainingSpec, model: Path, scenarios: Mapping[str, ScenarioSpec], days: int, seed: int
+        cls, spec: FleetTrainingSpec, model: Path, scenarios: Mapping[str, ScenarioSpec], days: int, seed: int
     ) -> Self:
         """Return the publication of a model with the demand of its training.
 
@@ -46,14 +47,11 @@ class FleetPublication(Publication):
         """
         if len(scenarios) != 1:
             raise InputError(f"--scenario names {len(scenarios)} scenarios, want one for a model of a fleet")
-        asked = {
-            "arrivals_per_hour": (spec.arrivals_per_hour or 120.0,), "knows": (spec.knows or "own",),
-            "stay_s": spec.stay_s, "patience_s": spec.patience_s,
-        }  # fmt: skip
         ((name, scenario),) = scenarios.items()
         fleets = FleetSpec().changed(
-            **{field: value for field, value in asked.items() if value is not None},
-            scenario=scenario, days=days, seed=seed, agents=tuple(AgentSpec(name=each) for each in BESIDE),
+            arrivals_per_hour=(spec.arrivals_per_hour,), knows=(spec.knows,), stay_s=spec.stay_s,
+            patience_s=spec.patience_s, scenario=scenario, days=days, seed=seed,
+            agents=tuple(AgentSpec(name=each) for each in BESIDE),
         )  # fmt: skip
         made = cls(model, {name: FleetExperiment(fleets).scenario}, days, seed, fleets)
         agents = (*fleets.agents, AgentSpec(name=made._source))

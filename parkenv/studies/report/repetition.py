@@ -21,6 +21,7 @@ from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.report.search_recording import MOST_SLOTS
 from parkenv.studies.results import read_settings
 from parkenv.studies.sensing.surveys import MAP_FILE, survey_of
+from parkenv.studies.training.spec import NetworkTrainingSpec, ScanTrainingSpec, SearchTrainingSpec
 from parkenv.world.scenario import Scenario
 
 Cases = list[tuple[Case, Sequence[int]]]
@@ -68,7 +69,7 @@ class Repetition:
                 with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
                     log = store.log()
                 return cls([*demo_cases(spec, its, log)], (its, settings), len(log.time))
-            case specs.TrainingSpec():
+            case SearchTrainingSpec() | ScanTrainingSpec() | NetworkTrainingSpec():
                 return cls(_trained(run, spec))
         return cls([])
 
@@ -116,9 +117,9 @@ def differences(watched: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-def _trained(run: RunFolder, spec: specs.TrainingSpec) -> Cases:
-    """Return the best model and the best planners in the test scenarios; none for driving, or without a test."""
-    if spec.env != "search" or not run.summary.get("transfer"):
+def _trained(run: RunFolder, spec: SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec) -> Cases:
+    """Return the best model and the best planners in the test scenarios; none without a test."""
+    if not run.summary.get("transfer"):
         return []
     # These load torch.
     from parkenv.studies.training.rl_training import MODEL

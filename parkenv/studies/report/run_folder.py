@@ -14,6 +14,7 @@ from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Spec, read_tables
 from parkenv.studies.fleet.experiment import TABLE
+from parkenv.studies.kinds import SPECS
 from parkenv.studies.results import (
     SETTINGS,
     SUMMARY,
@@ -24,7 +25,7 @@ from parkenv.studies.results import (
     without_nan,
 )
 from parkenv.studies.sensing.surveys import read_sessions
-from parkenv.studies.spec import SPEC_FILE, SPECS
+from parkenv.studies.spec import SPEC_FILE
 from parkenv.studies.training.curve_file import CURVE, read_curve
 
 

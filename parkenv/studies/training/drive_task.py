@@ -5,13 +5,12 @@ from __future__ import annotations
 from functools import cached_property
 from pathlib import Path
 
-from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.studies.figures.learning_curves import across_seeds, save_success_curves
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.configs import DRIVE_CONFIGS, config_of
 from parkenv.studies.training.drive_training import DriveTraining, parked_on
 from parkenv.studies.training.drive_training_env import slot_groups
+from parkenv.studies.training.spec import DriveTrainingSpec
 from parkenv.studies.training.training_task import (
     Row,
     Status,
@@ -24,18 +23,16 @@ from parkenv.studies.training.training_task import (
 from parkenv.studies.trips.parking_runs import parking_table
 from parkenv.studies.workers import Workers
 from parkenv.world.lot import ParkingLot
-from planners.driving.parking_agents import PLANNER
+from planners.names import PARKING_PLANNER
 
 
 class DriveTask(TrainingTask):
     """Training of parking agents on the lots of some scenarios."""
 
-    default_algorithm = "ppo"
-    default_scenarios = ("campus", "street")
-    default_episodes = 64
     prefix = "drive-"
+    spec: DriveTrainingSpec
 
-    def __init__(self, spec: TrainingSpec) -> None:
+    def __init__(self, spec: DriveTrainingSpec) -> None:
         super().__init__(spec)
         self.steps = spec.steps or int(config_of(self.algorithm, DRIVE_CONFIGS, "drive").steps)
         self.evaluate_every = spec.evaluate_every or max(1, self.steps // 20)
@@ -56,10 +53,6 @@ class DriveTask(TrainingTask):
         super().check()
         for lots in (self.lots, self.tested):
             slot_groups(lots)
-        if any(agent.label != PLANNER for agent in self.spec.agents or ()):
-            raise InputError(
-                f"--agents names other agents than {PLANNER}; with --env drive want {PLANNER} or none"
-            )
 
     def settings(self) -> Row:
         """See `TrainingTask`."""
@@ -92,13 +85,13 @@ class DriveTask(TrainingTask):
         """See `TrainingTask`."""
         lines: dict[str, float] = {}
         planners: list[Row] = []
-        if self.spec.agents is None or self.spec.agents:
+        if self.spec.agents:
             with status("The planner parks in the same tasks"):
-                parkings = parked_on(self.lots, self.evaluation_seeds, workers, PLANNER)
+                parkings = parked_on(self.lots, self.evaluation_seeds, workers, PARKING_PLANNER)
                 lines = {row["kind"]: row["success"] for row in parking_table(parkings)}
                 for lot in self.tested:
-                    table = parking_table(parked_on([lot], self.test_seeds, workers, PLANNER))
-                    planners += [{"agent": PLANNER, "scenario": lot.name, **row} for row in table]
+                    table = parking_table(parked_on([lot], self.test_seeds, workers, PARKING_PLANNER))
+                    planners += [{"agent": PARKING_PLANNER, "scenario": lot.name, **row} for row in table]
         rows, transfer = [], []
         names = ",".join(lot.name for lot in self.tested)
         with status("Testing"):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 from parkenv.engine.fleet_rules import RULES
 from parkenv.errors import InputError
@@ -14,9 +13,9 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.studies.fleet.drivers import MixedFleet, demand_in, driver_of
 from parkenv.studies.plurals import plural
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.configs import FLEET_CONFIGS, config_of
 from parkenv.studies.training.fleet_training import FleetTraining
+from parkenv.studies.training.spec import FleetTrainingSpec
 from parkenv.studies.training.training_task import (
     EVALUATION_SEED,
     TEST_SEED,
@@ -30,9 +29,7 @@ from parkenv.studies.training.training_task import (
 )
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
-from parkenv.world.week import HOUR_S
 
-PLANNERS = tuple(AgentSpec(name=name) for name in ("greedy-drive", "first-free"))
 FEW = 0.1
 """Share of the cars that a model drives in tests among other agents."""
 
@@ -40,18 +37,13 @@ FEW = 0.1
 class FleetTask(TrainingTask):
     """Training in one fleet."""
 
-    default_algorithm = "maskable-ppo"
-    default_scenarios: ClassVar[tuple[str, ...]] = ("campus",)
-    default_episodes = 8
     prefix = "fleet-"
+    spec: FleetTrainingSpec
 
-    def __init__(self, spec: TrainingSpec) -> None:
+    def __init__(self, spec: FleetTrainingSpec) -> None:
         super().__init__(spec)
-        self.steps = spec.steps or 500_000
+        self.steps, self.k, self.compared, self.test_among = spec.steps, spec.k, spec.agents, spec.test_among
         self.evaluate_every = spec.evaluate_every or max(1, self.steps // 10)
-        self.k = spec.k or 5
-        self.compared = PLANNERS if spec.agents is None else spec.agents
-        self.test_among = (AgentSpec(name="greedy-drive"),) if spec.test_among is None else spec.test_among
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -64,14 +56,9 @@ class FleetTask(TrainingTask):
     def fleet(self) -> MixedFleet:
         """The fleet to train in."""
         spec = self.spec
-        rate, stay_s, patience_s = (
-            spec.arrivals_per_hour or 120.0,
-            spec.stay_s or HOUR_S,
-            spec.patience_s or 600.0,
-        )
-        demand = demand_in(self.scenario, rate, stay_s, patience_s)
+        demand = demand_in(self.scenario, spec.arrivals_per_hour, spec.stay_s, spec.patience_s)
         share = 1.0 if spec.among is None else spec.learners or FEW
-        return MixedFleet(self.scenario, demand, spec.knows or "own", share, spec.among)
+        return MixedFleet(self.scenario, demand, spec.knows, share, spec.among)
 
     @cached_property
     def tests(self) -> list[MixedFleet]:
@@ -144,7 +131,7 @@ class FleetTask(TrainingTask):
                 main = transfer[-len(self.tests)]
                 own = {c: main[c] for c in ("total_s", "total_s_ci95", "search_s")}
                 rows.append(row_of(self.algorithm, self.scenario.name, number, curve, own, model))
-        rate = self.spec.arrivals_per_hour or 120.0
+        rate = self.spec.arrivals_per_hour
         title = (
             f"{self.scenario.name}, {rate:g} cars an hour, {self.fleet.name}: {plural(days, 'held-out day')}"
         )

@@ -31,10 +31,6 @@ from parkenv.world.scenario import Scenario
 from planners.network.agent import NetworkAgent
 from planners.network.policy import NetworkCard, NetworkPolicy, Part
 
-NETWORK = "network"
-"""Name of the algorithm, and of the agent."""
-STEPS = 10_000
-"""Default number of labelled decisions of a training."""
 STUDENT_DRIVES = (False, True)  # in the rounds with labels
 PAIR_ROUNDS = 2
 CLOSEST = 0.05  # time scales, difference of two scores that are about equal

@@ -5,21 +5,19 @@ from __future__ import annotations
 import itertools
 from functools import cached_property
 from pathlib import Path
-from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.envs.sb3 import search_batch
-from parkenv.envs.scan_observation import SCANS
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.scenarios.places import lot_share, place_of_episode, require_different_names, split_places
+from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.benchmark import suite_lots
 from parkenv.studies.compare.cases import rows_of
 from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.cloning import Demonstrations, require_cloneable
 from parkenv.studies.training.rl_training import AnyTraining
 from parkenv.studies.training.search_training import (
@@ -27,6 +25,12 @@ from parkenv.studies.training.search_training import (
     episode_times,
     search_config,
     times_row,
+)
+from parkenv.studies.training.spec import (
+    NetworkTrainingSpec,
+    PlacesTrainingSpec,
+    ScanTrainingSpec,
+    SearchTrainingSpec,
 )
 from parkenv.studies.training.training_task import (
     Row,
@@ -57,20 +61,27 @@ PLANNERS_OF_PLACES = tuple(spec for spec in PLANNERS if spec.name not in ("mdp-t
 class SearchTask(TrainingTask):
     """Training of search agents in some scenarios."""
 
-    default_algorithm = "maskable-ppo"
-    default_scenarios: ClassVar[tuple[str, ...]] = ("campus",)
-    default_episodes = 256
-
-    def __init__(self, spec: TrainingSpec) -> None:
+    def __init__(self, spec: SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec) -> None:
         super().__init__(spec)
-        self.steps = spec.steps or 2_000_000
-        self.evaluate_every = spec.evaluate_every or 100_000
-        self.observation = spec.observation or "local"
-        self.k = spec.k or (SCANS if self.observation == "scan" else 5)
-        self.demonstrations = spec.demonstrations or 2000
-        self._holds_out = spec.held_out is not None or spec.evaluate_on is not None
+        self.test_on, self.steps = spec.test_on, spec.steps
+        self.evaluate_every, self.observation, self.k = 100_000, "local", 5
+        if not isinstance(spec, NetworkTrainingSpec):
+            self.evaluate_every, self.observation, self.k = spec.evaluate_every, spec.observation, spec.k
+        self.clone, self.curriculum, self.demonstrations = None, None, 2000
+        if isinstance(spec, SearchTrainingSpec):
+            self.clone, self.curriculum = spec.clone, spec.curriculum
+            self.demonstrations = spec.demonstrations or 2000
+        self.held_out_share, self.evaluate_on = (
+            (spec.held_out, spec.evaluate_on) if isinstance(spec, PlacesTrainingSpec) else (None, None)
+        )
+        self._holds_out = self.held_out_share is not None or self.evaluate_on is not None
         usual = PLANNERS_OF_PLACES if self._holds_out else PLANNERS
         self.compared = usual if spec.agents is None else spec.agents
+
+    @property
+    def given_scenarios(self) -> tuple[ScenarioSpec, ...]:
+        """See `TrainingTask`."""
+        return (*self.scenarios, *(self.evaluate_on or ()))
 
     @property
     def folder(self) -> str:
@@ -81,10 +92,10 @@ class SearchTask(TrainingTask):
     def _sides(self) -> tuple[list[Scenario], list[Scenario]]:
         """Scenarios to train in, and held-out ones."""
         given = [build(scenario) for scenario in self.scenarios]
-        if self.spec.held_out is not None:
-            sides = split_places(given, self.spec.held_out, suite_lots())
+        if self.held_out_share is not None:
+            sides = split_places(given, self.held_out_share, suite_lots())
         else:
-            sides = given, [build(scenario) for scenario in self.spec.evaluate_on or ()]
+            sides = given, [build(scenario) for scenario in self.evaluate_on or ()]
         require_apart(*sides)
         require_trainable(sides[0])
         return sides
@@ -102,12 +113,12 @@ class SearchTask(TrainingTask):
     @cached_property
     def tests(self) -> dict[str, list[Scenario]]:
         """The tests in the end, by name: each in one scenario, or in many of which every search draws one."""
-        if self.spec.test_on is None and self._holds_out:
+        if self.test_on is None and self._holds_out:
             return {
                 f"{_places(self.worlds)} trained on": self.worlds,
                 f"{_places(self.held_out)} held out": self.held_out,
             }
-        tested = self.worlds if self.spec.test_on is None else [build(one) for one in self.spec.test_on]
+        tested = self.worlds if self.test_on is None else [build(one) for one in self.test_on]
         return {scenario.name: [scenario] for scenario in tested}
 
     @property
@@ -138,8 +149,8 @@ class SearchTask(TrainingTask):
             # What gives no scans in a batch is refused before training, not at the tests in the end.
             for place in (*self.worlds, *itertools.chain(*self.tests.values())):
                 search_batch(1, self.worlds if place in self.worlds else place, "scan", self.k)
-        if self.spec.clone is not None:
-            require_cloneable(self.algorithm, self.spec.clone, self.worlds[0])
+        if self.clone is not None:
+            require_cloneable(self.algorithm, self.clone, self.worlds[0])
         for world in (self.worlds[0], *(places[0] for places in self.tests.values())):
             for agent in self.compared:
                 make_agent(agent.name, world, **agent.options)
@@ -148,9 +159,9 @@ class SearchTask(TrainingTask):
         """See `TrainingTask`."""
         return {
             **super().settings(), "scenario": [w.name for w in self.worlds], "steps": self.steps, "k": self.k,
-            "clone": self.spec.clone, "demonstrations": self.demonstrations if self.spec.clone else None,
+            "clone": self.clone, "demonstrations": self.demonstrations if self.clone else None,
             "evaluate_every": self.evaluate_every, "held_out": [w.name for w in self.held_out],
-            "curriculum": self.spec.curriculum, "observation": self.observation,
+            "curriculum": self.curriculum, "observation": self.observation,
         }  # fmt: skip
 
     def evaluation_settings(self, settings: Row) -> Row:
@@ -165,10 +176,10 @@ class SearchTask(TrainingTask):
     def training(self, status: Status) -> AnyTraining:
         """See `TrainingTask`."""
         demonstrations = None
-        if self.spec.clone is not None:
+        if self.clone is not None:
             seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + self.demonstrations)
-            with status(f"Recording {self.demonstrations} searches of {self.spec.clone}"):
-                demonstrations = Demonstrations.collect(self.spec.clone, self._evaluated, seeds, self.k)
+            with status(f"Recording {self.demonstrations} searches of {self.clone}"):
+                demonstrations = Demonstrations.collect(self.clone, self._evaluated, seeds, self.k)
         return SearchTraining(
             self.algorithm,
             self.steps,
@@ -178,7 +189,7 @@ class SearchTask(TrainingTask):
             self.k,
             demonstrations,
             tuple(self.held_out),
-            self.spec.curriculum,
+            self.curriculum,
             self.observation,
         )
 
@@ -209,7 +220,7 @@ class SearchTask(TrainingTask):
                     if len(places) > 1:
                         by_place += [test | row for row in self._rows_by_place(places, times, parked)]
                 # The first test; of those on either side of a split, the one on held-out places.
-                split = self._holds_out and self.spec.test_on is None
+                split = self._holds_out and self.test_on is None
                 main = transfer[-1 if split else -len(self.tests)]
                 own = {c: main[c] for c in ("total_s", "total_s_ci95")}
                 rows.append(row_of(self.algorithm, main["test_scenario"], number, curve, own, model))

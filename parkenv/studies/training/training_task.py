@@ -11,13 +11,13 @@ from typing import Any, ClassVar, NamedTuple
 
 from parkenv.errors import InputError
 from parkenv.files.spec_file import Several, Spec
-from parkenv.scenarios.spec import scenario_spec
+from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.compare.experiment import fingerprints, flat_tables
 from parkenv.studies.figures.learning_curves import COLORS
 from parkenv.studies.results import SETTINGS, read_settings
-from parkenv.studies.spec import TrainingSpec
 from parkenv.studies.training.curve_file import CURVE, read_curve
 from parkenv.studies.training.rl_training import AnyTraining
+from parkenv.studies.training.spec import TrainingSpec
 from parkenv.studies.workers import Workers
 
 EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
@@ -50,21 +50,17 @@ class TrainingTask(ABC):
     """A kind of training: its defaults, checks and report.
 
     Args:
-        spec: specification of the training; the task supplies missing values.
+        spec: specification of the training.
     """
 
-    default_scenarios: ClassVar[tuple[str, ...]]
-    default_episodes: ClassVar[int]
-    """Default number of episodes of an evaluation."""
-    default_algorithm: ClassVar[str]
     prefix: ClassVar[str] = ""
     """Of the default name of the output folder."""
 
     def __init__(self, spec: TrainingSpec) -> None:
         self.spec = spec
-        self.algorithm = spec.algorithm or self.default_algorithm
-        self.scenarios = spec.scenarios or tuple(map(scenario_spec, self.default_scenarios))
-        self.evaluation_episodes = spec.evaluation_episodes or self.default_episodes
+        self.algorithm = spec.algorithm
+        self.scenarios = spec.scenarios or ()
+        self.evaluation_episodes = spec.evaluation_episodes
         self.evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
         self.test_seeds = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
 
@@ -72,6 +68,11 @@ class TrainingTask(ABC):
     def folder(self) -> str:
         """Default name of the output folder."""
         return self.prefix + self.algorithm
+
+    @property
+    def given_scenarios(self) -> tuple[ScenarioSpec, ...]:
+        """All scenarios that are trained or evaluated on."""
+        return self.scenarios
 
     @property
     @abstractmethod
@@ -97,7 +98,7 @@ class TrainingTask(ABC):
     @abstractmethod
     def settings(self) -> Row:
         """Return the settings that a resumed training must share with this one."""
-        given = (*self.scenarios, *(self.spec.evaluate_on or ()))
+        given = self.given_scenarios
         return {
             "algorithm": self.algorithm,
             "evaluation_episodes": self.evaluation_episodes,

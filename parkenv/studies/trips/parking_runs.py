@@ -21,7 +21,8 @@ from parkenv.studies.workers import HERE, Workers
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
 from planners.driving.parking import ParkingMemory
-from planners.driving.parking_agents import PLANNER, make_parking_agent
+from planners.driving.parking_agents import make_parking_agent
+from planners.names import PARKING_PLANNER
 
 CHUNK = 25  # episodes per task of a worker
 
@@ -142,7 +143,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
 
 def park_all(
-    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, agent: str = PLANNER
+    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, agent: str = PARKING_PLANNER
 ) -> Iterator[list[Parking]]:
     """Run every seed of every case with one agent; yield the parkings in order.
 

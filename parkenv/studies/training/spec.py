@@ -1,0 +1,299 @@
+"""Specifications of trainings, one for each kind: of search agents, on scans, of `network`, in fleets, and to drive."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv.files.known_names import KnowledgeName
+from parkenv.files.spec_file import Several
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.studies.spec import MAX_EPISODES, ArrivalRate, Level, Scenarios, Stay, Workplace
+from planners.names import PARKING_PLANNER
+
+Steps = Annotated[int, Field(ge=1, le=10**12, description="Decisions of a training.")]
+EvaluateEvery = Annotated[int, Field(ge=1, le=10**12, description="Decisions between evaluations.")]
+Episodes = Annotated[int, Field(ge=2, le=1_000_000)]
+ObservedSlots = Annotated[int, Field(ge=1, le=1_000, description="Slots in an observation.")]
+TensorBoard = Annotated[bool, Field(description="Keep logs for TensorBoard.")]
+
+
+class TrainingSpec(Workplace):
+    """Training by reinforcement learning, one model per seed: what all kinds of training have.
+
+    `TrainingSpec.parse` and `read` return the specification of the kind that `env`, `algorithm` and `observation`
+    choose.
+    """
+
+    chosen_by: ClassVar[str] = ""
+    """What chooses this kind of training, for messages."""
+
+    kind: Literal["train"] = "train"
+    env: Literal["search", "fleet", "drive"] = "search"
+    algorithm: str
+    scenarios: Scenarios | None = None
+    trainings: int = Field(5, ge=1, le=10_000, description="How many, one for each seed.")
+    seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
+    evaluation_episodes: Episodes
+    agents: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+
+    @classmethod
+    def parse(cls, tables: Mapping[str, Any], source: str, folder: str | Path = ".") -> Self:
+        """See `Spec.parse`."""
+        if cls is not TrainingSpec:
+            return super().parse(tables, source, folder)
+        chosen: Any = kind_of(tables)
+        made: Self = chosen.parse(tables, source, folder)
+        return made
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_this_kind(cls, tables: Any) -> Any:
+        """Refuse a field of another kind of training by naming the kinds that have it."""
+        for name in tables if isinstance(tables, Mapping) else ():
+            kinds = [kind.chosen_by for kind in KINDS if name in kind.model_fields]
+            if kinds and name not in cls.model_fields:
+                raise PydanticCustomError(
+                    "whole",
+                    "{name} goes with {kinds}, not with {own}",
+                    {"name": str(name), "kinds": " or ".join(kinds), "own": cls.chosen_by},
+                )
+        return tables
+
+    @field_validator("env", "observation", "algorithm", mode="before", check_fields=False)
+    @classmethod
+    def _known_choice(cls, value: object, info: ValidationInfo) -> object:
+        name = str(info.field_name)
+        if value in _choices(cls, name):
+            return value
+        kinds = (cls,) if name == "algorithm" else KINDS
+        known = dict.fromkeys(choice for kind in kinds for choice in _choices(kind, name))
+        raise PydanticCustomError(
+            "whole",
+            "{name} is {value}, want one of {known}{own}",
+            {
+                "name": name,
+                "value": repr(value),
+                "known": ", ".join(known),
+                "own": f" with {cls.chosen_by}" if name == "algorithm" else "",
+            },
+        )
+
+    @property
+    def tested(self) -> Scenarios | None:
+        """Scenarios of the tests in the end; None for made ones."""
+        return self.scenarios
+
+
+class TestedTrainingSpec(TrainingSpec):
+    """A training whose models may be tested in other scenarios."""
+
+    test_on: Scenarios | None = Field(None, description="Tested on in the end; the same if absent.")
+
+    @property
+    def tested(self) -> Scenarios | None:
+        """See `TrainingSpec`."""
+        return self.test_on or super().tested
+
+
+class PlacesTrainingSpec(TestedTrainingSpec):
+    """A training that can hold out places."""
+
+    held_out: Level | None = Field(
+        None,
+        description="Share of the places that is kept for evaluation: a place is held out by a hash of its lot, "
+        "whatever other places there are.",
+    )
+    evaluate_on: Scenarios | None = Field(
+        None, description="Also evaluated on, during training and in the end; no place to train on."
+    )
+    evaluation_episodes: Episodes = Field(
+        256, description="Episodes of an evaluation; the test in the end has twice as many."
+    )
+
+    @model_validator(mode="after")
+    def _held_out_once(self) -> Self:
+        if self.held_out is not None and self.evaluate_on is not None:
+            raise PydanticCustomError("whole", "at most one of held_out, evaluate_on")
+        return self
+
+    @property
+    def tested(self) -> Scenarios | None:
+        """See `TrainingSpec`."""
+        return self.test_on or self.evaluate_on or self.scenarios
+
+
+class SearchTrainingSpec(PlacesTrainingSpec):
+    """Training to search, from what is near the car, of belief and forecast."""
+
+    chosen_by: ClassVar[str] = "env search"
+
+    env: Literal["search"] = "search"
+    algorithm: Literal["ppo", "maskable-ppo", "recurrent-ppo", "dqn"] = "maskable-ppo"
+    scenarios: Scenarios = Field((scenario_spec("campus"),), description="Trained on, drawn for each search.")
+    observation: Literal["local"] = "local"
+    k: ObservedSlots = 5
+    curriculum: Literal["size"] | None = Field(
+        None,
+        description="size: begin with the smallest tenth of the places, and add larger ones evenly until half of the "
+        "steps.",
+    )
+    clone: str | None = Field(
+        None, description="Behaviour cloning of this planner first (ppo, maskable-ppo)."
+    )
+    demonstrations: int | None = Field(
+        None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone; 2000 if absent."
+    )
+    steps: Steps = 2_000_000
+    evaluate_every: EvaluateEvery = 100_000
+    tensorboard: TensorBoard = False
+
+    @model_validator(mode="after")
+    def _cloned(self) -> Self:
+        if self.demonstrations is not None and self.clone is None:
+            raise PydanticCustomError("whole", "demonstrations goes with clone")
+        return self
+
+
+class ScanTrainingSpec(TestedTrainingSpec):
+    """Training to search in one scenario, from raw laser scans and poses alone."""
+
+    chosen_by: ClassVar[str] = "observation scan"
+
+    env: Literal["search"] = "search"
+    algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
+    scenarios: Scenarios = Field((scenario_spec("campus"),), description="The one that is trained on.")
+    observation: Literal["scan"] = "scan"
+    k: int = Field(4, ge=1, le=1_000, description="Scans in an observation.")
+    steps: Steps = 2_000_000
+    evaluate_every: EvaluateEvery = 100_000
+    evaluation_episodes: Episodes = Field(
+        256, description="Episodes of an evaluation; the test in the end has twice as many."
+    )
+    tensorboard: TensorBoard = False
+
+
+class NetworkTrainingSpec(PlacesTrainingSpec):
+    """Training of `network`, which clones `belief`, observes its own features and is evaluated after each stage."""
+
+    chosen_by: ClassVar[str] = "algorithm network"
+
+    env: Literal["search"] = "search"
+    algorithm: Literal["network"] = "network"
+    scenarios: Scenarios | None = Field(
+        None, description="Trained on beside made lots; made lots alone if absent."
+    )
+    steps: Annotated[int, Field(ge=1, le=10**12, description="Decisions that belief labels.")] = 10_000
+    without: Several[Literal["lookahead", "tokens", "day", "memory"]] = Field(
+        (), description="Parts of the network to leave out, to see what they are worth."
+    )
+
+
+class FleetTrainingSpec(TrainingSpec):
+    """Training of one network for all cars of a fleet, or a share of them."""
+
+    chosen_by: ClassVar[str] = "env fleet"
+
+    env: Literal["fleet"] = "fleet"
+    algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
+    scenarios: Scenarios = Field((scenario_spec("campus"),), description="The one that is trained on.")
+    arrivals_per_hour: ArrivalRate = Field(120.0, description="Cars.")
+    stay_s: Stay = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
+    patience_s: Stay = Field(600.0, description="Search time after which a car goes elsewhere, s.")
+    knows: KnowledgeName = Field("own", description="What the learning cars know.")
+    among: AgentItem | None = Field(
+        None, description="Compiled driver of the other cars; every car learns if absent."
+    )
+    learners: Level | None = Field(
+        None, description="With among: share of the cars that learn; 0.1 if absent."
+    )
+    k: ObservedSlots = 5
+    steps: Steps = 500_000
+    evaluate_every: EvaluateEvery | None = Field(None, description="A tenth of the steps if absent.")
+    evaluation_episodes: Episodes = Field(
+        8, description="Days of an evaluation; the test in the end has twice as many."
+    )
+    agents: Several[AgentItem] = Field(
+        (AgentSpec(name="greedy-drive"), AgentSpec(name="first-free")),
+        max_length=1_000,
+        description="Drawn for comparison.",
+    )
+    test_among: Several[AgentItem] = Field(
+        (AgentSpec(name="greedy-drive"),),
+        max_length=100,
+        description="Tested also as each tenth car among these.",
+    )
+    tensorboard: TensorBoard = False
+
+    @model_validator(mode="after")
+    def _among_others(self) -> Self:
+        if self.learners is not None and self.among is None:
+            raise PydanticCustomError("whole", "learners goes with among")
+        return self
+
+
+def _planner(value: AgentSpec) -> AgentSpec:
+    if value.label != PARKING_PLANNER:
+        raise PydanticCustomError(
+            "whole", "agents has {name}, want planner or none with env drive", {"name": repr(value.label)}
+        )
+    return value
+
+
+class DriveTrainingSpec(TestedTrainingSpec):
+    """Training to drive into slots."""
+
+    chosen_by: ClassVar[str] = "env drive"
+
+    env: Literal["drive"] = "drive"
+    algorithm: Literal["ppo", "sac", "tqc"] = "ppo"
+    scenarios: Scenarios = Field(
+        (scenario_spec("campus"), scenario_spec("street")), description="Their lots are trained on."
+    )
+    steps: Steps | None = Field(None, description="The algorithm's own number if absent.")
+    evaluate_every: EvaluateEvery | None = Field(None, description="A twentieth of the steps if absent.")
+    evaluation_episodes: Episodes = Field(
+        64,
+        description="Parkings of an evaluation, on each lot for each kind of slot; the test in the end has twice as "
+        "many.",
+    )
+    agents: Several[Annotated[AgentItem, AfterValidator(_planner)]] = Field(
+        (AgentSpec(name=PARKING_PLANNER),),
+        max_length=1,
+        description="Drawn for comparison: planner, or none.",
+    )
+    tensorboard: TensorBoard = False
+
+
+AnyTrainingSpec = (
+    SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec | FleetTrainingSpec | DriveTrainingSpec
+)
+"""The kinds of training."""
+KINDS: tuple[type[AnyTrainingSpec], ...] = get_args(AnyTrainingSpec)
+
+
+def _choices(kind: type[TrainingSpec], name: str) -> tuple[str, ...]:
+    """Return the values of a field that are text, none for a kind without the field."""
+    return get_args(kind.model_fields[name].annotation) if name in kind.model_fields else ()
+
+
+def kind_of(tables: Mapping[str, Any]) -> type[AnyTrainingSpec]:
+    """Return the kind of training that the content of a file chooses.
+
+    Examples:
+        >>> kind_of({"env": "search", "observation": "scan"}).__name__
+        'ScanTrainingSpec'
+    """
+    env = tables.get("env", "search")
+    if env == "fleet":
+        return FleetTrainingSpec
+    if env == "drive":
+        return DriveTrainingSpec
+    if tables.get("algorithm") == "network":
+        return NetworkTrainingSpec
+    return ScanTrainingSpec if tables.get("observation") == "scan" else SearchTrainingSpec
