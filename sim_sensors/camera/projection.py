@@ -50,6 +50,49 @@ class ScreenTriangles(NamedTuple):
     instance: IntArray  # (n,) int32, index into the instances, the nearest first
 
 
+class _Meshes(NamedTuple):
+    """The arrays of a `MeshPool`, as compiled code takes them, and which materials are closed."""
+
+    vertices: Float32Array
+    normals: Float32Array
+    triangles: IntArray
+    material: NDArray[np.uint8]
+    color: NDArray[np.uint8]
+    vertex_start: NDArray[np.int64]
+    triangle_start: NDArray[np.int64]
+    closed: NDArray[np.bool_]
+
+
+class _Placed(NamedTuple):
+    """The visible instances: their numbers, meshes, and the poses of all instances."""
+
+    visible: IntArray
+    mesh: IntArray
+    poses: FloatArray
+
+
+class _Camera(NamedTuple):
+    """Pose, (4, 4) camera to world, and intrinsics and image size, px."""
+
+    pose: FloatArray
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+
+
+class _Work(NamedTuple):
+    """Work arrays of a thread."""
+
+    moved: FloatArray  # (n, 5) vertices in the camera frame, m, and in the image, px
+    to_camera: FloatArray  # (3, 4) instance to camera
+    cross: FloatArray  # (3, 3) cross products of a triangle's corners
+    polygon: FloatArray  # (4, 2) px, a triangle clipped at the near plane
+    box: IntArray  # (4,) pixels that it may cover
+
+
 def project(
     pool: MeshPool,
     instances: Instances,
@@ -96,7 +139,7 @@ def project(
     share = np.searchsorted(room, np.linspace(0, capacity, parts + 1)[1:-1])
     begin = np.concatenate([[0], share, [len(visible)]]).astype(np.int64)
     end = room[begin[:-1]]
-    _project_parts(
+    meshes = _Meshes(
         pool.vertices,
         pool.normals,
         pool.triangles,
@@ -104,18 +147,10 @@ def project(
         pool.color,
         pool.vertex_start,
         pool.triangle_start,
-        visible,
-        mesh,
-        instances.pose,
-        np.ascontiguousarray(pose, dtype=np.float64),
-        *intrinsics,
-        *size,
         _CLOSED,
-        begin,
-        end,
-        most_vertices,
-        out,
     )
+    camera = _Camera(np.ascontiguousarray(pose, dtype=np.float64), *intrinsics, *size)
+    _project_parts(meshes, _Placed(visible, mesh, instances.pose), camera, begin, end, most_vertices, out)
     count = int(end[0])
     for first, last in zip(room[begin[1:-1]].tolist(), end[1:].tolist(), strict=True):
         for column in out:
@@ -145,24 +180,9 @@ def _visible_instances(
 
 @compiled(parallel=True, fastmath=FAST, nogil=True)
 def _project_parts(
-    vertices: Float32Array,
-    normals: Float32Array,
-    triangles: IntArray,
-    material: NDArray[np.uint8],
-    color: NDArray[np.uint8],
-    vertex_start: NDArray[np.int64],
-    triangle_start: NDArray[np.int64],
-    visible: IntArray,
-    mesh: IntArray,
-    poses: FloatArray,
-    camera: FloatArray,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    closed: NDArray[np.bool_],
+    meshes: _Meshes,
+    placed: _Placed,
+    camera: _Camera,
     begin: NDArray[np.int64],
     end: NDArray[np.int64],
     most_vertices: int,
@@ -170,125 +190,118 @@ def _project_parts(
 ) -> None:
     """Project instances `begin[k]` to `begin[k + 1]` into `out` from row `end[k]` on, and set that to the next row."""
     for part in prange(end.shape[0]):
-        end[part] = _project(
-            vertices, normals, triangles, material, color, vertex_start, triangle_start,
-            visible, mesh, poses, camera, fx, fy, cx, cy, width, height, closed,
-            begin[part], begin[part + 1], end[part],
-            np.empty((most_vertices, 5)), np.empty((3, 4)), np.empty((3, 3)), np.empty((4, 2)),
-            np.empty(4, dtype=np.int32), out,
-        )  # fmt: skip
+        work = _Work(
+            np.empty((most_vertices, 5)),
+            np.empty((3, 4)),
+            np.empty((3, 3)),
+            np.empty((4, 2)),
+            np.empty(4, dtype=np.int32),
+        )
+        count = end[part]
+        for index in range(begin[part], begin[part + 1]):
+            count = _project_instance(meshes, placed, camera, index, count, work, out)
+        end[part] = count
 
 
 @compiled(fastmath=FAST, _nrt=False)
-def _project(
-    vertices: Float32Array,
-    normals: Float32Array,
-    triangles: IntArray,
-    material: NDArray[np.uint8],
-    color: NDArray[np.uint8],
-    vertex_start: NDArray[np.int64],
-    triangle_start: NDArray[np.int64],
-    visible: IntArray,
-    mesh: IntArray,
-    poses: FloatArray,
-    camera: FloatArray,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
-    width: int,
-    height: int,
-    closed: NDArray[np.bool_],
-    first_instance: int,
-    end_instance: int,
+def _project_instance(
+    meshes: _Meshes,
+    placed: _Placed,
+    camera: _Camera,
+    index: int,
     count: int,
-    moved: FloatArray,
-    to_camera: FloatArray,
-    cross: FloatArray,
-    polygon: FloatArray,
-    box: IntArray,
+    work: _Work,
     out: ScreenTriangles,
 ) -> int:
-    """Fill `out` from row `count` on, and return the row after the last; `moved` to `box` are work arrays."""
-    for index in range(first_instance, end_instance):
-        q = visible[index]
-        first_vertex = vertex_start[mesh[index]]
-        cosine = math.cos(poses[q, 3])
-        sine = math.sin(poses[q, 3])
+    """Fill `out` from row `count` on with the triangles of one instance; return the row after the last."""
+    q = placed.visible[index]
+    mesh = placed.mesh[index]
+    first_vertex = meshes.vertex_start[mesh]
+    cosine = math.cos(placed.poses[q, 3])
+    sine = math.sin(placed.poses[q, 3])
+    _move_vertices(meshes, mesh, placed.poses[q], cosine, sine, camera, work)
+    cross = work.cross
+    for t in range(meshes.triangle_start[mesh], meshes.triangle_start[mesh + 1]):
+        corner = meshes.triangles[t]
+        a = work.moved[corner[0]]
+        b = work.moved[corner[1]]
+        c = work.moved[corner[2]]
+        if a[2] < NEAR and b[2] < NEAR and c[2] < NEAR:
+            continue
+        corners = _clip(a, b, c, camera, work.polygon)
+        if not _covers_pixels(work.polygon, corners, camera.width, camera.height, work.box):
+            continue
         for i in range(3):
-            to_camera[i, 0] = camera[0, i] * cosine + camera[1, i] * sine
-            to_camera[i, 1] = camera[1, i] * cosine - camera[0, i] * sine
-            to_camera[i, 2] = camera[2, i]
-            to_camera[i, 3] = 0.0
-            for j in range(3):
-                to_camera[i, 3] += camera[j, i] * (poses[q, j] - camera[j, 3])
-        for k in range(vertex_start[mesh[index] + 1] - first_vertex):
-            x = vertices[first_vertex + k, 0]
-            y = vertices[first_vertex + k, 1]
-            z = vertices[first_vertex + k, 2]
+            j = (i + 1) % 3
+            k = (i + 2) % 3
+            cross[0, i] = b[j] * c[k] - b[k] * c[j]
+            cross[1, i] = c[j] * a[k] - c[k] * a[j]
+            cross[2, i] = a[j] * b[k] - a[k] * b[j]
+        volume = a[0] * cross[0, 0] + a[1] * cross[0, 1] + a[2] * cross[0, 2]
+        # Seen edge-on (or degenerate), or from behind.
+        if abs(volume) < 1e-12 or (volume > 0.0 and meshes.closed[meshes.material[t]]):
+            continue
+        nearest = np.float32(1.0 / max(min(a[2], b[2], c[2]), NEAR))
+        scale = 1.0 / volume
+        inverse_x = (cross[0, 0] + cross[1, 0] + cross[2, 0]) * scale / camera.fx
+        inverse_y = (cross[0, 1] + cross[1, 1] + cross[2, 1]) * scale / camera.fy
+        inverse_c = (cross[0, 2] + cross[1, 2] + cross[2, 2]) * scale
+        inverse_c -= inverse_x * camera.cx + inverse_y * camera.cy
+        for part in range(corners - 2):
+            for i in range(2):
+                out.corners[count, i] = work.polygon[0, i]
+                out.corners[count, 2 + i] = work.polygon[part + 1, i]
+                out.corners[count, 4 + i] = work.polygon[part + 2, i]
+            out.inverse_depth[count, 0] = inverse_x
+            out.inverse_depth[count, 1] = inverse_y
+            out.inverse_depth[count, 2] = inverse_c
+            out.nearest[count] = nearest
+            out.is_back[count] = volume > 0.0
+            for i in range(4):
+                out.box[count, i] = work.box[i]
             for i in range(3):
-                moved[k, i] = (
-                    to_camera[i, 0] * x + to_camera[i, 1] * y + to_camera[i, 2] * z + to_camera[i, 3]
-                )
-            # Where it is in the image, used if it is beyond the near plane.
-            scale = 1.0 / max(moved[k, 2], NEAR)
-            moved[k, 3] = fx * moved[k, 0] * scale + cx
-            moved[k, 4] = fy * moved[k, 1] * scale + cy
-        for t in range(triangle_start[mesh[index]], triangle_start[mesh[index] + 1]):
-            corner = triangles[t]
-            a = moved[corner[0]]
-            b = moved[corner[1]]
-            c = moved[corner[2]]
-            if a[2] < NEAR and b[2] < NEAR and c[2] < NEAR:
-                continue
-            corners = _clip(a, b, c, fx, fy, cx, cy, polygon)
-            if not _covers_pixels(polygon, corners, width, height, box):
-                continue
-            for i in range(3):
-                j = (i + 1) % 3
-                k = (i + 2) % 3
-                cross[0, i] = b[j] * c[k] - b[k] * c[j]
-                cross[1, i] = c[j] * a[k] - c[k] * a[j]
-                cross[2, i] = a[j] * b[k] - a[k] * b[j]
-            volume = a[0] * cross[0, 0] + a[1] * cross[0, 1] + a[2] * cross[0, 2]
-            # Seen edge-on (or degenerate), or from behind.
-            if abs(volume) < 1e-12 or (volume > 0.0 and closed[material[t]]):
-                continue
-            nearest = np.float32(1.0 / max(min(a[2], b[2], c[2]), NEAR))
-            scale = 1.0 / volume
-            inverse_x = (cross[0, 0] + cross[1, 0] + cross[2, 0]) * scale / fx
-            inverse_y = (cross[0, 1] + cross[1, 1] + cross[2, 1]) * scale / fy
-            inverse_c = (cross[0, 2] + cross[1, 2] + cross[2, 2]) * scale
-            inverse_c -= inverse_x * cx + inverse_y * cy
-            for part in range(corners - 2):
-                for i in range(2):
-                    out.corners[count, i] = polygon[0, i]
-                    out.corners[count, 2 + i] = polygon[part + 1, i]
-                    out.corners[count, 4 + i] = polygon[part + 2, i]
-                out.inverse_depth[count, 0] = inverse_x
-                out.inverse_depth[count, 1] = inverse_y
-                out.inverse_depth[count, 2] = inverse_c
-                out.nearest[count] = nearest
-                out.is_back[count] = volume > 0.0
-                for i in range(4):
-                    out.box[count, i] = box[i]
-                for i in range(3):
-                    in_x = 0.0
-                    in_y = 0.0
-                    in_z = 0.0
-                    for k in range(3):
-                        vertex = first_vertex + corner[k]
-                        in_x += normals[vertex, 0] * cross[k, i]
-                        in_y += normals[vertex, 1] * cross[k, i]
-                        in_z += normals[vertex, 2] * cross[k, i]
-                    out.normal[count, i] = (cosine * in_x - sine * in_y) * scale
-                    out.normal[count, 3 + i] = (sine * in_x + cosine * in_y) * scale
-                    out.normal[count, 6 + i] = in_z * scale
-                    out.color[count, i] = color[t, i]
-                out.material[count] = material[t]
-                out.instance[count] = q
-                count += 1
+                in_x = 0.0
+                in_y = 0.0
+                in_z = 0.0
+                for k in range(3):
+                    vertex = first_vertex + corner[k]
+                    in_x += meshes.normals[vertex, 0] * cross[k, i]
+                    in_y += meshes.normals[vertex, 1] * cross[k, i]
+                    in_z += meshes.normals[vertex, 2] * cross[k, i]
+                out.normal[count, i] = (cosine * in_x - sine * in_y) * scale
+                out.normal[count, 3 + i] = (sine * in_x + cosine * in_y) * scale
+                out.normal[count, 6 + i] = in_z * scale
+                out.color[count, i] = meshes.color[t, i]
+            out.material[count] = meshes.material[t]
+            out.instance[count] = q
+            count += 1
     return count
+
+
+@compiled(fastmath=FAST, _nrt=False)
+def _move_vertices(
+    meshes: _Meshes, mesh: int, pose: FloatArray, cosine: float, sine: float, camera: _Camera, work: _Work
+) -> None:
+    """Set `work.moved` to the vertices of a mesh at a pose: in the camera frame, m, and in the image, px."""
+    to_camera, moved = work.to_camera, work.moved
+    for i in range(3):
+        to_camera[i, 0] = camera.pose[0, i] * cosine + camera.pose[1, i] * sine
+        to_camera[i, 1] = camera.pose[1, i] * cosine - camera.pose[0, i] * sine
+        to_camera[i, 2] = camera.pose[2, i]
+        to_camera[i, 3] = 0.0
+        for j in range(3):
+            to_camera[i, 3] += camera.pose[j, i] * (pose[j] - camera.pose[j, 3])
+    first = meshes.vertex_start[mesh]
+    for k in range(meshes.vertex_start[mesh + 1] - first):
+        x = meshes.vertices[first + k, 0]
+        y = meshes.vertices[first + k, 1]
+        z = meshes.vertices[first + k, 2]
+        for i in range(3):
+            moved[k, i] = to_camera[i, 0] * x + to_camera[i, 1] * y + to_camera[i, 2] * z + to_camera[i, 3]
+        # Where it is in the image, used if it is beyond the near plane.
+        scale = 1.0 / max(moved[k, 2], NEAR)
+        moved[k, 3] = camera.fx * moved[k, 0] * scale + camera.cx
+        moved[k, 4] = camera.fy * moved[k, 1] * scale + camera.cy
 
 
 @compiled(**LEAF)
@@ -296,10 +309,7 @@ def _clip(
     a: FloatArray,
     b: FloatArray,
     c: FloatArray,
-    fx: float,
-    fy: float,
-    cx: float,
-    cy: float,
+    camera: _Camera,
     polygon: FloatArray,
 ) -> int:
     """Project the part of a triangle beyond the near plane into `polygon`, px; return its number of corners.
@@ -322,8 +332,8 @@ def _clip(
             count += 1
         if (p[2] >= NEAR) != (q[2] >= NEAR):
             along = (NEAR - p[2]) / (q[2] - p[2])
-            polygon[count, 0] = fx * (p[0] + along * (q[0] - p[0])) / NEAR + cx
-            polygon[count, 1] = fy * (p[1] + along * (q[1] - p[1])) / NEAR + cy
+            polygon[count, 0] = camera.fx * (p[0] + along * (q[0] - p[0])) / NEAR + camera.cx
+            polygon[count, 1] = camera.fy * (p[1] + along * (q[1] - p[1])) / NEAR + camera.cy
             count += 1
     return count
 
