@@ -136,16 +136,8 @@ class ParkingLot:
         def set_field(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
+        self._require_names()
         n = len(self.slot_ids)
-        if n == 0:
-            raise InputError(f"lot {self.name!r} has no slot")
-        if not is_plain("".join((self.name, *self.slot_ids))):
-            name = next(name for name in (self.name, *self.slot_ids) if not is_plain(name))
-            raise InputError(f"lot: name {name!a:.60} has control characters")
-        if len(set(self.slot_ids)) < n:
-            seen: set[str] = set()
-            twice = next(i for i in self.slot_ids if i in seen or seen.add(i))  # type: ignore[func-returns-value]
-            raise InputError(f"lot {self.name!r}: slot id {twice!r} appears twice")
         set_field("slot_ids", tuple(self.slot_ids))
         set_field("lanes", tuple(self.lanes))
         if np.size(self.slot_parking_cost_s) == 0:
@@ -193,6 +185,19 @@ class ParkingLot:
             values = getattr(graph, name)
             values.flags.writeable = False
             set_field(name, values)
+
+    def _require_names(self) -> None:
+        """Require slots with different names, all of them printable."""
+        if len(self.slot_ids) == 0:
+            raise InputError(f"lot {self.name!r} has no slot")
+        for name in (self.name, *self.slot_ids):
+            if not is_plain(name):
+                raise InputError(f"lot: name {name!a:.60} has control characters")
+        seen: set[str] = set()
+        for name in self.slot_ids:
+            if name in seen:
+                raise InputError(f"lot {self.name!r}: slot id {name!r} appears twice")
+            seen.add(name)
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, ParkingLot):
