@@ -15,12 +15,12 @@ from parkenv.lots.lot_files import PLACES
 from parkenv.lots.quality import combined_error_probability, read_provenance
 from parkenv.scenarios.places import lot_share
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.show.report.page import SCHEMA
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare import benchmark
 from parkenv.studies.compare.benchmark import Suite, by_group, check_result, result_of, suite_lots
 from parkenv.studies.compare.cases import run_cases
 from parkenv.studies.lot_census import slots_by_kind
-from parkenv.studies.report.page import SCHEMA
 from parkenv.studies.results import ResultFolder, write_summary
 from parkenv.studies.training.search_task import SearchTask
 from parkenv.studies.training.spec import SearchTrainingSpec

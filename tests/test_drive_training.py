@@ -14,6 +14,7 @@ import pytest
 from command_line import PARKENV, parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import shows_color
 from typer.testing import CliRunner
 
 from parkenv import make_scenario
@@ -23,9 +24,9 @@ from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.errors import InputError
 from parkenv.lots import packaged_lot
-from parkenv.studies.figures.learning_curves import across_seeds, save_success_curves
+from parkenv.show.figures.learning_curves import COLORS, save_success_curves
 from parkenv.studies.training.configs import DRIVE_CONFIGS, WAY_IN
-from parkenv.studies.training.curve_file import read_curve
+from parkenv.studies.training.curve_file import across_seeds, read_curve
 from parkenv.studies.training.drive_batch import (
     CONTACT,
     LEFT_AREA,
@@ -518,10 +519,10 @@ def test_success_is_drawn_by_kind(tmp_path):
     rows = across_seeds(curves, "oblique_success")
     assert rows[1]["oblique_success"] == pytest.approx(0.51)
     assert rows[1]["low"] < 0.51 < rows[1]["high"]
-    save_success_curves(
-        {"sac": curves}, ("oblique", "parallel"), {"oblique": 1.0}, "a title", tmp_path / "curve.png"
-    )
-    assert (tmp_path / "curve.png").stat().st_size > 10_000
+    means = {kind: across_seeds(curves, f"{kind}_success") for kind in ("oblique", "parallel")}
+    path = tmp_path / "curve.png"
+    save_success_curves({"sac": curves}, {"sac": means}, {"oblique": 1.0}, "a title", path)
+    assert shows_color(path, COLORS[0])
 
 
 # One on-policy algorithm, and one with a replay buffer.

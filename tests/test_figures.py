@@ -9,15 +9,17 @@ from PIL import Image
 from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
+from parkenv.show.figures import times as time_figures
+from parkenv.show.figures.picture_files import CAPTION, INK, save_picture
+from parkenv.show.figures.rates import save_rates
+from parkenv.show.figures.searches import BELIEF_MAP, draw_search, draw_searches
+from parkenv.show.figures.time_distribution import draw_time_distribution
+from parkenv.show.figures.times import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
+from parkenv.show.search_trace import SearchTrace
+from parkenv.studies.compare import figures as comparison_figures
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.episodes import EpisodeRunner, SearchTrace
-from parkenv.studies.figures import search_pictures, time_figures
-from parkenv.studies.figures.picture_files import CAPTION, INK, save_picture
-from parkenv.studies.figures.rates_picture import save_rates
-from parkenv.studies.figures.registry import FIGURES, ComparisonResults, draw_figures, remove_figures
-from parkenv.studies.figures.search_pictures import BELIEF_MAP, draw_search, draw_searches
-from parkenv.studies.figures.time_distribution import draw_time_distribution
-from parkenv.studies.figures.time_figures import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
+from parkenv.studies.compare.figures import FIGURES, ComparisonResults, draw_figures, remove_figures
+from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import episode_key
 from parkenv.world.occupancy.process import OccupancyProcess
 from planners.agent import make_agent
@@ -303,8 +305,8 @@ def test_the_fastest_agent_and_belief_are_among_the_searches_drawn(monkeypatch):
     cases = [(Case(mini, name), range(1)) for name in names]
     table = [row(name, scenario="mini", drive=10.0 if name == "mdp-tuned" else 30.0) for name in names]
     monkeypatch.setattr(Case, "trace", lambda self, seed: self.agent)
-    monkeypatch.setattr(search_pictures, "draw_searches", lambda traces: traces)
-    drawn = search_pictures.searches(ComparisonResults(cases, {}, table))
+    monkeypatch.setattr(comparison_figures, "draw_searches", lambda traces: traces)
+    drawn = comparison_figures.searches(ComparisonResults(cases, {}, table))
     assert [traces for *_, traces in drawn] == [["greedy-goal", "mdp-tuned", "belief", "oracle"]]
 
 

@@ -14,9 +14,8 @@ from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.figures.fleet_figure import looks_s
 from parkenv.studies.fleet.experiment import FleetExperiment, Setting, summarize_days
-from parkenv.studies.fleet.measures import MEANS, Roads, gini
+from parkenv.studies.fleet.measures import MEANS, Roads, gini, looks_s
 from parkenv.studies.spec import FleetSpec
 from parkenv.studies.trips.calibration import Calibration
 from parkenv.world.scenario import SearchProblem

@@ -14,9 +14,9 @@ from parkenv import make_scenario
 from parkenv.cli.arguments import Machines
 from parkenv.cli.report import Replays, make_report
 from parkenv.errors import InputError
+from parkenv.show.report.page import SCHEMA
 from parkenv.studies.fleet.experiment import FleetExperiment
 from parkenv.studies.report.fleet_recording import DRIVE, FAIL, QUEUE, choose_days
-from parkenv.studies.report.page import SCHEMA
 from parkenv.studies.spec import FleetSpec
 
 

@@ -29,9 +29,9 @@ from parkenv.perception.car_model import CarModel
 from parkenv.perception.lab.car_datasets import read_uiuc_test
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.report.page import write_page
 from parkenv.studies.compare.benchmark import Suite, check_result
 from parkenv.studies.fleet.experiment import TABLE
-from parkenv.studies.report.page import page_data, write_page
 from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.results import ResultFolder
 from parkenv.studies.sensing.surveys import detection_by_distance, read_sessions
@@ -107,7 +107,7 @@ def resumed_trips(path):
 def reported(path):
     run = RunFolder.read(path.parent)
     run.totals()
-    write_page(page_data(run), path.with_name("report.html"), run.figures)
+    write_page(run.page_data(), path.with_name("report.html"), run.figures)
 
 
 def reported_kind(path):

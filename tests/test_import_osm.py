@@ -24,8 +24,8 @@ from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.show.figures.lot_import import save_import_picture
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.figures.import_picture import save_import_picture
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
 

@@ -17,8 +17,8 @@ from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.show.figures.lot_import import save_import_picture
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.figures.import_picture import save_import_picture
 from parkenv.world.lot import Mouth
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"

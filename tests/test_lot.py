@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from parkenv.errors import InputError
 from parkenv.lots import city_lot, grid_lot, packaged_lot
 from parkenv.lots.generators import CROSSING_CLEARANCE, KERB_SIZE, bay_row
-from parkenv.studies.figures.lot_picture import draw_lot, save_lot_picture
+from parkenv.show.figures.lot import draw_lot, save_lot_picture
 from parkenv.world.drive_graph import LANE_OFFSET
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 

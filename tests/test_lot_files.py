@@ -19,7 +19,7 @@ from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.builders.packaged import LOTS, build
 from parkenv.lots.checks import check_lot
-from parkenv.studies.figures.lot_picture import save_lot_picture
+from parkenv.show.figures.lot import save_lot_picture
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"

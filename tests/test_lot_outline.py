@@ -6,7 +6,7 @@ import shapely
 
 from parkenv.driving.lot_outline import LotOutline
 from parkenv.lots import packaged_lot
-from parkenv.studies.report.lot_data import describe_lot
+from parkenv.show.report.lot_data import describe_lot
 
 
 def polygons(paved):

@@ -16,11 +16,11 @@ from parkenv.belief.slot_belief import SlotBelief
 from parkenv.cli.arguments import Machines
 from parkenv.cli.report import Replays, make_report
 from parkenv.lots import packaged_lot, write_lot
+from parkenv.show.report.page import SCHEMA
+from parkenv.show.report.tables import table_of
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.report.page import SCHEMA, page_data
 from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.report.search_recording import Encounter, choose, record
-from parkenv.studies.report.tables import table_of
 from parkenv.studies.results import episode_key
 from parkenv.world.lot import PARK
 from planners import make_agent
@@ -249,7 +249,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
         curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
         beside={"dqn": dict(zip(kinds, curves, strict=True)) if drives else curves[0]},
     )
-    data = page_data(RunFolder.read(tmp_path))
+    data = RunFolder.read(tmp_path).page_data()
     jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
     assert data["run"]["title"] == "ppo trained on campus and street"
     assert [panel["title"] for panel in data["learning"]] == (kinds if drives else ["total time, s"])
@@ -364,7 +364,7 @@ def test_a_survey_is_driven_again(tmp_path):
 
 def test_data_without_replays_are_valid_too(tmp_path):
     run = RunFolder.read(summary_in(tmp_path))
-    jsonschema.validate(page_data(run, notes=["a"]), json.loads(SCHEMA.read_text(encoding="utf-8")))
+    jsonschema.validate(run.page_data(notes=["a"]), json.loads(SCHEMA.read_text(encoding="utf-8")))
 
 
 def test_a_table_of_a_run_holds_what_json_can(tmp_path):

@@ -22,6 +22,7 @@ import pytest
 import torch
 from command_line import PARKENV, parkenv
 from gymnasium.vector import AutoresetMode
+from pictures import shows_color
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -35,12 +36,12 @@ from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.files.spec_file import read_tables
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
-from parkenv.studies.training.curve_file import read_curve
+from parkenv.studies.training.curve_file import across_seeds, read_curve
 from parkenv.studies.training.rl_training import TRAINING_SEEDS, train_one
 from parkenv.studies.training.search_task import SearchTask
 from parkenv.studies.training.search_training import SearchTraining, episode_times, search_times
@@ -517,9 +518,13 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     rows = across_seeds([*curves[:2], curves[2][:2]])
     assert [row["steps"] for row in rows] == [0, 10]
     assert rows[1]["total_s"] == rows[1]["median_s"] == pytest.approx(91.0)
-    save_learning_curves({"ppo": curves}, {"mdp": 85.0, "belief": 84.9}, "a title", tmp_path / "curve.png")
-    save_learning_curves({"ppo": [[curves[0][0]]]}, {}, "one evaluation", tmp_path / "one.png")
-    assert (tmp_path / "curve.png").stat().st_size > 10_000
+    for name, some, planners in (
+        ("curve.png", curves, {"mdp": 85.0, "belief": 84.9}),
+        ("one.png", [[curves[0][0]]], {}),
+    ):
+        means = {"ppo": across_seeds(some)}
+        save_learning_curves({"ppo": some}, means, planners, "a title", tmp_path / name)
+        assert shows_color(tmp_path / name, COLORS[0]) == (name == "curve.png"), "a line needs two points"
 
 
 # One on-policy algorithm, one with a replay buffer, and one on scans.

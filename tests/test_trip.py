@@ -21,7 +21,7 @@ from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.lots import packaged_lot
-from parkenv.studies.compare.cases import blind_scenario
+from parkenv.scenarios.blind import blind_scenario
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import (
     OBSERVED,

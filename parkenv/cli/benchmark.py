@@ -149,9 +149,9 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
         results (FILE|DIR): Result files, or folders with result.json files in them.
         out, -o (FILE.html): The page.
     """
+    from parkenv.show.report.page import write_page
     from parkenv.studies.compare.benchmark import check_result
     from parkenv.studies.report.benchmark_page import benchmark_data
-    from parkenv.studies.report.page import write_page
     from parkenv.studies.results import make_folder
 
     files = [each for path in results for each in (sorted(path.rglob(RESULT)) if path.is_dir() else [path])]

@@ -13,7 +13,7 @@ from parkenv.cli.tables import make_console, make_table, print_recorded, progres
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import RigName
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -147,13 +147,13 @@ def trip(
         notice (M): Metres along its path at which the car notices at the latest that it would drive into a taken slot.
         v_drive_kmh (V): Speed limit on the lanes, km/h.  [default: the scenario's, 10]
     """
+    from parkenv.scenarios.blind import blind_scenario
     from parkenv.scenarios.build import build
-    from parkenv.studies.compare.cases import blind_scenario
-    from parkenv.studies.figures.picture_files import save_film
-    from parkenv.studies.figures.trip_pictures import COLORS, FPS, film_trip
+    from parkenv.show.figures.picture_files import save_film
     from parkenv.studies.results import make_folder
     from parkenv.studies.trips.driven_search import DrivenSearch
     from parkenv.studies.trips.sensor_log import record_trip, require_viewer, sensor_log
+    from parkenv.studies.trips.trip_film import COLORS, FPS, film_trip
     from parkenv.studies.trips.vehicle_controller import DrivingStyle
     from parkenv.world.scenario import KMH
 

@@ -11,7 +11,7 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -119,7 +119,7 @@ def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> No
     if not result.complete:
         raise KeyboardInterrupt
     if spec.figures:
-        from parkenv.studies.figures.commute_curves import save_commute_curves
+        from parkenv.show.figures.commute import save_commute_curves
 
         with console.status("Drawing the picture"):
             save_commute_curves(result.rows, out / PICTURE)

@@ -19,7 +19,7 @@ from parkenv.cli.tables import (
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 from parkenv.files.known_names import RigName
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -136,7 +136,7 @@ def run_comparison(
         KeyboardInterrupt: the run was interrupted; the results of finished episodes are printed and in the folder.
     """
     from parkenv.studies.compare.experiment import run_experiment
-    from parkenv.studies.figures.registry import draw_figures
+    from parkenv.studies.compare.figures import draw_figures
     from parkenv.world.scenario import KMH
 
     if rerun is not None:

@@ -14,7 +14,7 @@ from parkenv.cli.compare import result_tables
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, print_recorded, progress_bar
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 FIGURES = ("time_split", "time_distribution")
-"""Names of figures in `parkenv.studies.figures.registry`."""
+"""Names of figures in `parkenv.studies.compare.figures`."""
 FILM = "search.gif"
 NEXT = (
     (
@@ -97,13 +97,13 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
         InputError: the scenario cannot be made, or the folder cannot be used.
     """
     from parkenv.mapping.store import MapStore
+    from parkenv.show.figures.survey import save_detections, save_session
+    from parkenv.show.report.drive_recording import record_drive
     from parkenv.studies.compare.cases import run_cases, table
     from parkenv.studies.compare.demo import AGENTS, FILMED, demo_cases, demo_survey
+    from parkenv.studies.compare.figures import ComparisonResults, draw_figures
+    from parkenv.studies.compare.search_film import film_search
     from parkenv.studies.compare.warm_up import warm_up_tasks
-    from parkenv.studies.figures.registry import ComparisonResults, draw_figures
-    from parkenv.studies.figures.search_film import film_search
-    from parkenv.studies.figures.survey_pictures import save_detections, save_session
-    from parkenv.studies.report.drive_recording import record_drive
     from parkenv.studies.results import ResultFolder
     from parkenv.studies.sensing.surveys import run_survey, summarize
     from parkenv.studies.spec import SPEC_FILE
@@ -189,7 +189,7 @@ def run_demo(spec: DemoSpec, out: Path, folder: args.RunFolder, rerun: Path | No
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
     """Draw the map at the middle of the arrival window, and the true probabilities."""
     from parkenv.mapping.inference import predict
-    from parkenv.studies.figures.survey_pictures import save_map
+    from parkenv.show.figures.survey import save_map
     from parkenv.studies.sensing.surveys import mean_occupancy
     from parkenv.world.occupancy.process import DAY_NAMES
     from parkenv.world.week import DAY_S

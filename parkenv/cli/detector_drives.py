@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from parkenv.cli import arguments as args
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.files.file_names import file_name
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -36,7 +36,7 @@ def compare_on_drives(
     """
     from parkenv.files.csv_writing import write_csv
     from parkenv.perception.detector_registry import make_detector
-    from parkenv.studies.figures.detector_pictures import save_misses, save_reach
+    from parkenv.show.figures.detectors import save_misses, save_reach
     from parkenv.studies.sensing import detector_surveys as compared
     from parkenv.studies.sensing.surveys import survey_of
     from parkenv.studies.spec import SurveySpec
@@ -81,7 +81,8 @@ def compare_on_drives(
                         r for r in table if (r["rig"], r["detector"], r["group"]) == (rig, detector, "cause")
                     ]
                     title = f"Cars that {detector} missed in pictures of {its.name}, rig {rig}"
-                    save_misses(cars, pictures, rows, title, out / f"misses_{survey.folder.name}.png")
+                    missed = compared.missed_by_cause(cars, pictures, rows)
+                    save_misses(missed, title, out / f"misses_{survey.folder.name}.png")
     console.print(f"Written: {out / 'table.csv'}, summary.json, figures, and a map for each rig and detector")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from parkenv.studies.spec import FleetSpec
@@ -151,10 +152,11 @@ def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
     if not result.complete:
         raise KeyboardInterrupt
     if spec.figures:
-        from parkenv.studies.figures.fleet_figure import save_fleet_figure
+        from parkenv.show.figures.fleet import save_fleet_figure
+        from parkenv.studies.fleet.measures import looks_s
 
         with console.status("Drawing the picture"):
-            save_fleet_figure(result.rows, its, title, out / PICTURE)
+            save_fleet_figure(result.rows, partial(looks_s, its), title, out / PICTURE)
     console.print(f"Days{', summary and the picture' if spec.figures else ' and summary'} are in {out}")
     if folder.report:
         make_report(out, spec)

@@ -13,7 +13,7 @@ from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 AUTO = "auto"
 """Value of `--entry` and `--goal` that allows a guess."""
@@ -37,7 +37,7 @@ def show(lot: str, /, graph: bool = False, out: Path | None = None) -> None:
         out, -o (FILE): Picture: .png, .pdf or .svg.  [default: NAME.png]
     """
     from parkenv.lots import load_lot
-    from parkenv.studies.figures.lot_picture import save_lot_picture
+    from parkenv.show.figures.lot import save_lot_picture
 
     its_lot = load_lot(lot)
     picture = out or Path(file_name(its_lot.name, ".png"))
@@ -184,7 +184,7 @@ def import_place(
     for left in draft.left_out:
         console.print(f"left out: {left}", style="yellow")
     if picture is not None:
-        from parkenv.studies.figures.import_picture import save_import_picture
+        from parkenv.show.figures.lot_import import save_import_picture
 
         save_import_picture(draft, picture)
         console.print(f"Picture: {picture}")
@@ -202,8 +202,8 @@ def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> 
     from parkenv.lots import write_lot
     from parkenv.lots.osm.town import import_town
     from parkenv.lots.quality import Provenance
+    from parkenv.show.figures.contact_sheet import save_contact_sheets
     from parkenv.studies.drivability import check_drivability
-    from parkenv.studies.figures.contact_sheet import save_contact_sheets
 
     rows: list[dict[str, object]] = []
     lots = []
@@ -284,8 +284,8 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
         out, -o (DIR): Folder for census.csv, summary.json, census.png and contact sheets.
     """
     from parkenv.files.csv_writing import write_csv
-    from parkenv.studies.figures.census_figure import save_census
-    from parkenv.studies.figures.contact_sheet import save_contact_sheets
+    from parkenv.show.figures.census import save_census
+    from parkenv.show.figures.contact_sheet import save_contact_sheets
     from parkenv.studies.lot_census import COLUMNS, count_lot, lot_files
     from parkenv.studies.results import make_folder
 

@@ -9,7 +9,7 @@ from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -68,7 +68,7 @@ def _fit_log(log: Path, max_gap_h: float, out: Path, console: Console) -> None:
 
     import numpy as np
 
-    from parkenv.studies.figures.rates_picture import save_rates
+    from parkenv.show.figures.rates import save_rates
     from parkenv.world.occupancy.fit import fit_process
     from parkenv.world.occupancy.log import OccupancyLog
     from parkenv.world.week import DAY_S, HOUR_S
@@ -195,7 +195,7 @@ def evaluate(
     from parkenv.forecast.comparison import MODELS, compare
     from parkenv.forecast.counts import Counts, is_counts
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
-    from parkenv.studies.figures.forecast_picture import save_forecast, shown_counts, shown_week
+    from parkenv.show.figures.forecast import save_forecast, shown_counts, shown_week
     from parkenv.studies.results import make_folder
 
     make_folder(out)
@@ -296,7 +296,7 @@ def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: C
     import numpy as np
 
     from parkenv.forecast.slot_comparison import compare_slot_days
-    from parkenv.studies.figures.forecast_picture import save_forecast, shown_slots
+    from parkenv.show.figures.forecast import save_forecast, shown_slots
     from parkenv.world.occupancy.log import OccupancyLog
 
     recorded = OccupancyLog.read(log)

@@ -11,7 +11,7 @@ from parkenv.cli.tables import make_console, make_table, progress_bar, save_summ
 from parkenv.cli.trust import readable_models
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from parkenv.studies.trips.parking_runs import Parking, ParkingCase
@@ -141,8 +141,8 @@ def _picture(
     folder: Path,
 ) -> None:
     """Write pictures of successes and failures, and an animation of the episode `film`."""
-    from parkenv.studies.figures.parking_pictures import save_parkings
-    from parkenv.studies.figures.picture_files import save_film
+    from parkenv.show.figures.parkings import save_parkings
+    from parkenv.show.figures.picture_files import save_film
     from parkenv.studies.trips.parking_runs import park_once
 
     lots = {case.lot.name: case.lot for case in cases}

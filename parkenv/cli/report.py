@@ -92,8 +92,8 @@ def make_report(
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
             are not trusted.
     """
+    from parkenv.show.report.page import write_page
     from parkenv.studies.report.fleet_recording import choose_days, differing_days
-    from parkenv.studies.report.page import page_data, write_page
     from parkenv.studies.report.repetition import Repetition, differences, drawable, drawable_settings
     from parkenv.studies.report.run_folder import RunFolder
     from parkenv.studies.report.search_recording import choose, record
@@ -149,7 +149,7 @@ def make_report(
     driven, shown = rest[: len(again)], rest[len(again) :]
     notes += differences(watched) + differing_days(shown)
     path = out or folder / PAGE
-    write_page(page_data(run, watched, driven if drives is None else drives, shown, notes), path, run.figures)
+    write_page(run.page_data(watched, driven if drives is None else drives, shown, notes), path, run.figures)
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")

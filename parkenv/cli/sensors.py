@@ -47,8 +47,8 @@ def preview(
 
     from parkenv.compiled.keyed_random import world_key
     from parkenv.scenarios.build import build
-    from parkenv.studies.figures.picture_files import save_film
-    from parkenv.studies.figures.sensor_pictures import save_sensor_preview, with_boxes
+    from parkenv.show.figures.picture_files import save_film
+    from parkenv.show.figures.sensors import save_sensor_preview, with_boxes
     from parkenv.studies.results import make_folder
     from parkenv.studies.spec import BUSY
     from parkenv.world.lot_scene import LotScenes, slot_lot

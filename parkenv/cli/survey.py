@@ -12,7 +12,7 @@ from parkenv.cli.tables import make_console, make_table, print_recorded, progres
 from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
-from parkenv.studies.plurals import plural
+from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from parkenv.studies.spec import SurveySpec
@@ -106,7 +106,7 @@ def run_survey_of(
     from parkenv.mapping.recorded_drive import record_drive, require_recordable
     from parkenv.mapping.store import MapStore
     from parkenv.mapping.survey import Survey
-    from parkenv.studies.figures import survey_pictures as pictures
+    from parkenv.show.figures import survey as pictures
     from parkenv.studies.sensing.surveys import (
         MAP_FILE,
         mean_occupancy,
@@ -246,7 +246,7 @@ def map_drive(
     from parkenv.mapping.store import MapStore
     from parkenv.perception.detector_registry import make_detector
     from parkenv.scenarios.build import build
-    from parkenv.studies.figures.survey_pictures import save_map
+    from parkenv.show.figures.survey import save_map
     from parkenv.studies.results import make_folder
 
     its = build(args.World(lot=lot).spec(scenario))
@@ -311,7 +311,7 @@ def show_map(
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.scenarios.build import build
-    from parkenv.studies.figures.survey_pictures import save_map
+    from parkenv.show.figures.survey import save_map
     from parkenv.studies.results import make_folder
     from parkenv.world.occupancy.process import DAY_NAMES
     from parkenv.world.week import DAY_S, HOUR_S

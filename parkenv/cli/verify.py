@@ -36,8 +36,8 @@ def verify(
         seed (N >= 0): First seed of the simulated cases.
         out, -o (DIR): Folder for summary.json and verify.png.  [default: none]
     """
-    from parkenv.studies.figures.verify_figure import save_verification
-    from parkenv.studies.plurals import plural
+    from parkenv.show.figures.verification import save_verification
+    from parkenv.show.plurals import plural
     from parkenv.studies.results import make_folder
     from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
     from parkenv.studies.verify.verification import tasks_of
@@ -67,7 +67,7 @@ def verify(
     console.print(f"{len(rows) - len(wrong)} of {plural(len(rows), 'row')} agree with theory.")
     if out is not None:
         save_summary(out, seed, [row.columns() for row in rows], confidence=CONFIDENCE)
-        save_verification(rows, out / "verify.png")
+        save_verification([row.columns() for row in rows], CONFIDENCE, out / "verify.png")
         console.print(f"Picture and summary are in {out}")
     if wrong:
         raise typer.Exit(1)

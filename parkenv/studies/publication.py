@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from parkenv import __version__
 from parkenv.files.atomic_write import atomic_write
+from parkenv.show.figures.picture_files import save_film
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import rows_of
-from parkenv.studies.figures.picture_files import save_film
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.studies.workers import Workers

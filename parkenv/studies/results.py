@@ -27,11 +27,11 @@ from parkenv.files.typed_csv import (
     typed_records,
     wholes,
 )
+from parkenv.show.columns import SETTING_AXES
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
 
-SETTING_AXES = ("failure_cost_s", "v_walk_kmh", "v_drive_kmh")  # of a grid, as columns
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
 KEY_COLUMNS = (*SETTING_COLUMNS, "seed")
 """Columns that identify an episode of a comparison."""

@@ -15,18 +15,17 @@ import numpy as np
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.scenarios.places import seeds_by_place
+from parkenv.show.search_trace import SearchTrace
 from parkenv.studies.agent_spec import AgentSpec, label_of
-from parkenv.studies.episodes import EpisodeRunner, SearchTrace
+from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
 from parkenv.studies.statistics import mean_interval, summarize
 from parkenv.studies.workers import HERE, Workers
 from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
 from parkenv.world.scenario import KMH, Scenario
-from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
-BLIND = "-blind"  # suffix of the names of scenarios whose slots are not observed before an attempt
 BLOCK = 10  # episodes per task: a crash loses few of them, and the overhead of starting a task stays small
 
 
@@ -120,11 +119,6 @@ def settings_of(
         scenario.replace(**failure, **walk, **drive)
         for failure, walk, drive in itertools.product(*(axis or [{}] for axis in axes))
     ]
-
-
-def blind_scenario(scenario: Scenario) -> Scenario:
-    """Return a renamed scenario in which slots are not observed before a parking attempt."""
-    return scenario.replace(name=f"{scenario.name}{BLIND}", sensor_model=SensorModel.blind())
 
 
 def at_occupancy(scenario: Scenario, level: float) -> Scenario:

@@ -8,26 +8,25 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.spec_file import Spec
 from parkenv.perception.detector_registry import detector_version, make_detector
+from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec, SensorModelSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import (
     Case,
     at_occupancy,
-    blind_scenario,
     check_worlds,
     require_distinct,
     run_cases,
     settings_of,
     table,
 )
-from parkenv.studies.figures.registry import ComparisonResults, remove_figures
 from parkenv.studies.results import ResultFolder, Row
 from parkenv.studies.spec import SPEC_FILE, CommuteSpec, ExperimentSpec
 from parkenv.studies.trips.calibration import Calibration
@@ -37,6 +36,9 @@ from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import agent_file, make_agent
+
+if TYPE_CHECKING:
+    from parkenv.studies.compare.figures import ComparisonResults
 
 NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
 """Agents that require observations of slots before an attempt."""
@@ -229,6 +231,8 @@ class ExperimentResult:
 
     def figure_data(self) -> ComparisonResults:
         """Return the data for the figures of a comparison."""
+        from parkenv.studies.compare.figures import ComparisonResults  # loads Matplotlib
+
         flat = {
             name: (name.partition(MAP_SAYS)[0], p)
             for name, (_, p) in self.experiment.wrong_map_scenarios.items()
@@ -281,6 +285,8 @@ def run_experiment(
         >>> [row["agent"] for row in result.rows], result.rows[0]["episodes"]
         (['first-free', 'oracle'], 3)
     """
+    from parkenv.studies.compare.figures import remove_figures  # loads Matplotlib
+
     experiment = Experiment(spec)
     for scenario in experiment.scenarios:
         check_worlds(scenario, experiment.seeds)

@@ -124,3 +124,16 @@ def day_measures(
 
 def _mean(values: FloatArray) -> float:
     return float(values.mean()) if len(values) else float("nan")
+
+
+def looks_s(problem: SearchProblem, occupancy: FloatArray) -> FloatArray:
+    """Return the search time, s, of looking at slots in random order, (n + 1)/(m + 1) of them if m of n are free.
+
+    A look takes the median drive from a slot to the next one; the drive from the entry to the first slot comes before.
+    """
+    lot, n = problem.lot, problem.lot.n_slots
+    source, column = np.nonzero(lot.neighbors[:n] >= 0)
+    to_slot = lot.neighbors[source, column] < n
+    hop_s = float(np.median(problem.move_s[source[to_slot], column[to_slot]])) if to_slot.any() else 0.0
+    first_s = Roads(problem).first_slot_m / problem.v_drive
+    return np.asarray(first_s + hop_s * ((n + 1.0) / ((1.0 - occupancy) * n + 1.0) - 1.0))

@@ -12,9 +12,9 @@ import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.figures.picture_files import save_film
 from parkenv.show.fleet_rendering import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.figures.picture_files import save_film
 from parkenv.studies.fleet.experiment import FleetExperiment, summarize_days
 from parkenv.studies.publication import MODEL, Publication, Row
 from parkenv.studies.spec import FleetSpec

@@ -1,1 +1,1 @@
-"""A self-contained HTML page on the results of a command, with replays of its searches and drives."""
+"""What a report page needs of a run: its folder, and recordings of its searches, drives and days."""

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet, total_s
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
+from parkenv.show.report.lot_data import describe_lot
 from parkenv.studies.fleet.experiment import FleetExperiment, Setting
-from parkenv.studies.report.lot_data import describe_lot
 from parkenv.world.scenario import Scenario
 
 MOST_CARS = 5_000

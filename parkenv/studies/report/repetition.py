@@ -9,13 +9,13 @@ from typing import Any
 from parkenv.files.spec_file import Spec
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
+from parkenv.show.report.drive_recording import record_drive
 from parkenv.studies import spec as specs
 from parkenv.studies.compare.benchmark import Suite
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.demo import demo_cases, demo_survey
 from parkenv.studies.compare.experiment import Experiment, require_unchanged
 from parkenv.studies.fleet.experiment import FleetExperiment, Setting
-from parkenv.studies.report.drive_recording import record_drive
 from parkenv.studies.report.fleet_recording import MOST_CARS
 from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.report.search_recording import MOST_SLOTS

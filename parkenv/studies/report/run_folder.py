@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -13,6 +13,8 @@ from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Spec, read_tables
+from parkenv.show.report.learning import learning_panels
+from parkenv.show.report.page import page_data
 from parkenv.studies.fleet.experiment import TABLE
 from parkenv.studies.kinds import SPECS
 from parkenv.studies.results import (
@@ -130,3 +132,26 @@ class RunFolder:
         """
         rows: list[Row] = without_nan(read_curve(self.path / f"seed_{seed}" / CURVE))
         return rows
+
+    def learning(self) -> list[dict[str, Any]]:
+        """Return the panels of a training's learning curves; none for runs of other kinds.
+
+        Raises:
+            InputError: a file of evaluations is damaged.
+        """
+        if self.kind != "train" or not self.summary.get("curve"):
+            return []
+        return learning_panels(self.summary, [self.curve(row["seed"]) for row in self.summary["rows"]])
+
+    def page_data(
+        self,
+        encounters: Sequence[Mapping[str, Any]] = (),
+        drives: Sequence[Mapping[str, Any]] = (),
+        fleets: Sequence[Mapping[str, Any]] = (),
+        notes: Sequence[str] = (),
+    ) -> dict[str, Any]:
+        """Return the data of the run's page; see `parkenv.show.report.page.page_data`."""
+        return page_data(
+            self.kind, self.summary, sessions=self.sessions(), learning=self.learning(), encounters=encounters,
+            drives=drives, fleets=fleets, notes=notes,
+        )  # fmt: skip

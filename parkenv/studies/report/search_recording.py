@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.engine.state import SearchState
+from parkenv.show.columns import TIME_COLORS
+from parkenv.show.report.lot_data import describe_lot
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.figures.picture_files import TIME_COLORS
-from parkenv.studies.report.lot_data import describe_lot
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.occupancy.process import World
 from planners.agent import Agent

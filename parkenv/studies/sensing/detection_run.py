@@ -18,7 +18,7 @@ from parkenv.files.recordings import SUFFIXES as RECORDING_SUFFIXES
 from parkenv.files.recordings import Footage, footage_in, is_recording
 from parkenv.files.videos import VIDEO_SUFFIXES, Video, film
 from parkenv.perception.detector import Detections, Detector
-from parkenv.studies.figures.survey_pictures import draw_detections
+from parkenv.show.figures.survey import draw_detections
 from sim_sensors.ground_truth import View
 
 Row = dict[str, Any]

@@ -23,7 +23,7 @@ from parkenv.perception.hog_detector import HogDetector
 from parkenv.perception.lab.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
 from parkenv.perception.lab.cross_validation import BLOCKS, scores_of
 from parkenv.perception.lab.detection_scores import RecallPrecision, recall_precision
-from parkenv.studies.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.picture_files import STYLE, save_picture
 
 _SMALLEST = {"single": 0.85, "multi": 0.8}
 _LARGEST = {"single": 1.2, "multi": 2.6}

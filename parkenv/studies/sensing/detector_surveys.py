@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,7 @@ from parkenv.files.file_names import file_name
 from parkenv.files.typed_csv import NUMBER_OR_NAN, typed_records
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, Survey, SurveySettings, drive_together
-from parkenv.mapping.survey_score import CLEAR, DISTANCE_ENDS, SIGHTING
+from parkenv.mapping.survey_score import CLEAR, DISTANCE_ENDS, SIDES, SIGHTING
 from parkenv.studies.results import make_folder
 from parkenv.studies.sensing.detector_drives import DISTANCES, LEAST_HEIGHT, VISIBLE
 from parkenv.studies.sensing.surveys import MAP_FILE, map_error, store_session, stored_sessions
@@ -30,6 +30,9 @@ from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS
 from sim_sensors.ground_truth import View
 from sim_sensors.rig import SensorRig
+
+if TYPE_CHECKING:
+    from parkenv.show.figures.detectors import MissedCar
 
 Row = dict[str, Any]
 Sightings = NDArray[np.void]
@@ -313,6 +316,39 @@ def choose_misses(
         misses = list(cars.values())
         chosen += [misses[k] for k in rng.permutation(len(misses))[:number].tolist()]
     return chosen
+
+
+def missed_by_cause(
+    misses: Sequence[Miss],
+    pictures: Mapping[tuple[int, int, int], NDArray[np.uint8]],
+    rows: Sequence[Row],
+) -> dict[str, list[MissedCar]]:
+    """Return missed cars for a contact sheet, by cause; the headings say how many there are in all.
+
+    Args:
+        misses: the cars.
+        pictures: from `pictures_of`.
+        rows: rows of the group `cause` of the comparison.
+    """
+    from parkenv.show.figures.detectors import MissedCar  # loads Matplotlib
+
+    sheet: dict[str, list[MissedCar]] = {}
+    for row in rows:
+        cause = row["part"]
+        missed = round(row["in_pictures"] * (1.0 - row["in_pictures_rate"])) if row["in_pictures"] else 0
+        heading = f"{cause} ({CAUSES[cause]}): {missed:,} of {row['in_pictures']:,} missed"
+        sheet[heading] = [
+            MissedCar(
+                pictures[miss.picture],
+                [float(miss.sighting[side]) for side in SIDES],
+                float(miss.sighting["distance"]),
+                float(miss.sighting["visible"]),
+                miss.weather,
+            )
+            for miss in misses
+            if miss.cause == cause
+        ]
+    return sheet
 
 
 def pictures_of(

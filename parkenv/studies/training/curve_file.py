@@ -1,4 +1,4 @@
-"""The file of a training's evaluations, `curve.csv`."""
+"""The file of a training's evaluations, `curve.csv`, and their means over seeds."""
 
 from __future__ import annotations
 
@@ -6,8 +6,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from parkenv.errors import InputError
 from parkenv.files.typed_csv import NUMBER_OR_NAN, WHOLE, Kind, typed_records
+from parkenv.show.columns import columns_of
+from parkenv.studies.statistics import mean_interval
 
 CURVE = "curve.csv"
 
@@ -37,6 +41,26 @@ def require_columns(curve: list[Row], columns: Sequence[str], path: Path) -> lis
         if any(name not in row for row in curve):
             raise InputError(f"{path}: has no column {name!r}, want {', '.join(columns)}")
     return curve
+
+
+def across_seeds(curves: Sequence[Sequence[Row]], measure: str = "total_s") -> list[dict[str, float]]:
+    """Return the mean over seeds with its 95 % interval, and the median, at evaluations that all seeds have.
+
+    Args:
+        curves: rows of `curve.csv` of each seed.
+        measure: the column.
+
+    Returns:
+        Rows with steps, `measure` and its `columns_of`.
+    """
+    low_name, high_name, median_name = columns_of(measure)
+    rows = []
+    for evaluations in zip(*curves, strict=False):
+        values = [row[measure] for row in evaluations]
+        mean, low, high = mean_interval(values)
+        row = {"steps": float(np.mean([row["steps"] for row in evaluations])), measure: mean}
+        rows.append(row | {low_name: low, high_name: high, median_name: float(np.median(values))})
+    return rows
 
 
 def _kind_of(column: str) -> Kind:

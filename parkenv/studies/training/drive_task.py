@@ -6,8 +6,9 @@ from functools import cached_property
 from pathlib import Path
 
 from parkenv.scenarios.build import build
-from parkenv.studies.figures.learning_curves import across_seeds, save_success_curves
+from parkenv.show.figures.learning_curves import save_success_curves
 from parkenv.studies.training.configs import DRIVE_CONFIGS, config_of
+from parkenv.studies.training.curve_file import across_seeds
 from parkenv.studies.training.drive_training import DriveTraining, parked_on
 from parkenv.studies.training.drive_training_env import slot_groups
 from parkenv.studies.training.spec import DriveTrainingSpec
@@ -108,16 +109,18 @@ class DriveTask(TrainingTask):
         kinds = [n.removesuffix("_success") for n in trained.curves[0][0] if n.endswith("_success")]
         lots = " and ".join(lot.name for lot in self.lots)
         title = f"{lots}: {self.evaluation_episodes} parkings of each kind in held-out tasks"
-        save_success_curves({self.algorithm: trained.curves, **trained.beside}, kinds, lines, title, figure)
-
-        def by_kind(curves: list[list[Row]]) -> Row:
-            return {kind: across_seeds(curves, f"{kind}_success") for kind in kinds}
+        curves = {self.algorithm: trained.curves, **trained.beside}
+        means = {
+            name: {kind: across_seeds(its, f"{kind}_success") for kind in kinds}
+            for name, its in curves.items()
+        }
+        save_success_curves(curves, means, lines, title, figure)
 
         heading = "Parkings that succeed, contacts, median s of those, in held-out tasks"
         return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
-            "curve": by_kind(trained.curves),
-            "beside": {name: by_kind(its) for name, its in trained.beside.items()},
+            "curve": means[self.algorithm],
+            "beside": {name: means[name] for name in trained.beside},
         }, table_of_tests(heading, self.algorithm, transfer, planners, _parkings, "kind")  # fmt: skip
 
 

@@ -9,11 +9,12 @@ from pathlib import Path
 from parkenv.engine.fleet_rules import RULES
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
+from parkenv.show.figures.learning_curves import save_learning_curves
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.studies.fleet.drivers import MixedFleet, demand_in, driver_of
-from parkenv.studies.plurals import plural
 from parkenv.studies.training.configs import FLEET_CONFIGS, config_of
+from parkenv.studies.training.curve_file import across_seeds
 from parkenv.studies.training.fleet_training import FleetTraining
 from parkenv.studies.training.spec import FleetTrainingSpec
 from parkenv.studies.training.training_task import (
@@ -135,14 +136,16 @@ class FleetTask(TrainingTask):
         title = (
             f"{self.scenario.name}, {rate:g} cars an hour, {self.fleet.name}: {plural(days, 'held-out day')}"
         )
-        save_learning_curves({self.algorithm: trained.curves} | trained.beside, lines, title, figure)
+        curves = {self.algorithm: trained.curves} | trained.beside
+        means = {name: across_seeds(its) for name, its in curves.items()}
+        save_learning_curves(curves, means, lines, title, figure)
         heading = (
             f"Mean total time, s, of a driver's cars and [of the others], {plural(2 * days, 'held-out day')}"
         )
         return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
-            "curve": across_seeds(trained.curves),
-            "beside": {name: across_seeds(its) for name, its in trained.beside.items()},
+            "curve": means[self.algorithm],
+            "beside": {name: means[name] for name in trained.beside},
         }, table_of_tests(heading, self.algorithm, transfer, planners, _times)  # fmt: skip
 
 

@@ -14,11 +14,12 @@ from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.scenarios.places import lot_share, place_of_episode, require_different_names, split_places
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.benchmark import suite_lots
 from parkenv.studies.compare.cases import rows_of
-from parkenv.studies.figures.learning_curves import across_seeds, save_learning_curves
 from parkenv.studies.training.cloning import Demonstrations, require_cloneable
+from parkenv.studies.training.curve_file import across_seeds
 from parkenv.studies.training.rl_training import AnyTraining
 from parkenv.studies.training.search_training import (
     SearchTraining,
@@ -229,13 +230,15 @@ class SearchTask(TrainingTask):
         if self._holds_out:
             where = f"{_places(self.held_out)} held out"
         title = f"{where}: {self.evaluation_episodes} searches in held-out worlds"
-        save_learning_curves(self._curves(name, trained.curves) | trained.beside, lines, title, figure)
+        curves = self._curves(name, trained.curves) | trained.beside
+        means = {name: across_seeds(its) for name, its in curves.items()}
+        save_learning_curves(curves, means, lines, title, figure)
         heading = "Mean total time, s, in held-out worlds"
         return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
             **({"places": by_place} if by_place else {}),
             "curve": across_seeds(trained.curves),
-            "beside": {name: across_seeds(its) for name, its in trained.beside.items()},
+            "beside": {name: means[name] for name in trained.beside},
         }, table_of_tests(heading, self.algorithm, transfer, planners, _interval)  # fmt: skip
 
     def times_of(self, model: Path, places: list[Scenario]) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:

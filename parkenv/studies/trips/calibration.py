@@ -26,8 +26,8 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.limited_reading import parse_json, read_text
 from parkenv.files.versioned_json import JsonFormat
-from parkenv.studies.compare.cases import blind_scenario
-from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
+from parkenv.scenarios.blind import blind_scenario
+from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 from parkenv.studies.results import require_same_settings, write_settings
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip

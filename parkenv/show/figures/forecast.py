@@ -20,7 +20,7 @@ from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import draw_days
 from parkenv.forecast.scores import Band, mean_where
 from parkenv.forecast.slot_comparison import SlotScores
-from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
 _WEEK = 7

@@ -15,8 +15,8 @@ from matplotlib.patches import Patch
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.draft import LotDraft
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.studies.figures.lot_picture import ENTRY, GOAL, GROUND, INK, draw_walls
-from parkenv.studies.figures.picture_files import save_picture
+from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK, draw_walls
+from parkenv.show.figures.picture_files import save_picture
 from parkenv.world.lot import Lane, corner_points, is_building, mouth_points
 
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")

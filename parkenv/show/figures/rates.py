@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from parkenv.studies.figures.picture_files import save_picture
+from parkenv.show.figures.picture_files import save_picture
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.week import DAY_S, HOUR_S
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -12,11 +12,9 @@ from matplotlib.lines import Line2D
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.studies.figures.picture_files import INK, STYLE
-from parkenv.studies.figures.registry import ComparisonResults, Drawn, Setting
-from parkenv.studies.figures.time_figures import AGENT_COLORS, OTHER_AGENT
-from parkenv.studies.plurals import plural
-from parkenv.studies.results import SETTING_AXES
+from parkenv.show.figures.picture_files import INK, STYLE
+from parkenv.show.figures.times import AGENT_COLORS, OTHER_AGENT
+from parkenv.show.plurals import plural
 
 Totals = Mapping[str, FloatArray]
 """Total times of each agent, (n_episodes,) s, by name."""
@@ -25,29 +23,6 @@ BOUND = "clairvoyant lower bound"
 OFF_SCALE = 2.5
 """The time axis ends at this multiple of the median, so that rare long searches do not compress the rest."""
 _DASHED = ("oracle", BOUND)
-
-
-def time_distributions(results: ComparisonResults) -> Iterator[Drawn]:
-    """Yield a figure for each setting of costs and speeds, with a panel per scenario.
-
-    The clairvoyant lower bound is added if the oracle is not among the agents.
-    """
-    settings: dict[Setting, dict[str, dict[str, FloatArray]]] = {}
-    for case, seeds in results.cases:
-        episodes = results.episodes_of(case, seeds)
-        c = case.columns
-        if not episodes or c["scenario"] not in results.scenarios:
-            continue
-        panels = settings.setdefault(tuple(c[name] for name in SETTING_AXES), {})
-        totals = panels.setdefault(c["scenario"], {})
-        totals[case.label] = np.array([episode["total_s"] for episode in episodes])
-        totals[BOUND] = np.array([episode["bound_s"] for episode in episodes])
-    for setting, panels in settings.items():
-        for totals in panels.values():
-            bound = totals.pop(BOUND)
-            if "oracle" not in totals:
-                totals[BOUND] = bound
-        yield "", setting, draw_time_distribution(panels)
 
 
 def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:

@@ -12,9 +12,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
-from parkenv.studies.fleet.measures import Roads
-from parkenv.world.scenario import SearchProblem
+from parkenv.compiled.arrays import FloatArray
+from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 
 Row = dict[str, Any]
 
@@ -24,7 +23,9 @@ _GREY = "#999999"
 _CLOSED_FORM = "slots looked at in random order"
 
 
-def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, path: str | Path) -> None:
+def save_fleet_figure(
+    rows: Sequence[Row], closed_form: Callable[[FloatArray], FloatArray], title: str, path: str | Path
+) -> None:
     """Draw the summary of an experiment.
 
     Panels: search time against occupancy, with the closed form of slots looked at in random order; price of anarchy
@@ -32,7 +33,7 @@ def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, p
 
     Args:
         rows: of `summarize_days`.
-        problem: lot and speeds.
+        closed_form: search time, s, of looking at slots in random order, as a function of the occupancy.
         title: title of the figure.
         path: file to write.
 
@@ -42,7 +43,7 @@ def save_fleet_figure(rows: Sequence[Row], problem: SearchProblem, title: str, p
     whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
     mixed = [row for row in rows if 0.0 < row["share"] < 1.0]
     priced = [row for row in whole if np.isfinite(row["price_of_anarchy"])]
-    panels: list[Callable[[Axes], None]] = [lambda ax: _draw_search(ax, whole, problem)]
+    panels: list[Callable[[Axes], None]] = [lambda ax: _draw_search(ax, whole, closed_form)]
     if priced:
         panels.append(lambda ax: _draw_price(ax, priced))
     if mixed and any(row["knows"] == "own" for row in rows):
@@ -90,28 +91,15 @@ def _errors(rows: Sequence[Row], name: str) -> np.ndarray:
     return np.asarray(np.nan_to_num(np.abs(ends - mean)))
 
 
-def _draw_search(ax: Axes, rows: Sequence[Row], problem: SearchProblem) -> None:
+def _draw_search(ax: Axes, rows: Sequence[Row], closed_form: Callable[[FloatArray], FloatArray]) -> None:
     for its, style in _curves(rows):
         x = [100.0 * row["occupancy"] for row in its]
         ax.errorbar(x, [row["search_s"] for row in its], _errors(its, "search_s"), linewidth=1.2, **style)
     low = min(row["occupancy"] for row in rows)
     occupancy = np.linspace(low, 1.0, 200)
-    ax.plot(100.0 * occupancy, looks_s(problem, occupancy), color=_GREY, linewidth=1.0)
+    ax.plot(100.0 * occupancy, closed_form(occupancy), color=_GREY, linewidth=1.0)
     most = max(row["search_s"] for row in rows)
     ax.set(xlabel="mean occupancy, %", ylabel="s", ylim=(0.0, 1.25 * most), title="Search time")
-
-
-def looks_s(problem: SearchProblem, occupancy: np.ndarray) -> np.ndarray:
-    """Return the search time, s, of looking at slots in random order, (n + 1)/(m + 1) of them if m of n are free.
-
-    A look takes the median drive from a slot to the next one; the drive from the entry to the first slot comes before.
-    """
-    lot, n = problem.lot, problem.lot.n_slots
-    source, column = np.nonzero(lot.neighbors[:n] >= 0)
-    to_slot = lot.neighbors[source, column] < n
-    hop_s = float(np.median(problem.move_s[source[to_slot], column[to_slot]])) if to_slot.any() else 0.0
-    first_s = Roads(problem).first_slot_m / problem.v_drive
-    return np.asarray(first_s + hop_s * ((n + 1.0) / ((1.0 - occupancy) * n + 1.0) - 1.0))
 
 
 def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:

@@ -24,8 +24,8 @@ from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
 from parkenv.show.drawing import write_tag
-from parkenv.studies.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot
-from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
+from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import View
 

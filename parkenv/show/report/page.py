@@ -16,14 +16,13 @@ from PIL import Image as PillowImage
 
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.images import image_text, read_image
-from parkenv.studies.figures.picture_files import CAPTION
-from parkenv.studies.figures.registry import FIGURES
-from parkenv.studies.plurals import plural
-from parkenv.studies.report.drive_recording import data_uri
-from parkenv.studies.report.learning import learning_of
-from parkenv.studies.report.run_folder import RunFolder
-from parkenv.studies.report.tables import tables_of
-from parkenv.studies.results import SETTING_AXES, Row
+from parkenv.show.columns import SETTING_AXES
+from parkenv.show.figures.picture_files import CAPTION
+from parkenv.show.plurals import plural
+from parkenv.show.report.drive_recording import data_uri
+from parkenv.show.report.tables import tables_of
+
+Row = Mapping[str, Any]
 
 FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
@@ -40,7 +39,8 @@ LOSSLESS = 150_000
 _QUALITY = 86
 _HERE = Path(__file__).parent
 _ORDER = (
-    *(kind.name for kind in FIGURES), "session", "detections", "slots_found", "reach", "graph", "map", "learning_curve",
+    "time_split", "time_distribution", "time_against_occupancy", "time_against_failure_cost", "time_against_map",
+    "searches", "session", "detections", "slots_found", "reach", "graph", "map", "learning_curve",
 )  # fmt: skip
 """The first figures of a page: prefixes of their file names."""
 _WHITE = 0.5
@@ -48,7 +48,11 @@ _WHITE = 0.5
 
 
 def page_data(
-    run: RunFolder,
+    kind: str,
+    summary: Mapping[str, Any],
+    *,
+    sessions: Sequence[Row] = (),
+    learning: Sequence[Mapping[str, Any]] = (),
     encounters: Sequence[Mapping[str, Any]] = (),
     drives: Sequence[Mapping[str, Any]] = (),
     fleets: Sequence[Mapping[str, Any]] = (),
@@ -57,7 +61,10 @@ def page_data(
     """Build the data of a page, without the figures; see `report.schema.json`.
 
     Args:
-        run: the run.
+        kind: kind of the run: compare, survey, demo, train, ...
+        summary: content of its `summary.json`.
+        sessions: drives of a survey, rows of `sessions.csv`.
+        learning: from `learning.learning_panels`.
         encounters: from `search_recording.record`.
         drives: from `drive_recording.record_drive`.
         fleets: from `fleet_recording.FleetDay.record`.
@@ -70,7 +77,6 @@ def page_data(
             lots.append(described)
         return lots.index(described)
 
-    kind, summary = run.kind, run.summary
     return {
         "format": FORMAT,
         "version": VERSION,
@@ -83,8 +89,8 @@ def page_data(
             "seed": summary.get("seed"),
             "notes": list(notes),
         },
-        "learning": learning_of(run),
-        "tables": tables_of(kind, summary, run.sessions()),
+        "learning": list(learning),
+        "tables": tables_of(kind, summary, sessions),
         "lots": lots,
         "worlds": [{**e["world"], "lot": lot(e["lot"]), "searches": e["searches"]} for e in encounters],
         "drives": [{**d["drive"], "lot": lot(d["lot"])} for d in drives],

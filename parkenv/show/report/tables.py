@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from parkenv.studies.figures.picture_files import OPTIONAL_TIMES
-from parkenv.studies.results import Row
+from parkenv.show.columns import OPTIONAL_TIMES
 
+Row = Mapping[str, Any]
 Cell = float | int | str | bool | None | list[float | None]
 
 

@@ -14,7 +14,10 @@ import numpy as np
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.engine.state import SearchState
 from parkenv.envs.perception import SearchPerceptionEnv
+from parkenv.show.columns import OPTIONAL_TIMES, TIME_COLORS
 from parkenv.show.drawing import SUBPIXEL_BITS, draw_dashes, fill_disc, fixed_point, write_text
+from parkenv.show.figures.picture_files import save_film
+from parkenv.show.figures.survey import draw_detections
 from parkenv.show.rendering import (
     CAR,
     GLASS,
@@ -29,8 +32,6 @@ from parkenv.show.rendering import (
     draw_belief_key,
 )
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.figures.picture_files import OPTIONAL_TIMES, TIME_COLORS, save_film
-from parkenv.studies.figures.survey_pictures import draw_detections
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario

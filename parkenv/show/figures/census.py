@@ -11,22 +11,27 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from parkenv.studies.figures.picture_files import STYLE, save_picture
-from parkenv.studies.lot_census import KINDS, MIXED
+from parkenv.show.figures.picture_files import STYLE, save_picture
 
-KIND_COLORS = {"perpendicular": "#0072b2", "oblique": "#e69f00", "kerbside": "#009e73", MIXED: "#8c8c8c"}
+KIND_COLORS = {"perpendicular": "#0072b2", "oblique": "#e69f00", "kerbside": "#009e73", "mixed": "#8c8c8c"}
+KINDS = ("perpendicular", "oblique", "kerbside")
+"""Columns with the number of slots of a kind."""
 _EDGES_AN_OCTAVE = 2
 
 
 def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
     """Draw how many lots there are of each size and kind, their drive times, and how sure they are.
 
+    Args:
+        rows: of a census: slots, kind, result, drive_s, doubt and the number of slots of each kind.
+        path: the PNG file to write.
+
     Raises:
         InputError: the file cannot be written.
     """
     slots = np.array([row["slots"] for row in rows], float)
     kinds = [row["kind"] for row in rows]
-    present = [kind for kind in (*KINDS, MIXED) if kind in kinds]
+    present = [kind for kind in KIND_COLORS if kind in kinds]
     colors = [KIND_COLORS[kind] for kind in present]
 
     def by_kind(name: str) -> list[np.ndarray]:

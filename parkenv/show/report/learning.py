@@ -5,22 +5,22 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from parkenv.studies.figures.learning_curves import columns_of
-from parkenv.studies.report.run_folder import RunFolder
-from parkenv.studies.results import Row
+from parkenv.show.columns import columns_of
+
+Row = Mapping[str, Any]
 
 
-def learning_of(run: RunFolder) -> list[dict[str, Any]]:
+def learning_panels(summary: Mapping[str, Any], seeds: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
     """Build the panels of learning curves: total time of searches, or success by kind of slot.
 
     Args:
-        run: a run of any kind; only trainings have curves.
+        summary: content of the `summary.json` of a training.
+        seeds: rows of each seed's `curve.csv`, NaN as None.
     """
-    curve, lines = run.summary.get("curve"), run.summary.get("evaluated")
-    if run.kind != "train" or not curve or not isinstance(lines, Mapping):
+    curve, lines = summary.get("curve"), summary.get("evaluated")
+    if not curve or not isinstance(lines, Mapping):
         return []
-    seeds = [run.curve(row["seed"]) for row in run.summary["rows"]]
-    beside = run.summary.get("beside", {})
+    beside = summary.get("beside", {})
     if isinstance(curve, Mapping):
         return [
             _panel(

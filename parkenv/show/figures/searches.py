@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -20,19 +20,14 @@ from matplotlib.transforms import Affine2D
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.studies.compare.cases import Case
-from parkenv.studies.episodes import SearchTrace
-from parkenv.studies.figures.lot_picture import BELIEF_MAP, draw_discs, draw_lot, points_per_m
-from parkenv.studies.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
-from parkenv.studies.figures.registry import ComparisonResults, Drawn, Setting
-from parkenv.studies.results import SETTING_AXES
+from parkenv.show.columns import OPTIONAL_TIMES, TIME_COLORS
+from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot, points_per_m
+from parkenv.show.figures.picture_files import INK, STYLE
+from parkenv.show.search_trace import SearchTrace
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
 
 PATH, WALK = "#ffd000", "#1852ba"
-PICTURED = ("belief", "oracle", "first-free", "greedy-goal")
-"""Agents whose paths are drawn beside those of the first and of the fastest agent, the most interesting first."""
-MOST_PICTURED = 4
 POLICY_SCALE = 2.2
 """Least scale, points per metre, at which arrows at every vertex are legible."""
 
@@ -185,35 +180,6 @@ def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatA
     """Place a shape, (k, 2) m with its nose towards +x, at each point, rotated to its heading."""
     turn = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)
     return list(at[:, None] + shape @ turn)
-
-
-def searches(results: ComparisonResults) -> Iterator[Drawn]:
-    """Yield `draw_searches` for each scenario and setting: some agents in the same world.
-
-    These are the first agent, the fastest one, and those in `PICTURED`; at most `MOST_PICTURED`.
-    """
-    settings: dict[tuple[str, Setting], list[Case]] = {}
-    for case, _ in results.cases:
-        if case.scenario.name in results.scenarios:
-            c = case.columns
-            setting = tuple(c[name] for name in SETTING_AXES)
-            settings.setdefault((c["scenario"], setting), []).append(case)
-    totals = {(*_setting_of(row), row["agent"]): row["total_s"] for row in results.rows}
-    for (name, setting), cases in settings.items():
-        acting = [case for case in cases if case.agent != "oracle"]
-        fastest = min(
-            acting,
-            key=lambda case: totals.get((*_setting_of(case.columns), case.label), np.inf),
-            default=cases[0],
-        )
-        wanted = [cases[0], fastest, *(c for word in PICTURED for c in cases if c.agent == word)]
-        labels = list(dict.fromkeys(case.label for case in wanted))[:MOST_PICTURED]
-        drawn = [case for case in cases if case.label in labels]
-        yield name, setting, draw_searches([case.trace(results.seed) for case in drawn])
-
-
-def _setting_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
-    return tuple(row[name] for name in ("scenario", *SETTING_AXES))
 
 
 def draw_searches(traces: Sequence[SearchTrace]) -> Figure:

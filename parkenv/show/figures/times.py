@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -14,11 +14,9 @@ from matplotlib.patches import Patch
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.studies.compare.cases import BLIND, against_occupancy
-from parkenv.studies.figures.picture_files import INK, OPTIONAL_TIMES, STYLE, TIME_COLORS
-from parkenv.studies.figures.registry import ComparisonResults, Drawn
-from parkenv.studies.plurals import plural
-from parkenv.studies.results import SETTING_AXES
+from parkenv.show.columns import OPTIONAL_TIMES, SETTING_AXES, TIME_COLORS
+from parkenv.show.figures.picture_files import INK, STYLE
+from parkenv.show.plurals import plural
 
 Row = Mapping[str, Any]
 
@@ -41,58 +39,8 @@ AGENT_COLORS = {
 }
 """Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
 OTHER_AGENT = "#5c4a3d"
-OCCUPANCY_BINS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.98, 1.0001)
-"""Bin edges for averaging episodes if the run has no occupancy levels."""
 OFF_SCALE = 3.0
 """Totals above this multiple of the median are cut off, so that they do not compress the rest."""
-
-
-def time_splits(results: ComparisonResults) -> Iterator[Drawn]:
-    """Yield `draw_time_split` of each scenario."""
-    for name in results.scenarios:
-        yield name, None, draw_time_split(results.rows_of(name))
-
-
-def times_against_occupancy(results: ComparisonResults) -> Iterator[Drawn]:
-    """Yield `draw_time_against_occupancy` of each scenario, at the first speeds."""
-    for name in results.scenarios:
-        rows = [
-            {**row, "occupancy": row["occupancy_level"]}
-            for row in results.occupancy_rows
-            if row["scenario"] == name
-        ]
-        if not rows:
-            cases = [(case, seeds) for case, seeds in results.cases if case.scenario.name == name]
-            speeds = cases[0][0].scenario.v_walk, cases[0][0].scenario.v_drive
-            episodes = [
-                episode
-                for case, seeds in cases
-                if (case.scenario.v_walk, case.scenario.v_drive) == speeds
-                for episode in results.episodes_of(case, seeds)
-            ]
-            rows = against_occupancy(episodes, OCCUPANCY_BINS)
-        if rows:
-            yield name, None, draw_time_against_occupancy(rows)
-
-
-def times_against_failure_cost(results: ComparisonResults) -> Iterator[Drawn]:
-    """Yield `draw_time_against_failure_cost` of each scenario of a sweep."""
-    for name in results.failure_cost_sweeps:
-        yield name, None, draw_time_against_failure_cost(results.rows_of(name), results.rows_of(name + BLIND))
-
-
-def times_against_map(results: ComparisonResults) -> Iterator[Drawn]:
-    """Yield `draw_time_against_map` of each scenario with flat forecasts, at the first cost and speeds."""
-    forecasts = results.flat_forecasts
-    if not forecasts:
-        return
-    setting = {c: results.rows[0][c] for c in SETTING_AXES}
-    rows = [row for row in results.rows if setting.items() <= row.items()]
-    for name in dict.fromkeys(varied for varied, _ in forecasts.values()):
-        probability = {flat: p for flat, (varied, p) in forecasts.items() if varied == name}
-        flat = [row for row in rows if row["scenario"] in probability]
-        own = [row for row in rows if row["scenario"] == name]
-        yield name, None, draw_time_against_map(flat, own, probability)
 
 
 def draw_time_split(rows: Sequence[Row]) -> Figure:

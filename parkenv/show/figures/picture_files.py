@@ -37,16 +37,6 @@ STYLE: dict[Any, Any] = {
 }
 
 INK = "#181b1f"
-TIME_COLORS = {
-    "drive_s": ("drive", "#0072b2"),
-    "failed_s": ("failed attempts", "#d55e00"),
-    "walk_s": ("walk", "#a6cfe8"),
-    "parking_cost_s": ("parking cost", "#cc79a7"),
-    "gave_up_s": ("give-up penalty", "#8c8c8c"),
-}
-"""Names and colours of the parts of the total time."""
-OPTIONAL_TIMES = ("parking_cost_s", "gave_up_s")
-"""Parts that are shown only if they are not 0."""
 
 
 def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:

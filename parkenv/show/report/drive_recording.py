@@ -15,7 +15,7 @@ from PIL import Image as PillowImage
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.survey import SessionResult, Survey, SurveyFrame
 from parkenv.perception.pipeline import CameraView, PerceptionResult
-from parkenv.studies.report.lot_data import describe_lot
+from parkenv.show.report.lot_data import describe_lot
 from sim_sensors.rig import poses_along
 
 PICTURE_WIDTH = 480

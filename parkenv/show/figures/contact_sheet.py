@@ -13,8 +13,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.studies.figures.lot_picture import ENTRY, GOAL, GROUND, INK
-from parkenv.studies.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
+from parkenv.show.figures.picture_files import STYLE, save_picture
 from parkenv.world.lot import ParkingLot, corner_points
 
 COLUMNS = 6

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -13,9 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from parkenv.compiled.arrays import Image
-from parkenv.mapping.survey_score import SIDES
-from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
-from parkenv.studies.sensing.detector_surveys import CAUSES, Miss
+from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 
 Row = Mapping[str, Any]
 
@@ -71,26 +69,26 @@ def save_reach(rows: Sequence[Row], ylabel: str, path: Path) -> None:
         save_picture(figure, path, "How often a car in a picture is found, by weather, distance and detector")
 
 
-def save_misses(
-    misses: Sequence[Miss],
-    pictures: Mapping[tuple[int, int, int], Image],
-    causes: Sequence[Row],
-    title: str,
-    path: Path,
-) -> None:
+class MissedCar(NamedTuple):
+    """A car that a detector missed, in its picture."""
+
+    picture: Image
+    box: Sequence[float]  # left, top, right, bottom, px
+    distance: float  # from the camera to the middle of the car, m
+    visible: float  # visible fraction
+    weather: str
+
+
+def save_misses(missed: Mapping[str, Sequence[MissedCar]], title: str, path: Path) -> None:
     """Draw a contact sheet of missed cars, a row for each cause.
 
     Args:
-        misses: the cars.
-        pictures: their pictures.
-        causes: rows of the group `cause` of the comparison.
+        missed: the cars of each row, by its heading; rows without cars are left out.
         title: title of the sheet.
         path: the PNG to write.
     """
-    of_cause = {cause: [m for m in misses if m.cause == cause] for cause in CAUSES}
-    shown = {cause: its for cause, its in of_cause.items() if its}
-    columns = max((len(its) for its in shown.values()), default=1)
-    rate = {row["part"]: row for row in causes}
+    shown = {heading: cars for heading, cars in missed.items() if cars}
+    columns = max((len(cars) for cars in shown.values()), default=1)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(1.75 * columns + 0.1, 1.78 * max(len(shown), 1) + 0.35))
         figure.suptitle(
@@ -100,31 +98,29 @@ def save_misses(
             max(len(shown), 1), columns, left=0.006, right=0.994, bottom=0.2 / figure.get_figheight(),
             top=1.0 - 0.62 / figure.get_figheight(), hspace=0.36, wspace=0.04,
         )  # fmt: skip
-        for i, (cause, its) in enumerate(shown.items()):
-            for k, miss in enumerate(its):
+        for i, (heading, cars) in enumerate(shown.items()):
+            for k, car in enumerate(cars):
                 ax = figure.add_subplot(grid[i, k])
-                _draw_miss(ax, miss, pictures[miss.picture])
+                _draw_miss(ax, car)
                 if k == 0:
-                    row = rate[cause]
-                    missed = round(row["in_pictures"] * (1.0 - row["in_pictures_rate"]))
-                    text = f"{cause} ({CAUSES[cause]}): {missed:,} of {row['in_pictures']:,} missed"
-                    ax.set_title(text, weight="bold", color=INK, pad=4.0)
+                    ax.set_title(heading, weight="bold", color=INK, pad=4.0)
         save_picture(figure, path, "Cars that a detector missed in pictures of survey drives, by cause")
 
 
-def _draw_miss(ax: Axes, miss: Miss, picture: Image) -> None:
+def _draw_miss(ax: Axes, car: MissedCar) -> None:
     """Draw the part of the picture around a car, with its box, distance, visible fraction and weather."""
-    height, width = picture.shape[:2]
-    left, top, right, bottom = (int(miss.sighting[side]) for side in SIDES)
+    height, width = car.picture.shape[:2]
+    left, top, right, bottom = (int(side) for side in car.box)
     wide = max(1.7 * (right - left), 1.7 * (bottom - top) * _CROP[0] / _CROP[1], _LEAST_CROP)
     wide = round(min(wide, width, height * _CROP[0] / _CROP[1]))
     high = round(wide * _CROP[1] / _CROP[0])
     x = int(np.clip((left + right - wide) // 2, 0, width - wide))
     y = int(np.clip((top + bottom - high) // 2, 0, height - high))
-    ax.imshow(picture[y : y + high, x : x + wide], extent=(x, x + wide, y + high, y), interpolation="lanczos")
+    ax.imshow(
+        car.picture[y : y + high, x : x + wide], extent=(x, x + wide, y + high, y), interpolation="lanczos"
+    )
     ax.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=BOX, linewidth=1.1))
     ax.set(xlim=(x, x + wide), ylim=(y + high, y))
     ax.set_axis_off()
-    s = miss.sighting
-    label = f"{s['distance']:.1f} m, {s['visible']:.0%} visible, {miss.weather.replace('_', ' ')}"
+    label = f"{car.distance:.1f} m, {car.visible:.0%} visible, {car.weather.replace('_', ' ')}"
     ax.text(0.0, -0.03, label, transform=ax.transAxes, va="top", fontsize=6.8, color="#444444")

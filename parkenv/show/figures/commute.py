@@ -13,11 +13,12 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from parkenv.studies.compare.commute import FIXED, NONE
-from parkenv.studies.figures.picture_files import STYLE, save_picture
-from parkenv.studies.figures.time_figures import AGENT_COLORS, OTHER_AGENT
+from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.times import AGENT_COLORS, OTHER_AGENT
 
 Row = Mapping[str, Any]
+FIXED, NONE = "fixed", "none"
+"""Column `map` of the references: a right map that does not learn; an agent that uses no map."""
 _WORDS = {"empty": "empty map at first", "right": "right map at first", "wrong": "wrong map at first"}
 _DASHES = ("-", (0, (5, 1.5)), (0, (2, 1)), (0, (5, 1, 1, 1)))
 """Lines of an agent with different options."""

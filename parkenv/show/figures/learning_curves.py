@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from parkenv.studies.figures.picture_files import INK, STYLE, save_picture
-from parkenv.studies.figures.time_figures import spread
-from parkenv.studies.statistics import mean_interval
+from parkenv.show.columns import columns_of
+from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.times import spread
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
 """Colours of trainings: as many as are easy to tell apart."""
@@ -24,37 +24,16 @@ OFF_SCALE = 2.0
 _APART = 0.045  # least distance of two labels, fraction of the axis
 _MARGIN_IN = 0.12  # beside the labels, inches
 
-Curves = Sequence[Sequence[Mapping[str, Any]]]
-
-
-def columns_of(measure: str) -> tuple[str, str, str]:
-    """Return the column names of the interval's ends and the median of a measure."""
-    unit = "_s" if measure.endswith("_s") else ""
-    return f"low{unit}", f"high{unit}", f"median{unit}"
-
-
-def across_seeds(curves: Curves, measure: str = "total_s") -> list[dict[str, float]]:
-    """Return the mean over seeds with its 95 % interval, and the median, at evaluations that all seeds have.
-
-    Args:
-        curves: rows of `curve.csv` of each seed.
-        measure: the column.
-
-    Returns:
-        Rows with steps, `measure` and its `columns_of`.
-    """
-    low_name, high_name, median_name = columns_of(measure)
-    rows = []
-    for evaluations in zip(*curves, strict=False):
-        values = [row[measure] for row in evaluations]
-        mean, low, high = mean_interval(values)
-        row = {"steps": float(np.mean([row["steps"] for row in evaluations])), measure: mean}
-        rows.append(row | {low_name: low, high_name: high, median_name: float(np.median(values))})
-    return rows
+Evaluations = Sequence[Mapping[str, Any]]
+Curves = Sequence[Evaluations]
 
 
 def save_learning_curves(
-    curves: Mapping[str, Curves], planners: Mapping[str, float], title: str, path: Path
+    curves: Mapping[str, Curves],
+    means: Mapping[str, Evaluations],
+    planners: Mapping[str, float],
+    title: str,
+    path: Path,
 ) -> None:
     """Draw each algorithm's total time, and planners as horizontal lines.
 
@@ -64,6 +43,7 @@ def save_learning_curves(
 
     Args:
         curves: rows of `curve.csv` by algorithm and seed.
+        means: their means over seeds: steps, `total_s` and its `columns_of`.
         planners: mean total time, s, of each planner in the same worlds.
         title: title of the figure.
         path: the PNG file to write.
@@ -74,7 +54,7 @@ def save_learning_curves(
         axes = figure.subplots()
         highest = 0.0
         for (name, its), color in zip(curves.items(), COLORS, strict=False):
-            drawn = _draw(axes, name, its, "total_s", color, alone=len(curves) == 1)
+            drawn = _draw(axes, name, its, means[name], "total_s", color, alone=len(curves) == 1)
             highest = max([highest, *drawn[len(drawn) // 10 :]])
         low = min([*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c)])
         # An untrained policy drives in circles, so cut off high values to keep the end of the curves readable.
@@ -96,7 +76,11 @@ def save_learning_curves(
 
 
 def save_success_curves(
-    curves: Mapping[str, Curves], kinds: Sequence[str], planner: Mapping[str, float], title: str, path: Path
+    curves: Mapping[str, Curves],
+    means: Mapping[str, Mapping[str, Evaluations]],
+    planner: Mapping[str, float],
+    title: str,
+    path: Path,
 ) -> None:
     """Draw the success rates of algorithms and of the planner, one panel per kind of slot.
 
@@ -104,17 +88,18 @@ def save_success_curves(
 
     Args:
         curves: rows of `curve.csv` by algorithm and seed; see `DriveTraining.evaluate`.
-        kinds: kinds of slots.
+        means: their means over seeds by algorithm and kind of slot, as in `save_learning_curves`.
         planner: success rate of the planner in the same tasks, by kind; empty to draw none.
         title: title of the figure.
         path: the PNG file to write.
     """
     with mpl.rc_context(STYLE):
+        kinds = list(next(iter(means.values())))
         figure = Figure(figsize=(2.4 + 2.8 * len(kinds), 3.4), layout="constrained")
         panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         for axes, kind in zip(panels, kinds, strict=True):
             for (name, its), color in zip(curves.items(), COLORS, strict=False):
-                _draw(axes, name, its, f"{kind}_success", color, alone=len(curves) == 1)
+                _draw(axes, name, its, means[name][kind], f"{kind}_success", color, alone=len(curves) == 1)
             if kind in planner:
                 share = planner[kind]
                 axes.axhline(share, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
@@ -133,9 +118,10 @@ def save_success_curves(
         save_picture(figure, path)
 
 
-def _draw(axes: Axes, name: str, curves: Curves, measure: str, color: str, *, alone: bool) -> Sequence[float]:
+def _draw(
+    axes: Axes, name: str, curves: Curves, rows: Evaluations, measure: str, color: str, *, alone: bool
+) -> Sequence[float]:
     """Draw the mean over seeds with its interval, or the median, and single seeds as thin lines; return the line."""
-    rows = across_seeds(curves, measure)
     low, high, median = columns_of(measure)
     steps, line = [row["steps"] for row in rows], [row[measure if alone else median] for row in rows]
     words = f"{len(curves)} seeds" if alone or len(curves) == 1 else f"median of {len(curves)} seeds"

@@ -1,0 +1,1 @@
+"""Figures, made of plain rows, lots and values (Matplotlib)."""

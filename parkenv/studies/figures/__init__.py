@@ -1,1 +1,0 @@
-"""Figures for commands and reports."""
