@@ -110,6 +110,24 @@ def import_graph(root):
     return graph
 
 
+def folder_graph(root):
+    """The folders of modules, and which of them each imports; a folder and those in it count as one room."""
+    folders = {}
+    for module, targets in import_graph(root).items():
+        here = folder_of(root, module)
+        others = {folder_of(root, target) for target in targets} - {here}
+        outside = {
+            o for o in others if not f"{o}.".startswith(f"{here}.") and not f"{here}.".startswith(f"{o}.")
+        }
+        folders.setdefault(here, set()).update(outside)
+    return folders
+
+
+def folder_of(root, module):
+    """The folder that a module stands in; a package's own `__init__` stands in the package."""
+    return module if (root / module.replace(".", "/")).is_dir() else module.rpartition(".")[0]
+
+
 def sources(package):
     return sorted((ROOT / package).rglob("*.py"))
 
@@ -180,6 +198,27 @@ def test_parkenv_holds_nothing_but_its_layers():
 
 def test_no_modules_import_each_other_in_a_circle():
     TopologicalSorter(import_graph(ROOT)).prepare()  # raises CycleError, which names the modules
+
+
+def test_no_folders_import_each_other_in_a_circle():
+    TopologicalSorter(folder_graph(ROOT)).prepare()
+
+
+def test_a_circle_of_folders_is_found_where_no_modules_are_in_one(tmp_path):
+    for folder in ("one", "two", "two/inner", "../planners", "../sim_sensors"):
+        (tmp_path / "parkenv" / folder).mkdir(parents=True, exist_ok=True)
+    for module, target in (
+        ("one/a", "two.inner.b"),
+        ("one/c", "errors"),
+        ("two/inner/b", "two.d"),
+        ("two/d", "errors"),
+    ):
+        (tmp_path / "parkenv" / f"{module}.py").write_text(f"import parkenv.{target}\n")
+    TopologicalSorter(folder_graph(tmp_path)).prepare()
+    (tmp_path / "parkenv" / "two" / "inner" / "e.py").write_text("from parkenv.one import c\n")
+    TopologicalSorter(import_graph(tmp_path)).prepare()
+    with pytest.raises(CycleError):
+        TopologicalSorter(folder_graph(tmp_path)).prepare()
 
 
 def test_a_circle_is_found_within_functions_and_not_for_type_checking(tmp_path):

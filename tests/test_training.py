@@ -524,7 +524,7 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
     ):
         means = {"ppo": across_seeds(some)}
         save_learning_curves({"ppo": some}, means, planners, "a title", tmp_path / name)
-        assert shows_color(tmp_path / name, COLORS[0]) == (name == "curve.png"), "a line needs two points"
+        assert shows_color(tmp_path / name, COLORS[0])
 
 
 # One on-policy algorithm, one with a replay buffer, and one on scans.

@@ -53,8 +53,8 @@ def publish(
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
     from parkenv.scenarios.build import build
-    from parkenv.studies.fleet.publication import FleetPublication
-    from parkenv.studies.publication import CARD, FILM, MODEL, Publication
+    from parkenv.studies.publish.fleet import FleetPublication
+    from parkenv.studies.publish.publication import CARD, FILM, MODEL, Publication
     from parkenv.studies.results import make_folder, write_summary
     from parkenv.studies.training.spec import FleetTrainingSpec
     from parkenv.studies.training.training_task import FIGURE, TEST_SEED

@@ -16,7 +16,7 @@ from parkenv.show.figures.picture_files import save_film
 from parkenv.show.fleet_rendering import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.experiment import FleetExperiment, summarize_days
-from parkenv.studies.publication import MODEL, Publication, Row
+from parkenv.studies.publish.publication import MODEL, Publication, Row
 from parkenv.studies.spec import FleetSpec
 from parkenv.studies.training.spec import FleetTrainingSpec
 from parkenv.studies.workers import Workers

@@ -1,0 +1,1 @@
+"""Publishing trained models: their results beside planners, a film, and a model card."""
