@@ -1,5 +1,6 @@
 """Help pages, hints, completion and the start of the command line; what commands do is tested elsewhere."""
 
+import ast
 import inspect
 import os
 import re
@@ -78,7 +79,6 @@ def test_an_option_means_the_same_everywhere():
 @pytest.mark.parametrize(
     ("function", "kind"),
     [
-        (compare.compare, specs.ExperimentSpec),
         (survey.survey, specs.SurveySpec),
         (demo.demo, specs.DemoSpec),
         (train.train, TrainingSpec),
@@ -114,7 +114,12 @@ def test_names_are_those_of_the_modules_behind_them():
             ("compare", "--agent", "mdp"),
             "no option --agent; did you mean '--agents'? see parkenv compare --help",
         ),
-        (("compare", "-n", "0"), "--episodes: want N >= 1; see parkenv compare --help"),
+        (("compare", "-n", "0"), "--episodes is 0, want a number of at least 1"),
+        (("compare", "-n", "many"), "--episodes is 'many', want a whole number"),
+        (("compare", "--occupancy-levels", "0.5,2"), "--occupancy-levels is 2.0, want a number below 1"),
+        (("compare", "--lot", "mini", "--scenario", "mini"), "--scenario and --lot exclude each other"),
+        (("compare", "--day-error", "x"), "--day-error is 'x', want a number"),
+        (("park", "-n", "0"), "--episodes: want 1 <= N <= 1000000; see parkenv park --help"),
         (("compare", "--agents", "gredy-goal"), "unknown agent 'gredy-goal'; did you mean 'greedy-goal'?"),
         (("compare", "--agents", "mdp(failre_s=1)"), "no option 'failre_s'; did you mean 'failure_s'?"),
         (
@@ -159,6 +164,8 @@ def fresh(*words, **environment):
     [
         ("parkenv compare --scenario ca", ["campus"]),
         ("parkenv compare --agents mdp,be", ["mdp,belief", "mdp,belief-rivals"]),
+        ("parkenv compare --figu", ["--figures"]),
+        ("parkenv compare --rig st", ["stereo"]),
         ("parkenv benchmark run v1 --agents be", ["belief", "belief-rivals"]),
         ("parkenv plan --sensor-model las", ["laser"]),
         ("parkenv survey --weather r", ["rain"]),
@@ -169,7 +176,10 @@ def fresh(*words, **environment):
 )
 def test_values_are_completed_without_loading_anything_large(line, wanted):
     variables = {"_PARKENV_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
-    assert fresh(**variables) == (wanted, "[]")
+    found, loaded = fresh(**variables)
+    assert found == wanted
+    # The options of a specification are its fields.
+    assert set(ast.literal_eval(loaded)) <= {"pydantic", "numba", "scipy", "shapely"}
 
 
 def test_version_and_help_load_nothing_large():

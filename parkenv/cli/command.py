@@ -15,18 +15,18 @@ import inspect
 import re
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import fields, is_dataclass
 from functools import wraps
 from inspect import Parameter
 from pathlib import Path
-from typing import Annotated, Any, NamedTuple, get_type_hints
+from typing import Annotated, Any, NamedTuple, TypeVar, get_type_hints
 
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup, TyperOption
 
 from parkenv.cli import arguments as args
-from parkenv.cli.completion import COMPLETERS, NAMES
+from parkenv.cli.completion import COMPLETERS, NAMES, completer
 from parkenv.errors import InputError, nearest
 
 if sys.flags.optimize > 1:
@@ -34,6 +34,7 @@ if sys.flags.optimize > 1:
         "parkenv: error: its help is made from docstrings; run it without PYTHONOPTIMIZE=2 and -OO\n"
     )
     sys.exit(2)
+F = TypeVar("F", bound=Callable[..., None])
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
 _HEADING = re.compile(r"^([A-Z][\w ,]*):$", re.MULTILINE)
 _ENTRY = re.compile(r"(\w+)((?:, -\w)?)(?: \(([^)]*)\))?: (.*)")
@@ -121,6 +122,34 @@ class _Page:
 class Command(_Page, TyperCommand):
     """A command."""
 
+    source: str | None = None
+    """Class of the specification whose fields are options, `MODULE:CLASS`; imported when they are needed."""
+    without: tuple[str, ...] = ()
+    """Options of the specification that the command does not have."""
+    names: Mapping[str, str] | None = None
+    """The options from fields by parameter."""
+    _own: list[Any]
+
+    @property
+    def params(self) -> list[Any]:
+        """The parameters: options of the specification, and the function's own."""
+        if self.source is not None and self.names is None:
+            self.names, options = _of_fields(self.source, self.without)
+            own = [param for param in self._own if param.name not in self.names]
+            self._own = sorted((*options, *own), key=_panel)
+        return self._own
+
+    @params.setter
+    def params(self, params: list[Any]) -> None:
+        self._own = params
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; options from fields that are given become one mapping."""
+        if self.names is not None:
+            values = {option: ctx.params.pop(name) for name, option in self.names.items()}
+            ctx.meta["given"] = {option: value for option, value in values.items() if value is not None}
+        return super().invoke(ctx)
+
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; an unknown option is answered by the nearest known one."""
         try:
@@ -165,6 +194,60 @@ def group(name: str, text: str) -> typer.Typer:
     return typer.Typer(name=name, help=text, cls=Group, rich_markup_mode=None, context_settings=CONTEXT)
 
 
+PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Code of others", "Machines")
+"""Headings on help pages, in their order; others stand before World."""
+
+
+def _panel(param: Any) -> tuple[float, bool]:
+    panel = getattr(param, "rich_help_panel", None) or "Options"
+    return (PANELS.index(panel) if panel in PANELS else 1.5), param.name in ("out", "help")
+
+
+def options_of(source: str, *without: str) -> Callable[[F], F]:
+    """Give a command the options of a specification; its parameter `given` has what was given, by option.
+
+    Args:
+        source: class of the specification, `MODULE:CLASS`.
+        without: options that the command does not have.
+    """
+
+    def mark(function: F) -> F:
+        function.options = {"source": source, "without": without}  # type: ignore[attr-defined]
+        return function
+
+    return mark
+
+
+def _of_fields(source: str, without: Collection[str]) -> tuple[dict[str, str], list[Any]]:
+    """Return options of a specification's fields by parameter, and Typer's parameters."""
+    from parkenv.cli.spec_options import field_options, spec_class
+
+    names, parameters = {}, []
+    for option in field_options(spec_class(source)):
+        name = option.name[2:].replace("-", "_")
+        if option.name in without or name in names:
+            continue
+        names[name] = option.name
+        switch = f"{option.name}/--no-{option.name[2:]}" if option.is_switch else option.name
+        info = typer.Option(
+            switch,
+            *filter(None, [option.option.short]),
+            help=option.help,
+            metavar=option.takes,
+            autocompletion=completer(option.choices) if option.choices else COMPLETERS.get(name),
+            rich_help_panel=None if option.option.panel == "Options" else option.option.panel,
+        )
+        kind: Any = Annotated[(bool if option.is_switch else str) | None, info]
+        parameters.append(Parameter(name, Parameter.KEYWORD_ONLY, default=None, annotation=kind))
+
+    def command(**_: Any) -> None: ...
+
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    app = typer.Typer(add_completion=False)
+    app.command()(command)
+    return names, [param for param in typer.main.get_command(app).params if param.name in names]
+
+
 def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str | None = None) -> None:
     """Add a command to a group, under a heading of the group's help page.
 
@@ -176,7 +259,11 @@ def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str
     annotations: dict[str, Any] = {name: p.annotation for name, p in signature.parameters.items()}
     groups: dict[str, Any] = {name: kind for name, kind in annotations.items() if is_dataclass(kind)}
     parameters: list[Parameter] = []
+    options: dict[str, Any] = getattr(function, "options", {})
     for parameter in signature.parameters.values():
+        if options and parameter.name == "given":
+            parameters.append(Parameter("given", Parameter.KEYWORD_ONLY, annotation=typer.Context))
+            continue
         kind = groups.get(parameter.name)
         if kind is None:
             entry = own.get(parameter.name) or SHARED[parameter.name]
@@ -195,13 +282,16 @@ def add(app: typer.Typer, name: str, function: Callable[..., None], heading: str
     def run(**given: Any) -> None:
         for name, kind in groups.items():
             given[name] = kind(**{f.name: given.pop(f.name) for f in fields(kind)})
+        if options:
+            given["given"] = given["given"].meta["given"]
         arguments = [given.pop(name) for name in first]
         function(*arguments, **given)
 
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {}
     page = f"{text}\n\nExamples:\n{textwrap.indent(examples, '  ')}"
-    app.command(name, cls=Command, help=page, rich_help_panel=heading, context_settings=CONTEXT)(run)
+    cls = type(name, (Command,), options)
+    app.command(name, cls=cls, help=page, rich_help_panel=heading, context_settings=CONTEXT)(run)
 
 
 def _option(parameter: Parameter, entry: Entry) -> Parameter:

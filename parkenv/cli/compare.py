@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.command import options_of
 from parkenv.cli.folder_run import run_into
 from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
@@ -16,9 +17,7 @@ from parkenv.cli.tables import (
     make_table,
     print_recorded,
 )
-from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
-from parkenv.files.known_names import RigName
 from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
@@ -35,27 +34,17 @@ MOST_TABLES = 12
 """Maximum number of settings to print; see the figures and files for larger grids."""
 
 
+@options_of("parkenv.studies.spec:ExperimentSpec", "--cars", "--pedestrians")
 def compare(
-    agents: str | None = None,
-    scenario: str | None = None,
-    episodes: int | None = None,
-    seed: int | None = None,
+    given: dict[str, Any],
+    /,
     out: Path = Path("results/compare"),
     *,
-    costs: args.Costs,
-    calibrated: Path | None = None,
-    world: args.ObservedSearches,
     largest: int | None = None,
-    occupancy_levels: str | None = None,
-    map_says: str | None = None,
-    rig: RigName | None = None,
-    detector: str | None = None,
-    figures: bool | None = None,
     rerun: Path | None = None,
     trust: bool = False,
     trust_model: bool = False,
     folder: args.ReportedRun,
-    machines: args.Machines,
 ) -> None:
     """Compare agents over failure costs and speeds, all in the same worlds.
 
@@ -72,56 +61,22 @@ def compare(
         parkenv compare --resume --episodes 1000
 
     Options:
-        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
-            campus]
-        episodes, -n (N >= 1): Episodes of each agent in each setting.  [default: 200]
-        seed (N >= 0): First seed; episode i uses seed + i.  [default: 0]
         out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json and the figures.
-
-    Costs and speeds:
-        calibrated (FILE): Also compare at the failure cost and driving speed in a calibrated.json of `parkenv
-            calibrate`, in the same worlds.
 
     World:
         largest (N >= 1): Of the scenarios, only those with the N largest lots.  [default: all]
-        occupancy_levels (P[,...]|none): Also set the lot's mean occupancy to these values, with a third of the episodes
-            each, for the figure of time against occupancy. Searches in a recorded log are binned instead.  [default:
-            0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep]
-        map_says (P[,...]): Also with wrong maps that give every slot this probability of being taken; draws total time
-            against it.
-
-    Results:
-        figures: Draw figures.  [default: figures]
     """
+    from parkenv.cli.spec_options import given_spec
     from parkenv.scenarios.build import largest_lots
-    from parkenv.studies.agent_spec import split_agents
     from parkenv.studies.spec import FAILURE_COST_SWEEP, ExperimentSpec
 
-    sweep = costs.failure_cost == "sweep"
-    if folder.resume:
-        base = args.saved(out, ExperimentSpec)
-        named = args.not_none(agents=agents, detector=detector)
-        require_trust(base, out, trust, given=named | machines.given)
-    else:
-        base = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
-    grid = costs.grid(base.grid)
-    if sweep:
-        grid = grid.changed(blind=True)
-    elif costs.failure_cost is not None and base.grid.failure_s == FAILURE_COST_SWEEP:
-        grid = grid.changed(blind=False)
-    if occupancy_levels == "none":
-        grid, occupancy_levels = grid.changed(occupancy_levels=()), None
-    if calibrated is not None:
-        grid = grid.changed("--calibrated", calibrated=calibrated)
-    grid = args.changed_axis(grid, "occupancy_levels", "--occupancy-levels", occupancy_levels)
-    grid = args.changed_axis(grid, "map_says", "--map-says", map_says)
-    given = args.not_none(episodes=episodes, seed=seed, rig=rig, detector=detector, figures=figures)
-    if agents is not None:
-        given["agents"] = readable_models(split_agents(agents), trust_model)
-    scenarios = tuple(world.specs(scenario, base.scenarios))
+    sweep = given.get("--failure-cost") == "sweep"
+    first = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
+    base, spec = given_spec(first, given, out, folder.resume, trust, trust_model)
+    if sweep or base.grid.failure_s == FAILURE_COST_SWEEP != spec.grid.failure_s:
+        spec = spec.changed(grid=spec.grid.changed(blind=sweep))
     if largest is not None:
-        scenarios = tuple(largest_lots(scenarios, largest))
-    spec = base.changed(scenarios=scenarios, grid=grid, **given, **machines.given)
+        spec = spec.changed(scenarios=tuple(largest_lots(spec.scenarios, largest)))
     with writing_into(out, f"--resume --out {out}"):
         run_comparison(spec, out, folder, rerun)
 

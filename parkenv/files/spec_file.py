@@ -140,12 +140,14 @@ class Spec(BaseModel):
         return self
 
     @classmethod
-    def parse(cls, tables: Mapping[str, Any], source: str, folder: str | Path = ".") -> Self:
-        """Validate the content of a file or an option.
+    def parse(
+        cls, tables: Mapping[str, Any], source: str | Mapping[str, str], folder: str | Path = "."
+    ) -> Self:
+        """Validate the content of a file or of options.
 
         Args:
             tables: nested mappings and lists.
-            source: name of the source for messages, such as the file.
+            source: name of the source for messages, such as the file; or the options that set fields, by field.
             folder: folder that relative paths start from.
 
         Raises:
@@ -156,11 +158,11 @@ class Spec(BaseModel):
         except ValidationError as error:
             raise InputError(_message(cls, error, source)) from error
 
-    def changed(self, source: str = "", /, **changes: Any) -> Self:
+    def changed(self, source: str | Mapping[str, str] = "", /, **changes: Any) -> Self:
         """Return a copy with some fields changed, validated again.
 
         Args:
-            source: name of the source for messages.
+            source: name of the source for messages; or the options that set fields, by field.
             changes: plain values or specs, by field name.
 
         Raises:
@@ -203,13 +205,15 @@ def read_tables(path: Path) -> dict[str, Any]:
     return tables
 
 
-def _message(model: type[BaseModel], error: ValidationError, source: str) -> str:
+def _message(model: type[BaseModel], error: ValidationError, source: str | Mapping[str, str]) -> str:
     details = error.errors(include_url=False)
     # Invalid items also make a list too short; drop that error.
     details = [d for d in details if d["type"] != "too_short"] or details
     # Report a misspelt key first: it explains a missing one.
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
+    if not isinstance(source, str):
+        source = source.get(str(first["loc"][0]) if first["loc"] else "", ", ".join(source.values()))
     if source.startswith("--"):
         # The source is an option, which names the field itself.
         return _fault(model, first, source)
@@ -244,12 +248,13 @@ def _keys_at(model: type[BaseModel], location: tuple[int | str, ...]) -> Iterato
     at: type[BaseModel] = model
     for part in location:
         if isinstance(part, str) and part in at.model_fields:
-            at = next(_models_in(at.model_fields[part].annotation), at)
+            at = next(models_in(at.model_fields[part].annotation), at)
     yield from at.model_fields
 
 
-def _models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    """Yield the classes of tables in the type of a field."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for part in get_args(annotation):
-        yield from _models_in(part)
+        yield from models_in(part)

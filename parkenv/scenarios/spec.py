@@ -27,6 +27,7 @@ from parkenv.files.known_names import (
     SensorModelName,
 )
 from parkenv.files.limited_reading import is_there
+from parkenv.files.option import Option, numbers_in
 from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
 from parkenv.world.occupancy import real_week
 from parkenv.world.occupancy.day_error import MAX_LOGITS
@@ -178,6 +179,10 @@ def _day_error_tables(value: object) -> object:
     return {"level": value} if isinstance(value, int | float) and not isinstance(value, bool) else value
 
 
+def _day_error_text(text: str) -> object:
+    return dict(zip(("level", "slope"), numbers_in(text, min(text.count(",") + 1, 2)), strict=False))
+
+
 Deviation = Annotated[float, Field(ge=0.0, le=MAX_LOGITS)]
 
 
@@ -203,7 +208,15 @@ class CountsSpec(Spec):
     file: FilePath = Field(
         description="Counts: car_park,capacity,hour,free (or hour_utc) as .csv or .csv.gz."
     )
-    car_park: str = Field(description="Name of the car park in the file.")
+    car_park: Annotated[
+        str,
+        Option(
+            takes="NAME[,NAME...]|all",
+            panel="World",
+            description="--occupancy is a file of hourly counts, car_park,capacity,hour,free; replay the days of these "
+            "car parks on the lot, each as a scenario of its own. all: those that show some use.",
+        ),
+    ] = Field(description="Name of the car park in the file.")
     timezone: str = Field("Europe/Berlin", description="Of the hours in `hour_utc`.")
     pull: float = Field(
         1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
@@ -227,22 +240,34 @@ class OccupancySpec(Spec):
         )
     )
     counts: CountsSpec | None = None
-    replay_from: Date | None = Field(
-        None, description="First day of the log or the counts that is replayed; all of a log if absent."
-    )
-    forecast_from: ForecastFrom | None = Field(
+    replay_from: Annotated[
+        Date | None, Option(takes="DATE", panel="World", default="the scenario's, all")
+    ] = Field(None, description="First day of the log or the counts that is replayed.")
+    forecast_from: Annotated[
+        ForecastFrom | None,
+        Option(panel="World", default="the scenario's; others, with counts rolling"),
+    ] = Field(
         None,
-        description="Days that the forecast is made from: others, all that a world does not replay (the default, only "
-        "for logs); rolling, those before the earliest that it replays (the default for counts); past, those before "
-        "replay_from.",
+        description="Days that the forecast is made from. past: those before the first replayed day; rolling: those "
+        "before the earliest that a world replays; others: all that it does not replay.",
     )
-    mapping: FilePath | None = Field(
-        None, description="CSV slot_id,log_slot_id: which slot of the log is which."
-    )
+    mapping: Annotated[
+        FilePath | None,
+        Option(panel="World", default="the log's fullest slots are nearest to the goal"),
+    ] = Field(None, description="CSV slot_id,log_slot_id that assigns the log's slots to the lot's.")
     event: Event | None = None
-    day_error: Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None = Field(
+    day_error: Annotated[
+        Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None,
+        Option(
+            takes="X[,Y]",
+            panel="World",
+            parse=_day_error_text,
+            default="the scenario's, 0.8 in the packaged ones, 0.7 for a lot alone",
+        ),
+    ] = Field(
         None,
-        description="Worlds whose days differ from the forecast; if absent, the process's own, 0 for a typical week.",
+        description="How far whole days differ from the forecast: standard deviations, logits, of their level and of "
+        "their slope to the goal; 0 for days that are as forecast.",
     )
 
     @model_validator(mode="after")
@@ -317,8 +342,14 @@ def _days(value: object) -> object:
 class Arrivals(Spec):
     """When searches begin."""
 
-    days: Annotated[str, BeforeValidator(_days)] = "weekdays"
-    hours: Hours = "08:00-13:00"
+    days: Annotated[
+        str,
+        BeforeValidator(_days),
+        Option(takes="DAYS", panel="World", default="the scenario's, weekdays"),
+    ] = Field("weekdays", description="weekdays, weekend, all, or names such as mon,tue.")
+    hours: Annotated[
+        Hours, Option(takes="HH:MM-HH:MM", panel="World", default="the scenario's, 08:00-13:00")
+    ] = Field("08:00-13:00", description="Searches begin between these hours.")
 
     def window(self) -> ArrivalWindow:
         """The arrival window."""
@@ -361,7 +392,9 @@ class SensorModelSpec(Spec):
     file: FilePath | None = Field(None, description="A sensor model that `parkenv fit-sensor-model` wrote.")
     hit_rate: Probability | None = Field(None, description="P(observed taken | taken).")
     false_alarm_rate: Probability | None = Field(None, description="P(observed taken | free).")
-    view_range: float | None = Field(None, ge=0.0, le=10_000.0, description="How far slots are observed, m.")
+    view_range: Annotated[float | None, Option(takes="M", panel="Sensors", default="the sensor model's")] = (
+        Field(None, ge=0.0, le=10_000.0, description="How far slots are observed from the car, m.")
+    )
 
     @model_validator(mode="after")
     def _one(self) -> Self:
@@ -376,8 +409,12 @@ class SensorModelSpec(Spec):
 class TrafficSpec(Spec):
     """Other road users."""
 
-    cars: Count = 0
-    pedestrians: Count = 0
+    cars: Annotated[Count, Option(panel="World", default="the scenario's")] = Field(
+        0, description="Other cars that drive about."
+    )
+    pedestrians: Annotated[Count, Option(panel="World", default="the scenario's")] = Field(
+        0, description="Pedestrians."
+    )
 
 
 def _goal(value: object) -> object:
@@ -388,6 +425,10 @@ def _goal(value: object) -> object:
         if all(isinstance(v, int | float) and not isinstance(v, bool) and abs(v) <= 1e7 for v in (x, y)):
             return float(x), float(y)
     raise ValueError("the index of one of the lot's goals, or a point [x, y] in m")
+
+
+def _goal_text(text: str) -> object:
+    return int(text) if text.isdecimal() else numbers_in(text, 2)
 
 
 def _name(value: str) -> str:
@@ -401,17 +442,35 @@ class ScenarioSpec(Spec):
 
     name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
     lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
-    goal: Annotated[int | tuple[float, float], BeforeValidator(_goal)] = Field(
-        0, description="Index of one of the lot's goals, or a point [x, y] in m."
-    )
+    goal: Annotated[
+        int | tuple[float, float],
+        BeforeValidator(_goal),
+        Option(takes="X,Y", panel="World", parse=_goal_text, default="the scenario's"),
+    ] = Field(0, description="Walk to this point, m, or to the lot's goal of this index.")
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
-    occupancy: Annotated[OccupancySpec, BeforeValidator(_occupancy_tables), OrText()] = OccupancySpec()
+    occupancy: Annotated[
+        OccupancySpec,
+        BeforeValidator(_occupancy_tables),
+        OrText(),
+        Option(takes="FILE[,FILE...]", panel="World", default="the scenario's", sets={"forecast": "own"}),
+    ] = Field(
+        OccupancySpec(),
+        description="Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, replayed day by day, "
+        "or a process that `parkenv occupancy fit` wrote (.json).",
+    )
     forecast: Annotated[ForecastSpec, BeforeValidator(_forecast_tables), OrText()] = ForecastSpec()
     arrivals: Arrivals = Arrivals()
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
-    sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = SensorModelSpec(
-        name="perfect"
+    sensor_model: Annotated[
+        SensorModelSpec,
+        BeforeValidator(_sensor_tables),
+        OrText(),
+        Option(takes="NAME|FILE", panel="Sensors", default="the scenario's; with --rig, the rig's"),
+    ] = Field(
+        SensorModelSpec(name="perfect"),
+        description="How slots are observed. perfect: without error; blind: by attempts alone; laser, stereo: as "
+        "measured with that rig; a file of `parkenv fit-sensor-model`.",
     )
     rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
     detector: PackagedDetector = Field(

@@ -8,6 +8,7 @@ from typing import Annotated, Literal, Self, TypeVar
 from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, model_validator
 from pydantic_core import PydanticCustomError
 
+from parkenv.errors import InputError
 from parkenv.files.known_names import (
     KNOWLEDGE,
     SCENARIO_NAMES,
@@ -19,6 +20,7 @@ from parkenv.files.known_names import (
     WeatherName,
 )
 from parkenv.files.limited_reading import is_there
+from parkenv.files.option import Option, numbers_in, words_in
 from parkenv.files.spec_file import Axis, DetectorName, FilePath, OrText, Several, Spec
 from parkenv.scenarios.spec import (
     Cost,
@@ -27,10 +29,12 @@ from parkenv.scenarios.spec import (
     ScenarioSpec,
     Speed,
     TrafficSpec,
+    lot_scenario,
     scenario_spec,
     scenario_specs,
 )
-from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.studies.agent_spec import AgentItem, AgentSpec, split_agents
+from planners.names import AGENTS
 
 MAX_EPISODES = 10_000_000
 """Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
@@ -72,10 +76,60 @@ def _with_folders(value: object, info: ValidationInfo) -> object:
     return listed
 
 
+def _one_word(text: str) -> str:
+    words = words_in(text)
+    if len(words) > 1:
+        raise InputError(f"names {len(words)} scenarios, want one")
+    return words[0]
+
+
+def _lots(text: str) -> list[ScenarioSpec]:
+    return [lot_scenario(word, "--lot") for word in words_in(text)]
+
+
+_LOT_ALONE = (
+    "Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON, or a Dragon Lake "
+    "map (.yml)."
+)
+_NAMES = ", ".join(SCENARIO_NAMES)
 Scenarios = Annotated[
-    Several[ScenarioItem], BeforeValidator(_with_folders), Field(min_length=1, max_length=1_000)
+    Several[ScenarioItem],
+    BeforeValidator(_with_folders),
+    Field(
+        min_length=1,
+        max_length=1_000,
+        description=f"{_NAMES}; scenario files (.toml), lots (.geojson), or folders.",
+    ),
+    Option("--scenario", takes="NAME|FILE|DIR[,...]", parse=words_in),
+    Option("--lot", takes="NAME|FILE[,...]", panel="World", parse=_lots, description=_LOT_ALONE),
 ]
 """Scenarios in a file: names, files, folders of scenario and lot files, or inline tables."""
+OneScenario = Annotated[
+    ScenarioItem,
+    Field(description=f"{_NAMES}, a scenario file (.toml), or a lot (.geojson)."),
+    Option("--scenario", takes="NAME|FILE", parse=_one_word),
+    Option(
+        "--lot",
+        takes="NAME|FILE",
+        panel="World",
+        parse=lambda text: _lots(_one_word(text))[0],
+        description=_LOT_ALONE,
+    ),
+]
+"""The one scenario of a file."""
+_AGENTS = (
+    f"Agents, with any options in brackets, mdp(failure_s=90): {', '.join(AGENTS)}; ALGORITHM:FILE for a trained "
+    "model; MODULE:CLASS for your own."
+)
+Agents = Annotated[
+    Several[AgentItem],
+    Field(min_length=1, max_length=1_000, description=_AGENTS),
+    Option(takes="NAME[,...]", parse=split_agents),
+]
+"""Agents in a file: names, or tables with a name and options."""
+Seed = Annotated[
+    int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option(takes="N >= 0")
+]
 
 
 def _listed(value: object) -> object:
@@ -86,39 +140,103 @@ Level = Annotated[float, Field(gt=0.0, lt=1.0)]
 Values = Annotated[Axis[T], BeforeValidator(_listed)]  # an axis of the grid; a single value needs no list
 
 
+def _failure_costs(text: str) -> object:
+    return FAILURE_COST_SWEEP if text == "sweep" else numbers_in(text)
+
+
+_COSTS = "Costs and speeds"
+
+
 class Grid(Spec):
     """Settings to vary; every combination is run. Scenarios keep their own values for missing axes."""
 
-    failure_s: Values[Cost] | None = Field(
+    failure_s: Annotated[
+        Values[Cost] | None,
+        Option(
+            "--failure-cost",
+            takes="S[,S...]|sweep",
+            default="the scenario's, 10",
+            panel=_COSTS,
+            parse=_failure_costs,
+        ),
+    ] = Field(
         None,
-        description="Cost of a failed attempt, s: what the world charges, and what planners assume of it.",
+        description="Seconds that the world charges for a failed attempt, and that planners expect unless their own "
+        "options say otherwise. sweep: 0 to 120 s.",
     )
-    v_walk_kmh: Values[Speed] | None = None
-    v_drive_kmh: Values[Speed] | None = None
-    occupancy_levels: Annotated[tuple[Level, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = Field(
+    v_walk_kmh: Annotated[
+        Values[Speed] | None, Option(takes="V[,V...]", default="the scenario's, 4", panel=_COSTS)
+    ] = Field(None, description="Walking speed, km/h.")
+    v_drive_kmh: Annotated[
+        Values[Speed] | None, Option(takes="V[,V...]", default="the scenario's, 10", panel=_COSTS)
+    ] = Field(None, description="Driving speed, km/h.")
+    occupancy_levels: Annotated[
+        tuple[Level, ...],
+        AfterValidator(lambda v: tuple(sorted(set(v)))),
+        Option(
+            takes="P[,...]|none",
+            default="0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep",
+            panel="World",
+        ),
+    ] = Field(
         (),
         strict=False,
         max_length=100,
-        description="Also set the mean occupancy to these, a third as many episodes.",
+        description="Also set the lot's mean occupancy to these values, with a third of the episodes each, for the "
+        "figure of time against occupancy. Searches in a recorded log are binned instead.",
     )
-    map_says: Annotated[tuple[Probability, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = Field(
-        (), strict=False, max_length=100, description="Also with wrong maps: this probability for every slot."
+    map_says: Annotated[
+        tuple[Probability, ...],
+        AfterValidator(lambda v: tuple(sorted(set(v)))),
+        Option(takes="P[,...]", panel="World", default="none"),
+    ] = Field(
+        (),
+        strict=False,
+        max_length=100,
+        description="Also with wrong maps that give every slot this probability of being taken; draws total time "
+        "against it.",
     )
     blind: bool = Field(
         False,
         description="Also without observations of slots before an attempt, for agents that can do without.",
     )
-    calibrated: FilePath | None = Field(
-        None, description="Also at the failure cost and speed in a calibrated.json of `parkenv calibrate`."
+    calibrated: Annotated[FilePath | None, Option(panel=_COSTS)] = Field(
+        None,
+        description="Also compare at the failure cost and driving speed in a calibrated.json of `parkenv calibrate`, "
+        "in the same worlds.",
     )
+
+
+_MACHINES = "Machines"
 
 
 class Workplace(Spec):
     """Where tasks run; the results do not depend on it."""
 
-    jobs: int = Field(0, ge=0, le=10_000, description="Worker processes; 0 for all cores.")
-    backend: BackendName = "loky"
-    address: str | None = Field(None, description="Of a Ray or Dask cluster.")
+    jobs: Annotated[int, Option(short="-j", takes="N >= 0", panel=_MACHINES, default="0, all cores")] = Field(
+        0, ge=0, le=10_000, description="Worker processes, at most one per core and per task."
+    )
+    backend: Annotated[BackendName, Option(panel=_MACHINES)] = Field(
+        "loky",
+        description="Run workers on this machine (loky), or on a Ray or Dask cluster (extras ray, dask).",
+    )
+    address: Annotated[
+        str | None, Option(takes="HOST:PORT", panel=_MACHINES, default="a cluster on this machine")
+    ] = Field(
+        None,
+        description="Of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, tcp://HOST:8786.",
+    )
+
+
+Detector = Annotated[
+    DetectorName | None,
+    Field(
+        description="hog: the packaged HOG models; side or front: one of them; net: the packaged network; a file of "
+        "`parkenv train-detector` (.npz) or a network (.onnx); MODULE:CLASS: your own."
+    ),
+    Option(takes="NAME|FILE|MODULE:CLASS", panel="Sensors", default="the scenario's, hog"),
+]
+Figures = Annotated[bool, Field(description="Draw figures."), Option(panel="Results")]
 
 
 def _require_distinct(agents: tuple[AgentSpec, ...], scenarios: tuple[ScenarioSpec, ...]) -> None:
@@ -135,19 +253,26 @@ class ExperimentSpec(Workplace):
     """An experiment file: all agents search in the same worlds, in every scenario and setting."""
 
     kind: Literal["compare"] = "compare"
-    agents: Several[AgentItem] = Field(
-        tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS), min_length=1, max_length=1_000,
-        description="Differences are to the first.",
-    )  # fmt: skip
+    agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents, default="all but exact")] = (
+        Field(
+            tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS),
+            description=f"{_AGENTS} Differences are to the first.",
+        )
+    )
     scenarios: Scenarios = (scenario_spec("campus"),)
     grid: Grid = Grid()
-    episodes: int = Field(200, ge=1, le=MAX_EPISODES, description="Searches of each agent in each setting.")
-    seed: int = Field(0, ge=0, lt=2**31, description="Episode i has the seed `seed` + i.")
-    rig: RigName | None = Field(None, description="Observe slots through this rig's simulated sensors.")
-    detector: DetectorName | None = Field(
-        None, description="hog, side, front, a file (.npz, .onnx) or MODULE:CLASS; the scenario's if absent."
+    episodes: Annotated[int, Option(short="-n", takes="N >= 1")] = Field(
+        200, ge=1, le=MAX_EPISODES, description="Episodes of each agent in each setting."
     )
-    figures: bool = True
+    seed: Seed = 0
+    rig: Annotated[RigName | None, Option(panel="Sensors")] = Field(
+        None,
+        description="Observe slots through simulated sensors, detector and all, instead of the sensor model: about a "
+        "second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and a camera to "
+        "each side.",
+    )
+    detector: Detector = None
+    figures: Figures = True
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:

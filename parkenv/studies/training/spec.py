@@ -43,7 +43,9 @@ class TrainingSpec(Workplace):
     agents: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
 
     @classmethod
-    def parse(cls, tables: Mapping[str, Any], source: str, folder: str | Path = ".") -> Self:
+    def parse(
+        cls, tables: Mapping[str, Any], source: str | Mapping[str, str], folder: str | Path = "."
+    ) -> Self:
         """See `Spec.parse`."""
         if cls is not TrainingSpec:
             return super().parse(tables, source, folder)

@@ -1,0 +1,72 @@
+"""Command-line options of the fields of specifications."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from parkenv.errors import InputError
+
+
+@dataclass(frozen=True)
+class Option:
+    """Make a field of a specification an option of the commands that run it: an annotation of the field.
+
+    Type, bounds, default and description are the field's own. A field with several such annotations has several
+    options, which exclude each other.
+
+    Args:
+        name: The option, such as `--episodes`.  [default: the field's name with dashes]
+        short: Its short form, such as `-n`.
+        takes: What it takes, such as `X,Y`.  [default: made from the field's type and bounds]
+        default: Text on the default.  [default: the field's default; none where that is None]
+        panel: Heading that it stands under in help pages.
+        parse: Convert text to the field's value.  [default: split lists at commas, and convert numbers]
+        sets: Other fields of the same table that the option sets.
+        description: Instead of the field's.
+    """
+
+    name: str = ""
+    short: str = ""
+    takes: str = ""
+    default: str = ""
+    panel: str = "Options"
+    parse: Callable[[str], Any] | None = None
+    sets: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    description: str = ""
+
+
+def words_in(text: str) -> list[str]:
+    """Split text at commas.
+
+    Raises:
+        InputError: there is no word.
+    """
+    words = [word.strip() for word in text.split(",") if word.strip()]
+    if not words:
+        raise InputError(f"is {text!r}, want values separated by commas")
+    return words
+
+
+def numbers_in(text: str, count: int | None = None) -> list[float]:
+    """Convert comma-separated numbers.
+
+    Args:
+        text: the numbers.
+        count: how many are wanted, all of them finite; None for any.
+
+    Raises:
+        InputError: the text is something else.
+    """
+    try:
+        numbers = [float(word) for word in text.split(",")]
+    except ValueError:
+        numbers = []
+    if not numbers or (count is not None and (len(numbers) != count or not all(map(math.isfinite, numbers)))):
+        wanted = (
+            "a number" if count == 1 else f"{count or ''} numbers separated by commas, e.g. 10,90".strip()
+        )
+        raise InputError(f"is {text!r}, want {wanted}")
+    return numbers
