@@ -7,14 +7,17 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
-from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
-from parkenv.lots.importers.slot_layout import infer_layout
-from parkenv.lots.importers.slot_rows import AmbiguousLayoutError
+from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
+from parkenv.lots.generators import KERB_SIZE, Slots
+from parkenv.lots.infer.centers import CenterRow, describe_rows, spaces_from_centers
+from parkenv.lots.infer.draft import draft_inferred_lot
+from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.rows import NO_SLOTS
+from parkenv.world.lot import Mouth
 
 COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")
 SAME_PLACE = 0.1  # distance, m, within which two slot centres are one slot listed twice
@@ -29,6 +32,12 @@ class SlotList:
     yaw: FloatArray | None  # (n_slots,) rad, heading of a car parked nose-in; None without the column
     parking_cost_s: FloatArray  # (n_slots,) s, at least 0
     frame: LocalFrame | None  # geographic frame of the lot; None for a file in metres
+
+    def subset(self, index: IntArray) -> SlotList:
+        """Return some of the slots."""
+        ids = tuple(self.ids[i] for i in index.tolist())
+        yaw = None if self.yaw is None else self.yaw[index]
+        return SlotList(ids, self.xy[index], yaw, self.parking_cost_s[index], self.frame)
 
 
 def read_slot_list(path: str | Path) -> SlotList:
@@ -102,8 +111,9 @@ def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple
 def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a list of slots.
 
-    See `parkenv.lots.importers.slot_layout` for the rules. If they are ambiguous, the draft has only slot centres and
-    says so; it can still be drawn. A list has neither entries nor goals.
+    The centres become rectangles (`parkenv.lots.infer.centers`), from which lanes are inferred
+    (`parkenv.lots.infer.layout`). Where that fails, the draft has only slot centres and says why; it can still be
+    drawn. A list has neither entries nor goals; they are given or guessed.
 
     Raises:
         InputError: see `read_slot_list`.
@@ -112,27 +122,30 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
     options = options or ImportOptions()
     listed = read_slot_list(path)
     box = options.box(listed.frame)
-    xy, ids, yaw, cost = listed.xy, listed.ids, listed.yaw, listed.parking_cost_s
-    left_out: tuple[LeftOut, ...] = ()
     if box is not None:
-        inside = np.asarray(((xy >= box[:2]) & (xy <= box[2:])).all(axis=1))
+        inside = np.asarray(((listed.xy >= box[:2]) & (listed.xy <= box[2:])).all(axis=1))
         if not inside.any():
             raise InputError(f"{path}: no slot within the bounds {', '.join(f'{b:g}' for b in box)} m")
-        xy, yaw, cost = xy[inside], None if yaw is None else yaw[inside], cost[inside]
-        ids = tuple(name for name, is_in in zip(ids, inside, strict=True) if is_in)
-    how = "LAT,LON" if listed.frame else "X,Y"
-    entries, goals = (
-        points_in_frame(listed.frame, options.entries),
-        points_in_frame(listed.frame, options.goals),
-    )
-    missing = []
-    found = [f"{len(ids)} slot centres"]
-    if listed.frame is not None:
-        found.append(f"frame: metres east and north of {listed.frame.lat:.7f}, {listed.frame.lon:.7f}")
+        listed = listed.subset(np.flatnonzero(inside))
+    entries, goals = (points_in_frame(listed.frame, given) for given in (options.entries, options.goals))
+    rows: list[CenterRow] = []
     try:
-        layout = infer_layout(xy, yaw, ids)
-    except AmbiguousLayoutError as error:
-        return LotDraft(
+        spaces, index, rows = spaces_from_centers(listed.ids, listed.xy, listed.yaw)
+        lot = infer_lot(spaces, entries=entries)
+        strays = np.setdiff1d(np.arange(len(listed.ids)), index)
+        draft = draft_inferred_lot(
+            path.stem,
+            replace(lot, slots=_as_listed(lot.slots, index[lot.index], listed)),
+            spaces,
+            options,
+            source="a list of slots",
+            unit="centres",
+            left_out={"slots in no row": [listed.ids[i] for i in strays]} if len(strays) else {},
+            frame=listed.frame,
+            goals=goals,
+        )
+    except InputError as error:
+        draft = LotDraft(
             name=path.stem,
             slot_ids=(),
             slots=NO_SLOTS,
@@ -140,35 +153,21 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
             lanes=(),
             entries=entries,
             goals=goals,
-            outlines=tuple(np.stack([row[0], row[-1]]) for row in error.rows),
-            loose=xy,
-            found=(*found, *error.found),
+            outlines=tuple(listed.xy[row.members[[0, -1]]] for row in rows),
+            loose=listed.xy,
             missing=(f"no aisles: {error}",),
             frame=listed.frame,
         )
-    if layout.strays:
-        left_out = (LeftOut("slots in no row", tuple(ids[i] for i in layout.strays)),)
-    if not len(entries):
-        ends = [lane.points[i] for lane in layout.lanes for i in (0, -1)]
-        if listed.frame is not None:
-            ends = list(listed.frame.to_lonlat(ends)[:, ::-1])
-        digits = 6 if listed.frame else 1
-        shown = " or ".join(f"{a:.{digits}f},{b:.{digits}f}" for a, b in ends[:2])
-        missing.append(f"no entry: a list of slots has none; give one by --entry {how}, e.g. {shown}")
-    if not len(goals):
-        missing.append(
-            f"no goal: a list of slots has none; give the place that people walk to by --goal {how}"
-        )
-    return LotDraft(
-        name=path.stem,
-        slot_ids=tuple(ids[i] for i in layout.index),
-        slots=replace(layout.slots, parking_cost_s=cost[list(layout.index)]),
-        slot_source=("a list of slots",) * len(layout.index),
-        lanes=layout.lanes,
-        entries=entries,
-        goals=goals,
-        found=(*found, *layout.found),
-        left_out=left_out,
-        missing=tuple(missing),
-        frame=listed.frame,
-    ).searchable()
+    found = [f"{len(listed.ids)} slot centres", *([describe_rows(rows)] if rows else [])]
+    return replace(draft, found=(*found, *draft.found))
+
+
+def _as_listed(slots: Slots, index: IntArray, listed: SlotList) -> Slots:
+    """Return inferred slots with the yaw and the parking costs of the list, kerbside ones with a car's usual length."""
+    mouth = slots.mouth
+    kerbside = mouth != Mouth.REAR
+    yaw = slots.yaw if listed.yaw is None else listed.yaw[index]
+    # A kerbside slot is inferred with its lane on the left; listed with the opposite yaw, it has it on the right.
+    mouth = np.where(kerbside & (np.cos(yaw - slots.yaw) < 0.0), Mouth.RIGHT, mouth).astype(np.int8)
+    length = np.where(kerbside, np.minimum(slots.length, KERB_SIZE[0]), slots.length)
+    return replace(slots, yaw=yaw, length=length, mouth=mouth, parking_cost_s=listed.parking_cost_s[index])

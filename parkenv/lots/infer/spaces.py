@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
@@ -24,7 +24,8 @@ STRAIGHTENED = 0.2  # tolerance, m, for further corners on the sides of an outli
 class Spaces:
     """The rectangles of n parking spaces, m in the lot's frame.
 
-    `axis` points along the longer side; its sign means nothing.
+    `axis` points along the longer side; its sign means nothing. `opens` points to the open side where that is known:
+    unit vectors decide it, shorter ones are a preference, zeros say nothing.
     """
 
     ids: tuple[str, ...]
@@ -32,6 +33,7 @@ class Spaces:
     axis: FloatArray  # (n, 2) unit vectors
     length: FloatArray  # (n,) along the axis
     width: FloatArray  # (n,) across it
+    opens: FloatArray | None = None  # (n, 2), or None if no open side is known
 
     def __len__(self) -> int:
         return len(self.ids)
@@ -55,6 +57,7 @@ class Spaces:
             self.axis[index],
             self.length[index],
             self.width[index],
+            None if self.opens is None else self.opens[index],
         )
 
 
@@ -83,7 +86,7 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
         np.minimum(np.where(turn, size[:, 0], size[:, 1]), area / length),
     )
     _refuse_drawn_twice(ids, outlines, area)
-    return _without_overlaps(spaces)
+    return without_overlaps(spaces)
 
 
 def validate_areas(ids: Sequence[str], area: FloatArray) -> None:
@@ -133,16 +136,15 @@ def _refuse_drawn_twice(ids: Sequence[str], outlines: NDArray[np.object_], area:
         )
 
 
-def _without_overlaps(spaces: Spaces) -> Spaces:
+def without_overlaps(spaces: Spaces) -> Spaces:
     """Narrow and shorten spaces that overlap others, by a few per cent at a time."""
     length, width = spaces.length.copy(), spaces.width.copy()
     for _ in range(6):
-        current = Spaces(spaces.ids, spaces.xy, spaces.axis, length, width)
-        boxes = current.boxes(shrink=0.08)
+        boxes = replace(spaces, length=length, width=width).boxes(shrink=0.08)
         one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
         hit = np.unique(one[one != other])
         if not len(hit):
             break
         width[hit] *= 0.97
         length[hit] *= 0.98
-    return Spaces(spaces.ids, spaces.xy, spaces.axis, length, width)
+    return replace(spaces, length=length, width=width)

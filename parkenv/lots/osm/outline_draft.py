@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +11,15 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
-from parkenv.lots.infer.layout import KERB_WIDTH, InferredLot, infer_lot
+from parkenv.lots.infer.draft import draft_inferred_lot
+from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.network import STREET, Line
-from parkenv.lots.infer.openings import least_aisle
-from parkenv.lots.infer.spaces import Spaces, rectangle_corners, spaces_from_outlines, validate_areas
+from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, validate_areas
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.buildings import Area, find_goals
 from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, whole_number
 from parkenv.lots.osm.spaces import split_space, why_no_slot
-from parkenv.lots.quality import QualityIssue
-from parkenv.world.drive_graph import SLOT_REACH
 
 MOST_SPACES = 20_000
 """Maximum number of spaces of one lot."""
@@ -100,49 +98,31 @@ def _draft(
     entries, goals = (points_in_frame(frame, given) for given in (options.entries, options.goals))
     lines = [Line(road.points, road.oneway, STREET if road.rank is Rank.STREET else -1) for road in roads]
     lot = infer_lot(spaces, obstacles, lines, entries)
-    for reason, members in lot.left_out.items():
-        left_out[reason] = [spaces.ids[i] for i in members]
-    lost = sum(len(members) for members in lot.left_out.values())
-    if lost > MOST_LOST * len(spaces):
-        raise InputError(
-            f"{lost} of {len(spaces)} spaces have no aisle: "
-            f"{_listed({r: [spaces.ids[i] for i in m] for r, m in lot.left_out.items()})}"
-        )
-    goal_note = "as given"
+    goal_note: str | None = None
     if not len(goals):
-        nodes = [e for e in elements if e.is_node]
-        found, note = find_goals(lot.slots, nodes, buildings, frame)
-        goals, goal_note = (found, note or "") if len(found) else (lot.goal, "on the side of the entry")
-        if not options.guess_goal and not len(found):
-            goals = goals[:0]
-    kept_entries = (
-        lot.entries if len(entries) or options.guess_entry or lot.entry is None else lot.entries[:0]
-    )
-    return LotDraft(
-        name=name,
-        slot_ids=tuple(spaces.ids[i] for i in lot.index),
-        slots=lot.slots,
-        slot_source=("amenity=parking_space",) * len(lot.index),
-        lanes=lot.lanes,
-        entries=kept_entries,
-        goals=goals,
-        walls=tuple(
-            shapely.get_coordinates(shapely.get_exterior_ring(part))
-            for a in buildings
-            for part in shapely.get_parts(a.polygon)
-        ),
-        outlines=tuple(
-            shapely.get_coordinates(shapely.get_exterior_ring(part))
-            for a in parking
-            for part in shapely.get_parts(a.polygon)
-        ),
-        found=tuple(_found(lot, spaces, frame)),
-        guesses=tuple(_guesses(lot, options, goal_note)),
-        issues=tuple(_issues(lot, spaces, len(areas), options)),
-        left_out=tuple(LeftOut(reason, tuple(members)) for reason, members in left_out.items()),
-        missing=tuple(_missing(lot, kept_entries, goals)),
+        goals, goal_note = find_goals(lot.slots, [e for e in elements if e.is_node], buildings, frame)
+    return draft_inferred_lot(
+        name,
+        lot,
+        spaces,
+        options,
+        source="amenity=parking_space",
+        unit="outlines",
+        left_out=left_out,
         frame=frame,
-    ).searchable()
+        goals=goals,
+        goal_note=goal_note or "",
+        walls=_exterior_rings(buildings),
+        outlines=_exterior_rings(parking),
+    )
+
+
+def _exterior_rings(areas: Sequence[Area]) -> list[FloatArray]:
+    return [
+        shapely.get_coordinates(shapely.get_exterior_ring(part))
+        for area in areas
+        for part in shapely.get_parts(area.polygon)
+    ]
 
 
 def refuse_number(count: int) -> None:
@@ -224,87 +204,3 @@ def _is_within(polygon: shapely.Geometry, box: tuple[float, float, float, float]
 
 def _listed(left_out: dict[str, list[str]]) -> str:
     return "; ".join(str(LeftOut(reason, tuple(members))) for reason, members in left_out.items())
-
-
-def _found(lot: InferredLot, spaces: Spaces, frame: LocalFrame) -> Iterator[str]:
-    rows = lot.rows
-    kinds = {"kerbside": 0, "oblique": 0, "perpendicular": 0}
-    for part in rows:
-        slant = np.degrees(part.row.slant)
-        kinds["kerbside" if slant < 15 else "oblique" if slant < 75 else "perpendicular"] += 1
-    listed = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
-    yield f"{len(lot.index)} slots of {len(spaces)} outlines, in {len(rows)} rows: {listed}"
-    wide = [aisle.width for aisle in lot.aisles if aisle.width < 2 * SLOT_REACH]
-    width = f", {min(wide):.1f} to {max(wide):.1f} m wide" if wide else ""
-    yield f"{len(lot.aisles)} aisles{width}, {len(lot.connections)} connections, {len(lot.lanes)} lanes"
-    yield f"frame: metres east and north of {frame.lat:.7f}, {frame.lon:.7f}"
-
-
-def _guesses(lot: InferredLot, options: ImportOptions, goal_note: str) -> Iterator[str]:
-    unsure = [part for part in lot.rows if part.certainty < SHARE_UNSURE]
-    yield (
-        f"open sides of {len(lot.rows)} rows: where the ground in front is free and rows share aisles"
-        + (f"; {len(unsure)} could open to either side" if unsure else "")
-    )
-    if lot.aisles:
-        yield f"{len(lot.aisles)} aisles along the rows' fronts"
-    if lot.connections:
-        far = max(shapely.LineString(c.points).length for c in lot.connections)
-        yield f"{len(lot.connections)} connections through free ground, the longest {far:.0f} m"
-    narrow = sum(c.clearance < TWO_WAY_WIDTH / 2 - 0.05 for c in lot.connections)
-    if narrow:
-        yield f"{narrow} connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless"
-    one_way = sum(aisle.one_way != 0 for aisle in lot.aisles) - len(lot.two_way)
-    if one_way:
-        yield f"{one_way} aisles one-way by the slant of their spaces"
-    if lot.two_way:
-        yield f"{len(lot.two_way)} aisles two-way against the slant of their spaces: no other way leads back"
-    if lot.widened:
-        yield f"{lot.widened} kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane"
-    if lot.entry is not None and not options.entries and options.guess_entry:
-        x, y = lot.entries[0].tolist()
-        yield f"entry at {x:.1f}, {y:.1f} m: {lot.entry.reason}"
-    if not options.goals and goal_note:
-        yield f"goal: {goal_note}"
-
-
-def _issues(lot: InferredLot, spaces: Spaces, drawn: int, options: ImportOptions) -> Iterator[QualityIssue]:
-    n = len(spaces)
-    unsure = sum(
-        len(part.row) * (SHARE_UNSURE - part.certainty) / SHARE_UNSURE
-        for part in lot.rows
-        if part.certainty < SHARE_UNSURE
-    )
-    if unsure:
-        yield QualityIssue("rows could open to either side", min(0.6, 0.6 * float(unsure) / n + 0.02))
-    lost = sum(len(members) for members in lot.left_out.values()) + drawn - n
-    if lost > 0:
-        yield QualityIssue("outlines left out", min(0.5, 1.5 * lost / max(drawn, 1)))
-    reach = [shapely.LineString(c.points).length for c in lot.connections]
-    far = sum(length for length in reach if length > 40.0)
-    if far:
-        yield QualityIssue("long connections through unknown ground", min(0.4, 0.002 * far + 0.05))
-    narrow = sum(c.clearance < TWO_WAY_WIDTH / 2 - 0.05 for c in lot.connections)
-    if narrow:
-        yield QualityIssue("narrow connections", min(0.3, 0.05 * narrow))
-    if lot.two_way:
-        yield QualityIssue("oblique rows on two-way aisles", 0.15)
-    tight = sum(
-        len(part.row) for part in lot.rows if np.median(part.view.clear) < least_aisle(part.row) + 0.4
-    )
-    if tight:
-        yield QualityIssue("narrow aisles", min(0.4, 0.5 * tight / n))
-    if lot.entry is not None and not options.entries:
-        yield QualityIssue("the entry is a guess", 0.05 + 0.1 * (1.0 - lot.entry.certainty))
-
-
-def _missing(lot: InferredLot, entries: FloatArray, goals: FloatArray) -> Iterator[str]:
-    if not len(entries):
-        x, y = lot.entries[0].tolist()
-        yield f"no entry: the file has no road; give one by --entry X,Y, or --entry auto for {x:.1f},{y:.1f}"
-    if not len(goals):
-        x, y = lot.goal[0].tolist()
-        yield (
-            f"no goal: the file has no building; give the place that people walk to by --goal X,Y, or --goal auto for "
-            f"{x:.1f},{y:.1f}"
-        )

@@ -1,1 +1,0 @@
-"""Import lots of real places: OpenStreetMap files and lists of slots."""
