@@ -30,5 +30,5 @@ with tempfile.TemporaryDirectory() as folder:
 
 scenario = make_scenario(lot)
 for agent in ("mdp", "greedy-goal", "greedy-drive", "oracle"):
-    rows, _ = Case(scenario, agent).run(range(50))
+    rows = Case(scenario, agent).run(range(50))
     print(f"{agent:13s} {np.mean([row['total_s'] for row in rows]):6.1f} s")

@@ -13,9 +13,9 @@ from parkenv import make_scenario
 from parkenv.lots import grid_lot
 from parkenv.mapping.learned_map import map_prior
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import SurveySettings
+from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.sensing.surveys import run_survey, summarize
+from parkenv.studies.sensing.surveys import session_row, summarize
 from parkenv.studies.statistics import mean_interval
 from parkenv.world.occupancy.constant_map import FlatMap
 from parkenv.world.occupancy.process import ArrivalWindow
@@ -26,11 +26,14 @@ print(f"{lot.n_slots} slots")
 
 with tempfile.TemporaryDirectory() as folder:
     file = Path(folder) / "map.sqlite"
-    settings = SurveySettings(every=2.5, windows=(world.arrival,), seed=1)
-    run = run_survey(world, settings, 3, file)
-    surveyed = summarize(world, settings, run, file)
-    with MapStore(file, lot, create=False) as store:
+    survey = Survey(world, SurveySettings(every=2.5, windows=(world.arrival,), seed=1))
+    drives = [survey.drive(number) for number in range(3)]
+    with MapStore(file, lot) as store:
+        for drive in drives:
+            store.add(drive.session)
         log = store.log()
+    rows = [session_row(drive) for drive in drives]
+    surveyed = summarize(world, survey.settings, rows, file)
 found, right = surveyed["car_detection_rate"], surveyed["slot_accuracy"]
 print(f"3 drives: {found:.1%} of the cars found, {right:.1%} of the slots judged right")
 
@@ -42,7 +45,7 @@ maps = {
 totals = {}
 for name, prior in maps.items():
     for agent in ("first-free", "mdp", "belief"):
-        rows, _ = Case(world.replace(prior=prior), agent).run(range(100, 200))
+        rows = Case(world.replace(prior=prior), agent).run(range(100, 200))
         totals[name, agent] = np.array([row["total_s"] for row in rows])
 
 print("\nseconds from the entry to the goal     (difference to mdp without a map, same worlds)")

@@ -4,7 +4,7 @@ import contextlib
 from dataclasses import replace
 from unittest import mock
 
-from parkenv.cli import benchmark
+from parkenv.studies.benchmark.suite import Suite
 
 SEARCHES = 150
 """Searches of a task."""
@@ -13,19 +13,11 @@ SEARCHES = 150
 @contextlib.contextmanager
 def few_searches():
     """While the block runs, `parkenv benchmark run` makes the first searches of each task only."""
-    run_suite = benchmark.run_suite
+    named = Suite.named
 
-    def run_first(*arguments):
-        from parkenv.studies.compare.benchmark import Suite
+    def shorter(cls, name):
+        suite = named(name)
+        return replace(suite, seeds=suite.seeds[:SEARCHES])
 
-        named = Suite.named
-
-        def shorter(cls, name):
-            suite = named(name)
-            return replace(suite, seeds=suite.seeds[:SEARCHES])
-
-        with mock.patch.object(Suite, "named", classmethod(shorter)):
-            run_suite(*arguments)
-
-    with mock.patch.object(benchmark, "run_suite", run_first):
+    with mock.patch.object(Suite, "named", classmethod(shorter)):
         yield

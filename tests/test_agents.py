@@ -19,7 +19,7 @@ SEEDS = range(12)
 
 
 def episodes(scenario, agent, seeds=SEEDS):
-    return Case(scenario, agent).run(seeds)[0]
+    return Case(scenario, agent).run(seeds)
 
 
 def mean(rows, column):

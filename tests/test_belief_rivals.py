@@ -9,8 +9,8 @@ from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.experiment import FleetExperiment, Setting
-from parkenv.studies.spec import FleetSpec
+from parkenv.studies.fleet.setting import Setting
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.lot import PARK
 from planners import make_agent
 from planners.belief.rivals import CROWD, PASSED, _take_rates, usual_arrivals
@@ -146,7 +146,7 @@ def test_wrong_rates_are_refused():
 
 def test_an_experiment_tells_it_the_demand():
     (scenario,) = scenario_specs("mini")
-    its = FleetExperiment(FleetSpec().changed(scenario=scenario))
+    its = FleetStudy().changed(scenario=scenario)
     for name, rate in (("belief-rivals", 120.0), ("belief-rivals(arrivals_per_hour=30)", 30.0)):
-        _, (agent, _) = its.fleet(Setting(AgentSpec.of(name), "own", 0.0, 120.0))
+        _, (agent, _) = its.fleet(Setting("mini", AgentSpec.of(name), "own", 0.0, 120.0))
         assert agent.arrivals_per_hour == rate

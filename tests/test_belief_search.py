@@ -113,7 +113,7 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ah
     """On jam the tuned planner trusts its map into every aisle; what the first slots show is enough to doubt it."""
     scenario = make_scenario("jam", day_error=day_error)
     ours, theirs = (
-        np.array([r["total_s"] for r in Case(scenario, name).run(range(10))[0]])
+        np.array([r["total_s"] for r in Case(scenario, name).run(range(10))])
         for name in ("belief", "mdp-tuned")
     )
     _, _, high = mean_interval(ours - theirs)
@@ -124,7 +124,7 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ah
 def test_knowing_the_day_helps_the_planner_of_the_thesis_too():
     scenario = make_scenario("jam")
     plain, learning = (
-        np.array([r["total_s"] for r in Case(scenario, "mdp", options={"day": day}).run(range(40))[0]])
+        np.array([r["total_s"] for r in Case(scenario, "mdp", options={"day": day}).run(range(40))])
         for day in (False, True)
     )
     _, _, high = mean_interval(learning - plain)
@@ -203,7 +203,7 @@ def test_what_a_worthless_map_costs(name, said):
     """The map has all slots free, or all taken. With all free, the thesis's planner is 90 s above the bound on jam."""
     scenario = make_scenario(name)
     prior = OccupancyProcess.from_demand(np.full(scenario.lot.n_slots, said), np.zeros(168))
-    rows = Case(scenario.replace(prior=prior), "belief").run(range(8))[0]
+    rows = Case(scenario.replace(prior=prior), "belief").run(range(8))
     assert all(row["parked"] for row in rows)
     lost_s = sorted(row["total_s"] - row["bound_s"] for row in rows)
     # On the fullest day of jam there is no free slot for minutes.
@@ -269,7 +269,7 @@ def hidden_lots(name, seen_rate, occupancy=None):
 
 @pytest.mark.parametrize("seen_rate", [0.5, 0.9])
 def test_a_slot_that_stays_hidden_is_not_looked_for_for_ever(seen_rate):
-    rows = Case(hidden_lots("campus", seen_rate, 0.9), "belief").run(range(12))[0]
+    rows = Case(hidden_lots("campus", seen_rate, 0.9), "belief").run(range(12))
     assert all(row["parked"] for row in rows)
     assert max(row["drive_s"] for row in rows) < 200.0
 
@@ -278,7 +278,7 @@ def test_a_slot_that_stays_hidden_is_not_looked_for_for_ever(seen_rate):
 def test_hidden_slots_are_tried_where_nothing_better_is_left(seen_rate):
     """On a small lot, all slots are soon hidden or taken; the reference planner attempts them one by one."""
     scenario = hidden_lots("mini", seen_rate, 0.8)
-    ours, theirs = (Case(scenario, agent).run(range(40))[0] for agent in ("belief", "mdp"))
+    ours, theirs = (Case(scenario, agent).run(range(40)) for agent in ("belief", "mdp"))
     assert not any(row["truncated"] for row in ours)
     means = [np.mean([row["total_s"] for row in rows]) for rows in (ours, theirs)]
     assert means[0] < 1.1 * means[1]

@@ -17,11 +17,10 @@ from parkenv.scenarios.places import lot_share
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.show.report.page import SCHEMA
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.compare import benchmark
-from parkenv.studies.compare.benchmark import Suite, by_group, check_result, result_of, suite_lots
-from parkenv.studies.compare.cases import run_cases
+from parkenv.studies.benchmark import suite as benchmark
+from parkenv.studies.benchmark.suite import Suite, by_group, check_result, result_of, suite_lots
 from parkenv.studies.lot_census import slots_by_kind
-from parkenv.studies.results import ResultFolder, write_summary
+from parkenv.studies.results import DECISIONS, EPISODES, write_summary
 from parkenv.studies.training.search_task import SearchTask
 from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
@@ -37,23 +36,21 @@ def small():
     return replace(suite, seeds=suite.seeds[:6], tasks=suite.tasks[3:5])
 
 
+def episodes_of(cells):
+    return {EPISODES.key(row): row for case, seeds in cells for row in case.run(seeds)}
+
+
 @pytest.fixture(scope="module")
-def result(small, tmp_path_factory):
-    folder = ResultFolder(tmp_path_factory.mktemp("benchmark") / "run", {})
+def result(small):
     cases = small.cases([AgentSpec(name=name) for name in AGENTS])
-    run_cases(cases, folder)
-    return result_of(small, cases, folder, ["parkenv", "benchmark", "run"])
+    return result_of(small, cases, episodes_of(cases), ["parkenv", "benchmark", "run"])
 
 
-def test_a_suite_without_its_timings_is_refused(small, tmp_path):
-    folder, cases = ResultFolder(tmp_path / "run", {}), small.cases([AgentSpec(name="first-free")])
-    run_cases(cases, folder)
-    (tmp_path / "run" / "timings.csv").write_text("")
-    folder = ResultFolder(tmp_path / "run", {}, resume=True)
-    with pytest.raises(
-        InputError, match=r"run: holds no decision_ms of first-free in .*timings\.csv is not whole"
-    ):
-        result_of(small, cases, folder, ["parkenv", "benchmark", "run"])
+def test_a_suite_without_its_timings_is_refused(small):
+    cases = small.cases([AgentSpec(name="first-free")])
+    episodes = {key: row | {DECISIONS: ""} for key, row in episodes_of(cases).items()}
+    with pytest.raises(InputError, match=r"no decision_ms of first-free in .*timings\.csv is not whole"):
+        result_of(small, cases, episodes, ["parkenv", "benchmark", "run"])
 
 
 def checked(content, small, path, monkeypatch):

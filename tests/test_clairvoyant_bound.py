@@ -9,9 +9,8 @@ import pytest
 from parkenv.engine.fleet import total_s
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
-from parkenv.studies.fleet.experiment import FleetExperiment
 from parkenv.studies.fleet.measures import Roads
-from parkenv.studies.spec import FleetSpec
+from parkenv.studies.fleet.study import FleetStudy
 
 
 def best_schedule_s(day):
@@ -96,10 +95,10 @@ def test_a_stay_for_ever_may_end_after_the_day():
 def test_no_fleet_is_below_it(knows):
     (scenario,) = scenario_specs("mini")
     scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
-    spec = FleetSpec().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
-    its = FleetExperiment(spec)
-    roads = Roads(its.scenario)
-    for setting in its.settings:
+    spec = FleetStudy().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
+    its = spec
+    roads = Roads(its.built)
+    for setting in its.fleet_settings:
         for day in range(3):
             fleet, agents = its.fleet(setting)
             fleet.reset(2, day)

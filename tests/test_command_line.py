@@ -16,7 +16,8 @@ from command_line import parkenv
 from parkenv.cli import app, compare, demo, survey, train
 from parkenv.cli.command import SHARED, read_docstring
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, RigName
-from parkenv.studies import spec as specs
+from parkenv.studies.demo.study import Demo
+from parkenv.studies.sensing.survey_study import SurveyStudy
 from parkenv.studies.training.spec import TrainingSpec
 from planners.names import AGENTS
 from sim_sensors.camera.weather import PRESETS
@@ -59,8 +60,8 @@ def test_a_help_page_says_what_a_newcomer_needs(path, command, monkeypatch):
 
 
 OPTIONAL = (
-    "address", "agents", "beside", "bounds", "calibrated", "car_park", "clone", "crops", "drives", "lot", "map_says",
-    "model", "labels", "picture", "replay", "rerun", "rig", "simulated", "uiuc",
+    "address", "agents", "beside", "bounds", "calibrated", "car_park", "clone", "crops", "drives", "lot",
+    "constant_forecast", "model", "labels", "picture", "replay", "rerun", "rig", "simulated", "uiuc",
 )  # fmt: skip
 """Options that do nothing unless they are given."""
 
@@ -79,8 +80,8 @@ def test_an_option_means_the_same_everywhere():
 @pytest.mark.parametrize(
     ("function", "kind"),
     [
-        (survey.survey, specs.SurveySpec),
-        (demo.demo, specs.DemoSpec),
+        (survey.survey, SurveyStudy),
+        (demo.demo, Demo),
         (train.train, TrainingSpec),
     ],
 )

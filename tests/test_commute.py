@@ -15,8 +15,10 @@ from parkenv.files.spec_file import read_tables
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.compare.commute import Commute, Course, calendar, run_commute
-from parkenv.studies.spec import CommuteSpec
+from parkenv.studies.commute.runs import TRIP, CommuteRun, calendar
+from parkenv.studies.commute.study import Commute
+from parkenv.studies.results import DECISIONS
+from parkenv.studies.study import run
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.occupancy.recorded import RecordedOccupancy
@@ -32,7 +34,7 @@ SMALL = {
 
 
 def spec(**changes):
-    return CommuteSpec.parse(SMALL | changes, "test")
+    return Commute.parse(SMALL | {"jobs": 1} | changes, "test")
 
 
 def content(folder):
@@ -83,14 +85,14 @@ def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
 
 def test_a_resumed_commute_equals_an_unbroken_one(tmp_path):
     """Also after a crash between trips and episodes, and with more days than at first."""
-    run_commute(spec(), tmp_path / "whole")
-    run_commute(spec(days=4), tmp_path / "broken")
+    run(spec(), tmp_path / "whole")
+    run(spec(days=4), tmp_path / "broken")
     # The last day's episodes are lost, its trips are not.
     lines = (tmp_path / "broken" / "episodes.csv").read_text().splitlines(keepends=True)
     kept = [line for line in lines if ",4," not in line or ",belief," not in line]
     assert len(kept) < len(lines)
     (tmp_path / "broken" / "episodes.csv").write_text("".join(kept))
-    run_commute(spec(), tmp_path / "broken", resume=True)
+    run(spec(), tmp_path / "broken", resume=True)
     whole, broken = content(tmp_path / "whole"), content(tmp_path / "broken")
     assert whole == broken
     for file in (tmp_path / "whole" / "maps").iterdir():
@@ -100,16 +102,19 @@ def test_a_resumed_commute_equals_an_unbroken_one(tmp_path):
             for mine, theirs in zip(one.trips(), other.trips(), strict=True):
                 np.testing.assert_array_equal(mine.taken, theirs.taken)
     with pytest.raises(InputError, match="--resume: fleet was 1"):
-        run_commute(spec(fleet=2), tmp_path / "broken", resume=True)
+        run(spec(fleet=2), tmp_path / "broken", resume=True)
 
 
 def test_days_do_not_depend_on_later_ones():
-    course = Course(make_scenario("mini"), AgentSpec(name="belief"), "wrong", 0, 2, 5)
+    course = CommuteRun(make_scenario("mini"), AgentSpec(name="belief"), "wrong", 0, 2, 5)
     days = calendar(course.scenario, 6)
-    rows, _, trips, _ = course.run(days, [])
-    first, _, first_trips, _ = course.run(days[:3], [])
-    rest, _, _, _ = course.run(days[3:], first_trips)
-    assert rows == first + rest
+    rows, first = course.run(days, []), course.run(days[:3], [])
+    trips = sorted((row[TRIP] for row in first), key=lambda trip: (trip.time, trip.key))
+    rest = course.run(days[3:], trips)
+    measured = (TRIP, DECISIONS)
+    for row, other in zip(rows, first + rest, strict=True):
+        assert {**row, **dict.fromkeys(measured)} == {**other, **dict.fromkeys(measured)}
+    trips = [row[TRIP] for row in rows]
     # A fleet's drivers meet the same day, at different times, and share their map.
     assert len(trips) == 12
     assert len({row["seed"] for row in rows if row["day_number"] == 1}) == 1
@@ -134,13 +139,13 @@ def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
         (8, dates[3]),
         (9, dates[4]),
     ]
-    rows, *_ = Course(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days, [])
+    rows = CommuteRun(recorded, AgentSpec(name="first-free"), "none", 0, 1, 0).run(days, [])
     assert [row["day"] for row in rows] == [day.date for day in days]
 
 
 def test_a_map_of_a_commute_is_a_forecast(tmp_path):
     """A scenario file takes the map file of a course; a copy of it goes on learning elsewhere."""
-    run_commute(spec(maps=["wrong"], agents=["belief"], drivers=1), tmp_path / "run")
+    run(spec(maps=["wrong"], agents=["belief"], drivers=1), tmp_path / "run")
     shutil.copy(tmp_path / "run" / "maps" / "mini_wrong_belief_0.sqlite", tmp_path / "map.sqlite")
     Path(tmp_path / "known.toml").write_text('lot = "mini"\nforecast = "map.sqlite"\n')
     known = make_scenario(tmp_path / "known.toml")
@@ -155,10 +160,9 @@ def test_a_bonus_for_observations_lets_the_car_see_more():
     days = calendar(scenario, 2)
     seen = []
     for bonus in (0, 1.0):
-        _, _, trips, _ = Course(scenario, AgentSpec.of(f"belief(explore={bonus})"), "empty", 0, 3, 0).run(
-            days, []
-        )
-        seen.append(np.mean([len(np.unique(trip.slots)) for trip in trips]))
+        agent = AgentSpec.of(f"belief(explore={bonus})")
+        rows = CommuteRun(scenario, agent, "empty", 0, 3, 0).run(days, [])
+        seen.append(np.mean([len(np.unique(row[TRIP].slots)) for row in rows]))
     assert seen[1] > seen[0] + 5
     with pytest.raises(InputError, match="explore is -1"):
         make_agent("belief", scenario, explore=-1.0)
@@ -171,8 +175,8 @@ def test_a_week_of_trips_closes_the_gap_of_a_wrong_map(monkeypatch):
     days = calendar(scenario, 8)
 
     def total_s(agent, start):
-        courses = [Course(scenario, AgentSpec(name=agent), start, number, 1, 0) for number in range(12)]
-        return np.array([[row["total_s"] for row in course.run(days, [])[0]] for course in courses])
+        courses = [CommuteRun(scenario, AgentSpec(name=agent), start, number, 1, 0) for number in range(12)]
+        return np.array([[row["total_s"] for row in course.run(days, [])] for course in courses])
 
     learning, right, without = (
         total_s("belief", "wrong"),
@@ -195,8 +199,8 @@ def test_a_log_keeps_its_slots_on_all_days_of_a_commute(tmp_path):
         lines += [f"s{s},{date}T{hour:02}:00,{int(taken[s])}" for s in range(10) for hour in range(7, 20)]
     (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
     (tmp_path / "recorded.toml").write_text('lot = "mini"\noccupancy = "log.csv"\n')
-    commute = Commute(spec(scenarios=[str(tmp_path / "recorded.toml")], drivers=1))
-    occupancy = commute.courses[0].scenario.occupancy
+    commute = spec(scenarios=[str(tmp_path / "recorded.toml")], drivers=1)
+    occupancy = commute.runs[0].scenario.occupancy
     anew = make_scenario(tmp_path / "recorded.toml").occupancy
     slots, ranked = (
         np.array([its.mapped_log(day).log_slot for day in its.log.days]) for its in (occupancy, anew)

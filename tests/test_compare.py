@@ -157,18 +157,18 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
 
 def test_agents_may_be_given_maps_that_are_wrong(tmp_path):
     done = parkenv(
-        "compare", "--scenario", "mini", "--agents", "mdp,first-free,oracle", "-n", 12, "--map-says", "0,0.5,1",
-        "--occupancy-levels", "none", "--jobs", 1, "--out", tmp_path,
+        "compare", "--scenario", "mini", "--agents", "mdp,first-free,oracle", "-n", 12,
+        "--constant-forecast", "0,0.5,1", "--occupancy-levels", "none", "--jobs", 1, "--out", tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
     total = {(row["scenario"], row["agent"]): row["total_s"] for row in rows}
-    worlds = ("mini", *(f"mini-map-says-{p}" for p in ("0", "0.5", "1")))
+    worlds = ("mini", *(f"mini-constant-forecast-{p}" for p in ("0", "0.5", "1")))
     assert {name for name, _ in total} == set(worlds)
     assert len({total[name, "oracle"] for name in worlds}) == 1, "the worlds are the same"
     assert len({total[name, "mdp"] for name in worlds}) > 1, "the maps are not"
     assert (tmp_path / "time_against_map_mini.png").exists()
-    assert not (tmp_path / "time_split_mini-map-says-1.png").exists()
+    assert not (tmp_path / "time_split_mini-constant-forecast-1.png").exists()
 
 
 def test_parking_costs_of_a_lot_file_reach_rows_table_and_figures(tmp_path):
@@ -364,7 +364,7 @@ def test_an_output_folder_that_cannot_be_written_is_refused_before_any_work(tmp_
 def test_a_finished_folder_may_be_used_again_and_a_foreign_one_is_refused(tmp_path):
     assert parkenv(*small(tmp_path, agents="greedy-goal")).returncode == 0
     again = parkenv(*small(tmp_path, agents="greedy-goal"))
-    assert_one_line_and_exit_2(again, "holds a finished comparison", "--overwrite")
+    assert_one_line_and_exit_2(again, "holds a finished compare run", "--overwrite")
     assert parkenv(*small(tmp_path, "--overwrite", agents="greedy-goal")).returncode == 0
     more = parkenv(*small(tmp_path, "--resume", agents="greedy-drive", episodes=5))
     assert more.returncode == 0
@@ -372,7 +372,7 @@ def test_a_finished_folder_may_be_used_again_and_a_foreign_one_is_refused(tmp_pa
     assert kept == ["greedy-drive"] * 5 + ["greedy-goal"] * 12, "what was there stays"
     (tmp_path / "episodes.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="not written by this version"):
-        ResultFolder(tmp_path, json.loads((tmp_path / "settings.json").read_text()), resume=True)
+        ResultFolder(tmp_path).claim(json.loads((tmp_path / "settings.json").read_text()), resume=True)
 
 
 def test_going_on_notices_that_an_agent_of_your_own_has_changed(tmp_path):

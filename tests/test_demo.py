@@ -5,11 +5,9 @@ import json
 from command_line import parkenv
 from PIL import Image
 
-from parkenv.mapping.store import MapStore
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.compare.demo import AGENTS, demo_cases, demo_survey
-from parkenv.studies.spec import DemoSpec
+from parkenv.studies.demo.study import AGENTS, Demo
 
 
 def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
@@ -32,10 +30,8 @@ def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     assert (out / "search.gif").stat().st_size < 3e6
 
     # The oracle needs no sensors.
-    spec = DemoSpec(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=4.0)
-    its, _ = demo_survey(spec)
-    with MapStore(out / "map.sqlite", its.lot, create=False) as store:
-        cases = demo_cases(spec, its, store.log())
+    spec = Demo(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=4.0)
+    cases = spec.cases_in(out)
     (oracle,) = [case for case, _ in cases if case.agent == "oracle"]
     seed = cases[0][1][0]
     looking = Case(oracle.scenario, "oracle", rig="laser").runner().run(seed).row

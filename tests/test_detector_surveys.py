@@ -12,11 +12,11 @@ from parkenv.mapping.survey_score import SIGHTING
 from parkenv.studies.sensing.detector_surveys import (
     CAUSES,
     SurveyedDrive,
-    _read_sightings,
-    _write_sightings,
     causes_of,
     is_wanted,
     never_found,
+    read_sightings,
+    write_sightings,
 )
 from parkenv.studies.statistics import rate_interval
 from sim_sensors.ground_truth import View
@@ -75,13 +75,13 @@ def test_sightings_are_read_back_and_checked(tmp_path):
     path = tmp_path / "laser_hog" / "sightings" / "00000.csv"
     path.parent.mkdir(parents=True)
     with pytest.raises(InputError, match=r"00000\.csv: is missing; delete the folder .*laser_hog to drive"):
-        _read_sightings(path)
+        read_sightings(path)
     seen = np.concatenate([sighting(), sighting(slot=-1, distance=np.nan)])
-    _write_sightings(path, seen)
-    assert repr(_read_sightings(path)) == repr(seen)
+    write_sightings(path, seen)
+    assert repr(read_sightings(path)) == repr(seen)
     path.write_text(path.read_text().replace("6.0", "near"))
     with pytest.raises(InputError, match=r"line 2: distance is 'near', want a number"):
-        _read_sightings(path)
+        read_sightings(path)
 
 
 @pytest.mark.slow
@@ -109,7 +109,7 @@ def test_detectors_on_the_command_line(tmp_path):
         "reach_mini.png",
     ]
     kept = (tmp_path / "d" / "table.csv").read_text()
-    table = tmp_path / "d" / "stereo_net" / "sessions.csv"
+    table = tmp_path / "d" / "sessions.csv"
     table.write_text(
         "".join(table.read_text().splitlines(keepends=True)[:-1])
     )  # as if it had been interrupted
@@ -123,7 +123,10 @@ def test_detectors_on_the_command_line(tmp_path):
     [
         (["--drives", "mini", "--rig", "stereo"], "--rig and --misses go with --sessions"),
         (["--uiuc", "x", "--sessions", 2], "--sessions goes with --drives"),
-        (["--drives", "mini", "--sessions", 1, "--rig", "sonar"], "rig is 'sonar', want one of laser"),
+        (
+            ["--drives", "mini", "--sessions", 1, "--rig", "sonar"],
+            "--rig is 'sonar', want 'laser', 'stereo' or",
+        ),
         (["--drives", "mini", "--sessions", 1, "--detector", "hog,none.onnx"], "none.onnx"),
         (["--drives", "mini", "--sessions", -1], "--sessions: want N >= 0"),
         (["--drives", "mini", "--sessions", 1, "--every", 0], "--every: want M >= 0.1"),

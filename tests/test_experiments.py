@@ -12,8 +12,9 @@ from parkenv import InputError
 from parkenv.cli.schema import schemas
 from parkenv.files.spec_file import read_tables
 from parkenv.studies.agent_spec import AgentSpec, parse_agent, split_agents
-from parkenv.studies.compare.experiment import Experiment, run_experiment
-from parkenv.studies.spec import SPEC_FILE, ExperimentSpec
+from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.results import SPEC_FILE
+from parkenv.studies.study import run
 from parkenv.world.scenario import KMH
 
 ROOT = Path(__file__).parents[1]
@@ -67,9 +68,9 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     assert {row["agent"] for row in rows} == {"first-free", "mdp(failure_s=90)", "mdp"}
     assert {row["scenario"] for row in rows} == {"mini", "own", "inline"}
     assert {row["v_walk_kmh"] for row in rows} == {4.0}, "the grid goes before the scenario's own speed"
-    assert {row["seed"] for row in Experiment(ExperimentSpec.read(sweep)).cases and [{"seed": 7}]} == {7}
-    kept = ExperimentSpec.read(out / SPEC_FILE)
-    assert kept == ExperimentSpec.read(sweep)
+    assert {row["seed"] for row in Comparison.read(sweep).cases and [{"seed": 7}]} == {7}
+    kept = Comparison.read(out / SPEC_FILE)
+    assert kept == Comparison.read(sweep)
 
     # The folder alone is enough to resume the run and to extend it.
     (out / "summary.json").unlink()
@@ -79,7 +80,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     assert (out / "episodes.csv").read_text() == episodes
     assert parkenv("compare", "--resume", "-n", 5, "--out", out).returncode == 0
     assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
-    assert ExperimentSpec.read(out / SPEC_FILE) == kept.changed(episodes=5)
+    assert Comparison.read(out / SPEC_FILE) == kept.changed(episodes=5)
 
     # A changed file of the experiment is detected.
     (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { give_up_s = 70 }\n')
@@ -89,7 +90,7 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
 
 
 def test_what_the_world_charges_and_what_a_planner_assumes_are_two_things(sweep):
-    cases = [case for case, _ in Experiment(ExperimentSpec.read(sweep)).cases if case.agent == "mdp"]
+    cases = [case for case, _ in Comparison.read(sweep).cases if case.agent == "mdp"]
     assert {case.scenario.failure_s for case in cases} == {5.0, 60.0}
     assert {case.label: case.options for case in cases} == {"mdp(failure_s=90)": {"failure_s": 90}, "mdp": {}}
 
@@ -105,35 +106,37 @@ def test_options_build_the_same_specification_as_a_file(tmp_path, sweep):
     text = SWEEP.replace(', { name = "inline", lot = { grid = { rows = 2, columns = 6 } } }', "")
     text = text.replace(', "mdp"]', "]").replace("v_drive_kmh = [10, 15]", "").replace("seed = 7", "")
     sweep.write_text(text.replace("episodes = 4", "episodes = 2"))
-    assert ExperimentSpec.read(out / SPEC_FILE) == ExperimentSpec.read(sweep)
+    assert Comparison.read(out / SPEC_FILE) == Comparison.read(sweep)
 
 
 def test_python_runs_the_same_object(tmp_path):
-    spec = ExperimentSpec.parse(
+    spec = Comparison.parse(
         {
             "agents": ["greedy-goal", "oracle"],
             "scenarios": ["mini"],
             "episodes": 3,
+            "jobs": 1,
+            "figures": False,
             "grid": {"v_drive_kmh": [5, 20]},
         },
         "test",
     )
     seen = []
-    result = run_experiment(spec, tmp_path, on_progress=seen.append)
-    assert sum(seen) == 12
-    assert [case.scenario.v_drive for case, _ in result.experiment.cases] == [5 * KMH] * 2 + [20 * KMH] * 2
+    result = run(spec, tmp_path, progress=lambda _, done, total: seen.append((done, total)))
+    assert seen[-1] == (12, 12)
+    assert [case.scenario.v_drive for case, _ in result.study.cases] == [5 * KMH] * 2 + [20 * KMH] * 2
     slow, _, fast, _ = result.rows
     assert slow["drive_s"] > fast["drive_s"]
 
 
 def test_a_scenario_may_be_called_like_a_blind_one_but_no_two_alike():
     named = {"name": "x-blind", "lot": "mini"}
-    spec = ExperimentSpec.parse({"agents": ["belief"], "scenarios": [named], "episodes": 2}, "test")
-    assert [case.scenario.name for case, _ in Experiment(spec).cases] == ["x-blind"]
+    spec = Comparison.parse({"agents": ["belief"], "scenarios": [named], "episodes": 2}, "test")
+    assert [case.scenario.name for case, _ in spec.cases] == ["x-blind"]
     plain = {"name": "x", "lot": "mini"}
     both = {"agents": ["mdp"], "scenarios": [plain, named], "grid": {"blind": True}, "episodes": 2}
     with pytest.raises(InputError, match="two scenarios are called 'x-blind'"):
-        Experiment(ExperimentSpec.parse(both, "test"))
+        Comparison.parse(both, "test").check()
 
 
 def test_agents_with_options_are_read_from_words_and_tables():
@@ -210,8 +213,8 @@ def test_the_documentation_says_how_files_are_refused(tmp_path, kind, text, answ
 
 
 def test_the_examples_of_the_documentation_are_run(tmp_path):
-    sweep = ExperimentSpec.read(COURTYARD / "sweep.toml").changed(episodes=1, jobs=1)
-    rows = run_experiment(sweep, tmp_path / "sweep").rows
+    sweep = Comparison.read(COURTYARD / "sweep.toml").changed(episodes=1, jobs=1)
+    rows = run(sweep, tmp_path / "sweep").rows
     assert len(rows) == 5 * 3 * 2 * 2
     assert {row["scenario"] for row in rows} == {"courtyard", "mini", "garage"}
     planned = parkenv("plan", "--scenario", COURTYARD / "courtyard.toml", "--out", tmp_path / "plan")

@@ -286,7 +286,7 @@ def test_distributions_of_any_number_of_scenarios_are_laid_out(tmp_path, panels)
 def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_path):
     mini = make_scenario("mini")
     cases = [(Case(mini, name), range(2)) for name in ("mdp", "first-free")]
-    rows = {case.agent: case.run(seeds)[0] for case, seeds in cases}
+    rows = {case.agent: case.run(seeds) for case, seeds in cases}
     episodes = {episode_key(row): row for its in rows.values() for row in its}
     table = [{**row(case.agent), "scenario": "mini"} for case, _ in cases]
     results = ComparisonResults(cases, episodes, table)
@@ -324,7 +324,7 @@ def test_a_single_search_has_no_band():
 
 
 def test_only_asked_for_figures_are_drawn(tmp_path):
-    flat = {"my_lot-map-says-0.5": ("my_lot", 0.5)}
+    flat = {"my_lot-constant-forecast-0.5": ("my_lot", 0.5)}
     table = [row(name, scenario=s) for name in ("mdp", "oracle") for s in ("my_lot", *flat)]
     files = draw_figures(
         ComparisonResults([], {}, table, (), flat), tmp_path, ("time_split", "time_against_map")

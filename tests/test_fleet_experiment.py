@@ -12,12 +12,13 @@ from parkenv.engine.fleet import total_s
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.experiment import FleetExperiment, Setting, summarize_days
-from parkenv.studies.fleet.measures import MEANS, Roads, gini, looks_s
-from parkenv.studies.spec import FleetSpec
-from parkenv.studies.trips.calibration import Calibration
+from parkenv.studies.fleet.measures import Roads, gini, looks_s
+from parkenv.studies.fleet.setting import MEASURES, Setting
+from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.fleet.tables import summarize_days
 from parkenv.world.scenario import SearchProblem
 
 
@@ -25,16 +26,16 @@ def experiment(**changes):
     (scenario,) = scenario_specs("mini")
     scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
     fields = {"scenario": scenario, "arrivals_per_hour": (20.0,), "days": 2, **changes}
-    return FleetExperiment(FleetSpec().changed(**fields))
+    return FleetStudy().changed(**fields)
 
 
 def setting(agent, *rest):
-    return Setting(AgentSpec.of(agent), *rest)
+    return Setting("mini", AgentSpec.of(agent), *rest)
 
 
 def days_of(its):
     """Return the days of each setting."""
-    return [[its.run_day(one, day)[0] for day in range(its.spec.days)] for one in its.settings]
+    return [[its.run_day(one, day) for day in range(its.days)] for one in its.fleet_settings]
 
 
 def test_gini():
@@ -45,7 +46,7 @@ def test_gini():
 
 
 def test_nobody_without_members_is_run_once():
-    its = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).settings
+    its = experiment(knows=("own", "shared", "reserve"), shares=(0.0, 0.5, 1.0)).fleet_settings
     assert its == [
         setting("greedy-drive", *rest, 20.0)
         for rest in (("own", 0.0), ("shared", 0.5), ("shared", 1.0), ("reserve", 0.5), ("reserve", 1.0))
@@ -69,9 +70,9 @@ def test_all_settings_have_the_same_days():
 def test_measures_of_a_day_are_those_of_its_cars():
     its = experiment(arrivals_per_hour=(60.0,), shares=(0.5,))
     its_setting = setting("greedy-drive", "shared", 0.5, 60.0)
-    day, _ = its.run_day(its_setting, 0)
+    day = its.run_day(its_setting, 0)
     fleet, agents = its.fleet(its_setting)
-    fleet.reset(its.spec.seed, 0)
+    fleet.reset(its.seed, 0)
     fleet.run(agents)
     cars = fleet.cars
     members = (cars["kind"] == 0).mean()
@@ -90,7 +91,7 @@ def test_nobody_is_faster_than_alone():
     scenario = make_scenario("mini")
     roads = Roads(scenario)
     its = experiment(arrivals_per_hour=(5.0,), knows=("full",))
-    fleet, agents = its.fleet(its.settings[0])
+    fleet, agents = its.fleet(its.fleet_settings[0])
     fleet.reset(1)
     fleet.run(agents)
     assert (total_s(fleet.cars) >= roads.alone_s(fleet.cars) - 1e-9).all()
@@ -100,7 +101,7 @@ def test_nobody_is_faster_than_alone():
 
 def test_an_agent_in_python_drives_as_the_compiled_one():
     compiled, python = (
-        experiment(agents=(agent,), knows=("own",), days=1).run_day(setting(agent, "own", 0.0, 20.0), 0)[0]
+        experiment(agents=(agent,), knows=("own",), days=1).run_day(setting(agent, "own", 0.0, 20.0), 0)
         for agent in ("first-free", "first-free(within_m=1000)")
     )
     assert compiled["cars"] == python["cars"]
@@ -125,7 +126,7 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
         day["total_s"] * day["cars"] for day in reserve
     )
     assert rows[0]["price_of_anarchy"] == pytest.approx(expected)
-    assert set(MEANS) <= rows[0].keys()
+    assert set(MEASURES) <= rows[0].keys()
     assert rows[0]["difference_s"] == 0.0
     paired = [one["total_s"] - other["total_s"] for one, other in zip(reserve, own, strict=True)]
     assert rows[1]["difference_s"] == rows[1]["members_difference_s"] == pytest.approx(np.mean(paired))
@@ -181,7 +182,7 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
         ),
         (
             ("--decision-limit", "1", "--backend", "dask"),
-            "decision_limit_s goes with the backends loky and ray",
+            "decision_limit_s requires the backend loky or ray",
         ),
         (("-n", "0"), "--episodes: want N >= 1"),
         (("--manoeuvre", "-1"), "--manoeuvre: want 0.0 <= X <= 3600"),
@@ -224,7 +225,7 @@ def test_a_finished_run_is_extended_and_not_mixed_with_another(tmp_path):
     assert parkenv("fleet", *WORDS, "-n", 1, "--no-figures", "--out", out).returncode == 0
     first = (out / "days.csv").read_text()
     refused = parkenv("fleet", *WORDS, "--out", out)
-    assert f"--out {out}: holds a finished fleet; add --resume to go on with it" in refused.stderr
+    assert f"--out {out}: holds a finished fleet run; add --resume to go on with it" in refused.stderr
     for words, message in (
         (("--stay-min", "30"), "--resume: stay_s was 3600.0"),
         (("--seed", "1"), "--resume: seed was 0"),
@@ -252,23 +253,23 @@ def test_a_part_of_the_days_is_compared_with_the_same_days():
 def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
     crowded = experiment(arrivals_per_hour=(60.0,), knows=("own",), days=1)
     for name, value in (("leaving_soon_s", 20.0), ("manoeuvre_s", 12.0), ("sees_cars", True)):
-        changed = FleetExperiment(crowded.spec.changed(**{name: value}))
-        assert changed.fingerprint() != crowded.fingerprint()
-        fleet, _ = changed.fleet(changed.settings[0])
+        changed = crowded.changed(**{name: value})
+        assert changed.settings() != crowded.settings()
+        fleet, _ = changed.fleet(changed.fleet_settings[0])
         expected = value if name == "sees_cars" else float(value)
         found = fleet.sees_cars if name == "sees_cars" else float(fleet.records[name][0])
         assert found == expected
     measured = Calibration("mini", 2.0, 15.0, 14.0, 40, 2.8)
     measured.to_file(tmp_path / "calibrated.json")
-    calibrated = FleetExperiment(crowded.spec.changed(calibrated=tmp_path / "calibrated.json"))
-    assert (calibrated.scenario.v_drive, calibrated.scenario.failure_s) == (2.0, 15.0)
-    assert calibrated.manoeuvre_s == 14.0
-    assert FleetExperiment(calibrated.spec.changed(manoeuvre_s=0.0)).manoeuvre_s == 0.0
+    calibrated = crowded.changed(calibrated=tmp_path / "calibrated.json")
+    assert (calibrated.built.v_drive, calibrated.built.failure_s) == (2.0, 15.0)
+    assert calibrated.blocked_s == 14.0
+    assert calibrated.changed(manoeuvre_s=0.0).blocked_s == 0.0
     (day,), (queueing,) = days_of(crowded)[0], days_of(calibrated)[0]
     assert (day["queued_s"], queueing["cars"]) == (0.0, day["cars"])
     assert 0.0 < queueing["queued_s"] < queueing["search_s"]
     with pytest.raises(InputError, match="was measured on 'mini', the fleet drives on 'street'"):
-        _ = FleetExperiment(calibrated.spec.changed(scenario=scenario_specs("street")[0])).scenario
+        _ = calibrated.changed(scenario=scenario_specs("street")[0]).built
 
 
 @pytest.mark.parametrize(

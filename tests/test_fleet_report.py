@@ -15,9 +15,8 @@ from parkenv.cli.arguments import Machines
 from parkenv.cli.report import Replays, make_report
 from parkenv.errors import InputError
 from parkenv.show.report.page import SCHEMA
-from parkenv.studies.fleet.experiment import FleetExperiment
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.report.fleet_recording import DRIVE, FAIL, QUEUE, choose_days
-from parkenv.studies.spec import FleetSpec
 
 
 @pytest.fixture(scope="module")
@@ -75,14 +74,14 @@ def test_cars_drive_along_the_lanes_and_no_slot_holds_two(run):
 
 
 def test_failed_attempts_and_queues_are_on_the_track():
-    spec = FleetSpec().changed(
+    spec = FleetStudy().changed(
         scenario={"lot": "mini", "arrivals": {"hours": "08:00-08:30"}}, agents=["first-free"], knows=["own"],
         arrivals_per_hour=[120], days=1, manoeuvre_s=6.0,
     )  # fmt: skip
-    experiment = FleetExperiment(spec)
-    (day,) = choose_days(experiment, experiment.settings, 1)
+    experiment = spec
+    (day,) = choose_days(experiment, experiment.fleet_settings, 1)
     its = day.record({})["fleet"]
-    fleet, agents = experiment.fleet(experiment.settings[0])
+    fleet, agents = experiment.fleet(experiment.fleet_settings[0])
     fleet.keep_steps()
     fleet.reset(0, 0)
     fleet.run(agents)

@@ -28,15 +28,17 @@ from parkenv.mapping.store import MapStore, Session
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.lab.car_datasets import read_uiuc_test
 from parkenv.scenarios.build import build
+from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.report.page import write_page
-from parkenv.studies.compare.benchmark import Suite, check_result
-from parkenv.studies.fleet.experiment import TABLE
+from parkenv.studies.benchmark.suite import Suite, check_result
+from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.report.run_folder import RunFolder
-from parkenv.studies.results import ResultFolder
-from parkenv.studies.sensing.surveys import detection_by_distance, read_sessions
-from parkenv.studies.spec import ExperimentSpec
-from parkenv.studies.trips.calibration import Calibration, TripFolder
+from parkenv.studies.results import ResultFolder, decision_s
+from parkenv.studies.sensing.sessions import SESSIONS
+from parkenv.studies.sensing.surveys import detection_by_distance
+from parkenv.studies.trips.calibration import TripFolder
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.sensor_model import SensorModel
@@ -95,9 +97,10 @@ def scenario(path):
 
 
 def resumed(path):
-    folder = ResultFolder(path.parent, {"seed": 0, "agents": {}}, resume=True)
-    for key in folder.episodes:
-        folder.decision_s(key)
+    folder = ResultFolder(path.parent)
+    folder.claim({"seed": 0, "agents": {}}, resume=True)
+    for row in folder.rows().values():
+        decision_s(row)
 
 
 def resumed_trips(path):
@@ -117,7 +120,7 @@ def reported_kind(path):
 
 
 def sessions(path):
-    detection_by_distance(read_sessions(path))
+    detection_by_distance(SESSIONS.read(path.parent))
 
 
 def true_locations(path):
@@ -264,7 +267,7 @@ FLEET_SUMMARY = {
         for knows, price in (("own", 1.1), ("shared", None))
     ],
 }  # fmt: skip
-DAY = dict.fromkeys((*TABLE.keys, *TABLE.columns), "1.5") | {
+DAY = dict.fromkeys((*FleetStudy.table.keys, *FleetStudy.table.columns), "1.5") | {
     "scenario": "mini", "agents": "random", "knows": "own", "day": "0", "cars": "20", "members_s": "nan",
 }  # fmt: skip
 DAY_ROWS = f"{','.join(DAY)}\n{','.join(DAY.values())}\n"
@@ -323,7 +326,7 @@ FORMATS = [
     Format("network.onnx", NETWORK, mutated_bytes, read_onnx),
     Format("scenario.toml", SCENARIO, mutated_text, scenario),
     Format("scenario.json", tomllib.loads(SCENARIO), mutated_json, scenario),
-    Format("experiment.json", EXPERIMENT, mutated_json, ExperimentSpec.read),
+    Format("experiment.json", EXPERIMENT, mutated_json, Comparison.read),
     Format(
         "calibrated.json",
         {
@@ -355,7 +358,7 @@ FORMATS = [
     Format("survey.json", SURVEY_SUMMARY, mutated_json, reported_kind),
     Format("commute.json", COMMUTE_SUMMARY, mutated_json, reported_kind),
     Format("fleet.json", FLEET_SUMMARY, mutated_json, reported_kind),
-    Format("days.csv", DAY_ROWS, mutated_text, TABLE.read),
+    Format("days.csv", DAY_ROWS, mutated_text, FleetStudy.table.read),
     Format("sessions.csv", SESSION_ROWS, mutated_text, sessions),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
     Format("timings.csv", TIMING_ROWS, mutated_text, resumed),

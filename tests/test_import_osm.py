@@ -1000,7 +1000,7 @@ def test_a_search_runs_on_what_was_imported(tmp_path, name):
     lot = read_lot(tmp_path / "lot.geojson")
     scenario = make_scenario(lot)
     for agent in ("mdp", "greedy-drive"):
-        rows = Case(scenario, agent).run(range(4))[0]
+        rows = Case(scenario, agent).run(range(4))
         assert all(row["parked"] for row in rows)
         assert all(row["drive_s"] > 0.0 and row["walk_s"] > 0.0 for row in rows)
 

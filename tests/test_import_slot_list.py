@@ -76,7 +76,7 @@ def test_dragon_lake_is_found_again_from_its_slots_alone(tmp_path):
     nearest, _, _ = nearest_on_lanes(found.lanes, lot.vertex_xy[: lot.n_slots])
     assert np.hypot(*(nearest - lot.vertex_xy[: lot.n_slots]).T).max() < 3.0
     scenario = make_scenario(found)
-    rows = Case(scenario, "greedy-drive").run(range(3))[0]
+    rows = Case(scenario, "greedy-drive").run(range(3))
     assert all(r["parked"] for r in rows)
 
 
@@ -331,5 +331,5 @@ def test_a_search_runs_on_a_list_of_slots(tmp_path):
     write_lot(draft.lot(), tmp_path / "lot.geojson")
     assert check_lot(tmp_path / "lot.geojson") == []
     scenario = make_scenario(read_lot(tmp_path / "lot.geojson"))
-    rows = Case(scenario, "mdp").run(range(4))[0]
+    rows = Case(scenario, "mdp").run(range(4))
     assert all(r["parked"] and r["walk_s"] > 0.0 for r in rows)

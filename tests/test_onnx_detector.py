@@ -19,8 +19,9 @@ from parkenv.perception import detector_registry
 from parkenv.perception.detector_registry import detector_version, make_detector
 from parkenv.perception.onnx_detector import OnnxDetector
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.results import SETTINGS
-from parkenv.studies.spec import ExperimentSpec, SurveySpec
+from parkenv.studies.sensing.survey_study import SurveyStudy
 
 CARS = [0, 2]
 NAMES = ("Car", "person", "truck")
@@ -284,7 +285,7 @@ def test_specifications_name_detectors(tmp_path):
     assert spec.files() == [file, tmp_path / "a.toml"]
     assert make_scenario(tmp_path / "s.toml").detector == str(file)
     (tmp_path / "e.toml").write_text('kind = "compare"\nrig = "laser"\ndetector = "a.onnx"\n')
-    assert ExperimentSpec.read(tmp_path / "e.toml").detector == str(file)
+    assert Comparison.read(tmp_path / "e.toml").detector == str(file)
     for text, kind, message in (
         (
             'lot = "mini"\ndetector = "mod:Mine"',
@@ -296,8 +297,8 @@ def test_specifications_name_detectors(tmp_path):
             ScenarioSpec,
             "detector is 'b.onnx', want a file; there is none at",
         ),
-        ('kind = "survey"\ndetector = 3', SurveySpec, "detector is 3, want text"),
-        ('kind = "compare"\ndetector = "side"', ExperimentSpec, "detector goes with a rig"),
+        ('kind = "survey"\ndetector = 3', SurveyStudy, "detector is 3, want text"),
+        ('kind = "compare"\ndetector = "side"', Comparison, "detector requires a rig"),
     ):
         (tmp_path / "bad.toml").write_text(text)
         with pytest.raises(InputError, match=message):
@@ -341,7 +342,7 @@ def test_a_network_looks_in_worker_processes_too(tmp_path):
     assert totals[0] == totals[1]
     bad = parkenv("compare", "--scenario", "mini", "--detector", file, "--out", tmp_path / "bad")
     assert bad.returncode == 2
-    assert "detector goes with a rig" in bad.stderr
+    assert "detector requires a rig" in bad.stderr
 
 
 def test_photographs_are_searched_and_scored_with_it(tmp_path):

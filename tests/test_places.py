@@ -18,7 +18,7 @@ from parkenv.lots import write_lot
 from parkenv.scenarios.places import by_size, lot_share, open_places, place_of_episode, split_places
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.bench.env import grids
-from parkenv.studies.spec import ExperimentSpec
+from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.training.cloning import clone
 from parkenv.studies.training.search_task import SearchTask
 from parkenv.studies.training.search_training import SearchTraining, episode_times
@@ -63,7 +63,7 @@ def test_names_files_folders_and_sequences_of_them_are_scenarios(folder):
     ]
     assert {one.failure_s for one in make_scenarios(several, failure_s=7.0)} == {7.0}
     # Experiment files and the command line say it in the same way.
-    spec = ExperimentSpec.parse({"scenarios": ["mini", "."]}, "test", folder)
+    spec = Comparison.parse({"scenarios": ["mini", "."]}, "test", folder)
     assert [one.title for one in spec.scenarios] == ["mini", *in_folder]
     done = parkenv("compare", "--scenario", f"mini,{folder}", "--agents", "first-free", "-n", 1, "--jobs", 1,
                    "--occupancy-levels", "none", "--no-figures", "--out", folder / "out")  # fmt: skip

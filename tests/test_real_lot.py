@@ -25,13 +25,13 @@ def scenario():
 
 
 def totals(scenario, agent, episodes):
-    return np.array([row["total_s"] for row in Case(scenario, agent).run(range(episodes))[0]])
+    return np.array([row["total_s"] for row in Case(scenario, agent).run(range(episodes))])
 
 
 @needs_data
 def test_the_world_is_the_log_and_the_forecast_is_not(scenario):
     """Searches fall on recorded weekdays in the window, with the occupancy of the log."""
-    rows = Case(scenario, "greedy-drive").run(range(40))[0]
+    rows = Case(scenario, "greedy-drive").run(range(40))
     days = set(scenario.occupancy.log.days)
     assert {row["day"] for row in rows} <= days
     assert all(8 * 3600 <= row["arrival_s"] % 86400 < 13 * 3600 for row in rows)

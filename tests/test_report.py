@@ -308,7 +308,7 @@ def test_asking_belief_for_its_plan_changes_nothing():
     scenario = make_scenario("mini")
     case = Case(scenario, "belief")
     recorded = record(Encounter((case,), 11), {})["searches"][0]
-    assert recorded["total_s"] == case.run([11])[0][0]["total_s"]
+    assert recorded["total_s"] == case.run([11])[0]["total_s"]
 
     agent = make_agent("belief", scenario)
     observation = {

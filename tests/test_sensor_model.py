@@ -145,7 +145,7 @@ def test_the_fast_environment_stands_for_the_slow_one():
 
 def mean_total_s(name, agent, rig):
     scenario = make_scenario(name, sensor_model=SensorModel.named("laser"), traffic=Traffic(3, 5))
-    rows, _ = Case(scenario, agent, rig=rig).run(range(2_000, 2_004))
+    rows = Case(scenario, agent, rig=rig).run(range(2_000, 2_004))
     return np.mean([row["total_s"] for row in rows])
 
 

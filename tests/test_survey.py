@@ -13,7 +13,11 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings, drive_together
 from parkenv.mapping.survey_score import METHODS
 from parkenv.perception.pipeline import PerceptionPipeline
-from parkenv.studies.sensing.surveys import map_error, run_survey
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.sensing.sessions import SESSIONS
+from parkenv.studies.sensing.survey_study import SurveyStudy
+from parkenv.studies.sensing.surveys import map_error
+from parkenv.studies.study import run
 from parkenv.world.occupancy.process import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
@@ -60,17 +64,22 @@ def test_smaller_pictures_are_another_session():
 
 
 def test_a_survey_goes_on_where_it_was(tmp_path):
-    scenario, _ = halves()
-    settings = SurveySettings(weather="sunny", every=4.0)
-    told = []
-    first = run_survey(scenario, settings, 1, tmp_path / "m.sqlite", on_session=told.append)
-    both = run_survey(scenario, settings, 2, tmp_path / "m.sqlite", on_session=told.append)
-    assert both.rows[0] == first.rows[0]
-    assert [r["key"] for r in told] == [r["key"] for r in both.rows]  # the first was not driven again
-    with MapStore(tmp_path / "m.sqlite", scenario.lot, create=False) as store:
-        assert [s.key for s in store.sessions()] == sorted(r["key"] for r in both.rows)
-    with pytest.raises(InputError, match="sessions is 0"):
-        run_survey(scenario, settings, 0, tmp_path / "m.sqlite")
+    study = SurveyStudy(scenario=scenario_spec("mini"), weather="sunny", every=4.0, sessions=1, jobs=1)
+    run(study, tmp_path)
+    (first,) = SESSIONS.read(tmp_path)
+    seen = []
+    run(study.changed(sessions=2), tmp_path, progress=lambda *news: seen.append(news[1:]))
+    rows = SESSIONS.read(tmp_path)
+    assert rows[0] == first, "was not driven again"
+    assert seen[:2] == [(1, 2), (2, 2)]
+    # Sessions that are not in the map are driven again, and others stay.
+    (tmp_path / "map.sqlite").unlink()
+    other = run(study.changed(seed=1), tmp_path)
+    assert [row["key"] for row in SESSIONS.read(tmp_path)] == [study.changed(seed=1).survey.key_of(0)]
+    assert other.rows[0]["sessions"] == 1
+    run(study, tmp_path)
+    with MapStore(tmp_path / "map.sqlite", study.built.lot, create=False) as store:
+        assert len(store.sessions()) == len(SESSIONS.read(tmp_path)) == 2
 
 
 def test_detectors_that_drive_together_find_what_each_finds_alone():

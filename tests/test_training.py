@@ -147,7 +147,7 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
     agent = make_agent(name, SCENARIO)
     times, _ = episode_times(agent.model, SCENARIO, EVALUATED)
     assert times.mean() == pytest.approx(best)
-    rows, _ = Case(SCENARIO, name).run(EVALUATED)
+    rows = Case(SCENARIO, name).run(EVALUATED)
     assert [row["total_s"] for row in rows] == pytest.approx(times)
     env = LocalObservation(gym.make("parkenv/Search-v2", scenario=SCENARIO))
     env.reset(seed=EVALUATED[0])
@@ -240,7 +240,7 @@ def test_cloning_begins_near_the_planner():
     fresh, _ = episode_times(model, campus, EVALUATED)
     clone(model, shown, 0, updates=2000)
     cloned, _ = episode_times(model, campus, EVALUATED)
-    planner = [row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)[0]]
+    planner = [row["total_s"] for row in Case(campus, "first-free").run(EVALUATED)]
     # The mean would be of those few searches in which a clone drives in circles; on empty days any agent parks soon.
     cloned_s, planner_s, fresh_s = (np.quantile(times, 0.75) for times in (cloned, planner, fresh))
     assert cloned_s < 1.2 * planner_s < fresh_s
@@ -272,7 +272,7 @@ def test_a_model_decides_on_driven_trips(trained):
     """On the lanes of the same world, it drives as in the search environment, as long as no attempt fails."""
     name = f"maskable-ppo:{trained / 'model.safetensors'}"
     search = DrivenSearch(SCENARIO, name)
-    planned = {row["seed"]: row for row in Case(SCENARIO, name).run(range(6))[0]}
+    planned = {row["seed"]: row for row in Case(SCENARIO, name).run(range(6))}
     trips = [search.run(seed) for seed in planned]
     assert all(trip.parked for trip in trips)
     same = [trip.slot == planned[trip.seed]["slot"] for trip in trips]

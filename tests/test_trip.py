@@ -22,11 +22,11 @@ from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.lots import packaged_lot
 from parkenv.scenarios.blind import blind_scenario
+from parkenv.scenarios.calibration import Calibration
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import (
     OBSERVED,
     UNOBSERVED,
-    Calibration,
     TripFolder,
     TripPlan,
     calibrate,

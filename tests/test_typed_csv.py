@@ -1,10 +1,13 @@
 """Tables of run folders: a wrong value is refused in a line with file, line, column, value, and what was wanted."""
 
+from dataclasses import replace
+
 import pytest
 
 from parkenv import InputError
-from parkenv.studies.results import read_rows
-from parkenv.studies.sensing.surveys import ERROR_COLUMNS, detection_by_distance, read_sessions
+from parkenv.studies.results import EPISODES
+from parkenv.studies.sensing.sessions import ERROR_COLUMNS, SESSIONS
+from parkenv.studies.sensing.surveys import detection_by_distance
 from parkenv.studies.training.curve_file import read_curve
 
 SESSION = {
@@ -28,6 +31,14 @@ EVALUATION = {"steps": "0", "total_s": "80.0", "low_s": "nan", "wall_s": "4.5"}
 def write(path, row):
     path.write_text(f"{','.join(row)}\n{','.join(row.values())}\n")
     return path
+
+
+def read_sessions(path):
+    return replace(SESSIONS, file=path.name).read(path.parent)
+
+
+def read_rows(path):
+    return replace(EPISODES, file=path.name, timings=None).read(path.parent)
 
 
 def test_good_tables_are_read(tmp_path):

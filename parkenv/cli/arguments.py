@@ -46,7 +46,8 @@ from parkenv.files.known_names import BackendName, ForecastFrom
 if TYPE_CHECKING:
     from parkenv.files.spec_file import Spec
     from parkenv.scenarios.spec import ScenarioSpec, TrafficSpec
-    from parkenv.studies.spec import Grid, Workplace
+    from parkenv.studies.compare.comparison import Grid
+    from parkenv.studies.study import ExecutionSpec
     from parkenv.studies.workers import Workers
 
     SpecT = TypeVar("SpecT", bound=Spec)
@@ -271,7 +272,7 @@ class Costs:
         Raises:
             InputError: the text has no numbers, or a number is out of range.
         """
-        from parkenv.studies.spec import FAILURE_COST_SWEEP
+        from parkenv.studies.compare.comparison import FAILURE_COST_SWEEP
 
         if self.failure_cost == "sweep":
             base = base.changed(failure_s=FAILURE_COST_SWEEP)
@@ -331,7 +332,7 @@ class Machines:
         return workers_of(self)
 
 
-def workers_of(place: Machines | Workplace) -> Workers:
+def workers_of(place: Machines | ExecutionSpec) -> Workers:
     """Return the workers for tasks, a context manager that connects to clusters.
 
     Raises:
@@ -431,7 +432,7 @@ def saved(folder: Path, kind: type[SpecT]) -> SpecT:
     Raises:
         InputError: there is none.
     """
-    from parkenv.studies.spec import SPEC_FILE
+    from parkenv.studies.results import SPEC_FILE
 
     file = folder / SPEC_FILE
     if not file.exists():

@@ -44,7 +44,7 @@ def bench(
         seed (N >= 0): Of the lots and the noise.
         out, -o (DIR): Folder for summary.json, and a table of each part for a page.  [default: none]
     """
-    from parkenv.studies.results import make_folder
+    from parkenv.files.atomic_write import make_folder
 
     chosen = parts or list(PARTS)
     for part in chosen:

@@ -5,21 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from parkenv import __version__
 from parkenv.cli import arguments as args
 from parkenv.cli.command import add, group
-from parkenv.cli.report import make_report
-from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import command_line, make_console, make_table, progress_bar
+from parkenv.cli.study_run import run_study
+from parkenv.cli.tables import command_line, make_console, make_table
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.spec import BenchmarkSpec
+    from parkenv.studies.study import Result
 
-RESULT = "result.json"
 PLACES = "-places"
 """End of the name of a suite of places."""
 
@@ -55,62 +52,25 @@ def run(
         by (TEXT): Who submits the result: a name, an address of the code.  [default: nobody]
     """
     from parkenv.studies.agent_spec import split_agents
-    from parkenv.studies.spec import BenchmarkSpec
+    from parkenv.studies.benchmark.study import Benchmark
 
     suite += PLACES if places else ""
     out = out or Path("results") / suite
-    base = args.saved(out, BenchmarkSpec) if folder.resume else BenchmarkSpec()
+    base = args.saved(out, Benchmark) if folder.resume else Benchmark()
     require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
     named = None if agents is None else readable_models(split_agents(agents), trust_model)
     given = args.not_none(by=by, agents=named)
     spec = base.changed(suite=suite, **given, **machines.given)
-    with writing_into(out, f"--resume --out {out}"):
-        run_suite(spec, out, folder)
+    run_study(spec, out, folder, show_scores)
 
 
-def run_suite(spec: BenchmarkSpec, out: Path, folder: args.ReportedRun) -> None:
-    """Run a suite with a progress bar, write its result and print the scores.
+def show_scores(console: Console, result: Result) -> None:
+    """Print the scores of a finished suite."""
+    from parkenv.files.limited_reading import read_json
+    from parkenv.studies.benchmark.study import RESULT
 
-    Raises:
-        InputError: an agent cannot be made, or the folder cannot be used.
-    """
-    from parkenv.studies.compare.benchmark import Suite, result_of
-    from parkenv.studies.compare.cases import run_cases
-    from parkenv.studies.compare.experiment import agent_fingerprints
-    from parkenv.studies.results import ResultFolder, write_summary
-    from parkenv.studies.spec import SPEC_FILE
-
-    suite = Suite.named(spec.suite)
-    cases = suite.cases(spec.agents)
-    settings = {
-        "version": __version__,
-        "suite": suite.name,
-        "suite_sha256": suite.fingerprint,
-        "agent files": agent_fingerprints(case.agent for case, _ in cases),
-    }
-    console = make_console()
-    complete = True
-    with args.workers_of(spec) as workers, progress_bar(console, "episodes") as progress:
-        results = ResultFolder(out, settings, resume=folder.resume, overwrite=folder.overwrite)
-        spec.write(out / SPEC_FILE)
-        bar = progress.add_task("Searching", total=sum(len(seeds) for _, seeds in cases))
-        try:
-            run_cases(cases, results, workers=workers, on_progress=lambda n: progress.advance(bar, n))
-        except KeyboardInterrupt:
-            complete = False
-    order = [case.key(seed) for case, seeds in cases for seed in seeds]
-    command = command_line()
-    if not complete:
-        results.finish(order, {"command": command, "complete": False}, complete=False)
-        raise KeyboardInterrupt
-    result = result_of(suite, cases, results, command, spec.by)
-    summary = {"command": command, "version": __version__, "complete": True, "rows": result["rows"]}
-    results.finish(order, summary)
-    write_summary(out, result, RESULT)
-    _print(console, [result])
-    console.print(f"Written: {out / RESULT}, and every episode beside it")
-    if folder.report:
-        make_report(out, spec)
+    if result.complete:
+        _print(console, [read_json(result.folder / RESULT)])
 
 
 def check(results: list[Path], /) -> None:
@@ -125,7 +85,7 @@ def check(results: list[Path], /) -> None:
     Options:
         results (FILE): Result files.
     """
-    from parkenv.studies.compare.benchmark import check_result
+    from parkenv.studies.benchmark.suite import check_result
 
     console = make_console()
     with console.status("Checking"):
@@ -149,10 +109,11 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
         results (FILE|DIR): Result files, or folders with result.json files in them.
         out, -o (FILE.html): The page.
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.show.report.page import write_page
-    from parkenv.studies.compare.benchmark import check_result
+    from parkenv.studies.benchmark.study import RESULT
+    from parkenv.studies.benchmark.suite import check_result
     from parkenv.studies.report.benchmark_page import benchmark_data
-    from parkenv.studies.results import make_folder
 
     files = [each for path in results for each in (sorted(path.rglob(RESULT)) if path.is_dir() else [path])]
     if not files:
@@ -177,7 +138,7 @@ def show(suite: str = "v2", /, places: bool = False) -> None:
         suite (SUITE): The suite.  [default: v2]
         places: Show the places of the suite instead of its packaged scenarios.
     """
-    from parkenv.studies.compare.benchmark import SUITES, Suite
+    from parkenv.studies.benchmark.suite import SUITES, Suite
 
     its = Suite.named(suite + PLACES if places else suite)
     console = make_console()
@@ -210,7 +171,7 @@ def show(suite: str = "v2", /, places: bool = False) -> None:
 
 
 def _print(console: Console, results: list[dict[str, Any]]) -> None:
-    from parkenv.studies.compare.benchmark import by_group
+    from parkenv.studies.benchmark.suite import by_group
 
     lines = []
     columns: list[str] = []

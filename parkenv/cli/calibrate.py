@@ -60,7 +60,7 @@ def calibrate(
     from parkenv.perception.detector_registry import detector_version
     from parkenv.scenarios.build import build
     from parkenv.studies.agent_spec import AgentSpec
-    from parkenv.studies.compare.experiment import agent_fingerprints, fingerprints, flat_tables
+    from parkenv.studies.fingerprints import agent_fingerprints, fingerprints, flat_tables
     from parkenv.studies.trips import calibration
     from parkenv.studies.trips.driven_search import DrivenSearch
     from parkenv.studies.trips.vehicle_controller import DrivingStyle
@@ -147,10 +147,10 @@ def trip(
         notice (M): Metres along its path at which the car notices at the latest that it would drive into a taken slot.
         v_drive_kmh (V): Speed limit on the lanes, km/h.  [default: the scenario's, 10]
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.scenarios.blind import blind_scenario
     from parkenv.scenarios.build import build
     from parkenv.show.figures.picture_files import save_film
-    from parkenv.studies.results import make_folder
     from parkenv.studies.trips.driven_search import DrivenSearch
     from parkenv.studies.trips.sensor_log import record_trip, require_viewer, sensor_log
     from parkenv.studies.trips.trip_film import COLORS, FPS, film_trip

@@ -6,19 +6,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
-from parkenv.cli.folder_run import run_into
-from parkenv.cli.report import make_report
-from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.study_run import run_study
+from parkenv.cli.tables import make_table
 from parkenv.cli.trust import readable_models, require_trust
 from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
-    from parkenv.studies.spec import CommuteSpec
-
-PICTURE = "commute.png"
+    from parkenv.studies.study import Result
 
 
 def commute(
@@ -86,11 +83,11 @@ def commute(
         figures: Draw the picture.  [default: figures]
     """
     from parkenv.studies.agent_spec import split_agents
-    from parkenv.studies.spec import CommuteSpec
+    from parkenv.studies.commute.study import Commute
 
-    base = CommuteSpec()
+    base = Commute()
     if folder.resume:
-        base = args.saved(out, CommuteSpec)
+        base = args.saved(out, Commute)
         if agents is None:
             require_trust(base, out, trust)
     given = args.not_none(days=days, drivers=drivers, fleet=fleet, seed=seed, figures=figures)
@@ -98,34 +95,15 @@ def commute(
         given["agents"] = readable_models(split_agents(agents), trust_model)
     if map is not None:
         given["maps"] = tuple(args.words("--map", map))
-    spec = base.changed(scenarios=tuple(world.specs(scenario, base.scenarios)), **given, **machines.given)
-    with writing_into(out, f"--resume --out {out}"):
-        run_commute_of(spec, out, folder)
+    study = base.changed(scenarios=tuple(world.specs(scenario, base.scenarios)), **given, **machines.given)
+    run_study(study, out, folder, show)
 
 
-def run_commute_of(spec: CommuteSpec, out: Path, folder: args.ReportedRun) -> None:
-    """Run a commute with a progress bar, print its tables and draw its picture.
-
-    Raises:
-        InputError: the commute cannot be run, or the folder cannot be used.
-        KeyboardInterrupt: the run was interrupted; the results of finished days are printed and in the folder.
-    """
-    from parkenv.studies.compare.commute import run_commute
-
-    console = make_console()
-    result = run_into(out, run_commute, spec, folder, console, doing="Driving", unit="searches")
-    for name in dict.fromkeys(row["scenario"] for row in result.weeks):
-        console.print(_table(name, [row for row in result.weeks if row["scenario"] == name]))
-    if not result.complete:
-        raise KeyboardInterrupt
-    if spec.figures:
-        from parkenv.show.figures.commute import save_commute_curves
-
-        with console.status("Drawing the picture"):
-            save_commute_curves(result.rows, out / PICTURE)
-    console.print(f"Episodes, summary and maps{' and the picture' if spec.figures else ''} are in {out}")
-    if folder.report:
-        make_report(out, spec)
+def show(console: Console, result: Result) -> None:
+    """Print the tables of a commute."""
+    weeks = result.summary["weeks"]
+    for name in dict.fromkeys(row["scenario"] for row in weeks):
+        console.print(_table(name, [row for row in weeks if row["scenario"] == name]))
 
 
 def _table(scenario: str, rows: list[dict[str, Any]]) -> Table:

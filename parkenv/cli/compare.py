@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
 from parkenv.cli.command import options_of
-from parkenv.cli.folder_run import run_into
-from parkenv.cli.report import make_report
-from parkenv.cli.single_writer import writing_into
+from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import (
     WIDE,
     make_console,
@@ -19,14 +17,15 @@ from parkenv.cli.tables import (
 )
 from parkenv.errors import InputError
 from parkenv.show.plurals import plural
+from parkenv.studies.results import Row
 
 if TYPE_CHECKING:
+    from rich.console import Console
     from rich.table import Table
 
     from parkenv.studies.compare.cases import Case
-    from parkenv.studies.spec import ExperimentSpec
-
-Row = dict[str, Any]
+    from parkenv.studies.compare.comparison import Comparison
+    from parkenv.studies.study import Result
 
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Default occupancy levels of a comparison."""
@@ -34,7 +33,7 @@ MOST_TABLES = 12
 """Maximum number of settings to print; see the figures and files for larger grids."""
 
 
-@options_of("parkenv.studies.spec:ExperimentSpec", "--cars", "--pedestrians")
+@options_of("parkenv.studies.compare.comparison:Comparison", "--cars", "--pedestrians")
 def compare(
     given: dict[str, Any],
     /,
@@ -68,63 +67,54 @@ def compare(
     """
     from parkenv.cli.spec_options import given_spec
     from parkenv.scenarios.build import largest_lots
-    from parkenv.studies.spec import FAILURE_COST_SWEEP, ExperimentSpec
+    from parkenv.studies.compare.comparison import FAILURE_COST_SWEEP, Comparison
 
     sweep = given.get("--failure-cost") == "sweep"
-    first = ExperimentSpec().changed(grid={"occupancy_levels": () if sweep else LEVELS})
+    first = Comparison().changed(grid={"occupancy_levels": () if sweep else LEVELS})
     base, spec = given_spec(first, given, out, folder.resume, trust, trust_model)
     if sweep or base.grid.failure_s == FAILURE_COST_SWEEP != spec.grid.failure_s:
         spec = spec.changed(grid=spec.grid.changed(blind=sweep))
     if largest is not None:
         spec = spec.changed(scenarios=tuple(largest_lots(spec.scenarios, largest)))
-    with writing_into(out, f"--resume --out {out}"):
-        run_comparison(spec, out, folder, rerun)
+    run_comparison(spec, out, folder, rerun)
 
 
-def run_comparison(
-    spec: ExperimentSpec, out: Path, folder: args.ReportedRun, rerun: Path | None = None
-) -> None:
-    """Run an experiment with a progress bar, print its tables and draw its figures.
+def run_comparison(study: Comparison, out: Path, folder: args.ReportedRun, rerun: Path | None = None) -> None:
+    """Run a comparison, print its tables, and record its first episode on request.
 
     Raises:
-        InputError: the experiment cannot be run, or the folder cannot be used.
+        InputError: the comparison cannot be run, or the folder cannot be used.
         KeyboardInterrupt: the run was interrupted; the results of finished episodes are printed and in the folder.
     """
-    from parkenv.studies.compare.experiment import run_experiment
-    from parkenv.studies.compare.figures import draw_figures
-    from parkenv.world.scenario import KMH
-
     if rerun is not None:
         from parkenv.studies.trips.sensor_log import require_viewer
 
-        if spec.rig is None:
+        if study.rig is None:
             raise InputError("--rerun records what sensors measure: add --rig laser")
         require_viewer()
-    console = make_console()
-    result = run_into(out, run_experiment, spec, folder, console, doing="Searching", unit="episodes")
+    run_study(study, out, folder, show)
+    if rerun is not None:
+        console = make_console()
+        with console.status(f"Running the first episode once more for {rerun}"):
+            _record(*study.cases[0], rerun)
+        print_recorded(console, rerun)
+
+
+def show(console: Console, result: Result) -> None:
+    """Print the tables of a comparison."""
+    from parkenv.world.scenario import KMH
+
     count = setting_count(result.rows)
     for printed in result_tables(result.rows, console.width) if count <= MOST_TABLES else []:
         console.print(printed)
     if count > MOST_TABLES:
         console.print(f"{count} settings: their tables are in summary.json")
-    if (measured := result.experiment.calibration) is not None:
+    if (measured := result.summary.get("calibrated")) is not None:
         console.print(
-            f"Calibrated over {plural(measured.trips, 'trip')}: failure cost {measured.failure_s:.4g} s, drive "
-            f"{measured.v_drive / KMH:.4g} km/h. Parking takes {measured.manoeuvre_s:.1f} s more for the manoeuvre "
-            "into the slot, under either cost; the tables leave that out."
+            f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, drive "
+            f"{measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for the "
+            "manoeuvre into the slot, under either cost; the tables leave that out."
         )
-    if not result.complete:
-        raise KeyboardInterrupt
-    if spec.figures:
-        with console.status("Drawing figures"):
-            draw_figures(result.figure_data(), out)
-    console.print(f"Episodes{', summary and figures' if spec.figures else ' and summary'} are in {out}")
-    if rerun is not None:
-        with console.status(f"Running the first episode once more for {rerun}"):
-            _record(*result.experiment.cases[0], rerun)
-        print_recorded(console, rerun)
-    if folder.report:
-        make_report(out, spec)
 
 
 def setting_count(rows: list[Row]) -> int:
@@ -132,7 +122,7 @@ def setting_count(rows: list[Row]) -> int:
     return len({(r["scenario"], r["failure_cost_s"], r["v_walk_kmh"], r["v_drive_kmh"]) for r in rows})
 
 
-def _record(case: Case, seeds: range, path: Path) -> None:
+def _record(case: Case, seeds: Sequence[int], path: Path) -> None:
     """Record the first episode of a case with its sensors."""
     from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.studies.trips.sensor_log import record_search, sensor_log

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from parkenv.cli import arguments as args
 from parkenv.cli.arguments import words
-from parkenv.cli.detector_drives import compare_on_drives
-from parkenv.cli.single_writer import writing_into
+from parkenv.cli.detector_drives import show
+from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
 from parkenv.errors import InputError
 from parkenv.files.file_names import distinct_names, file_name
@@ -55,8 +55,8 @@ def detect(
         step (N >= 1): Of a video, look at every N-th frame.
         out, -o (DIR): Folder for NAME_cars.png, NAME_cars.mp4, boxes.csv and summary.json.  [default: none]
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.files.csv_writing import write_csv
-    from parkenv.studies.results import make_folder
     from parkenv.studies.sensing.detection_run import (
         BOX_COLUMNS,
         detect_in_image,
@@ -375,18 +375,14 @@ def evaluate_detector(
     if drives is not None:
         names = words("--detector", detector or model)
         if sessions:
-            with writing_into(out, "the same command"):
-                compare_on_drives(
-                    drives,
-                    words("--rig", rig or "laser"),
-                    names,
-                    sessions,
-                    every,
-                    seed,
-                    misses,
-                    out,
-                    machines,
-                )
+            from parkenv.studies.sensing.detector_study import DetectorStudy
+
+            study = DetectorStudy().changed("--rig", rigs=words("--rig", rig or "laser"))
+            study = study.changed(
+                scenario=drives, detectors=names, sessions=sessions, every=every, seed=seed, misses=misses,
+                **machines.given,
+            )  # fmt: skip
+            run_study(study, out, args.ReportedRun(), show)
             return
         _evaluate_on_drives(drives, names, pictures, false_positives, seed, out)
     elif crops is not None:
@@ -398,9 +394,9 @@ def evaluate_detector(
 def _evaluate_on_drives(
     scenario: str, names: Sequence[str], pictures: int, false_positives: float, seed: int, out: Path
 ) -> None:
+    from parkenv.files.atomic_write import make_folder
     from parkenv.perception.detector_registry import make_detector
     from parkenv.scenarios.build import make_scenario
-    from parkenv.studies.results import make_folder
     from parkenv.studies.sensing.detector_drives import drive_pictures, score_on_drives
 
     if pictures < 1:
@@ -444,8 +440,8 @@ def _model_or_detector(model: str, detector: str | None) -> CarModel | Detector:
 
 
 def _evaluate_on_crops(folder: Path, model: str, detector: str | None, out: Path) -> None:
+    from parkenv.files.atomic_write import make_folder
     from parkenv.perception.lab.car_datasets import read_crop_folder
-    from parkenv.studies.results import make_folder
     from parkenv.studies.sensing.detector_scores import recall_on_crops
 
     loaded, crops = _model_or_detector(model, detector), read_crop_folder(folder)
@@ -471,8 +467,8 @@ def _evaluate_on_crops(folder: Path, model: str, detector: str | None, out: Path
 def _evaluate_on_uiuc(uiuc: Path, model: str, detector: str | None, out: Path) -> None:
     from rich.progress import Progress
 
+    from parkenv.files.atomic_write import make_folder
     from parkenv.perception.car_model import CarModel
-    from parkenv.studies.results import make_folder
     from parkenv.studies.sensing.detector_scores import save_curves, score_on_uiuc
 
     loaded = _model_or_detector(model, detector)

@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
-from parkenv.cli.folder_run import run_into
-from parkenv.cli.report import make_report
-from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import make_console, make_table
+from parkenv.cli.study_run import run_study
+from parkenv.cli.tables import make_table
 from parkenv.cli.trust import readable_models, require_trust
-from parkenv.show.plurals import plural
+from parkenv.studies.results import Row
 
 if TYPE_CHECKING:
-    from parkenv.studies.spec import FleetSpec
+    from rich.console import Console
 
-Row = dict[str, Any]
-
-PICTURE = "fleet.png"
+    from parkenv.studies.study import Result
 
 
 def fleet(
@@ -98,11 +93,11 @@ def fleet(
         figures: Draw the picture.  [default: figures]
     """
     from parkenv.studies.agent_spec import split_agents
-    from parkenv.studies.spec import FleetSpec
+    from parkenv.studies.fleet.study import FleetStudy
 
-    base = FleetSpec()
+    base = FleetStudy()
     if folder.resume:
-        base = args.saved(out, FleetSpec)
+        base = args.saved(out, FleetStudy)
         require_trust(base, out, trust, given=args.not_none(agents=agents) | machines.given)
     spec = base.changed(**args.not_none(days=episodes, seed=seed, figures=figures), **machines.given)
     if agents is not None:
@@ -126,40 +121,19 @@ def fleet(
     spec = spec.changed(**args.not_none(
         manoeuvre_s=manoeuvre, leaving_soon_s=leaving_soon, sees_cars=sees_cars, decision_limit_s=decision_limit,
     ))  # fmt: skip
-    with writing_into(out, f"--resume --out {out}"):
-        run_fleet_of(spec, out, folder)
+    run_study(spec, out, folder, show)
 
 
-def run_fleet_of(spec: FleetSpec, out: Path, folder: args.ReportedRun) -> None:
-    """Run an experiment with a progress bar, print its table and draw its picture.
-
-    Raises:
-        InputError: the experiment cannot be run, or the folder cannot be used.
-        KeyboardInterrupt: the run was interrupted; the results of finished days are printed and in the folder.
-    """
-    from parkenv.studies.fleet.experiment import run_fleets
-
-    console = make_console()
-    result = run_into(out, run_fleets, spec, folder, console, doing="Driving", unit="days")
-    its = result.experiment.scenario
-    title = f"{its.name}: {its.lot.n_slots} slots, {plural(spec.days, 'day')}"
-    if result.rows:
-        headings = (
-            "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
-            "cruising", "occupancy", "price of anarchy", "over bound",
-        )  # fmt: skip
-        console.print(make_table(title, headings, map(_cells, result.rows)))
-    if not result.complete:
-        raise KeyboardInterrupt
-    if spec.figures:
-        from parkenv.show.figures.fleet import save_fleet_figure
-        from parkenv.studies.fleet.measures import looks_s
-
-        with console.status("Drawing the picture"):
-            save_fleet_figure(result.rows, partial(looks_s, its), title, out / PICTURE)
-    console.print(f"Days{', summary and the picture' if spec.figures else ' and summary'} are in {out}")
-    if folder.report:
-        make_report(out, spec)
+def show(console: Console, result: Result) -> None:
+    """Print the table of a study of many cars."""
+    study: Any = result.study
+    if not result.rows:
+        return
+    headings = (
+        "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
+        "cruising", "occupancy", "price of anarchy", "over bound",
+    )  # fmt: skip
+    console.print(make_table(study.title, headings, map(_cells, result.rows)))
 
 
 def _cells(row: Row) -> tuple[str, ...]:

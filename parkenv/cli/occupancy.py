@@ -52,8 +52,8 @@ def fit(
         timezone (NAME): Local time of counts with hour_utc.
         out, -o (DIR): Folder for summary.json and, of a log, process.json and rates.png.
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.forecast.counts import Counts, is_counts
-    from parkenv.studies.results import make_folder
 
     make_folder(out)
     console = make_console()
@@ -192,11 +192,11 @@ def evaluate(
 
     import numpy as np
 
+    from parkenv.files.atomic_write import make_folder
     from parkenv.forecast.comparison import MODELS, compare
     from parkenv.forecast.counts import Counts, is_counts
     from parkenv.forecast.day_curves import FIT_STEPS, fit_settings
     from parkenv.show.figures.forecast import save_forecast, shown_counts, shown_week
-    from parkenv.studies.results import make_folder
 
     make_folder(out)
     console = make_console()

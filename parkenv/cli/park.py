@@ -62,8 +62,8 @@ def park(
         slack (M >= 0): Distance around the slot kept clear of parked cars, m.
     """
     from parkenv.driving.parking_task import KINDS, WAYS
+    from parkenv.files.atomic_write import make_folder
     from parkenv.scenarios.build import build
-    from parkenv.studies.results import make_folder
     from parkenv.studies.trips.parking_runs import ParkingCase, park_all, parking_table, write_parkings
     from planners.driving.parking_agents import make_parking_agent
 

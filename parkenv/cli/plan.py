@@ -34,13 +34,13 @@ def plan(
     """
     import numpy as np
 
+    from parkenv.files.atomic_write import make_folder
     from parkenv.scenarios.build import build
     from parkenv.show.figures.picture_files import save_picture
     from parkenv.show.figures.searches import draw_searches
     from parkenv.studies.agent_spec import AgentSpec
     from parkenv.studies.compare.cases import Case, settings_of
-    from parkenv.studies.results import make_folder
-    from parkenv.studies.spec import Grid
+    from parkenv.studies.compare.comparison import Grid
     from planners.agent import make_agent
     from planners.thesis.replanning import StaticAgent
 

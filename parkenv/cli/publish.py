@@ -52,10 +52,11 @@ def publish(
             fleet, 16]
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.scenarios.build import build
     from parkenv.studies.publish.fleet import FleetPublication
     from parkenv.studies.publish.publication import CARD, FILM, MODEL, Publication
-    from parkenv.studies.results import make_folder, write_summary
+    from parkenv.studies.results import write_summary
     from parkenv.studies.training.spec import FleetTrainingSpec
     from parkenv.studies.training.training_task import FIGURE, TEST_SEED
     from planners.model_file import ModelCard

@@ -14,10 +14,11 @@ from parkenv.cli.trust import require_trust
 from parkenv.errors import InputError, nearest
 
 if TYPE_CHECKING:
-    from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+    from parkenv.studies.fleet.setting import Setting
+    from parkenv.studies.fleet.study import FleetStudy
     from parkenv.studies.report.fleet_recording import FleetDay
     from parkenv.studies.report.repetition import Cases
-    from parkenv.studies.spec import Workplace
+    from parkenv.studies.study import ExecutionSpec
 
 PAGE = "report.html"
 EPISODES, SENSED, DAYS = 20, 4, 8
@@ -75,7 +76,7 @@ def report(
 
 def make_report(
     folder: Path,
-    machines: args.Machines | Workplace,
+    machines: args.Machines | ExecutionSpec,
     replays: Replays = REPLAYS,
     *,
     out: Path | None = None,
@@ -92,17 +93,24 @@ def make_report(
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
             are not trusted.
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.show.report.page import write_page
+    from parkenv.studies.replays import Replays as Repeated
     from parkenv.studies.report.fleet_recording import choose_days, differing_days
-    from parkenv.studies.report.repetition import Repetition, differences, drawable, drawable_settings
+    from parkenv.studies.report.repetition import (
+        differences,
+        drawable,
+        drawable_settings,
+        repeat_drive,
+        replays_of,
+    )
     from parkenv.studies.report.run_folder import RunFolder
     from parkenv.studies.report.search_recording import choose, record
-    from parkenv.studies.results import make_folder
 
     run = RunFolder.read(folder)
     make_folder(folder if out is None else out.parent)
     console = make_console()
-    repeated = Repetition([])
+    repeated = Repeated()
     notes: list[str] = []
     spec = None
     try:
@@ -113,21 +121,21 @@ def make_report(
         # The page is made on the machines of this command, not of the run.
         require_trust(spec.changed(address=None), folder, trust)
     try:
-        repeated = Repetition.of_run(run, spec)
+        repeated = replays_of(run, spec)
     except (InputError, OSError) as error:
         # The page still has tables and figures.
         notes.append(f"There is no replay: {error}")
-    sensed = any(case.rig is not None for case, _ in repeated.cases)
+    sensed = any(case.rig is not None for case, _ in repeated.searches)
     wanted = replays.episodes if replays.episodes is not None else SENSED if sensed else EPISODES
     days: list[FleetDay] = []
     cases: Cases = []
-    if (fleets := repeated.fleets) is not None:
+    if (fleets := repeated.fleet) is not None:
         settings, too_large = drawable_settings(fleets, _chosen_settings(fleets, replays.agents))
         wanted = replays.episodes if replays.episodes is not None else DAYS
-        numbers = replays.replay and _numbers_of(range(fleets.spec.days), replays.replay)
+        numbers = replays.replay and _numbers_of(range(fleets.days), replays.replay)
         days = choose_days(fleets, settings, wanted, numbers or None)
     else:
-        cases, too_large = drawable(_chosen(repeated.cases, replays.replay, replays.agents))
+        cases, too_large = drawable(_chosen([*repeated.searches], replays.replay, replays.agents))
     notes += too_large
     encounters = choose(cases, wanted) if wanted else []
     again = range(min(replays.sessions, repeated.sessions) if drives is None else 0)
@@ -136,7 +144,9 @@ def make_report(
     for encounter in encounters:
         keys = [case.key(encounter.seed) for case in encounter.cases]
         tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
-    tasks += [partial(repeated.drive, number, replays.frames // max(len(again), 1)) for number in again]
+    if repeated.survey is not None:
+        frames = replays.frames // max(len(again), 1)
+        tasks += [partial(repeat_drive, *repeated.survey, number, frames) for number in again]
     day_totals = run.day_totals() if days else {}
     tasks += [partial(one.record, day_totals) for one in days]
     with args.workers_of(machines) as workers, progress_bar(console) as progress:
@@ -156,12 +166,12 @@ def make_report(
     return path
 
 
-def _chosen_settings(fleets: FleetExperiment, agents: str | None) -> list[Setting]:
+def _chosen_settings(fleets: FleetStudy, agents: str | None) -> list[Setting]:
     """Return the settings with the agents selected by `--agents`."""
     if agents is None:
-        return fleets.settings
-    names = _agents_of(list(dict.fromkeys(one.agent.label for one in fleets.settings)), agents)
-    return [one for one in fleets.settings if one.agent.label in names]
+        return fleets.fleet_settings
+    names = _agents_of(list(dict.fromkeys(one.agent.label for one in fleets.fleet_settings)), agents)
+    return [one for one in fleets.fleet_settings if one.agent.label in names]
 
 
 def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:

@@ -6,27 +6,28 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from parkenv.cli import arguments as args
-from parkenv.cli.benchmark import run_suite
-from parkenv.cli.commute import run_commute_of
-from parkenv.cli.compare import run_comparison
+from parkenv.cli.benchmark import show_scores
+from parkenv.cli.commute import show as show_commute
+from parkenv.cli.compare import show as show_comparison
 from parkenv.cli.demo import run_demo
-from parkenv.cli.fleet import run_fleet_of
+from parkenv.cli.detector_drives import show as show_detectors
+from parkenv.cli.fleet import show as show_fleet
 from parkenv.cli.single_writer import writing_into
-from parkenv.cli.survey import run_survey_of
+from parkenv.cli.study_run import run_study
+from parkenv.cli.survey import show as show_survey
 from parkenv.cli.train import run_training
 from parkenv.cli.trust import require_trust
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError
 
-KINDS: Mapping[str, Callable[..., None]] = {
-    "compare": run_comparison,
-    "commute": run_commute_of,
-    "fleet": run_fleet_of,
-    "benchmark": run_suite,
-    "survey": run_survey_of,
-    "demo": run_demo,
-    "train": run_training,
+SHOWN: Mapping[str, Callable[..., None]] = {
+    "compare": show_comparison,
+    "commute": show_commute,
+    "fleet": show_fleet,
+    "benchmark": show_scores,
+    "survey": show_survey,
+    "detectors": show_detectors,
 }
-"""Function that runs each kind of file."""
+"""What prints the result of each kind of study."""
 
 
 def run(
@@ -52,21 +53,21 @@ def run(
         experiment (FILE|DIR): An experiment file (.toml, .json), or the folder of a run.
         out, -o (DIR): Folder for the results.  [default: results/NAME of the file]
     """
-    from parkenv.files.spec_file import read_tables
-    from parkenv.studies.kinds import SPECS
-    from parkenv.studies.spec import SPEC_FILE
+    from parkenv.studies.results import SPEC_FILE
+    from parkenv.studies.study import read_study
 
     file = experiment
     if file.is_dir():
         if out is not None:
             raise InputError(f"{file} is the folder of a run, which goes on there; leave out --out")
         file, out = file / SPEC_FILE, file
-    tables = read_tables(file)
-    name = tables.get("kind", "compare")
-    if not isinstance(name, str) or name not in KINDS:
-        raise InputError(f"{file}: kind is {name!r}; {nearest(str(name), KINDS)}")
-    spec = SPECS[name].parse(tables, str(file), file.parent)
-    require_trust(spec, experiment, trust)
-    out = out or Path("results") / file.stem
-    with writing_into(out, f"parkenv run {out} --resume"):
-        KINDS[name](spec.changed(**machines.given), out, folder)
+    study = read_study(file)
+    require_trust(study, experiment, trust)
+    study, out = study.changed(**machines.given), out or Path("results") / file.stem
+    if study.kind == "demo":
+        run_demo(study, out, folder)
+    elif study.kind == "train":
+        with writing_into(out, f"parkenv run {out} --resume"):
+            run_training(study, out, folder)
+    else:
+        run_study(study, out, folder, SHOWN[study.kind])

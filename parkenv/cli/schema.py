@@ -10,7 +10,7 @@ from typer import echo
 
 from parkenv.errors import InputError, nearest
 
-KINDS = ("scenario", "compare", "commute", "fleet", "benchmark", "survey", "demo", "train")
+KINDS = ("scenario", "compare", "commute", "fleet", "benchmark", "survey", "detectors", "demo", "train")
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -18,10 +18,11 @@ def schemas() -> dict[str, dict[str, Any]]:
     from pydantic import TypeAdapter
 
     from parkenv.scenarios.spec import ScenarioSpec
-    from parkenv.studies.kinds import SPECS
+    from parkenv.studies.study import study_class
     from parkenv.studies.training.spec import AnyTrainingSpec
 
-    models: dict[str, Any] = {"scenario": ScenarioSpec, **SPECS, "train": AnyTrainingSpec}
+    models: dict[str, Any] = {"scenario": ScenarioSpec}
+    models |= {kind: study_class(kind) for kind in KINDS[1:-1]} | {"train": AnyTrainingSpec}
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
     return {kind: draft | TypeAdapter(models[kind]).json_schema() for kind in KINDS}
 
@@ -34,8 +35,8 @@ def schema(kind: str | None = None, /, out: Path | None = None) -> None:
         parkenv schema --out docs/schemas
 
     Options:
-        kind (KIND): scenario, compare, commute, fleet, benchmark, survey, demo, train.  [default: scenario; all with
-            --out]
+        kind (KIND): scenario, compare, commute, fleet, benchmark, survey, detectors, demo, train.  [default: scenario;
+            all with --out]
         out, -o (DIR): Folder for all schemas, KIND.schema.json.  [default: none]
     """
     if kind is not None and kind not in KINDS:
@@ -44,7 +45,7 @@ def schema(kind: str | None = None, /, out: Path | None = None) -> None:
     if out is None:
         echo(json.dumps(made[kind or "scenario"], indent=1))
         return
-    from parkenv.studies.results import make_folder
+    from parkenv.files.atomic_write import make_folder
 
     make_folder(out)
     for name, content in made.items():

@@ -39,10 +39,10 @@ def fit_sensor_model(
         rig (laser|stereo|both_sides): Whose errors to measure.  [default: the scenario's, laser]
         out, -o (FILE.json): The file to write.
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.scenarios.build import build
-    from parkenv.studies.results import make_folder
+    from parkenv.studies.fields import BUSY
     from parkenv.studies.sensing.sensor_model_fit import AGENTS, measure_sensors
-    from parkenv.studies.spec import BUSY
 
     specs = [args.Traffic().on(spec, BUSY) for spec in world.specs(scenario, default=SCENARIOS)]
     scenarios = [build(spec) for spec in specs]

@@ -46,11 +46,11 @@ def preview(
     from scipy.spatial import cKDTree
 
     from parkenv.compiled.keyed_random import world_key
+    from parkenv.files.atomic_write import make_folder
     from parkenv.scenarios.build import build
     from parkenv.show.figures.picture_files import save_film
     from parkenv.show.figures.sensors import save_sensor_preview, with_boxes
-    from parkenv.studies.results import make_folder
-    from parkenv.studies.spec import BUSY
+    from parkenv.studies.fields import BUSY
     from parkenv.world.lot_scene import LotScenes, slot_lot
     from planners.routes import DriveRoutes
     from sim_sensors.camera.weather import Weather

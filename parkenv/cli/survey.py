@@ -6,16 +6,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from parkenv.cli import arguments as args
-from parkenv.cli.report import make_report
-from parkenv.cli.single_writer import writing_into
+from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
-from parkenv.files.file_names import file_name
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
-    from parkenv.studies.spec import SurveySpec
+    from rich.console import Console
+
+    from parkenv.studies.sensing.survey_study import SurveyStudy
+    from parkenv.studies.study import Result
 
 MOST_ROWS = 12
 """Slots in the table of a map; files have all."""
@@ -77,138 +78,82 @@ def survey(
         record (FILE.mcap): Also record images, scans and poses of the first session (extra bags), for `parkenv
             map-drive`.  [default: none]
     """
-    from parkenv.studies.spec import BUSY, SurveySpec
+    from parkenv.studies.fields import BUSY
+    from parkenv.studies.sensing.survey_study import SurveyStudy
 
     windows = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
-    spec = SurveySpec().changed(
+    study = SurveyStudy().changed(
         scenario=traffic.on(world.spec(scenario), BUSY), sessions=sessions, rig=rig, detector=detector,
         weather=weather, every=every, pose_noise=pose_noise, odometry_drift=odometry_drift, localise=localise,
         picture_width=picture_width, seed=seed, **windows, **machines.given,
     )  # fmt: skip
-    with writing_into(out, "the same command"):
-        run_survey_of(spec, out, folder, rerun, record)
+    run_survey(study, out, folder, rerun, record)
 
 
-def run_survey_of(
-    spec: SurveySpec,
+def run_survey(
+    study: SurveyStudy,
     out: Path,
     folder: args.ReportedRun,
     rerun: Path | None = None,
     record: Path | None = None,
 ) -> None:
-    """Drive the sessions that the map in the folder does not hold yet, print errors and draw figures.
+    """Run a survey, print its errors, and record its first session on request.
 
     Raises:
         InputError: the scenario cannot be made, or the folder cannot be used.
+        KeyboardInterrupt: the run was interrupted; finished sessions are in the folder.
     """
-    from parkenv.mapping.discovery import score_discovery
-    from parkenv.mapping.inference import predict
     from parkenv.mapping.recorded_drive import record_drive, require_recordable
-    from parkenv.mapping.store import MapStore
-    from parkenv.mapping.survey import Survey
-    from parkenv.show.figures import survey as pictures
-    from parkenv.studies.sensing.surveys import (
-        MAP_FILE,
-        mean_occupancy,
-        run_survey,
-        slots_found,
-        summarize,
-        survey_of,
-    )
-    from parkenv.studies.spec import SPEC_FILE
     from parkenv.studies.trips.sensor_log import record_session, require_viewer, sensor_log
 
     if rerun is not None:
         require_viewer()
     if record is not None:
         require_recordable(record)
-    its, settings = survey_of(spec)
-    map_file = out / MAP_FILE
-    if folder.overwrite:
-        map_file.unlink(missing_ok=True)
-    # A map of another lot is refused before its specification is replaced.
-    with MapStore(map_file, its.lot):
-        spec.write(out / SPEC_FILE)
+    run_study(study, out, folder, show)
     console = make_console()
-    with (
-        args.workers_of(spec) as workers,
-        progress_bar(console, "sessions") as progress,
-    ):
-        task = progress.add_task("Driving (compiles first after an installation)", total=spec.sessions)
-        run = run_survey(
-            its,
-            settings,
-            spec.sessions,
-            map_file,
-            workers=workers,
-            on_session=lambda _: progress.advance(task),
-        )
-        progress.update(task, completed=spec.sessions)
-    row = summarize(its, settings, run, map_file)
-    with MapStore(map_file, its.lot, create=False) as store:
-        log = store.log()
-        found = slots_found(store, len(log.time))
-    window = settings.windows[0]
-    predicted = predict(log, 86_400.0 * window.weekdays[0] + 0.5 * (window.start_s + window.end_s))
-    true = mean_occupancy(its.occupancy, window)
-    title = f"{its.name} after {plural(row['sessions'], 'session')}"
-    pictures.save_map(its.lot, predicted, true, title, out / file_name(f"map_{its.name}", ".png"))
-    if row["detection_by_distance"]:
-        title = f"{its.name}, rig {settings.rig}, {plural(row['sessions'], 'session')}"
-        pictures.save_detection_reach(
-            row["detection_by_distance"], title, out / file_name(f"reach_{its.name}", ".png")
-        )
-    if run.shown is not None:
-        pictures.save_detections(run.shown, out / file_name(f"detections_{its.name}", ".png"))
-        pictures.save_session(its.lot, run.shown, out / file_name(f"session_{its.name}", ".png"))
-        if settings.localise != "none":
-            name = file_name(f"localised_{its.name}", ".png")
-            pictures.save_localisation(its.lot, run.shown, out / name)
-        pictures.save_graph(its.lot, predicted, run.shown, out / file_name(f"graph_{its.name}", ".png"))
-    scored = score_discovery(found, its.lot)
-    pictures.save_found_slots(its.lot, found, scored, out / file_name(f"slots_found_{its.name}", ".png"))
-    error, mae = row["range_abs_error_m"], row["occupancy_mae"]
-    rates = (
-        "car_detection_rate",
-        "detection_precision",
-        "slot_accuracy",
-        "slot_accuracy_seen",
-        "unknown_fraction",
-    )
-    figures = (
-        *((name, f"{row[name]:.3f}") for name in rates),
-        ("range_abs_error_m", f"median {error['median']:.3f}, p95 {error['p95']:.3f}"),
-        ("occupancy_mae", f"{mae:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})"),
-        ("seconds_per_frame", f"{row['seconds_per_frame']:.4f}"),
-    )
-    its_poses = row["pose_error_m"]
-    if its_poses["odometry"] > 0.0 or settings.localise != "none":
-        figures += (
-            (
-                "pose_error_m",
-                f"{its_poses['estimated']:.2f}, at most {its_poses['max']:.2f} (odometry: {its_poses['odometry']:.2f})",
-            ),
-        )
-    console.print(make_table(None, ["figure", "value"], figures))
-    by_weather = (
-        (name, str(r["sessions"]), f"{r['car_detection_rate']:.1%}", f"{r['slot_accuracy']:.1%}")
-        for name, r in row["by_weather"].items()
-    )
-    console.print(make_table(None, ["weather", "sessions", "cars found", "slots right"], by_weather))
-    save_summary(out, spec.seed, [row])
-    console.print(f"Written: {map_file}, summary.json, sessions.csv and pictures")
-    if folder.report:
-        make_report(out, spec)
     if rerun is not None:
-        with console.status(f"Driving the first session once more for {rerun}"):
-            first = Survey(its, settings)
-            with sensor_log(rerun, its.lot, first.pipeline.rig) as recording:
-                record_session(first, 0, recording)
+        with (
+            console.status(f"Driving the first session once more for {rerun}"),
+            sensor_log(rerun, study.built.lot, study.survey.pipeline.rig) as recording,
+        ):
+            record_session(study.survey, 0, recording)
         print_recorded(console, rerun)
     if record is not None:
         with console.status(f"Driving the first session once more for {record}"):
-            record_drive(Survey(its, settings), 0, record)
+            record_drive(study.survey, 0, record)
         console.print(f"Recorded: {record}; map it with: parkenv map-drive {record}")
+
+
+def show(console: Console, result: Result) -> None:
+    """Print the errors of a survey."""
+    for row in result.rows:
+        error, pose = row["range_abs_error_m"], row["pose_error_m"]
+        rates = (
+            "car_detection_rate",
+            "detection_precision",
+            "slot_accuracy",
+            "slot_accuracy_seen",
+            "unknown_fraction",
+        )
+        figures = [
+            *((name, f"{row[name]:.3f}") for name in rates),
+            ("range_abs_error_m", f"median {error['median']:.3f}, p95 {error['p95']:.3f}"),
+            (
+                "occupancy_mae",
+                f"{row['occupancy_mae']:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})",
+            ),
+            ("seconds_per_frame", f"{row['seconds_per_frame']:.4f}"),
+        ]
+        if pose["odometry"] > 0.0 or row["localise"] != "none":
+            text = f"{pose['estimated']:.2f}, at most {pose['max']:.2f} (odometry: {pose['odometry']:.2f})"
+            figures.append(("pose_error_m", text))
+        console.print(make_table(None, ["figure", "value"], figures))
+        by_weather = (
+            (name, str(r["sessions"]), f"{r['car_detection_rate']:.1%}", f"{r['slot_accuracy']:.1%}")
+            for name, r in row["by_weather"].items()
+        )
+        console.print(make_table(None, ["weather", "sessions", "cars found", "slots right"], by_weather))
 
 
 def map_drive(
@@ -239,6 +184,7 @@ def map_drive(
         localise (none|scan-matching): scan-matching: the poses are odometry that drifts; correct it.
         out, -o (DIR): Folder for map.sqlite, to which the session is added, map.png and summary.json.
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.mapping.drive_calibration import DriveCalibration
     from parkenv.mapping.inference import predict
     from parkenv.mapping.recorded_drive import RecordedDrive
@@ -247,7 +193,6 @@ def map_drive(
     from parkenv.perception.detector_registry import make_detector
     from parkenv.scenarios.build import build
     from parkenv.show.figures.survey import save_map
-    from parkenv.studies.results import make_folder
 
     its = build(args.World(lot=lot).spec(scenario))
     finder = make_detector(detector or its.detector)
@@ -307,12 +252,12 @@ def show_map(
         confidence (P): Of the interval, 0 to 1.
         out, -o (DIR): Folder for map.png, slots.csv, summary.json.  [default: none]
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.files.csv_writing import write_csv
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.scenarios.build import build
     from parkenv.show.figures.survey import save_map
-    from parkenv.studies.results import make_folder
     from parkenv.world.occupancy.process import DAY_NAMES
     from parkenv.world.week import DAY_S, HOUR_S
 

@@ -201,7 +201,7 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside
     Raises:
         InputError: the training is impossible, or the folder cannot be used.
     """
-    from parkenv.studies.spec import SPEC_FILE
+    from parkenv.studies.results import SPEC_FILE
     from parkenv.studies.training.rl_training import MODEL
     from parkenv.studies.training.training_task import FIGURE, Trained, curves_beside
 

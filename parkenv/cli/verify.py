@@ -36,9 +36,9 @@ def verify(
         seed (N >= 0): First seed of the simulated cases.
         out, -o (DIR): Folder for summary.json and verify.png.  [default: none]
     """
+    from parkenv.files.atomic_write import make_folder
     from parkenv.show.figures.verification import save_verification
     from parkenv.show.plurals import plural
-    from parkenv.studies.results import make_folder
     from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
     from parkenv.studies.verify.verification import tasks_of
     from parkenv.studies.verify.verification import verify as rows_of

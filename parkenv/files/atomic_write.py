@@ -82,6 +82,21 @@ def append_text(path: Path, text: str, *, sync: bool = True) -> None:
         raise InputError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
+def make_folder(path: Path) -> None:
+    """Make a folder for results, and check that it is writable before any work is done.
+
+    Raises:
+        InputError: the folder cannot be made or written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / f".probe.{os.getpid()}"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from error
+
+
 def remove_torn(folder: Path) -> None:
     """Remove the temporary files of killed processes from a folder and its subfolders, which nobody else writes."""
     for pattern in (".*.[0-9]*.part", "*/.*.[0-9]*.part"):

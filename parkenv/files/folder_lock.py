@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import os
 import socket
-import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import datetime
 from pathlib import Path
 
-from parkenv.errors import InputError
-from parkenv.files.atomic_write import remove_torn
+from filelock import FileLock, Timeout
 
-if sys.platform != "win32":
-    import fcntl
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import make_folder, remove_torn
 
 LOCK = ".lock"
 
@@ -23,39 +21,50 @@ LOCK = ".lock"
 def folder_lock(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder during the block, and remove what a killed writer left half-written there.
 
-    The kernel releases the lock when this process ends, even by SIGKILL, so a lock cannot be stale. Worker processes do
-    not inherit it. Windows has no such lock; there, nothing is checked.
+    The system releases the lock when this process ends, even by SIGKILL, so a lock cannot be stale. Worker processes do
+    not inherit it.
 
     Raises:
         InputError: another process holds the lock; the message names the process.
     """
-    if sys.platform == "win32":
-        yield
-        return
     path = folder / LOCK
-    while True:
-        file = path.open("a+", encoding="utf-8")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            owner = file.read(200) or "another process"
-            file.close()
-            raise InputError(
-                f"{folder}: {owner}, writes there; wait for its end, or use another folder"
-            ) from None
-        # The previous holder removes the file: its lock would be no obstacle to the next process.
-        if path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat()):
-            break
-        file.close()
-    with file:
-        file.truncate(0)
-        file.write(
-            f"process {os.getpid()} on {socket.gethostname()}, since {datetime.now():%Y-%m-%d %H:%M:%S}"
+    lock = FileLock(path)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        owner = ""
+        with suppress(OSError):
+            owner = path.read_text(encoding="utf-8")[:200]
+        raise InputError(
+            f"{folder}: {owner or 'another process'}, writes there; wait for its end, or use another folder"
+        ) from None
+    try:
+        path.write_text(
+            f"process {os.getpid()} on {socket.gethostname()}, since {datetime.now():%Y-%m-%d %H:%M:%S}",
+            encoding="utf-8",
         )
-        file.flush()
         remove_torn(folder)
-        try:
+        yield
+    finally:
+        # Before the release: a process that then waits for this file opens a new one.
+        with suppress(OSError):
+            path.unlink()
+        lock.release()
+
+
+@contextmanager
+def only_writer(folder: Path) -> Iterator[None]:
+    """Make a folder, and be its only writer during the block; remove it again if the block leaves it empty.
+
+    Raises:
+        InputError: the folder cannot be made or written, or another process writes into it.
+    """
+    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    make_folder(folder)
+    try:
+        with folder_lock(folder):
             yield
-        finally:
-            path.unlink(missing_ok=True)
+    finally:
+        with suppress(OSError):
+            for each in made:
+                each.rmdir()

@@ -122,7 +122,10 @@ class Spec(BaseModel):
     """File that the specification was read from, for messages; no part of its value."""
 
     def __eq__(self, other: object) -> bool:
-        return type(self) is type(other) and self.__dict__ == other.__dict__
+        if type(self) is not type(other):
+            return False
+        same = all(getattr(self, name) == getattr(other, name) for name in type(self).model_fields)
+        return same and self.model_extra == getattr(other, "model_extra", None)
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -133,9 +136,10 @@ class Spec(BaseModel):
                 was wanted.
         """
         path = Path(path)
-        return cls.parse(read_tables(path), str(path), path.parent)._of_file(path)
+        return cls.parse(read_tables(path), str(path), path.parent).of_file(path)
 
-    def _of_file(self, path: str | Path) -> Self:
+    def of_file(self, path: str | Path) -> Self:
+        """Remember the file that the specification was read from, for messages."""
         self._file = str(path)
         return self
 
@@ -169,7 +173,7 @@ class Spec(BaseModel):
             InputError: see `read`.
         """
         fields = {name: getattr(self, name) for name in type(self).model_fields} | changes
-        return type(self).parse(fields, source)._of_file(self._file)
+        return type(self).parse(fields, source).of_file(self._file)
 
     def write(self, path: Path) -> None:
         """Write the specification as JSON, atomically, including fields at their defaults."""

@@ -490,7 +490,7 @@ class ScenarioSpec(Spec):
     def read(cls, path: str | Path) -> Self:
         """Read a scenario file; the default name of the scenario is that of the file."""
         path = Path(path)
-        return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent)._of_file(path)
+        return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent).of_file(path)
 
     def files(self) -> list[Path]:
         """Return every file named in the specification, and the settings beside the detector's."""
@@ -543,7 +543,7 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
         ['mini']
     """
     if str(source) in SCENARIO_NAMES:
-        return [ScenarioSpec.read(_PACKAGED / f"{source}.toml")._of_file("")]
+        return [ScenarioSpec.read(_PACKAGED / f"{source}.toml").of_file("")]
     path = Path(source)
     if is_there(path) and path.is_dir():
         return _in_folder(path)
@@ -572,7 +572,7 @@ def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
     """
     name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
     tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": real_week.DAY_ERROR}}
-    return ScenarioSpec.parse(tables, str(lot) if source is None else source)._of_file(lot)
+    return ScenarioSpec.parse(tables, str(lot) if source is None else source).of_file(lot)
 
 
 def _in_folder(folder: Path) -> list[ScenarioSpec]:

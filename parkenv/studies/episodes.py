@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.engine.state import SearchState
 from parkenv.show.search_trace import SearchTrace
+from parkenv.studies.results import DECISIONS
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
@@ -27,6 +28,11 @@ class Episode:
     # wall time of each decision, s; not in the row because it differs from run to run
     decision_s: list[float]
     trace: SearchTrace  # trace for pictures
+
+    @property
+    def timed_row(self) -> dict[str, Any]:
+        """The row with the wall times of its decisions."""
+        return self.row | {DECISIONS: " ".join(str(round(1e6 * s)) for s in self.decision_s)}
 
 
 class FirstPlan(Observer):

@@ -1,22 +1,22 @@
-"""Result folder of a run: finished episodes survive a crash.
+"""Results of a run: finished rows survive a crash.
 
-`settings.json` holds the settings. Every finished search appends a line to `episodes.csv`, and one with the wall time
-of its decisions to `timings.csv`; a day with many cars, a line to `days.csv`. `summary.json` is written at the end.
+`settings.json` holds the settings. Every finished row is appended to the table of the study, such as a search to
+`episodes.csv` or a day with many cars to `days.csv`. `summary.json` is written at the end.
 """
 
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import append_text, atomic_write
+from parkenv.files.atomic_write import append_text, atomic_write, make_folder
 from parkenv.files.csv_writing import csv_text, write_csv
-from parkenv.files.limited_reading import parse_json, read_json
+from parkenv.files.limited_reading import parse_json, read_json, read_text
 from parkenv.files.typed_csv import (
     NUMBER,
     NUMBER_OR_NOTHING,
@@ -69,50 +69,159 @@ KINDS: Mapping[str, Kind] = {
 }
 """What a column of an episode holds; all others hold numbers."""
 
+GoesOn = Literal["asked", "unfinished", "always"]
+"""When a run continues the one in its folder; see `Study`."""
+SPEC_FILE = "experiment.json"
+"""File in a run folder with the specification of its study."""
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
 
 
-@dataclass(frozen=True)
-class EpisodeTable:
-    """The table that a run appends a line to for every finished episode.
+class Table(ABC):
+    """The table that a run appends a row to for everything that is finished.
 
     Args:
-        file: its name.
-        keys: columns that identify an episode.
-        columns: the other columns of an episode.
-        kinds: what a column holds; all others hold numbers.
-        timings: name of the table with the wall times of decisions; None for a run that measures none.
+        file: name of its file.
+        keys: columns that identify a row.
+    """
+
+    file: str
+    keys: Sequence[str]
+
+    def key(self, row: Mapping[str, Any]) -> Key:
+        """Return the key of a row."""
+        return tuple(row[c] for c in self.keys)
+
+    @abstractmethod
+    def read(self, folder: Path) -> list[Row]:
+        """Read the complete lines of the file in a folder; none if there is no file.
+
+        Raises:
+            InputError: the file is damaged, or not of this version.
+        """
+
+    @abstractmethod
+    def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
+        """Append rows to the file in a folder, and flush them to disk; see `append_text`."""
+
+    @abstractmethod
+    def write(self, folder: Path, rows: Sequence[Row]) -> None:
+        """Replace the rows of the file in a folder, atomically."""
+
+
+@dataclass(frozen=True, eq=False)
+class CsvTable(Table):
+    """A table of numbers and texts.
+
+    Args:
+        file, keys: see `Table`.
+        columns: the other columns.
+        kinds: what a column holds.
+        other: what all other columns hold.
+        timings: name of a second file, with the wall times of decisions; None for a run that measures none.
     """
 
     file: str = "episodes.csv"
     keys: Sequence[str] = KEY_COLUMNS
     columns: Sequence[str] = OUTCOME_COLUMNS
     kinds: Mapping[str, Kind] = field(default_factory=lambda: KINDS)
+    other: Kind = NUMBER
     timings: str | None = "timings.csv"
 
-    def key(self, row: Mapping[str, Any]) -> Key:
-        """Return the key of an episode."""
-        return tuple(row[c] for c in self.keys)
-
-    def read(self, path: Path) -> list[Row]:
-        """Read the complete lines of a file; none if there is no file.
-
-        Raises:
-            InputError: the file is damaged, or not of this version.
-        """
-        return self._read(path, (*self.keys, *self.columns))
-
-    def read_timings(self, path: Path) -> list[Row]:
-        """Read the complete lines of a file of wall times; see `read`."""
-        return self._read(path, (*self.keys, DECISIONS))
+    def read(self, folder: Path) -> list[Row]:
+        """See `Table`; a row without wall times, as a crash lost them, has none."""
+        rows = self._read(folder / self.file, (*self.keys, *self.columns))
+        if self.timings is not None:
+            timings = self._read(folder / self.timings, (*self.keys, DECISIONS))
+            measured = {self.key(row): row[DECISIONS] for row in timings}
+            for row in rows:
+                row[DECISIONS] = measured.get(self.key(row), "")
+        return rows
 
     def _read(self, path: Path, columns: Sequence[str]) -> list[Row]:
         def kind_of(column: str) -> Kind:
-            return self.kinds.get(column, NUMBER)
+            return self.kinds.get(column, self.other)
 
         return [row for _, row in typed_records(path, kind_of, columns, whole_lines=True)]
+
+    def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
+        """See `Table`."""
+        for file, columns, some in self._files(rows):
+            append_text(folder / file, csv_text(columns, some), sync=sync)
+
+    def write(self, folder: Path, rows: Sequence[Row]) -> None:
+        """See `Table`."""
+        for file, columns, some in self._files(rows):
+            write_csv(folder / file, columns, some)
+
+    def _files(self, rows: Sequence[Row]) -> list[tuple[str, Sequence[str], list[Row]]]:
+        """Return each file with its columns and rows.
+
+        Timings come first: a finished row would not run again for its timing.
+        """
+        files: list[tuple[str, Sequence[str]]] = [(self.file, (*self.keys, *self.columns))]
+        if self.timings is not None:
+            files.insert(0, (self.timings, (*self.keys, DECISIONS)))
+        timed = [row for row in rows if row.get(DECISIONS)]
+        return [
+            (
+                file,
+                columns,
+                [{c: row.get(c) for c in columns} for row in (rows if file == self.file else timed)],
+            )
+            for file, columns in files
+        ]
+
+
+@dataclass(frozen=True, eq=False)
+class JsonTable(Table):
+    """A table whose rows hold lists: a JSON object in each line.
+
+    Args:
+        file, keys: see `Table`.
+        checked: returns a row of the file in the types of `Study.run`; raises ValueError, TypeError or KeyError if it
+            is none.
+        what: what a row is, for messages.
+    """
+
+    file: str
+    keys: Sequence[str]
+    checked: Callable[[Row], Row]
+    what: str
+
+    def read(self, folder: Path) -> list[Row]:
+        """See `Table`."""
+        path = folder / self.file
+        if not path.exists():
+            return []
+        # A crash may leave a last line without its end.
+        whole = read_text(path).rpartition("\n")[0]
+        rows = []
+        for number, line in enumerate(whole.splitlines(), start=1):
+            row = parse_json(line, f"{path}: line {number}")
+            try:
+                rows.append(self.checked(row))
+                self.key(rows[-1])
+            except (AttributeError, KeyError, TypeError, ValueError) as error:
+                raise InputError(f"{path}: line {number}: {line!r:.40} is not a valid {self.what}") from error
+        return rows
+
+    def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
+        """See `Table`."""
+        append_text(folder / self.file, _json_lines(rows), sync=sync)
+
+    def write(self, folder: Path, rows: Sequence[Row]) -> None:
+        """See `Table`."""
+        _write_text(folder / self.file, _json_lines(rows))
+
+
+def _json_lines(rows: Iterable[Row]) -> str:
+    return "".join(json.dumps(row) + "\n" for row in rows)
+
+
+EPISODES = CsvTable()
+"""Searches of comparisons."""
 
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
@@ -189,129 +298,125 @@ def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
     return parts
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder for results, and check that it is writable before any work is done.
-
-    Raises:
-        InputError: the folder cannot be made or written.
-    """
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-        probe = path / f".probe.{os.getpid()}"
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise InputError(f"--out {path}: cannot be written ({error.strerror})") from error
-
-
 def episode_key(row: Mapping[str, Any]) -> Key:
     """Return the key of an episode: its setting, agent and seed."""
-    return tuple(row[c] for c in KEY_COLUMNS)
+    return EPISODES.key(row)
 
 
 class ResultFolder:
-    """Collects episodes as they finish.
+    """Collects rows as they finish.
 
     Args:
-        path: the folder; created if missing.
-        settings: settings of the run; everything that affects the outcome of an episode.
-        table: the table of episodes.
-        kind: kind of run, for messages.
-        resume: continue an earlier run with the same settings.
-        overwrite: replace the results of another run.
-
-    Attributes:
-        episodes: finished episodes by key.
-
-    Raises:
-        InputError: the folder is not writable, it holds another run and neither `resume` nor `overwrite` is set, or
-            `resume` is set and the settings differ.
+        path: the folder.
+        tables: its tables, the most important first.
     """
 
-    def __init__(
+    def __init__(self, path: Path, tables: Sequence[Table] = (EPISODES,)) -> None:
+        self.path, self._tables = path, tables
+        self._rows: dict[str, dict[Key, Row]] = {table.file: {} for table in tables}
+
+    def read(self) -> None:
+        """Read the rows that the folder holds.
+
+        Raises:
+            InputError: a table is damaged, or not of this version.
+        """
+        for table in self._tables:
+            self._rows[table.file] = {table.key(row): row for row in table.read(self.path)}
+
+    def claim(
         self,
-        path: Path,
         settings: Mapping[str, Any],
+        kind: str = "compare",
         *,
-        table: EpisodeTable | None = None,
-        kind: str = "comparison",
         resume: bool = False,
         overwrite: bool = False,
-    ) -> None:
-        make_folder(path)
-        self.path = path
-        self._table = table = table or EpisodeTable()
-        self.episodes: dict[Key, Row] = {}
-        self._timings: dict[Key, Row] = {}
-        if resume:
-            settings = require_same_settings(path, settings, kind)
-            self.episodes = self._by_key(table.read(path / table.file))
-            if table.timings is not None:
-                self._timings = self._by_key(table.read_timings(path / table.timings))
-        elif (path / table.file).exists() and not overwrite:
-            state = "a finished" if (path / SUMMARY).exists() else "an unfinished"
-            raise InputError(
-                f"--out {path}: holds {state} {kind}; add --resume to go on with it, --overwrite to replace it, "
-                "or name another folder"
-            )
-        (path / SUMMARY).unlink(missing_ok=True)
-        write_settings(path, settings)
-        # Rewrite the readable lines: this drops a line truncated by a crash, and its episode runs again.
-        self._write(self.episodes.values(), self._timings.values())
+        goes_on: GoesOn = "asked",
+    ) -> tuple[Row, bool]:
+        """Check that a run may use the folder, and read what it goes on with.
 
-    def add(self, rows: Sequence[Row], timings: Sequence[Row] = (), *, sync: bool = True) -> None:
-        """Append finished episodes, and flush them to disk; see `append_text`."""
-        # Memory first: after an interruption, `finish` rewrites the files from it.
-        self._timings |= self._by_key(timings)
-        self.episodes |= self._by_key(rows)
-        # Timings before episodes: a finished episode would not run again for its timing.
-        for file, columns, new in self._files(rows, timings):
-            append_text(file, csv_text(columns, new), sync=sync)
+        Args:
+            settings: settings of the run; everything that affects a row.
+            kind: kind of run, for messages.
+            resume: continue an earlier run with the same settings.
+            overwrite: replace the results of another run.
+            goes_on: see `Study`.
 
-    def decision_s(self, key: Key) -> list[float]:
-        """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
-        row = self._timings.get(key)
-        return [int(us) * 1e-6 for us in row[DECISIONS].split()] if row else []
+        Returns:
+            The settings for `begin`, and whether an earlier run is continued.
 
-    def finish(self, order: Iterable[Key], summary: Mapping[str, Any], *, complete: bool = True) -> None:
-        """Put the episodes in order and write the summary.
-
-        Episodes are sorted by `order`, not by when they finished, so the file is the same for any number of jobs.
-        Further episodes of a resumed run come last. The summary of an incomplete run is called `summary.partial.json`.
+        Raises:
+            InputError: the folder is not writable, it holds another run and neither `resume` nor `overwrite` is set, or
+                `resume` is set and the settings differ.
         """
-        wanted = dict.fromkeys(key for key in order if key in self.episodes)
-        wanted |= dict.fromkeys(self.episodes)
-        rows = [self.episodes[key] for key in wanted]
-        timings = [self._timings[key] for key in wanted if key in self._timings]
-        self._write(rows, timings)
+        make_folder(self.path)
+        found, finished = (self.path / SETTINGS).exists(), (self.path / SUMMARY).exists()
+        if resume and goes_on != "always":
+            continues = True
+        elif goes_on == "asked":
+            if (self.path / self._tables[0].file).exists() and not overwrite:
+                state = "a finished" if finished else "an unfinished"
+                raise InputError(
+                    f"--out {self.path}: holds {state} {kind} run; add --resume to go on with it, --overwrite to "
+                    "replace it, or name another folder"
+                )
+            continues = False
+        else:
+            continues = not overwrite and (goes_on == "always" or (found and not finished))
+        if continues and goes_on != "always":
+            settings = require_same_settings(self.path, settings, kind)
+        if continues:
+            self.read()
+        return dict(settings), continues
+
+    def begin(self, settings: Mapping[str, Any]) -> None:
+        """Write the settings of the run, and the rows that it goes on with.
+
+        A line that a crash has truncated is dropped, and runs again.
+        """
+        (self.path / SUMMARY).unlink(missing_ok=True)
+        write_settings(self.path, settings)
+        for table in self._tables:
+            table.write(self.path, list(self._rows[table.file].values()))
+
+    def rows(self, table: Table = EPISODES) -> Mapping[Key, Row]:
+        """Return the finished rows of a table, by key."""
+        return self._rows[table.file]
+
+    def drop(self, keys: Iterable[Key], table: Table = EPISODES) -> None:
+        """Forget rows, which run again."""
+        for key in keys:
+            del self._rows[table.file][key]
+
+    def add(self, rows: Sequence[Row], table: Table = EPISODES, *, sync: bool = True) -> None:
+        """Append finished rows, and flush them to disk; see `append_text`."""
+        # Memory first: after an interruption, `put_in_order` rewrites the files from it.
+        self._rows[table.file] |= {table.key(row): row for row in rows}
+        table.append(self.path, rows, sync=sync)
+
+    def put_in_order(self, order: Iterable[Key], table: Table = EPISODES) -> None:
+        """Sort a table by `order`, not by when rows finished, so that the file is the same for any number of jobs.
+
+        Further rows of a resumed run come last.
+        """
+        rows = self._rows[table.file]
+        wanted = dict.fromkeys(key for key in order if key in rows) | dict.fromkeys(rows)
+        table.write(self.path, [rows[key] for key in wanted])
+
+    def finish(self, summary: Mapping[str, Any], *, complete: bool = True) -> None:
+        """Write the summary; that of an incomplete run is called `summary.partial.json`."""
         (self.path / SUMMARY_PARTIAL).unlink(missing_ok=True)
         write_summary(self.path, summary, SUMMARY if complete else SUMMARY_PARTIAL)
 
-    def _by_key(self, rows: Iterable[Row]) -> dict[Key, Row]:
-        return {self._table.key(row): row for row in rows}
 
-    def _files(
-        self, rows: Iterable[Row], timings: Iterable[Row]
-    ) -> Iterator[tuple[Path, Sequence[str], Iterable[Row]]]:
-        """Yield each file with its columns and rows, timings first."""
-        table = self._table
-        if table.timings is not None:
-            yield self.path / table.timings, (*table.keys, DECISIONS), timings
-        yield self.path / table.file, (*table.keys, *table.columns), rows
-
-    def _write(self, episodes: Iterable[Row], timings: Iterable[Row]) -> None:
-        for file, columns, rows in self._files(episodes, timings):
-            write_csv(file, columns, rows)
+def decision_s(row: Mapping[str, Any]) -> list[float]:
+    """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
+    return [int(us) * 1e-6 for us in row[DECISIONS].split()]
 
 
 def _write_text(path: Path, text: str) -> None:
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
-
-
-def read_rows(path: Path) -> list[Row]:
-    """Read the complete lines of the `episodes.csv` of a comparison; see `EpisodeTable.read`."""
-    return EpisodeTable().read(path)
 
 
 def without_nan(value: Any) -> Any:

@@ -71,6 +71,26 @@ def trimmed_mean_interval(values: ArrayLike, cut: float) -> tuple[float, float, 
     return mean, float(low), float(high)
 
 
+def ratio_interval(values: ArrayLike, others: ArrayLike) -> tuple[float, float, float]:
+    """Compute the ratio of two sums of pairs, such as days, and its 95 % bootstrap interval (percentiles).
+
+    Args:
+        values: (n,) numbers, n >= 1.
+        others: (n,) numbers.
+
+    Returns:
+        Ratio, lower and upper end. The resampling of pairs has a fixed seed.
+
+    Examples:
+        >>> ratio_interval([2.0, 4.0], [1.0, 2.0])
+        (2.0, 2.0, 2.0)
+    """
+    mine, theirs = np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64)
+    drawn = np.random.default_rng(0).integers(0, len(mine), (RESAMPLES, len(mine)))
+    low, high = np.percentile(mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1), [2.5, 97.5])
+    return float(mine.sum() / theirs.sum()), float(low), float(high)
+
+
 def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, float]:
     """Compute a rate over clusters, such as drives, and its 95 % interval.
 

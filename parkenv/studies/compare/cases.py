@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import itertools
-import warnings
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -18,15 +17,16 @@ from parkenv.scenarios.places import seeds_by_place
 from parkenv.show.search_trace import SearchTrace
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import SETTING_COLUMNS, ResultFolder, Row, episode_key
+from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
 from parkenv.studies.statistics import mean_interval, summarize
-from parkenv.studies.workers import HERE, Workers
+from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
-BLOCK = 10  # episodes per task: a crash loses few of them, and the overhead of starting a task stays small
+BLIND = "-blind"  # suffix of the names of scenarios whose slots are not observed before an attempt
+BLOCK = 50  # episodes per task of searches that are not saved
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,26 +61,13 @@ class Case:
         }
 
     def key(self, seed: int) -> tuple[Any, ...]:
-        """Return the key of an episode in a `ResultFolder`."""
-        return episode_key({**self.columns, "seed": seed})
+        """Return the key of an episode in `EPISODES`."""
+        return EPISODES.key({**self.columns, "seed": seed})
 
-    def run(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row]]:
-        """Run one episode per seed; return rows of `episodes.csv` and of `timings.csv`."""
+    def run(self, seeds: Sequence[int]) -> list[Row]:
+        """Run one episode per seed; return their rows of `episodes.csv`, with the wall times of their decisions."""
         runner = self.runner()
-        rows, timings = [], []
-        for seed in seeds:
-            episode = runner.run(seed)
-            rows.append({**self.columns, **episode.row})
-            microseconds = " ".join(str(round(1e6 * s)) for s in episode.decision_s)
-            timings.append({**self.columns, "seed": seed, "decisions_us": microseconds})
-        return rows, timings
-
-    def run_reporting(self, seeds: Sequence[int]) -> tuple[list[Row], list[Row], list[str]]:
-        """Like `run`, but also return the warnings: those of a worker process would not reach the user in order."""
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("default")
-            rows, timings = self.run(seeds)
-        return rows, timings, [f"{self.label} in {self.scenario.name}: {w.message}" for w in caught]
+        return [{**self.columns, **runner.run(seed).timed_row} for seed in seeds]
 
     def trace(self, seed: int) -> SearchTrace:
         """Run one episode, and return its trace for a picture."""
@@ -145,45 +132,6 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
     )
 
 
-def run_cases(
-    cases: Sequence[tuple[Case, range]],
-    folder: ResultFolder,
-    *,
-    workers: Workers = HERE,
-    block_size: int = BLOCK,
-    on_progress: Callable[[int], None] = lambda _: None,
-) -> None:
-    """Run the episodes that the folder does not hold yet.
-
-    Args:
-        cases: cases, each with the seeds of its episodes.
-        folder: folder for finished episodes.
-        workers: where episodes run; results do not depend on it.
-        block_size: episodes per task.
-        on_progress: called with the number of episodes just finished.
-
-    Raises:
-        KeyboardInterrupt: passed on; finished episodes are in the folder.
-    """
-    tasks = [
-        (case, block)
-        for case, seeds in cases
-        for block in _blocks([s for s in seeds if case.key(s) not in folder.episodes], block_size)
-    ]
-    done = sum(len(seeds) for _, seeds in cases) - sum(len(block) for _, block in tasks)
-    on_progress(done)
-    told = set()
-    work = [partial(case.run_reporting, block) for case, block in tasks]
-    for _, (rows, timings, messages) in workers.results(work):
-        folder.add(rows, timings)
-        on_progress(len(rows))
-        for message in messages:
-            # Warn once per agent and scenario: numbers in the text differ between episodes.
-            if (topic := message.partition(":")[0]) not in told:
-                told.add(topic)
-                warnings.warn(message, stacklevel=2)
-
-
 def rows_of(
     agents: Sequence[AgentSpec],
     places: Scenario | Sequence[Scenario],
@@ -205,9 +153,9 @@ def rows_of(
     for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
         cases = [Case(place, agent.name, options=agent.options) for agent in agents]
         require_distinct(cases)
-        work += [(case, block) for case in cases for block in _blocks(its, 5 * BLOCK)]
+        work += [(case, its[i : i + BLOCK]) for case in cases for i in range(0, len(its), BLOCK)]
     episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
-    for number, (rows, _) in workers.results([partial(case.run, block) for case, block in work]):
+    for number, rows in workers.results([partial(case.run, block) for case, block in work]):
         episodes[work[number][0].label] += rows
     by_seed = {label: sorted(rows, key=lambda row: row["seed"]) for label, rows in episodes.items()}
     first = by_seed[cases[0].label]
@@ -234,27 +182,25 @@ def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
             scenario.occupancy.world(key, arrival)
 
 
-def _blocks(seeds: Sequence[int], size: int) -> Iterator[Sequence[int]]:
-    for i in range(0, len(seeds), size):
-        yield seeds[i : i + size]
-
-
-def table(cases: Sequence[tuple[Case, range]], folder: ResultFolder) -> list[Row]:
+def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> list[Row]:
     """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
     If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
+
+    Args:
+        cells: cases with the seeds of their episodes.
+        finished: rows of episodes, by `Case.key`.
     """
     rows = []
     first: dict[tuple[Any, ...], list[Row]] = {}
-    for case, seeds in cases:
-        keys = [key for s in seeds if (key := case.key(s)) in folder.episodes]
-        if not keys:
+    for case, seeds in cells:
+        episodes = [finished[key] for s in seeds if (key := case.key(s)) in finished]
+        if not episodes:
             continue
-        episodes = [folder.episodes[key] for key in keys]
         columns = case.columns
         setting = tuple(v for k, v in columns.items() if k != "agent")
-        decision_s = list(itertools.chain.from_iterable(folder.decision_s(key) for key in keys))
-        rows.append(summarize(columns, episodes, first.get(setting), decision_s))
+        times = list(itertools.chain.from_iterable(decision_s(row) for row in episodes))
+        rows.append(summarize(columns, episodes, first.get(setting), times))
         first.setdefault(setting, episodes)
     names = [c for c in SETTING_COLUMNS if c != "agent"]
     optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == "exact"}

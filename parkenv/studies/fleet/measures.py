@@ -13,12 +13,6 @@ from parkenv.engine.fleet import Fleet, total_s
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
 from parkenv.world.scenario import SearchProblem
 
-MEANS = (
-    "total_s", "median_s", "p95_s", "gini", "search_s", "queued_s", "failed_attempts", "driven_m", "cruised_m",
-    "cruising_share", "balked_fraction", "occupancy", "members_s", "others_s", "bound_s", "clairvoyant_s",
-)  # fmt: skip
-"""Measures of a day, of which a summary has the mean over days."""
-
 
 class Roads:
     """Shortest drives from the entries of a scenario.

@@ -15,9 +15,9 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.fleet_rendering import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.experiment import FleetExperiment, summarize_days
+from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.fleet.tables import summarize_days
 from parkenv.studies.publish.publication import MODEL, Publication, Row
-from parkenv.studies.spec import FleetSpec
 from parkenv.studies.training.spec import FleetTrainingSpec
 from parkenv.studies.workers import Workers
 
@@ -34,7 +34,7 @@ class FleetPublication(Publication):
         fleets: lot, demand, days and seed; its last agent is the model.
     """
 
-    fleets: FleetSpec
+    fleets: FleetStudy
 
     @classmethod
     def of_training(
@@ -48,12 +48,12 @@ class FleetPublication(Publication):
         if len(scenarios) != 1:
             raise InputError(f"--scenario names {len(scenarios)} scenarios, want one for a model of a fleet")
         ((name, scenario),) = scenarios.items()
-        fleets = FleetSpec().changed(
+        fleets = FleetStudy().changed(
             arrivals_per_hour=(spec.arrivals_per_hour,), knows=(spec.knows,), stay_s=spec.stay_s,
             patience_s=spec.patience_s, scenario=scenario, days=days, seed=seed,
             agents=tuple(AgentSpec(name=each) for each in BESIDE),
         )  # fmt: skip
-        made = cls(model, {name: FleetExperiment(fleets).scenario}, days, seed, fleets)
+        made = cls(model, {name: fleets.built}, days, seed, fleets)
         agents = (*fleets.agents, AgentSpec(name=made._source))
         return cls(model, made.scenarios, days, seed, fleets.changed(agents=agents))
 
@@ -70,13 +70,12 @@ class FleetPublication(Publication):
 
     def evaluate(self, workers: Workers) -> list[Row]:
         """See `Publication`."""
-        experiment = FleetExperiment(self.fleets)
         tasks = [
-            partial(experiment.run_day, setting, day)
-            for setting in experiment.settings
+            partial(self.fleets.run_day, setting, day)
+            for setting in self.fleets.fleet_settings
             for day in range(self.fleets.days)
         ]
-        days = [row for row, _ in workers.in_order(tasks)]
+        days = list(workers.in_order(tasks))
         n = self.fleets.days
         rows = summarize_days([days[first : first + n] for first in range(0, len(days), n)])
         names = dict.fromkeys((self._source,), self.name)
@@ -84,10 +83,9 @@ class FleetPublication(Publication):
 
     def film(self, path: Path) -> None:
         """Film a minute of the first day, in the middle of its arrivals."""
-        experiment = FleetExperiment(self.fleets)
-        fleet, agents = experiment.fleet(experiment.settings[-1])
+        fleet, agents = self.fleets.fleet(self.fleets.fleet_settings[-1])
         fleet.reset(self.fleets.seed, 0)
-        window, renderer = experiment.scenario.arrival, FleetRenderer(fleet)
+        window, renderer = self.fleets.built.arrival, FleetRenderer(fleet)
         middle = fleet.begin + (window.end_s - window.start_s) / 2.0
         frames = []
         for second in np.arange(0.0, _FILM_S, _STEP_S):

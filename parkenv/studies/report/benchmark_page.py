@@ -10,7 +10,7 @@ from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.show.report.page import FORMAT, VERSION
 from parkenv.show.report.tables import Cell, Column, described, table_of
-from parkenv.studies.compare.benchmark import Suite, score_interval
+from parkenv.studies.benchmark.suite import Suite, score_interval
 from parkenv.studies.results import Row
 
 _WHO = (

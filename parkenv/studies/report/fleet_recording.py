@@ -13,7 +13,8 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet, total_s
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.report.lot_data import describe_lot
-from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+from parkenv.studies.fleet.setting import Setting
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.scenario import Scenario
 
 MOST_CARS = 5_000
@@ -32,12 +33,12 @@ class FleetDay:
     """A day of a setting.
 
     Attributes:
-        experiment: the experiment.
+        study: the study.
         setting: one of its settings.
         day: number of the day.
     """
 
-    experiment: FleetExperiment
+    study: FleetStudy
     setting: Setting
     day: int
 
@@ -45,18 +46,18 @@ class FleetDay:
         """Repeat the day, and record it: times in centiseconds since the day's arrivals begin.
 
         Args:
-            counted: mean total time, s, of the days in the original run, by `FleetExperiment.key`.
+            counted: mean total time, s, of the days in the original run, by `FleetStudy.keys`.
         """
-        experiment, scenario = self.experiment, self.experiment.scenario
-        fleet, agents = experiment.fleet(self.setting)
+        study, scenario = self.study, self.study.built
+        fleet, agents = study.fleet(self.setting)
         fleet.keep_steps()
-        fleet.reset(experiment.spec.seed, self.day)
+        fleet.reset(study.seed, self.day)
         fleet.run(agents, until=fleet.begin)
         residents = fleet.slots["leaves_at"].copy()
         fleet.run(agents)
         cars, begin = fleet.cars, fleet.begin
         mean_s = float(total_s(cars).mean())
-        before = counted.get(experiment.key(self.setting, self.day))
+        before = counted.get(study.keys(self.setting, self.day)[0])
         return {
             "lot": describe_lot(scenario.lot),
             "fleet": {
@@ -77,12 +78,12 @@ class FleetDay:
 
 
 def choose_days(
-    experiment: FleetExperiment, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
+    study: FleetStudy, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
 ) -> list[FleetDay]:
     """Choose days for a replay.
 
     Args:
-        experiment: the experiment.
+        study: the study.
         settings: settings to choose from.
         count: number of days to choose: the first day of each setting, those in which all or none are members first,
             then the next day.
@@ -91,12 +92,12 @@ def choose_days(
     if not settings:
         return []
     if days is not None:
-        return [FleetDay(experiment, setting, day) for setting in settings for day in days]
+        return [FleetDay(study, setting, day) for setting in settings for day in days]
     most = max(setting.share for setting in settings)
     order = sorted(range(len(settings)), key=lambda i: settings[i].share not in (0.0, most))
-    needed = min(experiment.spec.days, -(-count // len(settings)))
+    needed = min(study.days, -(-count // len(settings)))
     chosen = [(i, day) for day in range(needed) for i in order][:count]
-    return [FleetDay(experiment, settings[i], day) for i, day in sorted(chosen)]
+    return [FleetDay(study, settings[i], day) for i, day in sorted(chosen)]
 
 
 def differing_days(recorded: Sequence[Recording]) -> list[str]:

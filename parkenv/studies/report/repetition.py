@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 from parkenv.files.spec_file import Spec
-from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.show.report.drive_recording import record_drive
-from parkenv.studies import spec as specs
-from parkenv.studies.compare.benchmark import Suite
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.compare.demo import demo_cases, demo_survey
-from parkenv.studies.compare.experiment import Experiment, require_unchanged
-from parkenv.studies.fleet.experiment import FleetExperiment, Setting
+from parkenv.studies.fleet.setting import Setting
+from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.replays import Replays
 from parkenv.studies.report.fleet_recording import MOST_CARS
 from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.report.search_recording import MOST_SLOTS
-from parkenv.studies.results import read_settings
-from parkenv.studies.sensing.surveys import MAP_FILE, survey_of
+from parkenv.studies.study import Study
 from parkenv.studies.training.spec import NetworkTrainingSpec, ScanTrainingSpec, SearchTrainingSpec
 from parkenv.world.scenario import Scenario
 
@@ -30,56 +25,25 @@ BESIDE_MODELS = 3
 """Number of planners shown beside a trained model."""
 
 
-@dataclass(frozen=True, eq=False)
-class Repetition:
-    """The searches, survey drives and days of a run.
+def replays_of(run: RunFolder, spec: Spec | None) -> Replays:
+    """Return what a run can repeat; nothing without its specification.
 
-    Args:
-        cases: the searches.
-        survey: scenario and settings of the drives.
-        sessions: number of drives.
-        fleets: the experiment with many cars.
+    Raises:
+        InputError, OSError: the run cannot be repeated.
     """
-
-    cases: Cases
-    survey: tuple[Scenario, SurveySettings] | None = None
-    sessions: int = 0
-    fleets: FleetExperiment | None = None
-
-    @classmethod
-    def of_run(cls, run: RunFolder, spec: Spec | None) -> Repetition:
-        """Return what a run can repeat; nothing without its specification.
-
-        Raises:
-            InputError, OSError: the run cannot be repeated.
-        """
-        match spec:
-            case specs.ExperimentSpec():
-                require_unchanged(spec, read_settings(run.path) or {})
-                return cls([*Experiment(spec).cases])
-            case specs.FleetSpec():
-                require_unchanged(spec, read_settings(run.path) or {})
-                return cls([], fleets=FleetExperiment(spec))
-            case specs.BenchmarkSpec():
-                return cls([*Suite.named(spec.suite).cases(spec.agents)])
-            case specs.SurveySpec():
-                return cls([], survey_of(spec), len(run.sessions()))
-            case specs.DemoSpec():
-                its, settings = demo_survey(spec)
-                with MapStore(run.path / MAP_FILE, its.lot, create=False) as store:
-                    log = store.log()
-                return cls([*demo_cases(spec, its, log)], (its, settings), len(log.time))
-            case SearchTrainingSpec() | ScanTrainingSpec() | NetworkTrainingSpec():
-                return cls(_trained(run, spec))
-        return cls([])
-
-    def drive(self, number: int, frames: int) -> dict[str, Any]:
-        """Repeat one survey drive, and return its recording."""
-        assert self.survey is not None
-        return record_drive(Survey(*self.survey), number, most_frames=frames)[1]
+    if isinstance(spec, Study):
+        return spec.replays(run.path)
+    if isinstance(spec, SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec):
+        return Replays(_trained(run, spec))
+    return Replays()
 
 
-def drawable(cases: Cases) -> tuple[Cases, list[str]]:
+def repeat_drive(scenario: Scenario, settings: SurveySettings, number: int, frames: int) -> dict[str, Any]:
+    """Repeat a survey drive, and return its recording."""
+    return record_drive(Survey(scenario, settings), number, most_frames=frames)[1]
+
+
+def drawable(cases: Sequence[tuple[Case, Sequence[int]]]) -> tuple[Cases, list[str]]:
     """Return the searches on lots that are small enough to draw, and notes on the others."""
     slots = {case.scenario.name: case.scenario.lot.n_slots for case, _ in cases}
     large = {name: n for name, n in slots.items() if n > MOST_SLOTS}
@@ -90,13 +54,11 @@ def drawable(cases: Cases) -> tuple[Cases, list[str]]:
     return [(case, its) for case, its in cases if case.scenario.name not in large], notes
 
 
-def drawable_settings(
-    fleets: FleetExperiment, settings: Sequence[Setting]
-) -> tuple[list[Setting], list[str]]:
+def drawable_settings(fleets: FleetStudy, settings: Sequence[Setting]) -> tuple[list[Setting], list[str]]:
     """Return the settings with few enough cars, on a small enough lot, to draw, and notes on the others."""
-    if (n := fleets.scenario.lot.n_slots) > MOST_SLOTS:
+    if (n := fleets.built.lot.n_slots) > MOST_SLOTS:
         return [], [f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
-    window = fleets.scenario.arrival
+    window = fleets.built.arrival
     most = MOST_CARS / ((window.end_s - window.start_s) / 3600.0)
     rates = dict.fromkeys(one.arrivals_per_hour for one in settings if one.arrivals_per_hour > most)
     notes = [

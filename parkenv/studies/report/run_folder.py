@@ -15,19 +15,18 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Spec, read_tables
 from parkenv.show.report.learning import learning_panels
 from parkenv.show.report.page import page_data
-from parkenv.studies.fleet.experiment import TABLE
-from parkenv.studies.kinds import SPECS
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.results import (
+    EPISODES,
     SETTINGS,
+    SPEC_FILE,
     SUMMARY,
     SUMMARY_PARTIAL,
     Row,
-    episode_key,
-    read_rows,
     without_nan,
 )
-from parkenv.studies.sensing.surveys import read_sessions
-from parkenv.studies.spec import SPEC_FILE
+from parkenv.studies.sensing.sessions import SESSIONS
+from parkenv.studies.study import STUDIES, read_study
 from parkenv.studies.training.curve_file import CURVE, read_curve
 
 
@@ -91,8 +90,7 @@ class RunFolder:
         Raises:
             InputError: the file is missing or damaged.
         """
-        kind = SPECS.get(self.kind)
-        return None if kind is None else kind.read(self.path / SPEC_FILE)
+        return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
 
     @property
     def arguments(self) -> list[str]:
@@ -100,20 +98,21 @@ class RunFolder:
         return [str(word) for word in self.summary["command"][2:]]
 
     def totals(self) -> dict[tuple[Any, ...], float]:
-        """Read the total time, s, of every search in `episodes.csv`, by `results.episode_key`; empty without the file.
+        """Read the total time, s, of every search in `episodes.csv`, by `Case.key`; empty without the file.
 
         Raises:
             InputError: the file is damaged, or not of this version.
         """
-        return {episode_key(row): row["total_s"] for row in read_rows(self.path / "episodes.csv")}
+        return {EPISODES.key(row): row["total_s"] for row in EPISODES.read(self.path)}
 
     def day_totals(self) -> dict[tuple[Any, ...], float]:
-        """Read the mean total time, s, of every day in `days.csv`, by `FleetExperiment.key`; empty without the file.
+        """Read the mean total time, s, of every day in `days.csv`, by `FleetStudy.keys`; empty without the file.
 
         Raises:
             InputError: the file is damaged, or not of this version.
         """
-        return {TABLE.key(row): row["total_s"] for row in TABLE.read(self.path / TABLE.file)}
+        table = FleetStudy.table
+        return {table.key(row): row["total_s"] for row in table.read(self.path)}
 
     def sessions(self) -> list[Row]:
         """Read the drives of a survey from `sessions.csv`, NaN as None; none without the file.
@@ -121,7 +120,7 @@ class RunFolder:
         Raises:
             InputError: the file is damaged, or not of this version.
         """
-        rows: list[Row] = without_nan(read_sessions(self.path / "sessions.csv"))
+        rows: list[Row] = without_nan(SESSIONS.read(self.path))
         return rows
 
     def curve(self, seed: int) -> list[Row]:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Mapping, Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,16 +14,15 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import BoolArray
 from parkenv.errors import InputError
 from parkenv.files.csv_writing import write_csv
-from parkenv.files.file_names import file_name
 from parkenv.files.typed_csv import NUMBER_OR_NAN, typed_records
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import SessionResult, Survey, SurveySettings, drive_together
+from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.mapping.survey_score import CLEAR, DISTANCE_ENDS, SIDES, SIGHTING
-from parkenv.studies.results import make_folder
+from parkenv.studies.results import Row
 from parkenv.studies.sensing.detector_drives import DISTANCES, LEAST_HEIGHT, VISIBLE
-from parkenv.studies.sensing.surveys import MAP_FILE, map_error, store_session, stored_sessions
+from parkenv.studies.sensing.sessions import MAP_FILE
+from parkenv.studies.sensing.surveys import map_error
 from parkenv.studies.statistics import rate_interval
-from parkenv.studies.workers import HERE, Workers
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS
 from sim_sensors.ground_truth import View
@@ -34,7 +31,6 @@ from sim_sensors.rig import SensorRig
 if TYPE_CHECKING:
     from parkenv.show.figures.detectors import MissedCar
 
-Row = dict[str, Any]
 Sightings = NDArray[np.void]
 
 FAR = 12.0
@@ -69,6 +65,10 @@ class DetectorSurvey:
         """Rig and detector, for tables and figures."""
         return f"{self.settings.rig}, {self.settings.detector}"
 
+    def sightings_file(self, number: int) -> Path:
+        """Return the table of the sightings of a session."""
+        return self.folder / "sightings" / f"{number:05d}.csv"
+
 
 @dataclass(frozen=True, eq=False)
 class SurveyedDrive:
@@ -77,78 +77,6 @@ class SurveyedDrive:
     number: int  # of the session
     row: Row  # of `sessions.csv`
     sightings: Sightings
-
-
-def detector_surveys(
-    settings: SurveySettings, rigs: Sequence[str], detectors: Sequence[str], folder: Path
-) -> list[DetectorSurvey]:
-    """Return a survey for each rig and detector, each with a folder of its own.
-
-    Raises:
-        InputError: an unknown rig.
-    """
-    return [
-        DetectorSurvey(replace(settings, rig=rig, detector=name), folder / file_name(f"{rig}_{name}"))
-        for rig in rigs
-        for name in detectors
-    ]
-
-
-def run_detector_surveys(
-    scenario: Scenario,
-    surveys: Sequence[DetectorSurvey],
-    sessions: int,
-    *,
-    workers: Workers = HERE,
-    on_drive: Callable[[int], None] = lambda _: None,
-) -> list[list[SurveyedDrive]]:
-    """Drive the sessions that the folders do not hold yet; all detectors look at the same drives and pictures.
-
-    Args:
-        scenario: the scenario.
-        surveys: as `detector_surveys` returns them.
-        sessions: number of sessions of each.
-        workers: where the sessions run; results do not depend on it.
-        on_drive: called with the number of surveys that a drive was for, also if it was stored before.
-
-    Returns:
-        For each survey its drives, in order.
-
-    Raises:
-        InputError: an unknown detector, or an unusable folder.
-    """
-    made = [Survey(scenario, its.settings) for its in surveys]
-    keys = [[survey.key_of(k) for k in range(sessions)] for survey in made]
-    with ExitStack() as opened:
-        stores, rows = [], []
-        for its in surveys:
-            make_folder(its.folder / "sightings")
-            stores.append(opened.enter_context(MapStore(its.folder / MAP_FILE, scenario.lot)))
-            rows.append(stored_sessions(stores[-1], its.folder / "sessions.csv"))
-        tasks, of = [], []
-        # Rigs with the same route share their pictures.
-        for _, same_route in itertools.groupby(range(len(surveys)), lambda i: made[i].route.path.tobytes()):
-            group = list(same_route)
-            settings = [surveys[i].settings for i in group]
-            for k in range(sessions):
-                if all(keys[i][k] in rows[i] for i in group):
-                    on_drive(len(group))
-                else:
-                    tasks.append(partial(_drive_together, scenario, settings, k))
-                    of.append((k, group))
-        for (k, group), results in zip(of, workers.in_order(tasks), strict=True):
-            for i, result in zip(group, results, strict=True):
-                if keys[i][k] not in rows[i]:
-                    _write_sightings(_sightings_file(surveys[i], k), result.score.sightings)
-                    store_session(result, rows[i], stores[i], surveys[i].folder / "sessions.csv")
-            on_drive(len(group))
-    return [
-        [
-            SurveyedDrive(k, rows[i][key], _read_sightings(_sightings_file(its, k)))
-            for k, key in enumerate(keys[i])
-        ]
-        for i, its in enumerate(surveys)
-    ]
 
 
 def comparison_table(
@@ -372,6 +300,42 @@ def pictures_of(
     return drawn
 
 
+def draw_misses(
+    scenario: Scenario,
+    surveys: Sequence[DetectorSurvey],
+    drives: Sequence[Sequence[SurveyedDrive]],
+    number: int,
+    seed: int,
+    table: Sequence[Row],
+    folder: Path,
+) -> None:
+    """Draw a contact sheet of missed cars for each survey; rigs draw their pictures once for all detectors.
+
+    Args:
+        scenario: the scenario.
+        surveys: the surveys, those of a rig one after the other.
+        drives: the drives of each.
+        number: number of missed cars of each cause.
+        seed: seed of the choice.
+        table: rows of `comparison_table`.
+        folder: where the sheets go.
+    """
+    from parkenv.show.figures.detectors import save_misses
+
+    chosen = [choose_misses(survey, its, number, seed) for survey, its in zip(surveys, drives, strict=True)]
+    of_rig = itertools.groupby(zip(surveys, chosen, strict=True), lambda s: s[0].settings.rig)
+    for _, group in of_rig:
+        sheets = list(group)
+        wanted = {miss.picture for _, cars in sheets for miss in cars}
+        pictures = pictures_of(scenario, sheets[0][0].settings, wanted)
+        for survey, cars in sheets:
+            rig, detector = survey.settings.rig, survey.settings.detector
+            rows = [r for r in table if (r["rig"], r["detector"], r["group"]) == (rig, detector, "cause")]
+            title = f"Cars that {detector} missed in pictures of {scenario.name}, rig {rig}"
+            missed = missed_by_cause(cars, pictures, rows)
+            save_misses(missed, title, folder / f"misses_{survey.folder.name}.png")
+
+
 def _rate(measure: str, right: Sequence[int], total: Sequence[int]) -> Row:
     rate, low, high = rate_interval(right, total)
     values = (int(sum(total)), rate, low, high) if sum(total) else (0, None, None, None)
@@ -384,23 +348,14 @@ def _picture_size(rig: str) -> tuple[int, int]:
     return camera.height, camera.width
 
 
-def _drive_together(
-    scenario: Scenario, settings: Sequence[SurveySettings], number: int
-) -> list[SessionResult]:
-    return drive_together([Survey(scenario, its) for its in settings], number)
-
-
-def _sightings_file(survey: DetectorSurvey, number: int) -> Path:
-    return survey.folder / "sightings" / f"{number:05d}.csv"
-
-
-def _write_sightings(path: Path, sightings: Sightings) -> None:
+def write_sightings(path: Path, sightings: Sightings) -> None:
+    """Write the sightings of a session as CSV."""
     names = SIGHTING.names or ()
     write_csv(path, names, (dict(zip(names, row, strict=True)) for row in sightings.tolist()))
 
 
-def _read_sightings(path: Path) -> Sightings:
-    """Read the records of `_write_sightings`.
+def read_sightings(path: Path) -> Sightings:
+    """Read the records of `write_sightings`.
 
     Raises:
         InputError: the file is missing, damaged, or not of this version.

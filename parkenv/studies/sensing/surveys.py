@@ -1,93 +1,28 @@
-"""Run surveys: record many sessions in a map file, and measure the errors of sessions and map."""
+"""Errors of a survey's sessions and of its map."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
-from parkenv.files.csv_writing import write_csv
-from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE, Kind, typed_records, wholes
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
 from parkenv.mapping.inference import SessionLog, predict
-from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
+from parkenv.mapping.survey import SessionResult, SurveySettings
 from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
-from parkenv.scenarios.build import build
-from parkenv.studies.spec import BUSY, SurveySpec
-from parkenv.studies.workers import HERE, Workers
+from parkenv.studies.results import Row
+from parkenv.studies.sensing.sessions import ERROR_COLUMNS, SESSION_COLUMNS
 from parkenv.world.occupancy.counted import CountedOccupancy
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.process import Arrival, ArrivalWindow, OccupancyModel
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
-
-MAP_FILE = "map.sqlite"
-"""Map of the sessions in the folder of a survey or a demo."""
-Row = dict[str, Any]
-Recorder = Callable[[Survey, int, int], tuple[SessionResult, Any]]
-"""Drives a session, given its number and the number of perception results to keep, and records it."""
-
-PICTURES = 4
-"""Number of perception results of the first session that are kept for figures."""
-
-ERROR_COLUMNS = ("range_error_m", "range_error_p95_m", "place_error_m", "heading_error_deg")
-SESSION_COLUMNS = (
-    "key", "weather", "time_s", "parked", "found", "detections", "right",
-    *ERROR_COLUMNS, *(f"thesis_{name}" for name in ERROR_COLUMNS),
-    "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
-    "cars_in_frame", "cars_detected", "odometry_error_m", "pose_error_m", "pose_error_max_m",
-)  # fmt: skip
-
-
-_KINDS = {
-    **dict.fromkeys(("key", "weather"), TEXT),
-    **dict.fromkeys(("parked", "found", "detections", "right"), WHOLE),
-    **dict.fromkeys(("cars_in_frame", "cars_detected"), wholes(len(DISTANCE_ENDS))),
-}
-"""What a column of `sessions.csv` holds; all others hold numbers."""
-
-
-@dataclass(frozen=True, eq=False)
-class SurveyRun:
-    """A completed survey."""
-
-    rows: list[Row]  # one row per session, in order
-    # the first session, with results for figures; None if all sessions already existed
-    shown: SessionResult | None
-    recorded: Any = None  # what `record` of `run_survey` made of it
-
-
-def survey_of(spec: SurveySpec) -> tuple[Scenario, SurveySettings]:
-    """Return the scenario and the settings of a survey specification.
-
-    Raises:
-        InputError: the scenario cannot be made.
-    """
-    described = spec.scenario if spec.scenario.traffic else spec.scenario.changed(traffic=BUSY)
-    days = spec.scenario.arrivals.days
-    settings = SurveySettings(
-        rig=spec.rig or spec.scenario.rig,
-        every=spec.every,
-        weather=spec.weather,
-        windows=tuple(ArrivalWindow.parse(hours, days) for hours in spec.hours),
-        pose_noise=PoseNoise(spec.pose_noise, 0.02 * spec.pose_noise, drift=spec.odometry_drift),
-        localise=spec.localise,
-        seed=spec.seed,
-        detector=spec.detector or spec.scenario.detector,
-        picture_width=spec.picture_width,
-    )
-    return build(described), settings
 
 
 def session_row(result: SessionResult) -> Row:
@@ -131,115 +66,54 @@ def _error_columns(errors: FloatArray) -> tuple[float, ...]:
     return float(middle[0]), far, float(middle[1]), float(np.degrees(middle[2]))
 
 
-def run_survey(
-    scenario: Scenario,
-    settings: SurveySettings,
-    sessions: int,
-    map_file: Path,
-    *,
-    workers: Workers = HERE,
-    record: Recorder | None = None,
-    on_session: Callable[[Row], None] = lambda _: None,
-) -> SurveyRun:
-    """Drive the sessions that the map file does not hold yet, and write each in one transaction.
-
-    Args:
-        scenario: the scenario.
-        settings: settings of the survey.
-        sessions: number of sessions.
-        map_file: created if it does not exist. `sessions.csv` beside it holds the errors of each session.
-        workers: where the sessions run; results do not depend on it.
-        record: drives the first session, and records it; None not to record it.
-        on_session: called with the row of each completed session.
-
-    Raises:
-        InputError: fewer than one session, or an unusable map file.
-    """
-    if sessions < 1:
-        raise InputError(f"sessions is {sessions}, want at least 1")
-    survey = Survey(scenario, settings)
-    table = map_file.with_name("sessions.csv")
-    with MapStore(map_file, scenario.lot) as store:
-        rows = stored_sessions(store, table)
-        wanted = [survey.key_of(k) for k in range(sessions)]
-        missing = [k for k, key in enumerate(wanted) if key not in rows]
-        shown = recorded = None
-        for number, (result, recording) in zip(
-            missing, _driven(survey, missing, workers, record), strict=True
-        ):
-            row = store_session(result, rows, store, table)
-            if number == 0:
-                shown, recorded = result, recording
-            on_session(row)
-    return SurveyRun([rows[key] for key in wanted], shown, recorded)
-
-
-def stored_sessions(store: MapStore, table: Path) -> dict[str, Row]:
-    """Return the rows of the sessions that a map file and its `sessions.csv` hold, by their keys.
-
-    A row is written before its session: a row without a session is from an interrupted drive, which is repeated.
-    """
-    return {row["key"]: row for row in read_sessions(table) if store.has(row["key"])}
-
-
-def store_session(result: SessionResult, rows: dict[str, Row], store: MapStore, table: Path) -> Row:
-    """Add a session to `stored_sessions`, to the table and to the map; return its row."""
-    row = session_row(result)
-    rows[row["key"]] = row
-    write_csv(table, SESSION_COLUMNS, list(rows.values()))
-    if not store.has(row["key"]):
-        store.add(result.session)
-    return row
-
-
-def summarize(scenario: Scenario, settings: SurveySettings, run: SurveyRun, map_file: Path) -> Row:
-    """Return the row of `summary.json`."""
+def summarize(scenario: Scenario, settings: SurveySettings, rows: Sequence[Row], map_file: Path) -> Row:
+    """Return the row of `summary.json` from at least one row of `sessions.csv`."""
     with MapStore(map_file, scenario.lot, create=False) as store:
         log = store.log()
         found = score_discovery(slots_found(store, len(log.time)), scenario.lot)
     error, expected = map_error(scenario, settings.windows, log)
-    parked = sum(r["parked"] for r in run.rows)
-    detections = sum(r["detections"] for r in run.rows)
+    parked = sum(r["parked"] for r in rows)
+    detections = sum(r["detections"] for r in rows)
     return {
         "scenario": scenario.name,
         "rig": settings.rig,
         "detector": settings.detector,
         "weather": settings.weather or "any",
-        "sessions": len(run.rows),
+        "sessions": len(rows),
         "slots": scenario.lot.n_slots,
-        "car_detection_rate": sum(r["found"] for r in run.rows) / max(parked, 1),
-        "detection_precision": sum(r["right"] for r in run.rows) / max(detections, 1),
+        "car_detection_rate": sum(r["found"] for r in rows) / max(parked, 1),
+        "detection_precision": sum(r["right"] for r in rows) / max(detections, 1),
         "range_abs_error_m": {
-            "median": _mean(run.rows, "range_error_m"),
-            "p95": _mean(run.rows, "range_error_p95_m"),
+            "median": _mean(rows, "range_error_m"),
+            "p95": _mean(rows, "range_error_p95_m"),
         },
         "car_pose": {
-            name: {c: _mean(run.rows, prefix + c) for c in ERROR_COLUMNS}
+            name: {c: _mean(rows, prefix + c) for c in ERROR_COLUMNS}
             for name, prefix in (("fitted", ""), ("thesis", "thesis_"))
         },
         "localise": settings.localise,
         "pose_error_m": {
-            "odometry": _mean(run.rows, "odometry_error_m"),
-            "estimated": _mean(run.rows, "pose_error_m"),
-            "max": max(r["pose_error_max_m"] for r in run.rows),
+            "odometry": _mean(rows, "odometry_error_m"),
+            "estimated": _mean(rows, "pose_error_m"),
+            "max": max(r["pose_error_max_m"] for r in rows),
         },
-        "slot_accuracy": _mean(run.rows, "slot_accuracy"),
-        "slot_accuracy_seen": _mean(run.rows, "slot_accuracy_seen"),
-        "unknown_fraction": _mean(run.rows, "unknown_fraction"),
+        "slot_accuracy": _mean(rows, "slot_accuracy"),
+        "slot_accuracy_seen": _mean(rows, "slot_accuracy_seen"),
+        "unknown_fraction": _mean(rows, "unknown_fraction"),
         "by_weather": {
             weather: {
                 "sessions": len(its),
                 "car_detection_rate": sum(r["found"] for r in its) / max(sum(r["parked"] for r in its), 1),
                 "slot_accuracy": _mean(its, "slot_accuracy"),
             }
-            for weather in sorted({r["weather"] for r in run.rows})
-            for its in [[r for r in run.rows if r["weather"] == weather]]
+            for weather in sorted({r["weather"] for r in rows})
+            for its in [[r for r in rows if r["weather"] == weather]]
         },
-        "detection_by_distance": detection_by_distance(run.rows),
+        "detection_by_distance": detection_by_distance(rows),
         "slots_found": found._asdict(),
         "occupancy_mae": error,
         "occupancy_mae_expected": expected,
-        "seconds_per_frame": _mean(run.rows, "seconds_per_frame"),
+        "seconds_per_frame": _mean(rows, "seconds_per_frame"),
     }
 
 
@@ -324,63 +198,7 @@ def map_error(scenario: Scenario, windows: Sequence[ArrivalWindow], log: Session
     return float(np.mean(errors)), float(np.mean(chances))
 
 
-def _driven(
-    survey: Survey, numbers: Sequence[int], workers: Workers, record: Recorder | None
-) -> Iterator[tuple[SessionResult, Any]]:
-    """Yield the sessions in order, each with its recording."""
-    if workers.in_process or len(numbers) < 2:
-        for k in numbers:
-            yield _drive(survey, k, record)
-        return
-    yield from workers.in_order(
-        [partial(_drive_apart, survey.scenario, survey.settings, k, record) for k in numbers]
-    )
-
-
-def _drive(survey: Survey, number: int, record: Recorder | None) -> tuple[SessionResult, Any]:
-    """Drive a session; the first one with results for figures, and recorded."""
-    if number == 0 and record is not None:
-        return record(survey, number, PICTURES)
-    return survey.drive(number, pictures=PICTURES if number == 0 else 0), None
-
-
-_KEPT: dict[str, Survey] = {}
-
-
-def _drive_apart(
-    scenario: Scenario, settings: SurveySettings, number: int, record: Recorder | None
-) -> tuple[SessionResult, Any]:
-    """Drive a session in a worker process, which keeps the survey for the next session."""
-    name = repr((scenario.name, settings))
-    if name not in _KEPT:
-        _KEPT.clear()
-        _KEPT[name] = Survey(scenario, settings)
-    return _drive(_KEPT[name], number, record)
-
-
 def _mean(rows: Sequence[Row], column: str) -> float:
     """Return the mean over all sessions with a finite value; NaN if there is none."""
     finite = [r[column] for r in rows if np.isfinite(r[column])]
     return float(np.mean(finite)) if finite else math.nan
-
-
-def read_sessions(path: Path) -> list[Row]:
-    """Read the rows of `sessions.csv`; none if there is no file.
-
-    Raises:
-        InputError: the file is damaged, or not of this version.
-    """
-    rows = []
-    for line, row in typed_records(path, _kind_of, SESSION_COLUMNS):
-        there, detected = ([int(n) for n in row[name].split()] for name in ("cars_in_frame", "cars_detected"))
-        if any(some > most for some, most in zip(detected, there, strict=True)):
-            raise InputError(
-                f"{path}: line {line}: cars_detected is {row['cars_detected']!r:.80}, want at most cars_in_frame, "
-                f"{row['cars_in_frame']!r:.80}"
-            )
-        rows.append(row)
-    return rows
-
-
-def _kind_of(column: str) -> Kind:
-    return _KINDS.get(column, NUMBER_OR_NAN)

@@ -16,7 +16,7 @@ from parkenv.scenarios.places import lot_share, place_of_episode, require_differ
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.compare.benchmark import suite_lots
+from parkenv.studies.benchmark.suite import suite_lots
 from parkenv.studies.compare.cases import rows_of
 from parkenv.studies.training.cloning import Demonstrations, require_cloneable
 from parkenv.studies.training.curve_file import across_seeds

@@ -13,7 +13,8 @@ from parkenv.files.known_names import KnowledgeName
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentItem, AgentSpec
-from parkenv.studies.spec import MAX_EPISODES, ArrivalRate, Level, Scenarios, Stay, Workplace
+from parkenv.studies.fields import MAX_EPISODES, ArrivalRate, Level, Scenarios, Stay
+from parkenv.studies.study import ExecutionSpec
 from planners.names import PARKING_PLANNER
 
 Steps = Annotated[int, Field(ge=1, le=10**12, description="Decisions of a training.")]
@@ -23,7 +24,7 @@ ObservedSlots = Annotated[int, Field(ge=1, le=1_000, description="Slots in an ob
 TensorBoard = Annotated[bool, Field(description="Keep logs for TensorBoard.")]
 
 
-class TrainingSpec(Workplace):
+class TrainingSpec(ExecutionSpec):
     """Training by reinforcement learning, one model per seed: what all kinds of training have.
 
     `TrainingSpec.parse` and `read` return the specification of the kind that `env`, `algorithm` and `observation`

@@ -13,7 +13,7 @@ from parkenv.errors import InputError
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import COLORS
-from parkenv.studies.compare.experiment import fingerprints, flat_tables
+from parkenv.studies.fingerprints import fingerprints, flat_tables
 from parkenv.studies.results import SETTINGS, read_settings
 from parkenv.studies.training.curve_file import CURVE, read_curve
 from parkenv.studies.training.rl_training import AnyTraining

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Self
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -25,8 +25,8 @@ from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write
 from parkenv.files.limited_reading import parse_json, read_text
-from parkenv.files.versioned_json import JsonFormat
 from parkenv.scenarios.blind import blind_scenario
+from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 from parkenv.studies.results import require_same_settings, write_settings
 from parkenv.studies.statistics import mean_interval
@@ -40,61 +40,7 @@ Row = dict[str, Any]
 
 OBSERVED, UNOBSERVED = "observed", "unobserved"  # whether the agent observes slots from the lane
 BLOCK = 5  # trips per task
-MAX_VALUE = 1_000_000
-"""Maximum of each number of a calibration; sums of larger ones could overflow."""
 _TRIP = TypeAdapter(Trip)
-_FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibrate`")
-
-
-@dataclass(frozen=True)
-class Calibration:
-    """Values measured in a scenario, which may replace the assumed ones.
-
-    Raises:
-        InputError: a value is out of range; the message names it.
-    """
-
-    scenario: str
-    v_drive: float  # m/s, distance on the drive graph divided by the time on the lanes
-    # s, time of an attempt at a taken slot, less the time for the part of the onward route that it covers
-    failure_s: float
-    # s, from the decision to park until the car stands in the slot. The drive graph does not charge it, so it adds to
-    # the total time of every agent that parks.
-    manoeuvre_s: float
-    trips: int  # number of trips
-    speed_limit: float  # speed limit on the lanes, m/s
-
-    def __post_init__(self) -> None:
-        for name in ("v_drive", "failure_s", "manoeuvre_s", "trips", "speed_limit"):
-            value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            least = "at least 0" if name in ("failure_s", "manoeuvre_s") else "above 0"
-            in_range = number and (value >= 0.0 if "at" in least else value > 0.0) and value <= MAX_VALUE
-            if not in_range:
-                raise InputError(
-                    f"calibration {name} is {value!r:.60}, want a finite number {least}, at most {MAX_VALUE:,}"
-                )
-
-    def applied(self, scenario: Scenario) -> Scenario:
-        """Return the scenario with the measured speed and failure cost, under the same name."""
-        return scenario.replace(v_drive=self.v_drive, failure_s=self.failure_s)
-
-    def to_file(self, path: Path) -> None:
-        """Write the calibration as JSON, atomically."""
-        _FORMAT.write(path, dataclasses.asdict(self))
-
-    @classmethod
-    def from_file(cls, path: Path) -> Self:
-        """Read a file written by `to_file`.
-
-        Raises:
-            InputError: the file cannot be read or is not a calibration.
-        """
-        content = _FORMAT.read(path)
-        names = [f.name for f in dataclasses.fields(cls)]
-        if missing := [name for name in names if name not in content]:
-            raise InputError(f"{path}: has no {', '.join(missing)}")
-        return cls(**{name: content[name] for name in names})
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,4 +1,4 @@
-"""Choose the places of suite v2: `python -m parkenv.studies.compare.choose_places DIR OUT`.
+"""Choose the places of suite v2: `python -m parkenv.studies.benchmark.choose_places DIR OUT`.
 
 DIR holds the outlines of parking spaces of car parks, a file of each. A place is sure: it is imported without a
 warning of `parkenv lot check`, with an error probability of at most 0.3. Of the sure ones, each stratum gives those

@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -27,7 +27,8 @@ from parkenv.scenarios.build import make_scenario
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct, table
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import ResultFolder, Row
+from parkenv.studies.results import Key, Row
+from parkenv.studies.study import Cell
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
@@ -110,8 +111,8 @@ class Suite:
             hashlib.sha256(canonical.encode()).hexdigest(),
         )
 
-    def cases(self, agents: Sequence[AgentSpec]) -> list[tuple[Case, range]]:
-        """Return the cases for `run_cases`: every agent in every task.
+    def cases(self, agents: Sequence[AgentSpec]) -> list[Cell]:
+        """Return the cases: every agent in every task.
 
         Raises:
             InputError: an agent does not exist or does not support a task.
@@ -122,7 +123,7 @@ class Suite:
                 make_agent(agent.name, world, **agent.options)
         cases = [Case(world, agent.name, options=agent.options) for world in worlds for agent in agents]
         require_distinct(cases)
-        return [(case, self.seeds) for case in cases]
+        return [Cell(case, self.seeds) for case in cases]
 
 
 def _task(
@@ -133,47 +134,58 @@ def _task(
     return Task(sensor_model=sight, day_error=tuple(day_error), **fields)
 
 
+def score_rows(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> list[Row]:
+    """Return a row for each task and agent with finished episodes: its metrics, where known, and its score."""
+    searches = {
+        (case.scenario.name, case.label): _searches(rows)
+        for case, seeds in cells
+        if (rows := [finished[key] for s in seeds if (key := case.key(s)) in finished])
+    }
+    return [
+        {
+            "task": row["scenario"],
+            "agent": row["agent"],
+            **{metric: row.get(metric) for metric in METRICS},
+            "score": _score(searches[row["scenario"], row["agent"]]),
+        }
+        for row in table(cells, finished)
+    ]
+
+
+def _searches(rows: Sequence[Row]) -> dict[str, list[float]]:
+    return {column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")}
+
+
 def result_of(
     suite: Suite,
-    cases: Sequence[tuple[Case, range]],
-    folder: ResultFolder,
+    cells: Sequence[tuple[Case, Sequence[int]]],
+    finished: Mapping[Key, Row],
     command: Sequence[str],
     by: str = "",
 ) -> Row:
-    """Build the content of a result file from a folder in which all cases are finished.
+    """Build the content of a result file from finished cases.
 
     Args:
         suite: the suite.
-        cases: all cases.
-        folder: their finished episodes.
+        cells: all cases with their seeds.
+        finished: rows of all their episodes, by `Case.key`.
         command: the command that ran them.
         by: who submits the result; dated today.
 
     Raises:
         InputError: the wall times of an agent's decisions are lost.
     """
-    episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for case, seeds in cases:
-        rows = [folder.episodes[case.key(s)] for s in seeds]
-        episodes.setdefault(case.label, {})[case.scenario.name] = {
-            column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")
-        }
-    measured = table(cases, folder)
-    for row in measured:
-        if missing := [metric for metric in METRICS if metric not in row]:
+    rows = score_rows(cells, finished)
+    for row in rows:
+        if missing := [metric for metric in METRICS if row[metric] is None]:
             raise InputError(
-                f"{folder.path}: holds no {missing[0]} of {row['agent']} in {row['scenario']}, as timings.csv is not "
-                "whole; run the suite again with --overwrite"
+                f"no {missing[0]} of {row['agent']} in {row['task']}, as timings.csv is not whole; run the suite again "
+                "with --overwrite"
             )
-    rows = [
-        {
-            "task": row["scenario"],
-            "agent": row["agent"],
-            **{metric: row[metric] for metric in METRICS},
-            "score": _score(episodes[row["agent"]][row["scenario"]]),
-        }
-        for row in measured
-    ]
+    episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
+    for case, seeds in cells:
+        of_agent = episodes.setdefault(case.label, {})
+        of_agent[case.scenario.name] = _searches([finished[case.key(s)] for s in seeds])
     return {
         "format": RESULT_FORMAT,
         "version": RESULT_VERSION,

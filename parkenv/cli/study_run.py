@@ -1,0 +1,62 @@
+"""Run a study into a folder, with progress bars, and print its result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from parkenv.cli import arguments as args
+from parkenv.cli.report import make_report
+from parkenv.cli.tables import command_line, make_console, progress_bar
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import TaskID
+
+    from parkenv.studies.study import Result, Study
+
+
+def run_study(
+    study: Study, out: Path, folder: args.ReportedRun, show: Callable[[Console, Result], None]
+) -> Result:
+    """Run a study into a folder, print its result, and write its report on request.
+
+    Args:
+        study: the study.
+        out: the folder.
+        folder: whether an earlier run is continued or replaced, and whether there is a report.
+        show: prints the result; that of an interrupted run, too.
+
+    Raises:
+        InputError: the study cannot be run, or the folder cannot be used.
+        KeyboardInterrupt: the run was interrupted; what is finished is printed and in the folder.
+    """
+    from parkenv.studies.study import Interrupted, run
+
+    console = make_console()
+    bars: dict[str, TaskID] = {}
+    try:
+        with progress_bar(console, study.unit) as progress:
+
+            def advance(doing: str, done: int, total: int) -> None:
+                if doing not in bars:
+                    bars[doing] = progress.add_task(doing, total=total)
+                progress.update(bars[doing], completed=done)
+
+            result = run(
+                study, out, resume=folder.resume, overwrite=folder.overwrite, progress=advance,
+                command=command_line(),
+            )  # fmt: skip
+    except KeyboardInterrupt as stopped:
+        if isinstance(stopped, Interrupted):
+            show(console, stopped.result)
+        console.print(
+            f"Interrupted. What was finished is in {out}; parkenv run {out} --resume goes on.", soft_wrap=True
+        )
+        raise
+    show(console, result)
+    console.print(f"Results are in {out}")
+    if folder.report:
+        make_report(out, study)
+    return result

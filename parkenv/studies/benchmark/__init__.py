@@ -1,0 +1,1 @@
+"""Benchmark suites: fixed scenarios, seeds and metrics."""

@@ -1,0 +1,1 @@
+"""Commutes: drivers who come day after day, with a map that learns."""

@@ -1,0 +1,201 @@
+"""Commutes: drivers come day after day, with a map that learns from their trips."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv.errors import InputError
+from parkenv.files.known_names import MapName
+from parkenv.files.spec_file import Axis, Several
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.studies.fields import MAX_EPISODES, Scenarios, Seed, listed, require_distinct_names
+from parkenv.studies.results import OUTCOME_COLUMNS, CsvTable, Key, Row
+from parkenv.studies.study import Cell, Result, Results, Stage, Study
+from parkenv.studies.workers import Task
+
+if TYPE_CHECKING:
+    from parkenv.mapping.trips import Trip
+    from parkenv.studies.commute.runs import CommuteRun, Day
+    from parkenv.world.scenario import Scenario
+
+MAX_DAYS = 3_650
+"""Maximum number of days of a commute."""
+PICTURE = "commute.png"
+
+
+class _Days(NamedTuple):
+    """A block of days of a run, with the trips before."""
+
+    run: CommuteRun
+    before: list[Trip]
+
+
+class Commute(Study):
+    """Drivers who come day after day, with a map that learns from their trips."""
+
+    table: ClassVar = CsvTable(
+        keys=("scenario", "map", "agent", "course", "day_number", "driver"),
+        columns=("seed", *OUTCOME_COLUMNS, "forecast_error"),
+    )
+    doing: ClassVar = "Driving"
+    unit: ClassVar = "searches"
+
+    kind: Literal["commute"] = "commute"
+    agents: Several[AgentItem] = Field(
+        tuple(AgentSpec(name=name) for name in ("belief", "mdp", "first-free", "greedy-drive")),
+        min_length=1,
+        max_length=1_000,
+        description="Differences by week are to the first that uses no map.",
+    )
+    scenarios: Scenarios = (scenario_spec("campus"),)
+    maps: Annotated[Axis[MapName], BeforeValidator(listed)] = Field(
+        ("empty",), description="Maps to start from: empty, right or wrong."
+    )
+    days: int = Field(30, ge=1, le=MAX_DAYS, description="Days on which each driver comes.")
+    drivers: int = Field(40, ge=1, le=100_000, description="Repetitions, each with a map of its own.")
+    fleet: int = Field(1, ge=1, le=1_000, description="Drivers who share a map.")
+    seed: Seed = Field(0, description="Seed of days and drivers.")
+    figures: bool = Field(True, description="Draw the picture.")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        require_distinct_names(self.agents, self.scenarios)
+        count = len(self.agents) * len(self.scenarios) * (len(self.maps) + 1)
+        if (count := count * self.days * self.drivers * self.fleet) > MAX_EPISODES:
+            raise PydanticCustomError(
+                "whole",
+                "agents x scenarios x maps x days x drivers is {count} searches, want at most {most}",
+                {"count": count, "most": MAX_EPISODES},
+            )
+        return self
+
+    @cached_property
+    def built(self) -> list[Scenario]:
+        """The scenarios."""
+        from parkenv.scenarios.build import build
+        from parkenv.studies.commute.runs import with_fixed_slots
+
+        return [with_fixed_slots(build(spec)) for spec in self.scenarios]
+
+    @cached_property
+    def runs(self) -> list[CommuteRun]:
+        """All runs: every agent with every map, and the references."""
+        from parkenv.studies.commute.runs import CommuteRun
+        from parkenv.studies.commute.tables import FIXED, NONE
+        from planners.names import WITHOUT_FORECAST
+
+        return [
+            CommuteRun(scenario, agent, name, number, self.fleet, self.seed)
+            for scenario in self.built
+            for agent in self.agents
+            for name in ((NONE,) if agent.name in WITHOUT_FORECAST else (*self.maps, FIXED))
+            for number in range(self.drivers)
+        ]
+
+    @cached_property
+    def calendars(self) -> dict[str, list[Day]]:
+        """The days of each scenario, by its name."""
+        from parkenv.studies.commute.runs import calendar
+
+        return {scenario.name: calendar(scenario, self.days) for scenario in self.built}
+
+    def check(self) -> None:
+        """See `Study`."""
+        from planners.agent import make_agent
+
+        for scenario in self.built:
+            for agent in self.agents:
+                make_agent(agent.name, scenario, **agent.options)
+        name, count = Counter(tuple(run.columns.values()) for run in self.runs).most_common(1)[0]
+        if count > 1:
+            raise InputError(f"two agents are called {name[2]!r}, want different names")
+        for run in self.runs[:: self.drivers]:
+            run.start_map()
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        from parkenv.studies.fingerprints import search_settings
+
+        return {
+            **search_settings(self, self.scenarios, self.agents), "seed": self.seed, "fleet": self.fleet,
+        }  # fmt: skip
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [Cell(run, self.calendars[run.scenario.name]) for run in self.runs]
+
+    def keys(self, work: CommuteRun, item: Day) -> list[Key]:
+        """See `Study`."""
+        return [(*work.columns.values(), item.number, driver) for driver in range(work.fleet)]
+
+    def label(self, work: CommuteRun) -> str:
+        """See `Study`."""
+        return f"{work.agent.label} in {work.scenario.name}"
+
+    def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`: a block of days needs the maps of the days before."""
+        del results
+        for first in range(0, self.days, self.block):
+            doing = f"{self.doing}, days {first + 1} to {min(first + self.block, self.days)}"
+            yield Stage(
+                doing, self, [Cell(run, days[first : first + self.block]) for run, days in self.cells()]
+            )
+
+    def enough(self, work: CommuteRun, items: Sequence[Day], results: Results) -> _Days:
+        """See `Study`: the trips of the days before."""
+        from parkenv.mapping.store import MapStore
+        from parkenv.studies.commute.runs import map_file
+        from parkenv.world.week import DAY_S
+
+        before: list[Trip] = []
+        if work.learns:
+            with MapStore(map_file(results.path, work), work.scenario.lot) as store:
+                before = [trip for trip in store.trips() if trip.time < items[0].count * DAY_S]
+        return _Days(work, before)
+
+    def run(self, work: Any, items: Sequence[Day]) -> list[Row]:
+        """See `Study`."""
+        run, before = work
+        rows: list[Row] = run.run(items, before)
+        return rows
+
+    def keep(self, work: CommuteRun, rows: Sequence[Row], results: Results) -> None:
+        """See `Study`: trips go into the map of the run."""
+        from parkenv.mapping.store import MapStore
+        from parkenv.studies.commute.runs import TRIP, map_file
+
+        trips = [trip for row in rows if (trip := row.pop(TRIP)) is not None]
+        if trips:
+            with MapStore(map_file(results.path, work), work.scenario.lot) as store:
+                for trip in sorted(trips, key=lambda trip: (trip.time, trip.key)):
+                    if not store.has_trip(trip.key):
+                        store.add_trip(trip)
+
+    def prepare(self, results: Results, *, continues: bool) -> None:
+        """See `Study`."""
+        from parkenv.studies.commute.runs import MAPS_FOLDER
+
+        maps = results.path / MAPS_FOLDER
+        maps.mkdir(exist_ok=True)
+        for old in () if continues else maps.glob("*.sqlite"):
+            old.unlink()
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        from parkenv.studies.commute.tables import day_rows, week_rows
+
+        episodes = [row for cell in self.cells() for row in results.of(self, cell)]
+        return {"rows": day_rows(episodes), "weeks": week_rows(episodes)}
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: the picture."""
+        from parkenv.show.figures.commute import save_commute_curves
+
+        return [partial(save_commute_curves, result.rows, result.folder / PICTURE)]

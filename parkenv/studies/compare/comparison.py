@@ -1,0 +1,385 @@
+"""Comparisons: all agents search in the same worlds, in every scenario and setting."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv.errors import InputError
+from parkenv.files.known_names import RigName
+from parkenv.files.option import Option, numbers_in
+from parkenv.files.spec_file import FilePath, Spec
+from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
+from parkenv.studies.agent_spec import AgentSpec, split_agents
+from parkenv.studies.fields import (
+    AGENTS_HELP,
+    MAX_EPISODES,
+    Agents,
+    Detector,
+    Figures,
+    Level,
+    Scenarios,
+    Seed,
+    Values,
+    require_distinct_names,
+)
+from parkenv.studies.results import Row
+from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.workers import Task
+
+if TYPE_CHECKING:
+    from parkenv.scenarios.calibration import Calibration
+    from parkenv.studies.compare.cases import Case
+    from parkenv.studies.replays import Replays
+    from parkenv.world.scenario import Scenario
+
+DEFAULT_AGENTS = (
+    "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
+)  # fmt: skip
+FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
+"""Failure costs of `--failure-cost sweep`, s."""
+NEEDS_OBSERVATIONS = ("belief", "belief-rivals", "mdp-tuned", "exact", "network")
+"""Agents that require observations of slots before an attempt."""
+CONSTANT_FORECAST = "-constant-forecast-"
+"""Separator between the name of a scenario and the constant probability of its forecast."""
+
+
+def _failure_costs(text: str) -> object:
+    return FAILURE_COST_SWEEP if text == "sweep" else numbers_in(text)
+
+
+_COSTS = "Costs and speeds"
+
+
+class Grid(Spec):
+    """Settings to vary; every combination is run. Scenarios keep their own values for missing axes."""
+
+    failure_s: Annotated[
+        Values[Cost] | None,
+        Option(
+            "--failure-cost",
+            takes="S[,S...]|sweep",
+            default="the scenario's, 10",
+            panel=_COSTS,
+            parse=_failure_costs,
+        ),
+    ] = Field(
+        None,
+        description="Seconds that the world charges for a failed attempt, and that planners expect unless their own "
+        "options say otherwise. sweep: 0 to 120 s.",
+    )
+    v_walk_kmh: Annotated[
+        Values[Speed] | None, Option(takes="V[,V...]", default="the scenario's, 4", panel=_COSTS)
+    ] = Field(None, description="Walking speed, km/h.")
+    v_drive_kmh: Annotated[
+        Values[Speed] | None, Option(takes="V[,V...]", default="the scenario's, 10", panel=_COSTS)
+    ] = Field(None, description="Driving speed, km/h.")
+    occupancy_levels: Annotated[
+        tuple[Level, ...],
+        AfterValidator(lambda v: tuple(sorted(set(v)))),
+        Option(
+            takes="P[,...]|none",
+            default="0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep",
+            panel="World",
+        ),
+    ] = Field(
+        (),
+        strict=False,
+        max_length=100,
+        description="Also set the lot's mean occupancy to these values, with a third of the episodes each, for the "
+        "figure of time against occupancy. Searches in a recorded log are binned instead.",
+    )
+    constant_forecast: Annotated[
+        tuple[Probability, ...],
+        AfterValidator(lambda v: tuple(sorted(set(v)))),
+        Option(takes="P[,...]", panel="World", default="none"),
+    ] = Field(
+        (),
+        strict=False,
+        max_length=100,
+        description="Also with wrong forecasts that give every slot this probability of being taken; draws total "
+        "time against it.",
+    )
+    blind: bool = Field(
+        False,
+        description="Also without observations of slots before an attempt, for agents that can do without.",
+    )
+    calibrated: Annotated[FilePath | None, Option(panel=_COSTS)] = Field(
+        None,
+        description="Also compare at the failure cost and driving speed in a calibrated.json of `parkenv calibrate`, "
+        "in the same worlds.",
+    )
+
+
+class CaseStudy(Study):
+    """A study whose cells are cases: an agent in a scenario, with the seeds of its searches."""
+
+    def run(self, work: Case, items: Sequence[int]) -> list[Row]:
+        """See `Study`."""
+        return work.run(items)
+
+    def label(self, work: Case) -> str:
+        """See `Study`."""
+        return f"{work.label} in {work.scenario.name}"
+
+    def replays(self, folder: Path) -> Replays:
+        """See `Study`."""
+        from parkenv.studies.fingerprints import require_unchanged
+        from parkenv.studies.replays import Replays
+
+        require_unchanged(self, folder)
+        return Replays(searches=self.cells())
+
+
+class Comparison(CaseStudy):
+    """An experiment file: all agents search in the same worlds, in every scenario and setting."""
+
+    kind: Literal["compare"] = "compare"
+    agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents, default="all but exact")] = (
+        Field(
+            tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS),
+            description=f"{AGENTS_HELP} Differences are to the first.",
+        )
+    )
+    scenarios: Scenarios = (scenario_spec("campus"),)
+    grid: Grid = Grid()
+    episodes: Annotated[int, Option(short="-n", takes="N >= 1")] = Field(
+        200, ge=1, le=MAX_EPISODES, description="Episodes of each agent in each setting."
+    )
+    seed: Seed = 0
+    rig: Annotated[RigName | None, Option(panel="Sensors")] = Field(
+        None,
+        description="Observe slots through simulated sensors, detector and all, instead of the sensor model: about a "
+        "second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and a camera to "
+        "each side.",
+    )
+    detector: Detector = None
+    figures: Figures = True
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        require_distinct_names(self.agents, self.scenarios)
+        if self.detector is not None and self.rig is None:
+            raise PydanticCustomError("whole", "detector requires a rig, such as laser")
+        if (count := self.episode_count) > MAX_EPISODES:
+            raise PydanticCustomError(
+                "whole",
+                "agents x scenarios x grid x episodes is {count} searches, want at most {most}",
+                {"count": count, "most": MAX_EPISODES},
+            )
+        return self
+
+    @property
+    def episode_count(self) -> int:
+        """Upper bound on the episodes of all agents, scenarios and settings."""
+        grid = self.grid
+        failure, walk, drive = (
+            len(axis) if axis is not None else 1
+            for axis in (grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh)
+        )
+        worlds = len(self.scenarios) * (1 + len(grid.constant_forecast)) * (1 + grid.blind)
+        settings = (
+            failure * walk * drive + (walk if grid.calibrated else 0) + failure * len(grid.occupancy_levels)
+        )
+        return len(self.agents) * worlds * settings * self.episodes
+
+    @cached_property
+    def _base_scenarios(self) -> list[Scenario]:
+        from parkenv.scenarios.build import build
+
+        return [build(_seen_through(spec, self.rig)) for spec in self.scenarios]
+
+    @cached_property
+    def constant_forecasts(self) -> dict[str, tuple[Scenario, float]]:
+        """Scenarios with the same forecast for every slot, and its probability, by name."""
+        from parkenv.world.occupancy.constant_map import FlatMap
+
+        made = {}
+        for p_occupied in self.grid.constant_forecast:
+            for scenario in self._base_scenarios:
+                name = f"{scenario.name}{CONSTANT_FORECAST}{p_occupied:g}"
+                wrong = FlatMap(p_occupied, scenario.prior or scenario.occupancy)
+                made[name] = (scenario.replace(name=name, prior=wrong), p_occupied)
+        return made
+
+    @cached_property
+    def built(self) -> list[Scenario]:
+        """All scenarios, with their own costs and speeds."""
+        from parkenv.scenarios.blind import blind_scenario
+
+        made = self._base_scenarios + [flat for flat, _ in self.constant_forecasts.values()]
+        return (
+            [s for scenario in made for s in (scenario, blind_scenario(scenario))]
+            if self.grid.blind
+            else made
+        )
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The measured costs, if any."""
+        from parkenv.scenarios.calibration import Calibration
+
+        return None if self.grid.calibrated is None else Calibration.from_file(self.grid.calibrated)
+
+    @property
+    def seeds(self) -> range:
+        """Seeds of the episodes."""
+        return range(self.seed, self.seed + self.episodes)
+
+    def check(self) -> None:
+        """See `Study`."""
+        from parkenv.perception.detector_registry import make_detector
+        from parkenv.studies.compare.cases import check_worlds, require_distinct
+        from planners.agent import make_agent
+
+        for scenario in self._base_scenarios:
+            for agent in self.agents:
+                make_agent(agent.name, scenario, **agent.options)
+        if self.rig is not None:
+            for name in {self.detector or scenario.detector for scenario in self._base_scenarios}:
+                make_detector(name)
+        if self.grid.blind and not any(_works_blind(agent) for agent in self.agents):
+            raise InputError(
+                "blind searches have no observations, and all agents plan on observations: "
+                f"{', '.join(agent.label for agent in self.agents)}; add one that does not, such as mdp"
+            )
+        names = [scenario.name for scenario in self.built]
+        if repeated := [name for name in names if names.count(name) > 1]:
+            raise InputError(
+                f"two scenarios are called {repeated[0]!r}, want different names; rename one of them"
+            )
+        if (measured := self.calibration) is not None and names != [measured.scenario]:
+            raise InputError(
+                f"{self.grid.calibrated} was measured on {measured.scenario!r}, here are {', '.join(names)}; "
+                "compare that scenario alone, neither blind nor with constant forecasts"
+            )
+        require_distinct(case for case, _ in self.cases)
+        for scenario in self.built:
+            check_worlds(scenario, self.seeds)
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        from parkenv.perception.detector_registry import detector_version
+        from parkenv.studies.fingerprints import search_settings
+
+        detector = {} if self.detector is None else {"detector": detector_version(self.detector)}
+        return {**search_settings(self, self.scenarios, self.agents), "rig": self.rig, **detector}
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [*self.cases, *self.occupancy_cases]
+
+    @cached_property
+    def cases(self) -> list[Cell]:
+        """Every agent in every scenario and setting, with the seeds of its episodes."""
+        return [
+            Cell(self._case(setting, agent), self.seeds)
+            for scenario in self.built
+            for setting in self._settings(scenario)
+            for agent in self._agents_in(scenario)
+        ]
+
+    @cached_property
+    def occupancy_cases(self) -> list[Cell]:
+        """The cases at the occupancy levels, with a third of the episodes, at the first speeds of the grid."""
+        from parkenv.studies.compare.cases import at_occupancy
+        from parkenv.world.occupancy.process import OccupancyProcess
+
+        return [
+            Cell(self._case(setting, agent, level), self.seeds[: max(1, self.episodes // 3)])
+            for scenario in self.built
+            if isinstance(scenario.occupancy, OccupancyProcess)
+            and scenario.name not in self.constant_forecasts
+            for level in self.grid.occupancy_levels
+            for setting in self._grid_settings(at_occupancy(scenario, level), first_speeds=True)
+            for agent in self._agents_in(scenario)
+        ]
+
+    def _agents_in(self, scenario: Scenario) -> list[AgentSpec]:
+        from parkenv.world.sensor_model import SensorModel
+
+        blind = scenario.sensor_model == SensorModel.blind()
+        return [agent for agent in self.agents if not blind or _works_blind(agent)]
+
+    def _case(self, scenario: Scenario, agent: AgentSpec, level: float | None = None) -> Case:
+        from parkenv.studies.compare.cases import Case
+
+        return Case(scenario, agent.name, level, self.rig, agent.options, self.detector)
+
+    def _settings(self, scenario: Scenario) -> list[Scenario]:
+        from parkenv.studies.compare.cases import settings_of
+
+        settings = self._grid_settings(scenario)
+        if (measured := self.calibration) is not None:
+            settings += settings_of(measured.applied(scenario), v_walk_kmh=self.grid.v_walk_kmh)
+        return settings
+
+    def _grid_settings(self, scenario: Scenario, first_speeds: bool = False) -> list[Scenario]:
+        from parkenv.studies.compare.cases import settings_of
+
+        walk, drive = self.grid.v_walk_kmh, self.grid.v_drive_kmh
+        if first_speeds:
+            walk, drive = walk and walk[:1], drive and drive[:1]
+        return settings_of(scenario, self.grid.failure_s, walk, drive)
+
+    def prepare(self, results: Results, *, continues: bool) -> None:
+        """See `Study`."""
+        from parkenv.studies.compare.figures import remove_figures
+
+        del continues
+        remove_figures(results.path)
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        from parkenv.studies.compare.cases import table
+
+        episodes, measured = results.rows(self.table), self.calibration
+        return {
+            "rows": table(self.cases, episodes),
+            "occupancy_rows": table(self.occupancy_cases, episodes),
+            "calibrated": None if measured is None else dataclasses.asdict(measured),
+        }
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`."""
+        from parkenv.studies.compare.figures import ComparisonResults, draw_figures
+
+        flat = {
+            name: (name.partition(CONSTANT_FORECAST)[0], p)
+            for name, (_, p) in self.constant_forecasts.items()
+        }
+        data = ComparisonResults(
+            self.cases,
+            result.results.rows(self.table),
+            result.rows,
+            result.summary["occupancy_rows"],
+            flat,
+            self.seed,
+        )
+        return [partial(draw_figures, data, result.folder)]
+
+
+def _works_blind(agent: AgentSpec) -> bool:
+    return agent.name not in NEEDS_OBSERVATIONS
+
+
+def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:
+    """Return the scenario with the rig's fitted sensor model, unless the scenario names another."""
+    if (
+        rig is None
+        or spec.sensor_model.name not in (None, "perfect")
+        or spec.sensor_model.hit_rate is not None
+    ):
+        return spec
+    if spec.sensor_model.file is not None:
+        return spec
+    measured = SensorModelSpec(
+        name="stereo" if rig == "stereo" else "laser", view_range=spec.sensor_model.view_range
+    )
+    return spec.changed(sensor_model=measured)

@@ -1,0 +1,1 @@
+"""The demo: a survey, and searches on other days with its map."""

@@ -1,0 +1,190 @@
+"""The demo: a survey, and searches on other days that use only its map."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from parkenv import __version__
+from parkenv.files.known_names import RigName
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.compare.comparison import CaseStudy
+from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, ScenarioItem, Seed
+from parkenv.studies.results import EPISODES, Row, Table
+from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
+from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
+from parkenv.studies.study import Cell, Result, Results, Stage
+from parkenv.studies.workers import Task
+
+if TYPE_CHECKING:
+    from parkenv.mapping.inference import SessionLog
+    from parkenv.mapping.survey import SessionResult
+    from parkenv.studies.replays import Replays
+    from parkenv.world.scenario import Scenario
+
+AGENTS = ("mdp", "belief", "first-free", "greedy-drive", "oracle")
+FILMED = "belief"
+FILM = "search.gif"
+FIGURES = ("time_split", "time_distribution")
+"""Names of figures of comparisons."""
+QUICK = {"sessions": 2, "episodes": 2, "every": 4.0}
+"""Settings of a shorter demo."""
+RIG: RigName = "laser"
+_HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
+_APART = 1_000_000  # offset between the seeds of survey and searches, so that their worlds differ
+
+
+class _RecordedSurvey(SurveyStudy):
+    """A survey whose first session is recorded for the report."""
+
+    doing: ClassVar = "1/4 survey drives"
+
+    def drive(self, number: int) -> tuple[SessionResult, Any]:
+        """See `SurveyStudy`."""
+        from parkenv.show.report.drive_recording import record_drive
+
+        return record_drive(self.survey, number, PICTURES) if number == 0 else super().drive(number)
+
+
+class Demo(CaseStudy):
+    """A survey, and searches on other days with its map."""
+
+    block: ClassVar = 1
+    goes_on: ClassVar = "unfinished"
+    all_tables: ClassVar[tuple[Table, ...]] = (EPISODES, SESSIONS)
+
+    kind: Literal["demo"] = "demo"
+    scenario: ScenarioItem = scenario_spec("campus")
+    sessions: int = Field(4, ge=1, le=100_000, description="Survey drives.")
+    episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
+    every: CaptureDistance = Field(2.5, description="Between captures, m, in the survey and in the searches.")
+    detector: Detector = None
+    seed: Seed = Field(0, description="Seed of drives and searches.")
+
+    @cached_property
+    def survey(self) -> SurveyStudy:
+        """The survey."""
+        return _RecordedSurvey(
+            scenario=self.scenario,
+            sessions=self.sessions,
+            rig=RIG,
+            hours=_HOURS,
+            every=self.every,
+            seed=self.seed,
+            detector=self.detector,
+        )
+
+    def check(self) -> None:
+        """See `Study`."""
+        self.survey.check()
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        from parkenv.perception.detector_registry import detector_version
+        from parkenv.studies.fingerprints import fingerprints, flat_tables
+
+        varied = {"jobs", "backend", "address", "episodes"}
+        return {
+            "version": __version__,
+            **flat_tables(self.model_dump(mode="json", exclude=varied)),
+            "files": fingerprints(self.files()),
+            "detector": detector_version(self.detector or self.scenario.detector),
+        }
+
+    def warm_up(self) -> list[Task[object]]:
+        """See `Study`."""
+        from parkenv.studies.demo.warm_up import warm_up_tasks
+
+        return [*warm_up_tasks(self.survey.drive_settings, AGENTS)]
+
+    def prepare(self, results: Results, *, continues: bool) -> None:
+        """See `Study`."""
+        self.survey.prepare(results, continues=continues)
+
+    def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`."""
+        yield from self.survey.stages(results)
+        yield Stage("2/4 searches through the sensors", self, self.cases_in(results.path))
+
+    def cases_in(self, folder: Path) -> list[Cell]:
+        """Return the cases: every agent with the map in the folder and simulated sensors.
+
+        The oracle knows which slots are taken, so it needs no sensors.
+        """
+        from parkenv.mapping.learned_map import map_prior
+        from parkenv.studies.compare.cases import Case
+        from parkenv.world.sensor_model import SensorModel
+
+        scenario = self.survey.built
+        prior = map_prior(self._log(folder), (), scenario.lot.walk_m(scenario.goal))
+        known = scenario.replace(prior=prior, sensor_model=SensorModel.named(RIG))
+        seeds = range(self.seed + _APART, self.seed + _APART + self.episodes)
+        sensors: dict[str, Any] = {"rig": RIG, "detector": self.detector, "every": self.every}
+        return [Cell(Case(known, name, **({} if name == "oracle" else sensors)), seeds) for name in AGENTS]
+
+    def _log(self, folder: Path) -> SessionLog:
+        from parkenv.mapping.store import MapStore
+
+        with MapStore(folder / MAP_FILE, self.survey.built.lot, create=False) as store:
+            return store.log()
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        from parkenv.studies.compare.cases import table
+
+        episodes = results.rows(EPISODES)
+        surveyed = self.survey.summarise(results)["rows"]
+        return {
+            "rows": table(self.cases_in(results.path), episodes) if episodes else [],
+            "survey": surveyed[0] if surveyed else None,
+        }
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: pictures and a film."""
+        from parkenv.show.figures.survey import save_detections, save_session
+        from parkenv.studies.compare.figures import ComparisonResults, draw_figures
+        from parkenv.studies.compare.search_film import film_search
+
+        folder, scenario = result.folder, self.survey.built
+        cells = self.cases_in(folder)
+        filmed = next(case for case, _ in cells if case.agent == FILMED)
+        data = ComparisonResults(cells, result.results.rows(EPISODES), result.rows)
+        tasks: list[Task[object]] = [
+            partial(film_search, filmed, cells[0].items[0], folder / FILM),
+            partial(_draw_map, scenario, self._log(folder), self.sessions, folder / "map.png"),
+            partial(draw_figures, data, folder, FIGURES),
+        ]
+        if (kept := result.results.kept.get(SHOWN)) is not None:
+            tasks += [
+                partial(save_detections, kept[0], folder / "detections.png"),
+                partial(save_session, scenario.lot, kept[0], folder / "session.png"),
+            ]
+        return tasks
+
+    def replays(self, folder: Path) -> Replays:
+        """See `Study`."""
+        from parkenv.studies.replays import Replays
+
+        drives = self.survey.replays(folder)
+        return Replays(self.cases_in(folder), drives.survey, drives.sessions)
+
+
+def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:
+    """Draw the map at the middle of the arrival window, and the true probabilities."""
+    from parkenv.mapping.inference import predict
+    from parkenv.show.figures.survey import save_map
+    from parkenv.show.plurals import plural
+    from parkenv.studies.sensing.surveys import mean_occupancy
+    from parkenv.world.occupancy.process import DAY_NAMES
+    from parkenv.world.week import DAY_S
+
+    shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])
+    time = DAY_S * shown.weekdays[0] + 0.5 * (shown.start_s + shown.end_s)
+    hour, minute = divmod(int(time % DAY_S // 60), 60)
+    title = f"{scenario.name}, {DAY_NAMES[shown.weekdays[0]]} {hour:02d}:{minute:02d}, {plural(sessions, 'session')}"
+    save_map(scenario.lot, predict(log, time), mean_occupancy(scenario.occupancy, shown), title, path)

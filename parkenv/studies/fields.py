@@ -1,0 +1,149 @@
+"""Types of fields that several kinds of studies have."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, TypeVar
+
+from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic_core import PydanticCustomError
+
+from parkenv.errors import InputError
+from parkenv.files.known_names import (
+    SCENARIO_NAMES,
+)
+from parkenv.files.limited_reading import is_there
+from parkenv.files.option import Option, words_in
+from parkenv.files.spec_file import Axis, DetectorName, OrText, Several
+from parkenv.scenarios.spec import (
+    ScenarioSpec,
+    TrafficSpec,
+    lot_scenario,
+    scenario_spec,
+    scenario_specs,
+)
+from parkenv.studies.agent_spec import AgentItem, AgentSpec, split_agents
+from planners.names import AGENTS
+
+MAX_EPISODES = 10_000_000
+"""Maximum number of episodes of an experiment, over all agents, scenarios and settings."""
+T = TypeVar("T")
+
+
+def _scenario_tables(value: object, info: ValidationInfo) -> object:
+    """Resolve the name of a packaged scenario, or a file relative to the one that names it."""
+    if not isinstance(value, str | Path):
+        return value
+    folder = (info.context or {}).get("folder", Path())
+    return scenario_spec(value if str(value) in SCENARIO_NAMES else Path(folder) / value)
+
+
+ScenarioItem = Annotated[ScenarioSpec, BeforeValidator(_scenario_tables), OrText()]
+"""A scenario in a file: a name, a file, or an inline table."""
+
+
+def _with_folders(value: object, info: ValidationInfo) -> object:
+    """Replace folders in a list of scenarios by the scenarios in them."""
+    if not isinstance(value, list | tuple):
+        return value
+    folder = Path((info.context or {}).get("folder", Path()))
+    listed: list[object] = []
+    for one in value:
+        at = folder / one if isinstance(one, str | Path) and str(one) not in SCENARIO_NAMES else None
+        listed += scenario_specs(at) if at is not None and is_there(at) and at.is_dir() else [one]
+    return listed
+
+
+def _one_word(text: str) -> str:
+    words = words_in(text)
+    if len(words) > 1:
+        raise InputError(f"names {len(words)} scenarios, want one")
+    return words[0]
+
+
+def _lots(text: str) -> list[ScenarioSpec]:
+    return [lot_scenario(word, "--lot") for word in words_in(text)]
+
+
+_LOT_ALONE = (
+    "Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON, or a Dragon Lake "
+    "map (.yml)."
+)
+_NAMES = ", ".join(SCENARIO_NAMES)
+Scenarios = Annotated[
+    Several[ScenarioItem],
+    BeforeValidator(_with_folders),
+    Field(
+        min_length=1,
+        max_length=1_000,
+        description=f"{_NAMES}; scenario files (.toml), lots (.geojson), or folders.",
+    ),
+    Option("--scenario", takes="NAME|FILE|DIR[,...]", parse=words_in),
+    Option("--lot", takes="NAME|FILE[,...]", panel="World", parse=_lots, description=_LOT_ALONE),
+]
+"""Scenarios in a file: names, files, folders of scenario and lot files, or inline tables."""
+OneScenario = Annotated[
+    ScenarioItem,
+    Field(description=f"{_NAMES}, a scenario file (.toml), or a lot (.geojson)."),
+    Option("--scenario", takes="NAME|FILE", parse=_one_word),
+    Option(
+        "--lot",
+        takes="NAME|FILE",
+        panel="World",
+        parse=lambda text: _lots(_one_word(text))[0],
+        description=_LOT_ALONE,
+    ),
+]
+"""The one scenario of a file."""
+AGENTS_HELP = (
+    f"Agents, with any options in brackets, mdp(failure_s=90): {', '.join(AGENTS)}; ALGORITHM:FILE for a trained "
+    "model; MODULE:CLASS for your own."
+)
+Agents = Annotated[
+    Several[AgentItem],
+    Field(min_length=1, max_length=1_000, description=AGENTS_HELP),
+    Option(takes="NAME[,...]", parse=split_agents),
+]
+"""Agents in a file: names, or tables with a name and options."""
+Seed = Annotated[
+    int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option(takes="N >= 0")
+]
+
+
+def listed(value: object) -> object:
+    """Make a single value a list of one."""
+    return value if isinstance(value, list | tuple) else [value]
+
+
+Level = Annotated[float, Field(gt=0.0, lt=1.0)]
+Values = Annotated[Axis[T], BeforeValidator(listed)]  # an axis of the grid; a single value needs no list
+Detector = Annotated[
+    DetectorName | None,
+    Field(
+        description="hog: the packaged HOG models; side or front: one of them; net: the packaged network; a file of "
+        "`parkenv train-detector` (.npz) or a network (.onnx); MODULE:CLASS: your own."
+    ),
+    Option(takes="NAME|FILE|MODULE:CLASS", panel="Sensors", default="the scenario's, hog"),
+]
+Figures = Annotated[bool, Field(description="Draw figures."), Option(panel="Results")]
+ArrivalRate = Annotated[float, Field(gt=0.0, le=1e6)]
+Stay = Annotated[float, Field(ge=1.0, le=1e7)]  # s
+BUSY = TrafficSpec(cars=3, pedestrians=5)
+"""Default traffic of runs with simulated sensors."""
+CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
+"""Distance between captures, m."""
+
+
+def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[ScenarioSpec, ...] = ()) -> None:
+    """Check that no two agents, and no two scenarios, share a name.
+
+    Raises:
+        PydanticCustomError: two share one.
+    """
+    for what, names in (
+        ("agents", [agent.label for agent in agents]),
+        ("scenarios", [scenario.title for scenario in scenarios]),
+    ):
+        repeated = [name for i, name in enumerate(names) if name in names[:i]]
+        if repeated:
+            raise PydanticCustomError("whole", f"{what} has {{name}} twice", {"name": repr(repeated[0])})

@@ -1,0 +1,297 @@
+"""Days on which many cars search one lot: agents, knowledge, shares and demand, all on the same days."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
+
+from pydantic import BeforeValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv import __version__
+from parkenv.errors import InputError
+from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
+from parkenv.files.spec_file import Axis, FilePath, Several
+from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
+from parkenv.scenarios.spec import Probability, scenario_spec
+from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.studies.fields import (
+    MAX_EPISODES,
+    ArrivalRate,
+    ScenarioItem,
+    Seed,
+    Stay,
+    Values,
+    listed,
+    require_distinct_names,
+)
+from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS, Setting
+from parkenv.studies.results import CsvTable, Row
+from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.workers import Task
+
+if TYPE_CHECKING:
+    from parkenv.engine.fleet import Fleet
+    from parkenv.scenarios.calibration import Calibration
+    from parkenv.studies.fleet.measures import Roads
+    from parkenv.studies.replays import Replays
+    from parkenv.world.scenario import Scenario
+
+MAX_SETTINGS = 10_000
+"""Maximum number of settings of a study."""
+SAMPLE_S = 300.0
+"""Time between two samples of the occupancy, s."""
+OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
+"""Fields of the specification that all settings have in common."""
+PICTURE = "fleet.png"
+
+
+class FleetStudy(Study):
+    """Days on which many cars search one lot, and what they know."""
+
+    table: ClassVar = CsvTable(
+        "days.csv",
+        keys=(*SETTING_COLUMNS, "day"),
+        columns=("cars", *MEASURES),
+        kinds=dict.fromkeys(("scenario", "agents", "knows"), TEXT)
+        | dict.fromkeys(("day", "cars"), WHOLE)
+        | dict.fromkeys(("members_s", "others_s"), NUMBER_OR_NAN),
+        timings=None,
+    )
+    block: ClassVar = 1
+    doing: ClassVar = "Driving"
+    unit: ClassVar = "days"
+
+    kind: Literal["fleet"] = "fleet"
+    agents: Several[AgentItem] = Field(
+        (AgentSpec(name="greedy-drive"),), min_length=1, max_length=1_000,
+        description="Each drives all cars in turn.",
+    )  # fmt: skip
+    scenario: ScenarioItem = scenario_spec("campus")
+    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = Field(
+        KNOWLEDGE, description="What members know: own, shared, reserve or full."
+    )
+    shares: Values[Probability] = Field((1.0,), description="Shares of the cars that are members.")
+    arrivals_per_hour: Values[ArrivalRate] = Field((60.0, 120.0, 240.0), description="Cars.")
+    days: int = Field(10, ge=1, le=100_000, description="Days of each setting.")
+    stay_s: Stay = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
+    patience_s: Stay = Field(600.0, description="Search time after which a car goes elsewhere, s.")
+    delay_s: float = Field(0.0, ge=0.0, le=1e5, description="Age of the live map, s.")
+    manoeuvre_s: float | None = Field(
+        None, ge=0.0, le=3600.0,
+        description="Time for which a car that parks or leaves blocks its lane, s; if absent, as calibrated, or 0.",
+    )  # fmt: skip
+    leaving_soon_s: float = Field(
+        0.0,
+        ge=0.0,
+        le=3600.0,
+        description="Time for which a car shows that it leaves, s; who waits has the slot.",
+    )
+    sees_cars: bool = Field(False, description="Whether agents observe the other cars in view.")
+    calibrated: FilePath | None = Field(
+        None, description="Speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`."
+    )
+    decision_limit_s: float | None = Field(
+        None, ge=0.01, le=1e5, description="Wall time after which a decision in Python stops the run, s."
+    )
+    seed: Seed = Field(0, description="Seed of the days.")
+    figures: bool = Field(True, description="Draw the picture.")
+
+    @model_validator(mode="after")
+    def _bounded(self) -> Self:
+        require_distinct_names(self.agents)
+        if self.decision_limit_s is not None and self.backend == "dask":
+            raise PydanticCustomError(
+                "whole",
+                "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
+            )
+        settings = len(self.agents) * len(self.knows) * len(self.shares) * len(self.arrivals_per_hour)
+        if settings > MAX_SETTINGS:
+            raise PydanticCustomError(
+                "whole",
+                "agents x knows x shares x arrivals_per_hour is {count} settings, want at most {most}",
+                {"count": settings, "most": MAX_SETTINGS},
+            )
+        if (count := settings * self.days) > MAX_EPISODES:
+            raise PydanticCustomError(
+                "whole",
+                "agents x knows x shares x arrivals_per_hour x days is {count} days, want at most {most}",
+                {"count": count, "most": MAX_EPISODES},
+            )
+        return self
+
+    @cached_property
+    def built(self) -> Scenario:
+        """Lot, residents, hours of arrival, speeds and costs."""
+        from parkenv.scenarios.build import build
+
+        scenario = build(self.scenario)
+        return scenario if self.calibration is None else self.calibration.applied(scenario)
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """The measured speed, failure cost and manoeuvre, if any."""
+        from parkenv.scenarios.build import build
+        from parkenv.scenarios.calibration import Calibration
+
+        if (path := self.calibrated) is None:
+            return None
+        measured = Calibration.from_file(path)
+        if measured.scenario != (name := build(self.scenario).name):
+            raise InputError(f"{path} was measured on {measured.scenario!r}, the fleet drives on {name!r}")
+        return measured
+
+    @property
+    def blocked_s(self) -> float:
+        """Time for which a car that parks or leaves blocks its lane, s."""
+        if self.manoeuvre_s is not None:
+            return self.manoeuvre_s
+        return 0.0 if self.calibration is None else self.calibration.manoeuvre_s
+
+    @cached_property
+    def _roads(self) -> Roads:
+        from parkenv.studies.fleet.measures import Roads
+
+        return Roads(self.built)
+
+    @cached_property
+    def fleet_settings(self) -> list[Setting]:
+        """All settings. Without members only `own` is left: it is not repeated for each share."""
+        # Agents have no hash: their options may be lists.
+        made = dict.fromkeys(
+            (per_hour, number, OWN if share == 0.0 else knows, 0.0 if knows == OWN else share)
+            for per_hour, number, knows, share in itertools.product(
+                self.arrivals_per_hour, range(len(self.agents)), self.knows, self.shares
+            )
+        )
+        name = self.built.name
+        return [
+            Setting(name, self.agents[number], knows, share, per_hour)
+            for per_hour, number, knows, share in made
+        ]
+
+    def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
+        """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled.
+
+        Raises:
+            InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
+        """
+        from parkenv.engine.fleet import DriverKind, Fleet
+        from parkenv.studies.fleet.decision_limit import LimitedAgent
+        from parkenv.studies.fleet.drivers import demand_in, driver_of
+
+        rule, agent = driver_of(setting.agent, self.built, setting.arrivals_per_hour)
+        kinds = [
+            DriverKind(setting.share, rule, setting.knows, shares=setting.knows == "shared"),
+            DriverKind(1.0 - setting.share, rule),
+        ]
+        fleet = Fleet(
+            self.built,
+            demand_in(self.built, setting.arrivals_per_hour, self.stay_s, self.patience_s),
+            background="residents",
+            drivers=kinds,
+            leave_full_lot=False,
+            manoeuvre_s=self.blocked_s,
+            **{name: getattr(self, name) for name in ("delay_s", "leaving_soon_s", "sees_cars")},
+        )
+        if agent is not None and self.decision_limit_s is not None:
+            agent = LimitedAgent(agent, self.decision_limit_s)
+        return fleet, [agent, agent]
+
+    def run_day(self, setting: Setting, day: int) -> Row:
+        """Run a day of a setting; return its row of `days.csv`.
+
+        Raises:
+            InputError: an agent raised an error or took too long; the message names setting, day, car and time.
+        """
+        import numpy as np
+
+        from parkenv.studies.fleet.clairvoyant_bound import clairvoyant_bound_s
+        from parkenv.studies.fleet.measures import day_measures
+
+        fleet, agents = self.fleet(setting)
+        fleet.reset(self.seed, day)
+        bound_s = clairvoyant_bound_s(self._roads.parking_day(fleet))
+        window = self.built.arrival
+        taken = []
+        try:
+            for second in np.arange(0.0, window.end_s - window.start_s, SAMPLE_S):
+                fleet.run(agents, until=fleet.begin + second)
+                taken.append(fleet.taken().mean())
+            fleet.run(agents)
+        except InputError as error:
+            raise InputError(f"{setting}, day {day}, {error}") from error
+        members = fleet.cars["kind"] == 0
+        measured = day_measures(fleet, self._roads, members, float(np.mean(taken)), bound_s)
+        return {**setting.columns, "day": day, **measured}
+
+    def check(self) -> None:
+        """See `Study`."""
+        for setting in self.fleet_settings:
+            self.fleet(setting)
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        from parkenv.studies.fingerprints import agent_fingerprints, fingerprints, flat_tables
+
+        return {
+            "version": __version__,
+            "scenario": {self.scenario.title: flat_tables(self.scenario.model_dump(mode="json"))},
+            "files": fingerprints(self.files()),
+            "agent files": agent_fingerprints(agent.name for agent in self.agents),
+            "manoeuvre_s": self.blocked_s,
+            **{name: getattr(self, name) for name in (*OPTIONS, "seed")},
+        }
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [Cell(setting, range(self.days)) for setting in self.fleet_settings]
+
+    def run(self, work: Setting, items: Sequence[int]) -> list[Row]:
+        """See `Study`."""
+        return [self.run_day(work, day) for day in items]
+
+    def label(self, work: Setting) -> str:
+        """See `Study`."""
+        return work.agent.label
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        from parkenv.studies.fleet.tables import summarize_days
+
+        days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
+        options = {name: getattr(self, name) for name in OPTIONS}
+        return {"manoeuvre_s": self.blocked_s, **options, "rows": summarize_days(days)}
+
+    @property
+    def title(self) -> str:
+        """Title of the table and of the picture."""
+        from parkenv.show.plurals import plural
+
+        return f"{self.built.name}: {self.built.lot.n_slots} slots, {plural(self.days, 'day')}"
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: the picture."""
+        from parkenv.show.figures.fleet import save_fleet_figure
+        from parkenv.studies.fleet.measures import looks_s
+
+        return [
+            partial(
+                save_fleet_figure,
+                result.rows,
+                partial(looks_s, self.built),
+                self.title,
+                result.folder / PICTURE,
+            )
+        ]
+
+    def replays(self, folder: Path) -> Replays:
+        """See `Study`."""
+        from parkenv.studies.fingerprints import require_unchanged
+        from parkenv.studies.replays import Replays
+
+        require_unchanged(self, folder)
+        return Replays(fleet=self)

@@ -1,0 +1,92 @@
+"""Summary of the days of a study of many cars."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+
+from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS
+from parkenv.studies.results import Row
+from parkenv.studies.statistics import mean_interval, ratio_interval
+
+ASSIGNED = "reserve"
+WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
+"""Measures whose summary has a 95 % interval over days."""
+DIFFERENCES = {
+    "difference_s": "total_s",
+    "members_difference_s": "members_s",
+    "others_difference_s": "others_s",
+}
+"""Columns of paired differences, and the measures that are compared."""
+Pairs = list[tuple[Row, Row]]
+"""The same days in two settings."""
+
+
+def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
+    """Return the summary, a row for each setting, from the days of each, at least one.
+
+    The *price of anarchy* of a row is the ratio of its mean total time to that of `reserve` for all cars, with the same
+    agents and demand; its interval is a bootstrap over days. The *price over the bound* is the ratio to the clairvoyant
+    lower bound of the same days, likewise. Differences are paired: to the mean total time of all cars
+    on the same days if nobody knows more than what it observes. Both are over the days that both settings have; null if
+    there are none.
+    """
+    by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
+
+    def paired(days: list[Row], knows: str, share: float) -> Pairs:
+        first = days[0]
+        key = (first["scenario"], first["agents"], knows, share, first["arrivals_per_hour"])
+        others = {day["day"]: day for day in by_setting.get(key, ())}
+        return [(day, others[day["day"]]) for day in days if day["day"] in others]
+
+    return [
+        {
+            **{name: days[0][name] for name in SETTING_COLUMNS},
+            "days": len(days),
+            "cars": sum(day["cars"] for day in days),
+            **_means(days),
+            **_differences(paired(days, OWN, 0.0)),
+            **_price(paired(days, ASSIGNED, 1.0)),
+            **_ratio("price_over_bound", days, days, "clairvoyant_s"),
+        }
+        for days in settings
+    ]
+
+
+def _differences(pairs: Pairs) -> Row:
+    row: Row = {}
+    for name, column in DIFFERENCES.items():
+        values = [one[column] - other["total_s"] for one, other in pairs]
+        row[name], low, high = mean_interval([value for value in values if not math.isnan(value)])
+        row[f"{name}_ci95"] = [low, high]
+    return row
+
+
+def _means(days: list[Row]) -> Row:
+    row: Row = {}
+    for name in MEASURES:
+        # On a day without members, or without others, there is no mean of theirs.
+        values = [day[name] for day in days if not math.isnan(day[name])]
+        if name in WITH_INTERVAL:
+            row[name], low, high = mean_interval(values)
+            row[f"{name}_ci95"] = [low, high]
+        else:
+            row[name] = float(np.mean(values))
+    return row
+
+
+def _price(pairs: Pairs) -> Row:
+    mine, theirs = zip(*pairs, strict=True) if pairs else ((), ())
+    return _ratio("price_of_anarchy", mine, theirs, "total_s")
+
+
+def _ratio(name: str, days: Sequence[Row], others: Sequence[Row], column: str) -> Row:
+    """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
+    if not days:
+        return {name: float("nan"), f"{name}_ci95": [float("nan")] * 2}
+    mine = np.array([day["total_s"] * day["cars"] for day in days])
+    theirs = np.array([day[column] * day["cars"] for day in others])
+    ratio, low, high = ratio_interval(mine, theirs)
+    return {name: ratio, f"{name}_ci95": [low, high]}

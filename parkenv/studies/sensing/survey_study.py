@@ -1,0 +1,174 @@
+"""Surveys: drives past every slot with simulated sensors, recorded in a map file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
+
+from pydantic import Field
+
+from parkenv import __version__
+from parkenv.files.known_names import LocaliserName, RigName, WeatherName
+from parkenv.files.spec_file import Several
+from parkenv.scenarios.spec import Hours, scenario_spec
+from parkenv.studies.fields import BUSY, CaptureDistance, Detector, ScenarioItem, Seed
+from parkenv.studies.results import Key, Row
+from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
+from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.workers import Task
+
+if TYPE_CHECKING:
+    from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
+    from parkenv.studies.replays import Replays
+    from parkenv.world.scenario import Scenario
+
+PICTURES = 4
+"""Number of perception results of the first session that are kept for figures."""
+DRIVEN = "driven"
+"""Key of what a session found in its row; the map keeps it."""
+SHOWN = "shown"
+"""Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording."""
+
+
+class SurveyStudy(Study):
+    """A survey: drives past every slot with simulated sensors, recorded in a map file."""
+
+    table: ClassVar = SESSIONS
+    block: ClassVar = 1
+    doing: ClassVar = "Driving (compiles first after an installation)"
+    unit: ClassVar = "sessions"
+    goes_on: ClassVar = "always"
+    keeps_order: ClassVar = True
+
+    kind: Literal["survey"] = "survey"
+    scenario: ScenarioItem = scenario_spec("campus")
+    sessions: int = Field(6, ge=1, le=100_000, description="Survey drives; the thesis made 21.")
+    rig: RigName | None = Field(None, description="The scenario's if absent.")
+    detector: Detector = None
+    hours: Several[Hours] = Field(
+        ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
+        description="When drives begin, one window after the other, on the scenario's days.",
+    )  # fmt: skip
+    weather: WeatherName | None = Field(None, description="Drawn for each session if absent.")
+    every: CaptureDistance = Field(1.25, description="Distance between captures, m.")
+    pose_noise: float = Field(0.0, ge=0.0, le=100.0, description="Localisation error of the car, m.")
+    odometry_drift: float = Field(
+        0.0,
+        ge=0.0,
+        le=0.5,
+        description="Error of the car's odometry after 100 m, as a share of the distance.",
+    )
+    localise: LocaliserName = Field("none", description="What corrects the odometry.")
+    picture_width: int | None = Field(
+        None, ge=64, le=4_096, description="Width of the cameras' pictures, px; 640 if absent."
+    )
+    seed: Seed = Field(0, description="Seed of the drives.")
+
+    @cached_property
+    def built(self) -> Scenario:
+        """The scenario."""
+        from parkenv.scenarios.build import build
+
+        return build(self.scenario if self.scenario.traffic else self.scenario.changed(traffic=BUSY))
+
+    @cached_property
+    def drive_settings(self) -> SurveySettings:
+        """Settings of the drives."""
+        from parkenv.mapping.odometry import PoseNoise
+        from parkenv.mapping.survey import SurveySettings
+        from parkenv.world.occupancy.process import ArrivalWindow
+
+        days = self.scenario.arrivals.days
+        return SurveySettings(
+            rig=self.rig or self.scenario.rig,
+            every=self.every,
+            weather=self.weather,
+            windows=tuple(ArrivalWindow.parse(hours, days) for hours in self.hours),
+            pose_noise=PoseNoise(self.pose_noise, 0.02 * self.pose_noise, drift=self.odometry_drift),
+            localise=self.localise,
+            seed=self.seed,
+            detector=self.detector or self.scenario.detector,
+            picture_width=self.picture_width,
+        )
+
+    @cached_property
+    def survey(self) -> Survey:
+        """The drives."""
+        from parkenv.mapping.survey import Survey
+
+        return Survey(self.built, self.drive_settings)
+
+    def check(self) -> None:
+        """See `Study`."""
+        self.survey.key_of(0)
+
+    def settings(self) -> Row:
+        """See `Study`: the keys of sessions hold the others."""
+        return {"version": __version__}
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [Cell("survey", range(self.sessions))]
+
+    def keys(self, work: Any, item: int) -> list[Key]:
+        """See `Study`."""
+        del work
+        return [(self.survey.key_of(item),)]
+
+    def run(self, work: Any, items: Sequence[int]) -> list[Row]:
+        """See `Study`."""
+        from parkenv.studies.sensing.surveys import session_row
+
+        del work
+        driven = [self.drive(number) for number in items]
+        return [session_row(result) | {DRIVEN: (result, recording)} for result, recording in driven]
+
+    def drive(self, number: int) -> tuple[SessionResult, Any]:
+        """Drive a session, the first one with results for figures; return it with its recording, if any."""
+        return self.survey.drive(number, pictures=PICTURES if number == 0 else 0), None
+
+    def prepare(self, results: Results, *, continues: bool) -> None:
+        """See `Study`; sessions that are not in the map are driven again."""
+        from parkenv.mapping.store import MapStore
+
+        file = results.path / MAP_FILE
+        if not continues:
+            file.unlink(missing_ok=True)
+        with MapStore(file, self.built.lot) as store:
+            results.drop([key for key in results.rows(self.table) if not store.has(key[0])], self.table)
+
+    def keep(self, work: Any, rows: Sequence[Row], results: Results) -> None:
+        """See `Study`: sessions go into the map."""
+        from parkenv.mapping.store import MapStore
+
+        del work
+        with MapStore(results.path / MAP_FILE, self.built.lot) as store:
+            for row in rows:
+                result, recording = row.pop(DRIVEN)
+                if not store.has(row["key"]):
+                    store.add(result.session)
+                if row["key"] == self.survey.key_of(0):
+                    results.kept[SHOWN] = result, recording
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        from parkenv.studies.sensing.surveys import summarize
+
+        rows = results.of(self, self.cells()[0])
+        file = results.path / MAP_FILE
+        return {"rows": [summarize(self.built, self.drive_settings, rows, file)] if rows else []}
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: pictures of the map; those of the first session only if it was driven in this run."""
+        from parkenv.studies.sensing.survey_figures import draw_survey
+
+        shown, _ = result.results.kept.get(SHOWN, (None, None))
+        return [partial(draw_survey, self.built, self.drive_settings, result.rows[0], shown, result.folder)]
+
+    def replays(self, folder: Path) -> Replays:
+        """See `Study`."""
+        from parkenv.studies.replays import Replays
+
+        return Replays(survey=(self.built, self.drive_settings), sessions=len(self.table.read(folder)))
