@@ -38,7 +38,7 @@ from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.results import ResultFolder, decision_s
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.sensing.surveys import detection_by_distance
-from parkenv.studies.trips.calibration import TripFolder
+from parkenv.studies.trips.calibration_study import CalibrationStudy
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.sensor_model import SensorModel
@@ -104,7 +104,7 @@ def resumed(path):
 
 
 def resumed_trips(path):
-    TripFolder(path.parent, {"seed": 0}, resume=True)
+    CalibrationStudy.table.read(path.parent)
 
 
 def reported(path):

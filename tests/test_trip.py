@@ -23,17 +23,22 @@ from parkenv.envs.search import SearchEnv
 from parkenv.lots import packaged_lot
 from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.calibration import Calibration
+from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.simulate import Observer
-from parkenv.studies.trips.calibration import (
-    OBSERVED,
-    UNOBSERVED,
-    TripFolder,
-    TripPlan,
-    calibrate,
-    drive_trips,
-)
+from parkenv.studies.study import run
+from parkenv.studies.trips.calibration import calibrate
+from parkenv.studies.trips.calibration_study import CalibrationStudy
 from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
-from parkenv.studies.trips.executor import ACROSS, ALONG, NO_ROOM, TAKEN, TURN, ParkingAttempt
+from parkenv.studies.trips.executor import (
+    ACROSS,
+    ALONG,
+    NO_ROOM,
+    OBSERVED,
+    TAKEN,
+    TURN,
+    UNOBSERVED,
+    ParkingAttempt,
+)
 from parkenv.studies.trips.sensor_log import record_trip
 from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
 from parkenv.world.lot_scene import LotScenes
@@ -656,36 +661,33 @@ def test_a_calibration_comes_back_from_its_file_and_others_are_refused(tmp_path)
 
 
 def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
-    plan = TripPlan(MINI, "mdp", DrivingStyle())
-    settings_row = {"agent": "mdp"}
-    rows = drive_trips(plan, range(1, 3), TripFolder(tmp_path, settings_row))
-    text = (tmp_path / "trips.jsonl").read_text()
+    study = CalibrationStudy(scenario=scenario_spec("mini"), episodes=2, seed=1, jobs=1)
+    file = tmp_path / "trips.jsonl"
+    run(study, tmp_path)
+    summary, text = (tmp_path / "summary.json").read_text(), file.read_text()
     lines = text.splitlines(keepends=True)
     assert len(lines) == 4
-    (tmp_path / "trips.jsonl").write_text(lines[0] + lines[2] + lines[3][:20])  # torn by a crash
-    told = []
-    again = drive_trips(
-        plan, range(1, 3), TripFolder(tmp_path, settings_row, resume=True), on_progress=told.append
-    )
-    assert told[0] == 2
-    assert sum(told) == 4
-    assert json.dumps(again) == json.dumps(rows)
-    assert (tmp_path / "trips.jsonl").read_text() == text
+    file.write_text(lines[0] + lines[2] + lines[3][:20])  # torn by a crash
+    seen = []
+    run(study, tmp_path, resume=True, progress=lambda *news: seen.append(news[1:]))
+    assert seen[0] == (2, 4)
+    assert file.read_text() == text
+    assert (tmp_path / "summary.json").read_text() == summary
     with pytest.raises(InputError, match="add --resume"):
-        TripFolder(tmp_path, settings_row)
+        run(study, tmp_path)
     with pytest.raises(InputError, match="agent was 'mdp' in"):
-        TripFolder(tmp_path, {"agent": "belief"}, resume=True)
+        run(study.changed(agent="belief"), tmp_path, resume=True)
     for damaged in ('{"slots": [], "seed": 1}', lines[0].replace('"seed": 1', '"seed": "x"'), "[1]"):
-        (tmp_path / "trips.jsonl").write_text(f"{damaged.strip()}\n")
-        with pytest.raises(InputError, match=r"line 1: .* is no trip"):
-            TripFolder(tmp_path, settings_row, resume=True)
+        file.write_text(f"{damaged.strip()}\n")
+        with pytest.raises(InputError, match=r"line 1: .* is not a valid trip"):
+            run(study, tmp_path, resume=True)
 
 
 @pytest.mark.slow
 def test_the_commands_calibrate_compare_and_film(tmp_path):
-    run = CliRunner().invoke
+    command = CliRunner().invoke
     out = tmp_path / "calibrate"
-    result = run(
+    result = command(
         app, ["calibrate", "--scenario", "mini", "--episodes", "3", "--seed", "0", "--out", str(out)]
     )
     assert result.exit_code == 0, result.output
@@ -706,7 +708,7 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
         "--occupancy-levels",
         "none",
     ]
-    result = run(
+    result = command(
         app,
         [
             *words,
@@ -723,7 +725,7 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
     rows = json.loads((compared / "summary.json").read_text())["rows"]
     assert [r["failure_cost_s"] for r in rows] == [10.0, 10.0, made.failure_s, made.failure_s]
     assert {r["agent"] for r in rows[2:]} == {"mdp", "greedy-goal"}
-    result = run(
+    result = command(
         app,
         [
             "compare",
@@ -739,7 +741,7 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
     assert "was measured on 'mini'" in str(result.exception)
     film = tmp_path / "trip.gif"
     others = ["--cars", "2", "--pedestrians", "2"]
-    result = run(app, ["trip", "--scenario", "mini", "--seed", "1", *others, "--out", str(film)])
+    result = command(app, ["trip", "--scenario", "mini", "--seed", "1", *others, "--out", str(film)])
     assert result.exit_code == 0, result.output
     assert "behind and before others; 0 contacts" in result.output
     from PIL import Image
@@ -749,6 +751,6 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
         assert picture.n_frames > 40
     recording = tmp_path / "trip.rrd"
     words = ["trip", "--scenario", "mini", "--seed", "3", "--rig", "laser", "--rerun", str(recording)]
-    result = run(app, [*words, "--out", str(film)])
+    result = command(app, [*words, "--out", str(film)])
     assert result.exit_code == 0, result.output
     assert recording.stat().st_size > 50_000

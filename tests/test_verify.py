@@ -8,12 +8,11 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.files.known_names import VERIFY_CASES
+from parkenv.studies.study import run
 from parkenv.studies.verify import line, looks
 from parkenv.studies.verify.line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
 from parkenv.studies.verify.rows import certain_row, disagreeing, mean_row
-from parkenv.studies.verify.verification import tasks_of, verify
-from parkenv.studies.workers import Workers
+from parkenv.studies.verify.study import Verification
 from planners.agent import make_agent
 
 
@@ -105,15 +104,9 @@ def test_looks_follow_from_how_many_slots_are_free():
             assert not mean_row("", looks.SLOTS / free, mine, "").agrees, "with replacement"
 
 
-def test_cases_run_in_order_and_unknown_ones_are_named(monkeypatch):
-    monkeypatch.setattr(looks, "EPISODES", 300)
-    steps = []
-    made = list(verify(tasks_of(["looks"], 3), Workers(1), lambda: steps.append(1)))
-    assert [case for case, _ in made] == ["looks"]
-    assert len(made[0][1]) == len(looks.FREE)
-    assert len(steps) == 1
-    with pytest.raises(InputError, match=r"--cases: there is no case 'lne'; did you mean 'line'\?"):
-        tasks_of(["lne"], 0)
+def test_unknown_cases_are_named():
+    with pytest.raises(InputError, match=r"cases: there is no case 'lne'; did you mean 'line'\?"):
+        Verification(cases=("lne",)).check()
 
 
 def test_the_command_writes_rows_and_a_picture(tmp_path, monkeypatch):
@@ -142,6 +135,7 @@ def test_a_row_that_disagrees_is_said_and_makes_the_exit_code(monkeypatch):
 
 @pytest.mark.slow
 def test_every_row_is_inside_its_interval():
-    rows = [row for _, made in verify(tasks_of(VERIFY_CASES, 0), Workers(2)) for row in made]
+    study = Verification(jobs=2)
+    rows = study.statements(run(study).results)
     assert not disagreeing(rows)
     assert len(rows) >= 70

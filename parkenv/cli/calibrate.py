@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
+from parkenv.cli.study_run import run_study
+from parkenv.cli.tables import make_console, make_table, print_recorded
 from parkenv.errors import InputError
-from parkenv.files.file_names import file_name
 from parkenv.files.known_names import RigName
-from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from parkenv.studies.study import Result
 
 
 def calibrate(
@@ -57,62 +55,39 @@ def calibrate(
     Results:
         resume: Go on with the trips in --out.
     """
-    from parkenv.perception.detector_registry import detector_version
-    from parkenv.scenarios.build import build
     from parkenv.studies.agent_spec import AgentSpec
-    from parkenv.studies.fingerprints import agent_fingerprints, fingerprints, flat_tables
-    from parkenv.studies.trips import calibration
-    from parkenv.studies.trips.driven_search import DrivenSearch
-    from parkenv.studies.trips.vehicle_controller import DrivingStyle
+    from parkenv.studies.trips.calibration_study import CalibrationStudy
+
+    args.require_rig(rig, detector)
+    study = CalibrationStudy().changed(
+        scenario=traffic.on(world.spec(scenario)), agent=AgentSpec.of(args.one_agent(agents)), episodes=episodes,
+        seed=seed, notice_m=notice, v_drive_kmh=v_drive_kmh, rig=rig, detector=detector, **machines.given,
+    )  # fmt: skip
+    run_study(study, out, args.ReportedRun(resume=resume), show_calibration)
+
+
+def show_calibration(console: Console, result: Result) -> None:
+    """Print the distributions and the calibration."""
     from parkenv.world.scenario import KMH
 
-    spec = traffic.on(world.spec(scenario))
-    its = build(spec)
-    speed = its.v_drive if v_drive_kmh is None else v_drive_kmh * KMH
-    style = DrivingStyle(speed=speed, notice_m=notice)
-    agents = args.one_agent(agents)
-    args.require_rig(rig, detector)
-    DrivenSearch(
-        its, agents, style=style, rig=rig, detector=detector
-    )  # raises an error before anything is driven
-    with writing_into(out, "the same command with --resume"):
-        settings = {
-            "version": __version__, "scenario": its.name,
-            "scenarios": {its.name: flat_tables(spec.model_dump(mode="json"))},
-            "files": fingerprints(spec.files()), "agent": agents, "style": dataclasses.asdict(style), "rig": rig,
-            **({} if detector is None else {"detector": detector_version(detector)}),
-            "traffic": dataclasses.asdict(its.traffic), "agent files": agent_fingerprints([AgentSpec.of(agents).name]),
-        }  # fmt: skip
-        folder = calibration.TripFolder(out, settings, resume=resume)
-        console = make_console()
-        with progress_bar(console, "trips") as progress, machines.workers() as workers:
-            bar = progress.add_task("Driving", total=2 * episodes)
-            trips = calibration.TripPlan(its, agents, style, rig, detector)
-            seeds = range(seed, seed + episodes)
-            rows = calibration.drive_trips(trips, seeds, folder, workers, lambda n: progress.advance(bar, n))
-        made, table = calibration.calibrate(rows, its, speed)
-        made.to_file(out / "calibrated.json")
-        touched, stuck = (sum(row[name] for row in rows) for name in ("contacts", "rescues"))
-        counts = {"trips": len(rows), "contacts": touched, "rescues": stuck}
-        save_summary(out, seed, table, **settings | counts, calibrated=dataclasses.asdict(made))
-        title = f"{its.name}: {plural(episodes, 'trip')} with and as many without observations, by {agents}"
-        calibration.save_distributions(rows, speed, title, out / file_name(f"calibration_{its.name}", ".png"))
-        cells = (
-            (
-                row["what"],
-                str(row["n"]),
-                f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",
-                *(f"{row[name]:.2f}" if name in row else "" for name in ("median", "p95")),
-            )
-            for row in table
+    study: Any = result.study
+    cells = (
+        (
+            row["what"],
+            str(row["n"]),
+            f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",
+            *(f"{row[name]:.2f}" if name in row else "" for name in ("median", "p95")),
         )
-        console.print(make_table(title, ("what", "n", "mean [95 %]", "median", "p95"), cells))
+        for row in result.rows
+    )
+    console.print(make_table(study.title, ("what", "n", "mean [95 %]", "median", "p95"), cells))
+    if (made := result.summary["calibrated"]) is not None:
+        trips, touched, stuck = (result.summary[name] for name in ("trips", "contacts", "rescues"))
         console.print(
-            f"Calibrated: driving at {made.v_drive / KMH:.2f} km/h, a failed attempt costs {made.failure_s:.1f} s, and "
-            f"parking takes {made.manoeuvre_s:.1f} s that the drive graph leaves out. In {len(rows)} trips: "
-            f"{touched} contacts, {stuck} times stuck."
+            f"Calibrated: driving at {made['v_drive'] / KMH:.2f} km/h, a failed attempt costs "
+            f"{made['failure_s']:.1f} s, and parking takes {made['manoeuvre_s']:.1f} s that the drive graph leaves out."
+            f" In {trips} trips: {touched} contacts, {stuck} times stuck."
         )
-        console.print(f"Calibration, trips, summary and figure are in {out}")
 
 
 def trip(

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from parkenv.cli import arguments as args
 from parkenv.cli.benchmark import show_scores
+from parkenv.cli.calibrate import show_calibration
 from parkenv.cli.commute import show as show_commute
 from parkenv.cli.compare import show as show_comparison
 from parkenv.cli.demo import run_demo
@@ -17,6 +18,7 @@ from parkenv.cli.study_run import run_study
 from parkenv.cli.survey import show as show_survey
 from parkenv.cli.train import run_training
 from parkenv.cli.trust import require_trust
+from parkenv.cli.verify import show as show_verification
 from parkenv.errors import InputError
 
 SHOWN: Mapping[str, Callable[..., None]] = {
@@ -26,6 +28,8 @@ SHOWN: Mapping[str, Callable[..., None]] = {
     "benchmark": show_scores,
     "survey": show_survey,
     "detectors": show_detectors,
+    "calibrate": show_calibration,
+    "verify": show_verification,
 }
 """What prints the result of each kind of study."""
 

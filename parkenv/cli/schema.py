@@ -10,7 +10,10 @@ from typer import echo
 
 from parkenv.errors import InputError, nearest
 
-KINDS = ("scenario", "compare", "commute", "fleet", "benchmark", "survey", "detectors", "demo", "train")
+KINDS = (
+    "scenario", "compare", "commute", "fleet", "benchmark", "survey", "detectors", "demo", "calibrate", "verify",
+    "train",
+)  # fmt: skip
 
 
 def schemas() -> dict[str, dict[str, Any]]:
@@ -35,8 +38,8 @@ def schema(kind: str | None = None, /, out: Path | None = None) -> None:
         parkenv schema --out docs/schemas
 
     Options:
-        kind (KIND): scenario, compare, commute, fleet, benchmark, survey, detectors, demo, train.  [default: scenario;
-            all with --out]
+        kind (KIND): scenario, compare, commute, fleet, benchmark, survey, detectors, demo, calibrate, verify,
+            train.  [default: scenario; all with --out]
         out, -o (DIR): Folder for all schemas, KIND.schema.json.  [default: none]
     """
     if kind is not None and kind not in KINDS:

@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 def run_study(
-    study: Study, out: Path, folder: args.ReportedRun, show: Callable[[Console, Result], None]
+    study: Study, out: Path | None, folder: args.ReportedRun, show: Callable[[Console, Result], None]
 ) -> Result:
     """Run a study into a folder, print its result, and write its report on request.
 
     Args:
         study: the study.
-        out: the folder.
+        out: the folder; None to keep nothing.
         folder: whether an earlier run is continued or replaced, and whether there is a report.
         show: prints the result; that of an interrupted run, too.
 
@@ -51,12 +51,12 @@ def run_study(
     except KeyboardInterrupt as stopped:
         if isinstance(stopped, Interrupted):
             show(console, stopped.result)
-        console.print(
-            f"Interrupted. What was finished is in {out}; parkenv run {out} --resume goes on.", soft_wrap=True
-        )
+        kept = "" if out is None else f" What was finished is in {out}; parkenv run {out} --resume goes on."
+        console.print(f"Interrupted.{kept}", soft_wrap=True)
         raise
     show(console, result)
-    console.print(f"Results are in {out}")
-    if folder.report:
+    if out is not None:
+        console.print(f"Results are in {out}")
+    if out is not None and folder.report:
         make_report(out, study)
     return result

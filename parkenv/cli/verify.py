@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.cli.study_run import run_study
+from parkenv.cli.tables import make_table
 from parkenv.files.known_names import VERIFY_CASES
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.studies.study import Result
     from parkenv.studies.verify.rows import Row
 
 
@@ -36,22 +40,23 @@ def verify(
         seed (N >= 0): First seed of the simulated cases.
         out, -o (DIR): Folder for summary.json and verify.png.  [default: none]
     """
-    from parkenv.files.atomic_write import make_folder
-    from parkenv.show.figures.verification import save_verification
+    from parkenv.studies.verify.rows import disagreeing
+    from parkenv.studies.verify.study import Verification
+
+    names = VERIFY_CASES if cases is None else args.words("--cases", cases)
+    study = Verification().changed("--cases", cases=names, seed=seed, **machines.given)
+    result = run_study(study, out, args.ReportedRun(), show)
+    if disagreeing(study.statements(result.results)):
+        raise typer.Exit(1)
+
+
+def show(console: Console, result: Result) -> None:
+    """Print what theory expects and what is found."""
     from parkenv.show.plurals import plural
     from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
-    from parkenv.studies.verify.verification import tasks_of
-    from parkenv.studies.verify.verification import verify as rows_of
 
-    tasks = tasks_of(VERIFY_CASES if cases is None else args.words("--cases", cases), seed)
-    if out is not None:
-        make_folder(out)
-    console = make_console()
-    rows: list[Row] = []
-    with machines.workers() as workers, progress_bar(console, "tasks") as progress:
-        bar = progress.add_task("Verifying", total=sum(map(len, tasks.values())))
-        for _, made in rows_of(tasks, workers, lambda: progress.advance(bar)):
-            rows += made
+    study: Any = result.study
+    rows = study.statements(result.results)
     cells = (
         (
             row.case,
@@ -63,14 +68,8 @@ def verify(
         for row in rows
     )
     console.print(make_table(None, ("case", "expected", "found", f"{CONFIDENCE:.2%} interval", ""), cells))
-    wrong = disagreeing(rows)
-    console.print(f"{len(rows) - len(wrong)} of {plural(len(rows), 'row')} agree with theory.")
-    if out is not None:
-        save_summary(out, seed, [row.columns() for row in rows], confidence=CONFIDENCE)
-        save_verification([row.columns() for row in rows], CONFIDENCE, out / "verify.png")
-        console.print(f"Picture and summary are in {out}")
-    if wrong:
-        raise typer.Exit(1)
+    agree = len(rows) - len(disagreeing(rows))
+    console.print(f"{agree} of {plural(len(rows), 'row')} agree with theory.")
 
 
 def _interval(row: Row) -> str:

@@ -12,16 +12,18 @@ from __future__ import annotations
 
 import math
 import re
+import shutil
 import time
 import warnings
+import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
 from uuid import uuid4
 
@@ -58,6 +60,8 @@ STUDIES: Mapping[str, str] = {
     "survey": "parkenv.studies.sensing.survey_study:SurveyStudy",
     "detectors": "parkenv.studies.sensing.detector_study:DetectorStudy",
     "demo": "parkenv.studies.demo.study:Demo",
+    "calibrate": "parkenv.studies.trips.calibration_study:CalibrationStudy",
+    "verify": "parkenv.studies.verify.study:Verification",
     "train": "parkenv.studies.training.spec:TrainingSpec",
 }
 """`MODULE:CLASS` of each kind of study, by the key `kind` of its files."""
@@ -248,7 +252,6 @@ class Result:
     study: Study
     results: Results
     summary: Row
-    _kept: TemporaryDirectory[str] | None = field(default=None, repr=False)
 
     @property
     def folder(self) -> Path:
@@ -349,8 +352,19 @@ def run(
         Interrupted: Ctrl-C; the exception holds the result so far.
     """
     study.check()
-    kept = TemporaryDirectory(prefix="parkenv-") if folder is None else None
-    path = Path(folder or (kept.name if kept else ""))
+    if folder is None:
+        path = Path(mkdtemp(prefix="parkenv-"))
+        try:
+            result = run(study, path, progress=progress, workers=workers, command=command)
+        except Interrupted as stopped:
+            weakref.finalize(stopped.result, shutil.rmtree, path)
+            raise
+        except BaseException:
+            shutil.rmtree(path)
+            raise
+        weakref.finalize(result, shutil.rmtree, path)
+        return result
+    path = Path(folder)
     with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
         results = Results(path, study.all_tables or (study.table,))
         settings, continues = results.claim(
@@ -375,7 +389,7 @@ def run(
             "seed": getattr(study, "seed", None),
         }
         summary = head | {"complete": not interrupted} | study.summarise(results)
-        result = Result(study, results, summary, kept)
+        result = Result(study, results, summary)
         if interrupted:
             results.finish(summary, complete=False)
             raise Interrupted(result)

@@ -7,12 +7,8 @@ failed attempt. This module measures these values in driven trips.
 from __future__ import annotations
 
 import dataclasses
-import json
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import matplotlib as mpl
 import numpy as np
@@ -23,43 +19,15 @@ from scipy import stats
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import append_text, atomic_write
-from parkenv.files.limited_reading import parse_json, read_text
-from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
-from parkenv.studies.results import require_same_settings, write_settings
+from parkenv.studies.results import Row
 from parkenv.studies.statistics import mean_interval
-from parkenv.studies.trips.driven_search import DrivenSearch, Trip
-from parkenv.studies.trips.executor import EDGE_KINDS, Leg, ParkingAttempt
-from parkenv.studies.trips.vehicle_controller import DrivingStyle
-from parkenv.studies.workers import HERE, Workers
+from parkenv.studies.trips.driven_search import Trip
+from parkenv.studies.trips.executor import EDGE_KINDS, OBSERVED, UNOBSERVED, Leg, ParkingAttempt
 from parkenv.world.scenario import KMH, Scenario
 
-Row = dict[str, Any]
-
-OBSERVED, UNOBSERVED = "observed", "unobserved"  # whether the agent observes slots from the lane
-BLOCK = 5  # trips per task
 _TRIP = TypeAdapter(Trip)
-
-
-@dataclass(frozen=True, eq=False)
-class TripPlan:
-    """Which trips to drive."""
-
-    scenario: Scenario
-    agent: str
-    style: DrivingStyle  # driving style
-    rig: str | None = None  # name of the sensor rig; None for the scenario's sensor model
-    detector: str | None = None  # the rig's detector; None for the scenario's
-
-    def run(self, slots: str, seeds: Sequence[int]) -> list[Row]:
-        """Drive the trips; return the `trip_row` of each."""
-        scenario, rig = (
-            (self.scenario, self.rig) if slots == OBSERVED else (blind_scenario(self.scenario), None)
-        )
-        search = DrivenSearch(scenario, self.agent, style=self.style, rig=rig, detector=self.detector)
-        return [trip_row(search.run(seed), slots) for seed in seeds]
 
 
 def trip_row(trip: Trip, slots: str) -> Row:
@@ -73,85 +41,17 @@ def trip_row(trip: Trip, slots: str) -> Row:
     }
 
 
-class TripFolder:
-    """The file of trips, with one line per finished trip.
-
-    Args:
-        path: an existing folder.
-        settings: everything that affects the outcome of a trip.
-        resume: continue an earlier run.
-
-    Attributes:
-        rows: finished trips by (slots, seed).
+def trip_of_row(row: Row) -> Row:
+    """Return a row of `trip_row` that was read from a file.
 
     Raises:
-        InputError: the folder holds trips and `resume` is not set, or their settings differ.
+        ValueError, KeyError: it is no trip.
     """
-
-    def __init__(self, path: Path, settings: Row, *, resume: bool = False) -> None:
-        self._file = path / "trips.jsonl"
-        self.rows: dict[tuple[str, int], Row] = {}
-        if self._file.exists():
-            if not resume:
-                raise InputError(
-                    f"--out {path}: holds trips; add --resume to continue, or name another folder"
-                )
-            require_same_settings(path, settings, "trips")
-            whole, _, _ = read_text(self._file).rpartition("\n")
-            for number, line in enumerate(whole.splitlines(), start=1):
-                row = parse_json(line, f"{self._file}: line {number}")
-                try:
-                    slots = row.pop("slots")
-                    row = {"slots": slots, **dataclasses.asdict(_TRIP.validate_python(row))}
-                    if slots not in (OBSERVED, UNOBSERVED):
-                        raise ValueError(slots)
-                except (AttributeError, KeyError, TypeError, ValueError) as error:
-                    raise InputError(f"{self._file}: line {number}: {line!r:.40} is no trip") from error
-                self.rows[row["slots"], row["seed"]] = row
-        write_settings(path, settings)
-        self.put_in_order()
-
-    def add(self, rows: Sequence[Row]) -> None:
-        """Append finished trips."""
-        append_text(self._file, "".join(json.dumps(row) + "\n" for row in rows))
-        self.rows |= {(row["slots"], row["seed"]): row for row in rows}
-
-    def put_in_order(self) -> None:
-        """Sort the file by slots and seed."""
-        with atomic_write(self._file) as beside:
-            beside.write_text(
-                "".join(json.dumps(row) + "\n" for _, row in sorted(self.rows.items())), encoding="utf-8"
-            )
-
-
-def drive_trips(
-    plan: TripPlan,
-    seeds: Sequence[int],
-    folder: TripFolder,
-    workers: Workers = HERE,
-    on_progress: Callable[[int], None] = lambda _: None,
-) -> list[Row]:
-    """Drive the missing trips, each seed with and without slot observations; return all rows in order.
-
-    Agents that observe slots hardly ever attempt a taken one; trips without observations provide failed attempts.
-    """
-    tasks = [
-        partial(plan.run, slots, block)
-        for slots in (OBSERVED, UNOBSERVED)
-        for block in _blocks([s for s in seeds if (slots, s) not in folder.rows])
-    ]
-    wanted = [(slots, seed) for slots in (OBSERVED, UNOBSERVED) for seed in seeds]
-    on_progress(sum(key in folder.rows for key in wanted))
-    for _, rows in workers.results(tasks):
-        folder.add(rows)
-        on_progress(len(rows))
-    folder.put_in_order()
-    return [folder.rows[key] for key in wanted]
-
-
-def _blocks(seeds: Sequence[int]) -> Iterator[Sequence[int]]:
-    for i in range(0, len(seeds), BLOCK):
-        yield seeds[i : i + BLOCK]
+    fields = dict(row)
+    slots = fields.pop("slots")
+    if slots not in (OBSERVED, UNOBSERVED):
+        raise ValueError(slots)
+    return {"slots": slots, **dataclasses.asdict(_TRIP.validate_python(fields))}
 
 
 def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:

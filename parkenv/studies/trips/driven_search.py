@@ -168,7 +168,7 @@ class DrivenSearch:
     def __init__(
         self,
         scenario: Scenario,
-        agent: str = "mdp",
+        agent: str | AgentSpec = "mdp",
         vehicle: VehicleParameters | None = None,
         style: DrivingStyle | None = None,
         rig: str | SensorRig | None = None,
@@ -180,8 +180,8 @@ class DrivenSearch:
             None if rig is None else OnboardPerception(scenario, rig, weather, captures, detector=detector)
         )
         self.scenario = scenario if perception is None else perception.scenario
-        self.agent = agent
-        spec = AgentSpec.of(agent)
+        spec = AgentSpec.of(agent) if isinstance(agent, str) else agent
+        self.agent = spec.label
         self._agent: Agent = make_agent(spec.name, self.scenario, **spec.options)
         self.driver = VehicleController(self.scenario, vehicle, style)
         self.env = DrivenSearchEnv(self.scenario, self.driver, perception)

@@ -1,0 +1,203 @@
+"""Drive whole trips, with and without observations of slots, to calibrate the search environment."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
+from parkenv.files.known_names import RigName
+from parkenv.scenarios.spec import Speed, scenario_spec
+from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.studies.fields import Detector, OneScenario, Seed
+from parkenv.studies.results import JsonTable, Row
+from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
+from parkenv.studies.workers import Task
+
+if TYPE_CHECKING:
+    from parkenv.scenarios.calibration import Calibration
+    from parkenv.studies.trips.driven_search import DrivenSearch
+    from parkenv.studies.trips.vehicle_controller import DrivingStyle
+    from parkenv.world.scenario import Scenario
+
+CALIBRATED = "calibrated.json"
+
+
+class _Trips(NamedTuple):
+    """Trips with or without observations of slots."""
+
+    slots: str
+
+    @property
+    def columns(self) -> Row:
+        """Columns that identify them."""
+        return {"slots": self.slots}
+
+
+def _trip(row: Row) -> Row:
+    from parkenv.studies.trips.calibration import trip_of_row
+
+    return trip_of_row(row)
+
+
+class CalibrationStudy(Study):
+    """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
+
+    Agents that observe slots hardly ever attempt a taken one, so every seed is driven twice: trips without observations
+    provide failed attempts.
+    """
+
+    table: ClassVar = JsonTable("trips.jsonl", ("slots", "seed"), _trip, "trip")
+    block: ClassVar = 5
+    doing: ClassVar = "Driving"
+    unit: ClassVar = "trips"
+
+    kind: Literal["calibrate"] = "calibrate"
+    scenario: OneScenario = scenario_spec("campus")
+    agent: AgentItem = Field(AgentSpec(name="mdp"), description="The agent that searches, with any options.")
+    episodes: int = Field(
+        100, ge=1, le=1_000_000, description="Trips with observations, and as many without."
+    )
+    seed: Seed = 0
+    notice_m: float = Field(
+        2.0,
+        ge=0.0,
+        le=1_000.0,
+        description="Metres along its path at which the car notices at the latest that it would drive into a taken "
+        "slot.",
+    )
+    v_drive_kmh: Speed | None = Field(
+        None, description="Speed limit on the lanes, km/h; the scenario's if absent."
+    )
+    rig: RigName | None = Field(None, description="Observe slots through this rig's simulated sensors.")
+    detector: Detector = None
+
+    @model_validator(mode="after")
+    def _seen(self) -> Self:
+        if self.detector is not None and self.rig is None:
+            raise PydanticCustomError("whole", "detector requires a rig, such as laser")
+        return self
+
+    @cached_property
+    def built(self) -> Scenario:
+        """The scenario."""
+        from parkenv.scenarios.build import build
+
+        return build(self.scenario)
+
+    @cached_property
+    def style(self) -> DrivingStyle:
+        """How the car drives."""
+        from parkenv.studies.trips.vehicle_controller import DrivingStyle
+
+        return DrivingStyle(speed=self.speed_limit, notice_m=self.notice_m)
+
+    @property
+    def speed_limit(self) -> float:
+        """Speed limit on the lanes, m/s."""
+        from parkenv.world.scenario import KMH
+
+        return self.built.v_drive if self.v_drive_kmh is None else self.v_drive_kmh * KMH
+
+    def search(self, slots: str) -> DrivenSearch:
+        """Return the trips with or without observations of slots.
+
+        Raises:
+            InputError: agent, rig and scenario do not fit together.
+        """
+        from parkenv.scenarios.blind import blind_scenario
+        from parkenv.studies.trips.driven_search import DrivenSearch
+
+        scenario, rig = (self.built, self.rig) if slots == OBSERVED else (blind_scenario(self.built), None)
+        return DrivenSearch(scenario, self.agent, style=self.style, rig=rig, detector=self.detector)
+
+    def check(self) -> None:
+        """See `Study`."""
+        self.search(OBSERVED)
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        from parkenv.perception.detector_registry import detector_version
+        from parkenv.studies.fingerprints import search_settings
+
+        return {
+            **search_settings(self, [self.scenario], [self.agent]),
+            "agent": self.agent.label,
+            "style": dataclasses.asdict(self.style),
+            "rig": self.rig,
+            **({} if self.detector is None else {"detector": detector_version(self.detector)}),
+        }
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        seeds = range(self.seed, self.seed + self.episodes)
+        return [Cell(_Trips(slots), seeds) for slots in (OBSERVED, UNOBSERVED)]
+
+    def run(self, work: _Trips, items: Sequence[int]) -> list[Row]:
+        """See `Study`."""
+        from parkenv.studies.trips.calibration import trip_row
+
+        search = self.search(work.slots)
+        return [trip_row(search.run(seed), work.slots) for seed in items]
+
+    def label(self, work: _Trips) -> str:
+        """See `Study`."""
+        del work
+        return f"{self.agent.label} in {self.built.name}"
+
+    def measured(self, rows: Sequence[Row]) -> tuple[Calibration, list[Row]]:
+        """Return the calibration and a row for each distribution.
+
+        Raises:
+            InputError: no trip ended parked, or no attempt failed.
+        """
+        from parkenv.studies.trips.calibration import calibrate
+
+        return calibrate(rows, self.built, self.speed_limit)
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        cells = self.cells()
+        rows = [row for cell in cells for row in results.of(self, cell)]
+        calibrated: Row | None = None
+        table: list[Row] = []
+        try:
+            made, table = self.measured(rows)
+            calibrated = dataclasses.asdict(made)
+        except InputError:
+            if len(rows) == sum(len(cell.items) for cell in cells):
+                raise
+        return {
+            **self.settings(),
+            "trips": len(rows),
+            "contacts": sum(row["contacts"] for row in rows),
+            "rescues": sum(row["rescues"] for row in rows),
+            "calibrated": calibrated,
+            "rows": table,
+        }
+
+    @property
+    def title(self) -> str:
+        """Title of the table and of the figure."""
+        from parkenv.show.plurals import plural
+
+        trips = plural(self.episodes, "trip")
+        return f"{self.built.name}: {trips} with and as many without observations, by {self.agent.label}"
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: the calibration, and the figure."""
+        from parkenv.studies.trips.calibration import save_distributions
+
+        rows: list[Any] = [row for cell in self.cells() for row in result.results.of(self, cell)]
+        picture = result.folder / file_name(f"calibration_{self.built.name}", ".png")
+        return [
+            partial(self.measured(rows)[0].to_file, result.folder / CALIBRATED),
+            partial(save_distributions, rows, self.speed_limit, self.title, picture),
+        ]

@@ -1,0 +1,54 @@
+"""A study of a user's own: one class, which the runner of all studies runs."""
+
+import time
+import warnings
+from typing import ClassVar, Literal, NamedTuple
+
+from pydantic import Field
+
+from parkenv.files.spec_file import Several
+from parkenv.files.typed_csv import WHOLE
+from parkenv.studies.results import CsvTable
+from parkenv.studies.study import Cell, Study
+
+
+class Power(NamedTuple):
+    power: int
+
+    @property
+    def columns(self):
+        return {"power": self.power}
+
+
+class Toy(Study):
+    """Powers of whole numbers."""
+
+    table: ClassVar = CsvTable("powers.csv", ("power", "number"), ("value",), {}, other=WHOLE, timings=None)
+    block: ClassVar = 2
+    unit: ClassVar = "numbers"
+
+    kind: Literal["toy"] = "toy"
+    powers: Several[int] = Field((2, 3), description="Exponents.")
+    numbers: int = Field(6, ge=1, description="How many numbers.")
+    pause_s: float = Field(0.0, ge=0.0, description="Time that a number takes, s.")
+    offset: int = 0
+    warns: bool = False
+
+    def settings(self):
+        return {"offset": self.offset}
+
+    def cells(self):
+        return [Cell(Power(power), range(self.numbers)) for power in self.powers]
+
+    def run(self, work, items):
+        time.sleep(self.pause_s * len(items))
+        if self.warns and 4 in items:
+            warnings.warn(f"{items[0]} comes before 4", stacklevel=2)
+        return [{"power": work.power, "number": n, "value": self.offset + n**work.power} for n in items]
+
+    def summarise(self, results):
+        sums = {cell.work.power: [row["value"] for row in results.of(self, cell)] for cell in self.cells()}
+        return {"rows": [{"power": power, "sum": sum(values)} for power, values in sums.items()]}
+
+    def outputs(self, result):
+        return [(result.folder / "done.txt").touch]
