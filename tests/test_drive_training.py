@@ -46,7 +46,7 @@ from parkenv.studies.training.drive_training_env import (
     slot_groups,
 )
 from parkenv.studies.training.rl_training import train_one
-from parkenv.studies.workers import HERE
+from parkenv.studies.workers import SERIAL
 from planners.driving.parking_agents import make_parking_agent
 from planners.driving.policy_interface import (
     ACTION_REPEAT,
@@ -427,7 +427,7 @@ def test_a_model_is_trained_evaluated_and_driven(trained):
     best = next(row for row in curve if row["steps"] == card.steps)
     assert card.results["success"] == best["success"]
     assert card.settings["contact_cost"] == DRIVE_CONFIGS[algorithm].contact_cost
-    rows = parked_on([MINI], EVALUATED, HERE, f"{algorithm}:{folder / 'model.safetensors'}")
+    rows = parked_on([MINI], EVALUATED, SERIAL, f"{algorithm}:{folder / 'model.safetensors'}")
     assert len(rows) == len(EVALUATED)
     assert np.mean([row["parked"] for row in rows]) == best["success"]
 

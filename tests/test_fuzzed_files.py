@@ -119,6 +119,10 @@ def reported_kind(path):
     reported(path.with_name("summary.json"))
 
 
+def days(path):
+    FleetStudy.table.read(path.parent)
+
+
 def sessions(path):
     detection_by_distance(SESSIONS.read(path.parent))
 
@@ -358,7 +362,7 @@ FORMATS = [
     Format("survey.json", SURVEY_SUMMARY, mutated_json, reported_kind),
     Format("commute.json", COMMUTE_SUMMARY, mutated_json, reported_kind),
     Format("fleet.json", FLEET_SUMMARY, mutated_json, reported_kind),
-    Format("days.csv", DAY_ROWS, mutated_text, FleetStudy.table.read),
+    Format("days.csv", DAY_ROWS, mutated_text, days),
     Format("sessions.csv", SESSION_ROWS, mutated_text, sessions),
     Format("episodes.csv", EPISODE_ROWS, mutated_text, resumed),
     Format("timings.csv", TIMING_ROWS, mutated_text, resumed),

@@ -154,9 +154,9 @@ def test_folders_that_hold_no_finished_run_are_refused_in_words(tmp_path):
         RunFolder.read(tmp_path)
     with pytest.raises(InputError, match=r"written by parkenv 0\.0\.9"):
         RunFolder.read(summary_in(tmp_path, version="0.0.9"))
-    with pytest.raises(InputError, match="rows None is not of type 'array'"):
+    with pytest.raises(InputError, match="rows is None, want a list"):
         RunFolder.read(summary_in(tmp_path, rows=None))
-    with pytest.raises(InputError, match=r"summary\.json: .* \$\.weeks\[0\] \[\] is not of type 'object'"):
+    with pytest.raises(InputError, match=r"summary\.json: .* weeks\.0 is \[\], want"):
         RunFolder.read(summary_in(tmp_path, command=["parkenv", "commute"], weeks=[[]]))
     with pytest.raises(InputError, match=r"\$\.rows \[\] should be non-empty"):
         RunFolder.read(summary_in(tmp_path, command=["parkenv", "train"]))

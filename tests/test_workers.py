@@ -12,7 +12,7 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.studies.workers import HERE, Workers, kill_workers
+from parkenv.studies.workers import SERIAL, Workers, kill_workers
 
 CLUSTERS = ("ray", "dask")
 
@@ -38,8 +38,8 @@ def test_results_carry_the_number_of_their_task_and_come_in_order_where_asked():
         assert squares(workers, 20) == {k: k * k for k in range(20)}
         ordered = workers.in_order([partial(killed_once.square, k) for k in range(20)])
         assert list(ordered) == [k * k for k in range(20)]
-    assert squares(HERE, 5) == {k: k * k for k in range(5)}
-    assert list(HERE.results([])) == []
+    assert squares(SERIAL, 5) == {k: k * k for k in range(5)}
+    assert list(SERIAL.results([])) == []
 
 
 @pytest.mark.parametrize("backend", ["loky", *(pytest.param(c, marks=pytest.mark.slow) for c in CLUSTERS)])
@@ -100,9 +100,9 @@ def other_error():
 
 def test_an_interruption_is_one_whatever_it_is_wrapped_in():
     with pytest.raises(KeyboardInterrupt):
-        list(HERE.results([wrapped_interruption]))
+        list(SERIAL.results([wrapped_interruption]))
     with pytest.raises(SystemError, match="of another kind"):
-        list(HERE.results([other_error]))
+        list(SERIAL.results([other_error]))
 
 
 @pytest.mark.parametrize(

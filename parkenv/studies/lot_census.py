@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
@@ -12,10 +11,9 @@ from parkenv.errors import InputError
 from parkenv.lots import read_lot
 from parkenv.lots.quality import QualityIssue, read_provenance
 from parkenv.studies.drivability import check_drivability, manoeuvre_kinds
+from parkenv.studies.results import Row
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import KMH
-
-Row = dict[str, Any]
 
 KINDS = ("perpendicular", "oblique", "kerbside")
 MIXED = "mixed"

@@ -226,7 +226,7 @@ def _run_by_dask(client: Any, tasks: dict[int, Task[Result]]) -> Generator[tuple
         future.release()
 
 
-HERE = Workers(1)
+SERIAL = Workers(1)
 """Runs everything in this process."""
 
 

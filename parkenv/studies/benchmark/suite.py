@@ -14,14 +14,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
-import jsonschema
 import numpy as np
+from pydantic import Field
 
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
+from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.agent_spec import AgentSpec
@@ -126,6 +127,51 @@ class Suite:
         return [Cell(case, self.seeds) for case in cases]
 
 
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Seconds = Annotated[float, Field(ge=0.0)]
+Ends = Annotated[tuple[float | None, float | None], Field(strict=False)]
+
+
+class _ResultRow(Spec, extra="allow"):
+    """An agent in a task, in seconds and milliseconds."""
+
+    task: str
+    agent: str
+    episodes: int = Field(ge=1)
+    parked_fraction: Share
+    total_s: float
+    total_s_ci95: Ends
+    regret_s: float
+    regret_s_ci95: Ends
+    failed_parks: float
+    decision_ms: float
+    decision_ms_p99: float
+    score: Share
+
+
+class _Searches(Spec):
+    """Times of each search, in the order of the seeds."""
+
+    total_s: Several[Seconds]
+    bound_s: Several[Seconds]
+
+
+class ResultFile(Spec):
+    """Result of a benchmark suite: scores by agent, and searches by agent and task."""
+
+    format: Literal["parkenv-benchmark-result"]
+    version: Literal[1]
+    suite: str
+    suite_sha256: str = Field(pattern="^[0-9a-f]{64}$")
+    parkenv: str
+    command: Several[str]
+    by: str = Field(max_length=200)
+    date: str = Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}$")
+    rows: Several[_ResultRow] = Field(min_length=1)
+    scores: dict[str, Share]
+    episodes: dict[str, dict[str, _Searches]]
+
+
 def _task(
     sight: str = "perfect", day_error: Sequence[float] = (0.0,), lot_share: float | None = None, **fields: Any
 ) -> Task:
@@ -210,11 +256,8 @@ def check_result(path: Path) -> Row:
     Raises:
         InputError: the check failed; the message says where, with agent and task.
     """
-    try:
-        result: Row = read_json(path)
-        jsonschema.validate(result, _packaged("result.schema"))
-    except jsonschema.ValidationError as error:
-        raise InputError(f"{path}: {error.json_path} {error.message[:200]}") from error
+    result: Row = read_tables(path)
+    ResultFile.parse(result, str(path))
     suite = Suite.named(result["suite"])
     if result["suite_sha256"] != suite.fingerprint:
         raise InputError(f"{path}: made with settings that are not those of suite {suite.name}")
@@ -227,7 +270,7 @@ def check_result(path: Path) -> Row:
         for task in suite.tasks:
             _check_task(path, agent, task.name, tasks.get(task.name), by_row[agent, task.name], suite, bounds)
         if abs(result["scores"][agent] - _mean_score(tasks)) > _ROUNDING:
-            raise InputError(f"{path}: the score of {agent} is not what its searches come to")
+            raise InputError(f"{path}: the score of {agent} does not match its searches")
     return result
 
 
@@ -249,9 +292,9 @@ def _check_task(
     total, bound = np.array(searches["total_s"]), np.array(searches["bound_s"])
     if (total < bound - 2 * _ROUNDING).any():
         raise InputError(f"{where}: a search beats the clairvoyant bound")
-    told = row["total_s"], row["regret_s"], row["score"]
-    if not np.allclose(told, (total.mean(), (total - bound).mean(), _score(searches)), atol=1e-4):
-        raise InputError(f"{where}: its row is not what its searches come to")
+    stated = row["total_s"], row["regret_s"], row["score"]
+    if not np.allclose(stated, (total.mean(), (total - bound).mean(), _score(searches)), atol=1e-4):
+        raise InputError(f"{where}: its row does not match its searches")
 
 
 @functools.cache

@@ -13,6 +13,7 @@ from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.engine.fleet_rules import RULES, Rule
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.results import Row
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.workers import Workers
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
@@ -21,7 +22,6 @@ from planners.agent import ClairvoyantAgent, make_agent
 from planners.learned import LearnedAgent
 from planners.names import EXPECTS_RIVALS
 
-Row = dict[str, Any]
 _WITHOUT_NETWORK_RULE = ("recurrent-ppo",)
 
 
@@ -32,7 +32,7 @@ def driver_of(
 
     Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
     actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
-    An agent that expects rivals is told how many cars arrive in an hour, if that is given, as by a forecast of traffic.
+    An agent that expects rivals gets how many cars arrive in an hour, if that is given, as by a forecast of traffic.
 
     Raises:
         InputError: there is no such agent, or it is none for fleets.
@@ -40,8 +40,8 @@ def driver_of(
     if not spec.options and spec.name in RULES:
         return RULES[spec.name], None
     expects = spec.name == EXPECTS_RIVALS and arrivals_per_hour is not None
-    told = {"arrivals_per_hour": arrivals_per_hour} if expects else {}
-    agent = make_agent(spec.name, scenario, **told | spec.options)
+    known = {"arrivals_per_hour": arrivals_per_hour} if expects else {}
+    agent = make_agent(spec.name, scenario, **known | spec.options)
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
     if isinstance(agent, LearnedAgent):

@@ -17,7 +17,8 @@ from parkenv.show.fleet_rendering import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import summarize_days
-from parkenv.studies.publish.publication import MODEL, Publication, Row
+from parkenv.studies.publish.publication import MODEL, Publication
+from parkenv.studies.results import Row
 from parkenv.studies.training.spec import FleetTrainingSpec
 from parkenv.studies.workers import Workers
 

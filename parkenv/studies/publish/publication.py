@@ -18,6 +18,7 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.show.figures.picture_files import save_film
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import rows_of
+from parkenv.studies.results import Row
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.studies.workers import Workers
@@ -31,8 +32,6 @@ MODEL, FILM, CARD = "model.safetensors", "replay.gif", "README.md"
 BESIDE = ("mdp", "belief", "first-free")
 """Agents that search in the same worlds."""
 _FILMED, _LONGEST = 3, 150
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
 
-import jsonschema
-
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
@@ -16,6 +14,7 @@ from parkenv.files.spec_file import Spec, read_tables
 from parkenv.show.report.learning import learning_panels
 from parkenv.show.report.page import page_data
 from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.report.summary import SUMMARIES, Summary
 from parkenv.studies.results import (
     EPISODES,
     SETTINGS,
@@ -69,14 +68,7 @@ class RunFolder:
         spec, command = path / SPEC_FILE, summary.get("command")
         kind = read_tables(spec).get("kind") if spec.exists() else None
         kind = str(kind or (command[1] if isinstance(command, list) and len(command) > 1 else ""))
-        try:
-            jsonschema.validate(
-                {**summary, "kind": kind}, read_json(Path(__file__).with_name("summary.schema.json"))
-            )
-        except jsonschema.ValidationError as error:
-            raise InputError(
-                f"{file}: is not as a command wrote it: {error.json_path:.80} {error.message:.200}"
-            ) from error
+        SUMMARIES.get(kind, Summary).parse(summary, f"{file}: is not as a command wrote it")
         if summary["version"] != __version__:
             raise InputError(
                 f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cv2
 
@@ -19,9 +19,9 @@ from parkenv.files.recordings import Footage, footage_in, is_recording
 from parkenv.files.videos import VIDEO_SUFFIXES, Video, film
 from parkenv.perception.detector import Detections, Detector
 from parkenv.show.figures.survey import draw_detections
+from parkenv.studies.results import Row
 from sim_sensors.ground_truth import View
 
-Row = dict[str, Any]
 Film = Video | Footage
 
 BOX_COLUMNS = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +14,12 @@ from parkenv.compiled.keyed_random import world_key
 from parkenv.mapping.route import survey_route
 from parkenv.perception.boxes import overlaps
 from parkenv.perception.detector import Detections, Detector
+from parkenv.studies.results import Row
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
 from sim_sensors.rig import SensorRig, poses_along
-
-Row = dict[str, Any]
 
 DISTANCES = (0.0, 6.0, 9.0, 12.0, 20.0)  # m, limits of the bins
 VISIBLE = (0.3, 0.6, 0.9, 1.0001)  # limits of the bins of the visible fraction

@@ -13,7 +13,7 @@ import numpy as np
 from parkenv.compiled.arrays import IntArray
 from parkenv.errors import InputError
 from parkenv.studies.simulate import Observer, Step, simulate
-from parkenv.studies.workers import HERE, Workers
+from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorBand, SensorModel
 from planners.agent import make_agent
@@ -145,7 +145,7 @@ def measure_sensors(
     seed: int = 0,
     weather: str | None = None,
     detector: str | None = None,
-    workers: Workers = HERE,
+    workers: Workers = SERIAL,
     on_progress: Callable[[], None] = lambda: None,
 ) -> ObservationCounts:
     """Sum `count_observations` over all agents of `AGENTS` and all scenarios.

@@ -17,7 +17,7 @@ from parkenv.driving.vehicle import STEERING, YAW
 from parkenv.envs.drive import DriveEnv
 from parkenv.files.csv_writing import write_csv
 from parkenv.studies.simulate import Observer, Step, simulate
-from parkenv.studies.workers import HERE, Workers
+from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
 from planners.driving.parking import ParkingMemory
@@ -143,7 +143,10 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
 
 
 def park_all(
-    cases: Sequence[ParkingCase], seeds: Sequence[int], workers: Workers = HERE, agent: str = PARKING_PLANNER
+    cases: Sequence[ParkingCase],
+    seeds: Sequence[int],
+    workers: Workers = SERIAL,
+    agent: str = PARKING_PLANNER,
 ) -> Iterator[list[Parking]]:
     """Run every seed of every case with one agent; yield the parkings in order.
 
