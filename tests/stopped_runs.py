@@ -18,7 +18,7 @@ from pathlib import Path
 from command_line import parkenv
 from few_searches import few_searches
 
-from parkenv.studies.training.rl_training import MODEL
+from parkenv.studies.training.training import MODEL
 
 COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",

@@ -21,7 +21,7 @@ from parkenv.studies.benchmark import suite as benchmark
 from parkenv.studies.benchmark.suite import Suite, by_group, check_result, result_of, suite_lots
 from parkenv.studies.lot_census import slots_by_kind
 from parkenv.studies.results import DECISIONS, EPISODES, write_summary
-from parkenv.studies.training.search_task import SearchTask
+from parkenv.studies.training.search import SearchTraining
 from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival
@@ -201,11 +201,12 @@ def test_no_agent_is_trained_on_a_place_of_the_suite(tmp_path):
     shutil.copy(PLACES / "place-15.geojson", tmp_path / "mine.geojson")
     specs = tuple(scenario_specs(tmp_path))
     with pytest.raises(InputError, match="scenario 'mine' is place-15 of benchmark suite v2, which no agent"):
-        SearchTask(SearchTrainingSpec(scenarios=specs)).check()
-    split = SearchTask(SearchTrainingSpec(scenarios=specs, held_out=0.001))
-    assert [scenario.name for scenario in split.held_out] == ["mine"]
+        SearchTraining(SearchTrainingSpec(scenarios=specs)).check()
+    split = SearchTraining(SearchTrainingSpec(scenarios=specs, held_out=0.001))
+    assert [scenario.name for scenario in split.sides[1]] == ["mine"]
     assert (
-        SearchTask(SearchTrainingSpec(scenarios=specs[:3], evaluate_on=specs[3:])).held_out[0].name == "mine"
+        SearchTraining(SearchTrainingSpec(scenarios=specs[:3], evaluate_on=specs[3:])).sides[1][0].name
+        == "mine"
     )
 
 

@@ -27,7 +27,7 @@ from parkenv.lots import packaged_lot
 from parkenv.show.figures.learning_curves import COLORS, save_success_curves
 from parkenv.studies.training.configs import DRIVE_CONFIGS, WAY_IN
 from parkenv.studies.training.curve_file import across_seeds, read_curve
-from parkenv.studies.training.drive_batch import (
+from parkenv.studies.training.drive.batch import (
     CONTACT,
     LEFT_AREA,
     PARKED,
@@ -35,17 +35,18 @@ from parkenv.studies.training.drive_batch import (
     DriveBatch,
     PreparedTask,
 )
-from parkenv.studies.training.drive_replay_buffer import TerminalGoalReplayBuffer
-from parkenv.studies.training.drive_training import DriveTraining, evaluate_parking, parked_on
-from parkenv.studies.training.drive_training_env import (
+from parkenv.studies.training.drive.env import (
     MASTERED,
     RECENT_DRIVES,
     STANDSTILL_DECISIONS,
     DriveTrainingEnv,
+    TerminalGoalReplayBuffer,
     planned_path,
     slot_groups,
 )
-from parkenv.studies.training.rl_training import train_one
+from parkenv.studies.training.drive.training import DriveTraining, evaluate_parking, parked_on
+from parkenv.studies.training.spec import DriveTrainingSpec
+from parkenv.studies.training.training import train_one
 from parkenv.studies.workers import SERIAL
 from planners.driving.parking_agents import make_parking_agent
 from planners.driving.policy_interface import (
@@ -75,7 +76,15 @@ class Always:
 
 
 def training_of(algorithm, steps, every=None, lots=(MINI,)):
-    return DriveTraining(algorithm, steps, every or steps // 2, lots, EVALUATED)
+    spec = DriveTrainingSpec(
+        algorithm=algorithm,
+        steps=steps,
+        evaluate_every=every or steps // 2,
+        evaluation_episodes=len(EVALUATED),
+    )
+    training = DriveTraining(spec)
+    training.lots = lots
+    return training
 
 
 FULL_SIZE = dict(DRIVE_CONFIGS)
@@ -340,11 +349,6 @@ def test_the_kind_that_lags_is_drawn_most():
         (lambda: training_env("ppo", 0), "num_envs is 0"),
         (lambda: training_env("ppo", levels={"parallel": 10}), "level of parallel slots is 10, want 0 to 9"),
         (lambda: DriveTrainingEnv(2, (), DRIVE_CONFIGS["sac"]), "at least one kind of slots"),
-        (
-            lambda: DriveTraining("dqn", 10, 10, (MINI,), EVALUATED),
-            "'dqn', want one of ppo, sac, tqc for drive",
-        ),
-        (lambda: DriveTraining("sac", 0, 10, (MINI,), EVALUATED), "steps is 0, want at least 1"),
     ],
 )
 def test_bad_settings_are_refused_in_words(make, wanted):

@@ -23,10 +23,9 @@ from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, driver_of
 from parkenv.studies.training.curve_file import read_curve
-from parkenv.studies.training.fleet_task import FleetTask
-from parkenv.studies.training.fleet_training import FleetTraining
-from parkenv.studies.training.rl_training import train_one
-from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.fleet import FleetTraining
+from parkenv.studies.training.spec import FleetTrainingSpec, TrainingSpec
+from parkenv.studies.training.training import train_one
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 from planners.model_file import save_model
@@ -202,7 +201,9 @@ def test_layers_that_do_not_fit_are_named():
 
 
 def fleet_training(steps=2048):
-    return FleetTraining("maskable-ppo", steps, 1024, MixedFleet(MINI, DEMAND), 2_000_000, 2)
+    training = FleetTraining(FleetTrainingSpec(steps=steps, evaluate_every=1024, evaluation_episodes=2))
+    training.fleet = MixedFleet(MINI, DEMAND)
+    return training
 
 
 @pytest.fixture
@@ -211,11 +212,8 @@ def small_config(monkeypatch):
 
     settings = {**configs.SEARCH_CONFIGS["ppo"].settings, "n_steps": 32, "batch_size": 256}
     config = configs.TrainingConfig(8, "MultiInputPolicy", settings)
-    monkeypatch.setattr(configs, "FLEET_CONFIGS", {"ppo": config, "maskable-ppo": config})
-    from parkenv.studies.training import fleet_task, fleet_training
-
-    for module in (fleet_task, fleet_training):
-        monkeypatch.setattr(module, "FLEET_CONFIGS", {"ppo": config, "maskable-ppo": config})
+    for name in ("ppo", "maskable-ppo"):
+        monkeypatch.setitem(configs.FLEET_CONFIGS, name, config)
 
 
 def test_a_resumed_training_equals_an_unbroken_one(tmp_path, small_config, monkeypatch):
@@ -283,7 +281,7 @@ def test_specifications_that_make_no_sense_are_refused(fields, wanted):
 )
 def test_trainings_that_make_no_sense_are_refused(fields, wanted):
     with pytest.raises(InputError, match=wanted):
-        FleetTask(TrainingSpec.parse({"env": "fleet", **fields}, "file")).check()
+        FleetTraining(TrainingSpec.parse({"env": "fleet", **fields}, "file")).check()
 
 
 @pytest.mark.slow

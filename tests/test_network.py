@@ -1,6 +1,5 @@
 """The agent `network`: symmetry, one size for all lots, masks, parity with PyTorch, files, training."""
 
-import dataclasses
 import itertools
 import json
 
@@ -126,7 +125,7 @@ def test_the_look_ahead_knows_the_shortest_drive_and_walk_where_all_slots_are_fr
 
 def test_numpy_and_torch_agree():
     torch = pytest.importorskip("torch")
-    from parkenv.studies.training.network_fit import Network
+    from parkenv.studies.training.network.fit import Network
 
     rng = np.random.default_rng(0)
     n = 32
@@ -257,12 +256,14 @@ def test_without_news_it_does_not_circle_forever():
 
 @pytest.mark.slow
 def test_trainings_are_repeatable_and_learn(tmp_path):
-    from parkenv.studies.training.network_training import NetworkTraining
-    from parkenv.studies.training.rl_training import MODEL
+    from parkenv.studies.training.network.training import NetworkTraining
+    from parkenv.studies.training.spec import NetworkTrainingSpec
+    from parkenv.studies.training.training import MODEL
 
     places = tuple(make_scenario(name) for name in ("mini", "campus"))
     held_out = (make_scenario(grid_lot(4, 10), name="grid", day_error=0.8),)
-    training = NetworkTraining("network", 200, 200, places, range(2_000_000, 2_000_005), held_out)
+    training = NetworkTraining(NetworkTrainingSpec(steps=200, evaluation_episodes=5))
+    training.sides, training.places = (places, held_out), places
     curves = [training.train(0, tmp_path / str(i)) for i in range(2)]
     assert (tmp_path / "0" / MODEL).read_bytes() == (tmp_path / "1" / MODEL).read_bytes()
     for one, other in zip(*curves, strict=True):
@@ -275,4 +276,4 @@ def test_trainings_are_repeatable_and_learn(tmp_path):
     training.train(0, tmp_path / "0")
     assert (tmp_path / "0" / MODEL).stat().st_mtime_ns == before
     with pytest.raises(InputError, match="steps is 0"):
-        dataclasses.replace(training, steps=0)
+        training.spec.changed(steps=0)

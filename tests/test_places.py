@@ -20,8 +20,7 @@ from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.bench.env import grids
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.training.cloning import clone
-from parkenv.studies.training.search_task import SearchTask
-from parkenv.studies.training.search_training import SearchTraining, episode_times
+from parkenv.studies.training.search import SearchTraining, episode_times
 from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week import DAY_ERROR, real_week_occupancy
@@ -329,21 +328,22 @@ def small(monkeypatch):
         config, n_envs=16, settings={**config.settings, "batch_size": 256, "n_steps": 32}
     )
     monkeypatch.setitem(SEARCH_CONFIGS, "ppo", few)
-    monkeypatch.setattr("parkenv.studies.training.search_training.MAX_STEPS", 60)
+    monkeypatch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
+
+
+def training_in(places, held_out, steps, every, episodes):
+    spec = SearchTrainingSpec(
+        algorithm="ppo", steps=steps, evaluate_every=every, evaluation_episodes=episodes, curriculum="size"
+    )
+    training = SearchTraining(spec)
+    training.sides = places, held_out
+    return training
 
 
 def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     small(monkeypatch)
     met = []
-    training = SearchTraining(
-        "ppo",
-        2_048,
-        1_024,
-        tuple(PLACES[:4]),
-        range(2_000_000, 2_000_012),
-        held_out=tuple(PLACES[4:]),
-        curriculum="size",
-    )
+    training = training_in(PLACES[:4], PLACES[4:], steps=2_048, every=1_024, episodes=12)
     before = SearchTraining.before_rollout
 
     def watched(self, model):
@@ -376,7 +376,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
 
 def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
     small(monkeypatch)
-    training = SearchTraining("ppo", 1_536, 512, tuple(PLACES), range(8), curriculum="size")
+    training = training_in(PLACES, (), steps=1_536, every=512, episodes=8)
     calls = []
 
     def stopped(*arguments):
@@ -388,7 +388,7 @@ def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
     from parkenv.studies.training.checkpoint import save_checkpoint as save
 
     with monkeypatch.context() as patch:
-        patch.setattr("parkenv.studies.training.rl_training.save_checkpoint", stopped)
+        patch.setattr("parkenv.studies.training.learning.save_checkpoint", stopped)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, tmp_path / "resumed")
     resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
@@ -399,20 +399,20 @@ def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
 
 def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     specs = tuple(scenario_specs(folder))
-    task = SearchTask(SearchTrainingSpec().changed(scenarios=specs, held_out=0.5))
-    names = {one.name for one in task.worlds}, {one.name for one in task.held_out}
+    training = SearchTraining(SearchTrainingSpec().changed(scenarios=specs, held_out=0.5))
+    names = tuple({one.name for one in side} for side in training.sides)
     assert names[0] | names[1] == {spec.title for spec in specs}
     assert not names[0] & names[1]
-    assert sorted(task.settings()["held_out"]) == sorted(names[1])
-    assert task.announcement.endswith(", ".join(one.name for one in task.held_out))
-    assert [len(places) for places in task.tests.values()] == [len(side) for side in names]
+    assert sorted(training.settings()["held_out"]) == sorted(names[1])
+    assert training.announcement.endswith(", ".join(one.name for one in training.sides[1]))
+    assert [len(places) for places in training.tests.values()] == [len(side) for side in names]
     same = scenario_spec(folder / "busy.toml").changed(name="again")
     for others, message in (
         ((same,), "evaluate_on has 'again', whose lot is that of 'busy', which is trained on"),
         (specs[1:2], "scenarios has 'lot0' twice, want places of different names"),
     ):
         with pytest.raises(InputError, match=message):
-            SearchTask(SearchTrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
+            SearchTraining(SearchTrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
 
 
 @pytest.mark.parametrize(
@@ -438,7 +438,7 @@ def test_bad_options_of_held_out_places_are_one_line(tmp_path, options, message)
 
 @pytest.mark.slow
 def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
-    monkeypatch.setattr("parkenv.studies.training.search_training.clone", partial(clone, updates=50))
+    monkeypatch.setattr("parkenv.studies.training.search.clone", partial(clone, updates=50))
     out = folder / "trained"
     done = parkenv(
         "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 20_000, "--trainings", 1,

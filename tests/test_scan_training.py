@@ -22,8 +22,9 @@ from parkenv.studies.fleet.drivers import driver_of
 from parkenv.studies.simulate import make_search, simulate
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.configs import SCAN_CONFIGS
-from parkenv.studies.training.rl_training import train_one
-from parkenv.studies.training.search_training import SearchTraining, episode_times
+from parkenv.studies.training.search import SearchTraining, episode_times
+from parkenv.studies.training.spec import ScanTrainingSpec
+from parkenv.studies.training.training import train_one
 from parkenv.studies.trips.driven_search import DrivenSearch
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
@@ -115,11 +116,12 @@ def small(monkeypatch):
     sizes = {"batch_size": 128, "n_steps": 16, "policy_kwargs": {"net_arch": [32]}}
     changed = dataclasses.replace(config, n_envs=8, settings={**config.settings, **sizes})
     monkeypatch.setitem(SCAN_CONFIGS, "maskable-ppo", changed)
-    monkeypatch.setattr("parkenv.studies.training.search_training.MAX_STEPS", 60)
+    monkeypatch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
 
 
 def training_of(steps):
-    return SearchTraining("maskable-ppo", steps, 128, (MINI,), SEEDS, observation="scan")
+    spec = ScanTrainingSpec(steps=steps, evaluate_every=128, evaluation_episodes=len(SEEDS))
+    return SearchTraining(spec.changed(scenarios=["mini"]))
 
 
 def test_a_resumed_training_equals_an_unbroken_one_and_its_model_searches_in_the_same_worlds(
@@ -135,7 +137,7 @@ def test_a_resumed_training_equals_an_unbroken_one_and_its_model_searches_in_the
 
     training = training_of(384)
     with monkeypatch.context() as patch:
-        patch.setattr("parkenv.studies.training.rl_training.save_checkpoint", killed)
+        patch.setattr("parkenv.studies.training.learning.save_checkpoint", killed)
         with pytest.raises(KeyboardInterrupt):
             train_one(training, 0, tmp_path / "resumed")
     resumed, whole = (train_one(training, 0, tmp_path / name).curve for name in ("resumed", "whole"))

@@ -42,9 +42,7 @@ from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import across_seeds, read_curve
-from parkenv.studies.training.rl_training import TRAINING_SEEDS, train_one
-from parkenv.studies.training.search_task import SearchTask
-from parkenv.studies.training.search_training import SearchTraining, episode_times, search_times
+from parkenv.studies.training.search import SearchTraining, episode_times, search_times
 from parkenv.studies.training.spec import (
     DriveTrainingSpec,
     FleetTrainingSpec,
@@ -53,7 +51,7 @@ from parkenv.studies.training.spec import (
     SearchTrainingSpec,
     TrainingSpec,
 )
-from parkenv.studies.training.training_task import curves_beside
+from parkenv.studies.training.training import TRAINING_SEEDS, curves_beside, train_one
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
@@ -67,11 +65,22 @@ SCENARIO = _MINI.replace(occupancy=_MINI.occupancy.with_day_error(DayError()))
 EVALUATED = range(2_000_000, 2_000_020)
 
 
+def search_training(algorithm, steps, every, places=(SCENARIO,), episodes=4, **fields):
+    """A training in places that are no files."""
+    training = SearchTraining(
+        SearchTrainingSpec(
+            algorithm=algorithm, steps=steps, evaluate_every=every, evaluation_episodes=episodes, **fields
+        )
+    )
+    training.sides = places, ()
+    return training
+
+
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A short training in a folder."""
     folder = tmp_path_factory.mktemp("trained")
-    training = SearchTraining("maskable-ppo", 80_000, 32_768, (SCENARIO,), EVALUATED)
+    training = search_training("maskable-ppo", 80_000, 32_768, episodes=len(EVALUATED))
     train_one(training, 0, folder)
     return folder
 
@@ -159,7 +168,7 @@ def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
     small_config("ppo", monkeypatch)
     seeds = []
     monkeypatch.setattr(SearchVecEnv, "seed", lambda self, seed: seeds.append(seed))
-    training = SearchTraining("ppo", 400, 400, (SCENARIO,), EVALUATED[:4])
+    training = search_training("ppo", 400, 400)
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
     for seed in (0, 1):
@@ -174,7 +183,7 @@ def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
 def test_a_resumed_training_equals_an_unbroken_one(algorithm, tmp_path, monkeypatch):
     """Killed right before its third checkpoint: the evaluation before it is repeated."""
     small_config(algorithm, monkeypatch)
-    training = SearchTraining(algorithm, 1_500, 400, (SCENARIO, make_scenario("campus")), EVALUATED[:4])
+    training = search_training(algorithm, 1_500, 400, (SCENARIO, make_scenario("campus")))
     stop_training(training, tmp_path / "resumed", monkeypatch)
     resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
     assert [row["steps"] for row in whole][:3] == [0, 512, 1024] if algorithm != "dqn" else len(whole) == 5
@@ -182,7 +191,7 @@ def test_a_resumed_training_equals_an_unbroken_one(algorithm, tmp_path, monkeypa
     files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
     assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
-    row = search_times(LearnedAgent(SCENARIO, algorithm, files[0]), training.scenarios, EVALUATED[:4])
+    row = search_times(LearnedAgent(SCENARIO, algorithm, files[0]), training.sides[0], EVALUATED[:4])
     assert row["total_s"] == min(row["total_s"] for row in whole)
     assert training.train(0, tmp_path / "resumed") == resumed, "a finished training is not repeated"
 
@@ -198,7 +207,7 @@ def stop_training(training, folder, monkeypatch):
         save_checkpoint(*arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr("parkenv.studies.training.rl_training.save_checkpoint", killed)
+        patch.setattr("parkenv.studies.training.learning.save_checkpoint", killed)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, folder)
 
@@ -212,7 +221,7 @@ def small_config(algorithm, monkeypatch):
     }
     small = dataclasses.replace(config, n_envs=16, settings={**config.settings, **sizes})
     monkeypatch.setitem(SEARCH_CONFIGS, algorithm, small)
-    monkeypatch.setattr("parkenv.studies.training.search_training.MAX_STEPS", 60)
+    monkeypatch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
 
 
 class Waits:
@@ -257,9 +266,8 @@ def test_cloning_takes_the_read_only_arrays_of_a_worker():
 
 
 def test_algorithms_without_cloning_are_refused():
-    shown = Demonstrations.collect("mdp", SCENARIO, range(5_000_000, 5_000_002))
     with pytest.raises(InputError, match="dqn has no behaviour cloning"):
-        SearchTraining("dqn", 10, 10, (SCENARIO,), EVALUATED, demonstrations=shown)
+        search_training("dqn", 10, 10, clone="mdp").check()
 
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
@@ -408,7 +416,7 @@ def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
     mark = tmp_path / "was_run"
     torch.save({"format": "parkenv-checkpoint-1", "curve": Payload(mark)}, tmp_path / "checkpoint.pt")
     with pytest.raises(InputError, match="no checkpoint of this version"):
-        SearchTraining("ppo", 400, 400, (SCENARIO,), EVALUATED[:4]).train(0, tmp_path)
+        search_training("ppo", 400, 400).train(0, tmp_path)
     assert not mark.exists()
 
 
@@ -416,7 +424,7 @@ def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
 def checkpoint(tmp_path, monkeypatch):
     """A small training that was stopped, and its checkpoint."""
     small_config("ppo", monkeypatch)
-    training = SearchTraining("ppo", 1_100, 400, (SCENARIO,), EVALUATED[:4])
+    training = search_training("ppo", 1_100, 400)
     stop_training(training, tmp_path, monkeypatch)
     return training, tmp_path / "checkpoint.pt"
 
@@ -587,7 +595,7 @@ def training_in(folder, **changed):
 
 
 def course_of(algorithm="ppo"):
-    return SearchTask(
+    return SearchTraining(
         SearchTrainingSpec(
             algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
             evaluation_episodes=16, agents=(),

@@ -58,7 +58,7 @@ def publish(
     from parkenv.studies.publish.publication import CARD, FILM, MODEL, Publication
     from parkenv.studies.results import write_summary
     from parkenv.studies.training.spec import FleetTrainingSpec
-    from parkenv.studies.training.training_task import FIGURE, TEST_SEED
+    from parkenv.studies.training.training import FIGURE, TEST_SEED
     from planners.model_file import ModelCard
 
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
@@ -106,8 +106,8 @@ def _best(folder: Path, trust: bool) -> tuple[TrainingSpec, Path, Sequence[Scena
         InputError: the folder holds no finished training.
     """
     from parkenv.studies.report.run_folder import RunFolder
-    from parkenv.studies.training.rl_training import MODEL
     from parkenv.studies.training.spec import PlacesTrainingSpec, TrainingSpec
+    from parkenv.studies.training.training import MODEL
 
     run = RunFolder.read(folder)
     spec = run.spec()

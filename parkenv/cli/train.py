@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import threading
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,9 +18,9 @@ from parkenv.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.training.rl_training import AnyTraining
+    from parkenv.studies.training.curve_file import Row
     from parkenv.studies.training.spec import TrainingSpec
-    from parkenv.studies.training.training_task import Row, TrainingTask
+    from parkenv.studies.training.training import Training
     from parkenv.studies.workers import Workers
 
 
@@ -138,6 +137,7 @@ def train(
         tensorboard: Keep logs for TensorBoard in --out.
     """
     from parkenv.studies.training.spec import TrainingSpec
+    from parkenv.studies.training.training import training_of
 
     if day_error and not (scenario or lot):
         raise InputError("--day-error goes with --scenario or --lot")
@@ -156,7 +156,7 @@ def train(
         "tensorboard": tensorboard or None, **machines.given,
     }  # fmt: skip
     spec = TrainingSpec.parse({name: value for name, value in given.items() if value is not None}, "")
-    out = out or Path("results") / _task_of(spec).folder
+    out = out or Path("results") / training_of(spec).folder
     with writing_into(out, "the same command with --resume"):
         run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
 
@@ -171,30 +171,6 @@ def _agents(text: str | None) -> list[str] | None:
     return None if text is None else [] if text == "none" else split_agents(text)
 
 
-def _task_of(spec: TrainingSpec) -> TrainingTask:
-    from parkenv.studies.training import spec as specs
-
-    # These load torch.
-    match spec:
-        case specs.FleetTrainingSpec():
-            from parkenv.studies.training.fleet_task import FleetTask
-
-            return FleetTask(spec)
-        case specs.DriveTrainingSpec():
-            from parkenv.studies.training.drive_task import DriveTask
-
-            return DriveTask(spec)
-        case specs.NetworkTrainingSpec():
-            from parkenv.studies.training.network_task import NetworkTask
-
-            return NetworkTask(spec)
-        case specs.SearchTrainingSpec() | specs.ScanTrainingSpec():
-            from parkenv.studies.training.search_task import SearchTask
-
-            return SearchTask(spec)
-    raise TypeError(f"{type(spec).__name__} is no kind of training")
-
-
 def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside: Sequence[str] = ()) -> None:
     """Train, test and draw; see `train`.
 
@@ -202,27 +178,26 @@ def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside
         InputError: the training is impossible, or the folder cannot be used.
     """
     from parkenv.studies.results import SPEC_FILE
-    from parkenv.studies.training.rl_training import MODEL
-    from parkenv.studies.training.training_task import FIGURE, Trained, curves_beside
+    from parkenv.studies.training.training import FIGURE, MODEL, Trained, curves_beside, training_of
 
-    task = _task_of(spec)
-    task.check()
-    settings = {"version": __version__, **task.settings()}
-    others = curves_beside(beside, out, task)
+    training = training_of(spec, tuple(command_line()))
+    training.check()
+    settings = {"version": __version__, **training.settings()}
+    others = curves_beside(beside, out, training)
     _require_free(out, settings, folder)
     console = make_console()
-    if task.announcement:
-        console.print(task.announcement)
+    if training.announcement:
+        console.print(training.announcement)
     with args.workers_of(spec) as workers:
-        training = dataclasses.replace(task.training(console.status), command=tuple(command_line()))
+        training.begin(console.status)
         _claim(out, settings, folder.overwrite)
         spec.write(out / SPEC_FILE)
         numbers = range(spec.seed, spec.seed + spec.trainings)
-        curves = _train_all(
-            console, task, training, numbers, out, workers, getattr(spec, "tensorboard", False)
-        )
+        curves = _train_all(console, training, numbers, out, workers)
         models = {n: out / f"seed_{n}" / MODEL for n in numbers}
-        outcome, table = task.report(console.status, workers, Trained(curves, models, others), out / FIGURE)
+        outcome, table = training.report(
+            console.status, workers, Trained(curves, models, others), out / FIGURE
+        )
     console.print(make_table(*table))
     save_summary(out, spec.seed, outcome.pop("rows"), settings=settings, **outcome)
     console.print(f"Models, curves, summary and figure are in {out}")
@@ -250,7 +225,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     import shutil
 
     from parkenv.studies.results import SUMMARY, write_settings
-    from parkenv.studies.training.training_task import FIGURE
+    from parkenv.studies.training.training import FIGURE
 
     # Delete the summary: a folder without one holds an unfinished training.
     for outcome in (SUMMARY, PAGE, FIGURE):
@@ -262,13 +237,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
 
 
 def _train_all(
-    console: Console,
-    task: TrainingTask,
-    training: AnyTraining,
-    seeds: range,
-    out: Path,
-    workers: Workers,
-    tensorboard: bool,
+    console: Console, training: Training, seeds: range, out: Path, workers: Workers
 ) -> list[list[Row]]:
     """Train all seeds, with one progress bar each, updated from the curves that the trainings write."""
     from functools import partial
@@ -276,7 +245,7 @@ def _train_all(
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
     from parkenv.studies.training.curve_file import CURVE, read_curve
-    from parkenv.studies.training.rl_training import train_one
+    from parkenv.studies.training.training import train_one
 
     progress = Progress(
         TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[score]}"), TimeElapsedColumn(),
@@ -292,14 +261,14 @@ def _train_all(
                 with suppress(InputError):
                     if curve := read_curve(out / f"seed_{k}" / CURVE, training.columns):
                         last = curve[-1]
-                        progress.update(bar, completed=last["steps"], score=task.score_text(last))
+                        progress.update(bar, completed=last["steps"], score=training.score_text(last))
             over.wait(2.0)
 
     watcher = threading.Thread(target=update_bars, daemon=True)
     with progress:
         watcher.start()
         try:
-            tasks = [partial(train_one, training, k, out / f"seed_{k}", tensorboard) for k in seeds]
+            tasks = [partial(train_one, training, k, out / f"seed_{k}") for k in seeds]
             curves: dict[int, list[Row]] = {}
             for i, trained in workers.results(tasks):
                 trained.save(out / f"seed_{seeds[i]}")

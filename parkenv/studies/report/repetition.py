@@ -84,21 +84,22 @@ def _trained(run: RunFolder, spec: SearchTrainingSpec | ScanTrainingSpec | Netwo
     if not run.summary.get("transfer"):
         return []
     # These load torch.
-    from parkenv.studies.training.rl_training import MODEL
-    from parkenv.studies.training.search_task import SearchTask
-    from parkenv.studies.training.training_task import TEST_SEED
+    from parkenv.studies.training.search import SearchTraining
+    from parkenv.studies.training.training import MODEL, TEST_SEED, training_of
 
     best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
     model = run.path / f"seed_{int(best['seed'])}" / MODEL
-    task = SearchTask(spec)
+    training = training_of(spec)
+    assert isinstance(training, SearchTraining)
     seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
     cases: Cases = []
-    for name, (scenario, *_) in task.tests.items():
+    for name, (scenario, *_) in training.tests.items():
         planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
         beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        cases.append((Case(scenario, f"{task.algorithm}:{model}"), seeds))
+        cases.append((Case(scenario, f"{training.algorithm}:{model}"), seeds))
         made = {
-            case.label: case for case in (Case(scenario, a.name, options=a.options) for a in task.compared)
+            case.label: case
+            for case in (Case(scenario, a.name, options=a.options) for a in training.compared)
         }
         cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
     return cases

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
-
-from parkenv.errors import InputError
+from typing import Any
 
 REWARD_SCALE = 0.01  # scales returns of about -100 s to about -1
 MAX_STEPS = 500  # step limit of training episodes: longer searches only drive in circles
@@ -176,22 +174,3 @@ DRIVE_CONFIGS: dict[str, DriveTrainingConfig] = {
     "tqc": _HINDSIGHT,
 }
 """Config of each algorithm for driving."""
-
-AnyConfig = TypeVar("AnyConfig", bound=TrainingConfig)
-
-
-def config_of(algorithm: str, configs: Mapping[str, AnyConfig], task: str) -> AnyConfig:
-    """Look up the config of an algorithm.
-
-    Args:
-        algorithm: name of the algorithm.
-        configs: configs of the task.
-        task: search or drive.
-
-    Raises:
-        InputError: the algorithm has no config for this task.
-    """
-    if algorithm not in configs:
-        known = [*configs, *(("network",) if task == "search" else ())]
-        raise InputError(f"ALGORITHM is {algorithm!r}, want one of {', '.join(known)} for {task}")
-    return configs[algorithm]

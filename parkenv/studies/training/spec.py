@@ -33,6 +33,8 @@ class TrainingSpec(ExecutionSpec):
 
     chosen_by: ClassVar[str] = ""
     """What chooses this kind of training, for messages."""
+    trained_by: ClassVar[str] = ""
+    """`MODULE:CLASS` of the training, in this package; importing it loads torch."""
 
     kind: Literal["train"] = "train"
     env: Literal["search", "fleet", "drive"] = "search"
@@ -135,6 +137,7 @@ class SearchTrainingSpec(PlacesTrainingSpec):
     """Training to search, from what is near the car, of belief and forecast."""
 
     chosen_by: ClassVar[str] = "env search"
+    trained_by: ClassVar[str] = "search:SearchTraining"
 
     env: Literal["search"] = "search"
     algorithm: Literal["ppo", "maskable-ppo", "recurrent-ppo", "dqn"] = "maskable-ppo"
@@ -167,6 +170,13 @@ class ScanTrainingSpec(TestedTrainingSpec):
     """Training to search in one scenario, from raw laser scans and poses alone."""
 
     chosen_by: ClassVar[str] = "observation scan"
+    trained_by: ClassVar[str] = "search:SearchTraining"
+    # What other trainings to search may choose.
+    held_out: ClassVar[None] = None
+    evaluate_on: ClassVar[None] = None
+    curriculum: ClassVar[None] = None
+    clone: ClassVar[None] = None
+    demonstrations: ClassVar[None] = None
 
     env: Literal["search"] = "search"
     algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
@@ -185,6 +195,10 @@ class NetworkTrainingSpec(PlacesTrainingSpec):
     """Training of `network`, which clones `belief`, observes its own features and is evaluated after each stage."""
 
     chosen_by: ClassVar[str] = "algorithm network"
+    trained_by: ClassVar[str] = "network.training:NetworkTraining"
+    # What other trainings to search may choose.
+    observation: ClassVar[str] = "local"
+    clone: ClassVar[None] = None
 
     env: Literal["search"] = "search"
     algorithm: Literal["network"] = "network"
@@ -201,6 +215,7 @@ class FleetTrainingSpec(TrainingSpec):
     """Training of one network for all cars of a fleet, or a share of them."""
 
     chosen_by: ClassVar[str] = "env fleet"
+    trained_by: ClassVar[str] = "fleet:FleetTraining"
 
     env: Literal["fleet"] = "fleet"
     algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
@@ -252,6 +267,7 @@ class DriveTrainingSpec(TestedTrainingSpec):
     """Training to drive into slots."""
 
     chosen_by: ClassVar[str] = "env drive"
+    trained_by: ClassVar[str] = "drive.training:DriveTraining"
 
     env: Literal["drive"] = "drive"
     algorithm: Literal["ppo", "sac", "tqc"] = "ppo"
@@ -273,9 +289,9 @@ class DriveTrainingSpec(TestedTrainingSpec):
     tensorboard: TensorBoard = False
 
 
-AnyTrainingSpec = (
-    SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec | FleetTrainingSpec | DriveTrainingSpec
-)
+RLTrainingSpec = SearchTrainingSpec | ScanTrainingSpec | FleetTrainingSpec | DriveTrainingSpec
+"""The kinds of training with stable-baselines3."""
+AnyTrainingSpec = RLTrainingSpec | NetworkTrainingSpec
 """The kinds of training."""
 KINDS: tuple[type[AnyTrainingSpec], ...] = get_args(AnyTrainingSpec)
 

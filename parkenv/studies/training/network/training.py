@@ -11,25 +11,33 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+import torch
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchEnv
-from parkenv.errors import InputError
 from parkenv.files.csv_writing import write_csv
+from parkenv.lots import city_lot, grid_lot
+from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.places import seeds_by_place
 from parkenv.studies.simulate import STEP_LIMIT, simulate
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.training.curve_file import CURVE, Row, read_curve
-from parkenv.studies.training.rl_training import MODEL, TRAINING_SEEDS, AnyTraining
-from parkenv.studies.training.search_training import HELD_OUT, METRICS
-from parkenv.world.scenario import Scenario
+from parkenv.studies.training.network.data import Labelled, Pairs, Place, label_searches, play_pairs
+from parkenv.studies.training.network.fit import Network, fit
+from parkenv.studies.training.search import SearchTraining
+from parkenv.studies.training.spec import NetworkTrainingSpec
+from parkenv.studies.training.training import MODEL, TRAINING_SEEDS
+from parkenv.world.occupancy.real_week import DAY_ERROR, real_week_occupancy
+from parkenv.world.scenario import KMH, Scenario
+from planners.agent import make_agent
+from planners.model_file import algorithm_class
 from planners.network.agent import NetworkAgent
-from planners.network.policy import NetworkCard, NetworkPolicy, Part
+from planners.network.policy import NetworkCard, NetworkPolicy
 
 STUDENT_DRIVES = (False, True)  # in the rounds with labels
 PAIR_ROUNDS = 2
@@ -37,37 +45,51 @@ CLOSEST = 0.05  # time scales, difference of two scores that are about equal
 EPOCHS, LEARNING_RATES = 8.0, (2e-3, 1e-3, 5e-4)
 PAIRS_WEIGHT = 3.0
 WORLDS_APART = 1_000_000  # between the first seeds of the rounds
+VARIED_SEED = 1
+"""Seed of the speeds and costs of the varied places."""
+GRIDS = ((2, 8), (2, 20), (4, 10), (4, 25), (6, 15), (8, 12), (8, 30), (12, 20))
+"""Rows of slots, and slots in a row."""
+CITIES = (40, 80, 120, 160, 240, 320, 400, 500)
+"""Slots along the streets of a made town."""
+FULLER_THAN = (0.5, 0.7, 0.9, 0.95)
+"""Shares of real car parks that are less full than the made ones, in turn."""
 
 
-@dataclass(frozen=True, eq=False)
-class NetworkTraining(AnyTraining):
-    """Training of `network`; `steps` are the labelled decisions, and there are a quarter as many played pairs.
+class NetworkTraining(SearchTraining):
+    """Training of `network` in made lots, and in the given places if there are any.
 
-    Args:
-        places: scenarios to train in.
-        evaluation_seeds: seeds of the evaluations.
-        held_out: further places to evaluate in, never trained on.
-        without: parts of the network to leave out.
+    `steps` are the labelled decisions, and there are a quarter as many played pairs. Every place is trained in twice:
+    as it is, and with other speeds and costs.
     """
 
-    places: tuple[Scenario, ...]
-    evaluation_seeds: range
-    held_out: tuple[Scenario, ...] = ()
-    without: tuple[Part, ...] = ()
+    spec: NetworkTrainingSpec  # type: ignore[assignment]  # it is evaluated as a search agent, and learns otherwise
 
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """Mean total time, s, with its 95 % interval, and the share of searches that parked; also held out."""
-        return METRICS + (HELD_OUT if self.held_out else ())
+    def build_sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
+        """Build the given places, and made ones to train in."""
+        learned, held_out = super().build_sides() if self.scenarios else ([], [])
+        return [*learned, *made_places()], held_out
 
-    def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
-        """Train with one seed; a training that has ended is not repeated.
+    @cached_property
+    def places(self) -> Sequence[Scenario]:
+        """Scenarios to train in, also with other speeds and costs."""
+        learned = self.sides[0]
+        return [*learned, *varied(learned, VARIED_SEED)]
 
-        Raises:
-            InputError: a log for TensorBoard is wanted.
-        """
-        if tensorboard:
-            raise InputError("--tensorboard: a training of network keeps no log, want another algorithm")
+    def check(self) -> None:
+        """See `Training`."""
+        algorithm_class("ppo")  # raises the error of the missing extra
+        for places in self.tests.values():
+            for agent in self.compared:
+                make_agent(agent.name, places[0], **agent.options)
+
+    def times_of(
+        self, model: Path, places: Sequence[Scenario]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """See `SearchTraining`."""
+        return Evaluation(places, self.test_seeds).times(NetworkPolicy.load(model))
+
+    def train(self, seed: int, folder: Path) -> list[Row]:
+        """Train with one seed; a training that has ended is not repeated."""
         folder.mkdir(parents=True, exist_ok=True)
         done = read_curve(folder / CURVE, self.columns)
         if done and (folder / MODEL).exists() and len(done) == 1 + len(STUDENT_DRIVES) + PAIR_ROUNDS:
@@ -75,25 +97,14 @@ class NetworkTraining(AnyTraining):
         return self._train(seed, folder)
 
     def _train(self, seed: int, folder: Path) -> list[Row]:
-        import torch
-
-        from parkenv.studies.training.network_data import (
-            Labelled,
-            Pairs,
-            Place,
-            label_searches,
-            play_pairs,
-        )
-        from parkenv.studies.training.network_fit import Network, fit
-
         torch.manual_seed(seed)
         begin, curve = time.monotonic(), list[Row]()
-        network = Network(NetworkCard(seed=seed, without=self.without))
+        network = Network(NetworkCard(seed=seed, without=self.spec.without))
         order = np.random.default_rng(seed).permutation(len(self.places))
         places = [Place.of(self.places[i], network.policy()) for i in order]
         worlds, decisions = TRAINING_SEEDS * (seed + 1), 0
 
-        sides = (self.places, self.held_out) if self.held_out else (self.places,)
+        sides = filter(None, (self.places, self.sides[1]))
         evaluations = [Evaluation(side, self.evaluation_seeds) for side in sides]
 
         def evaluate() -> None:
@@ -177,3 +188,31 @@ class Evaluation:
                 times[seed], parked[seed] = float(info["total_s"]), bool(info["parked"])
         found = [times[seed] for seed in self._seeds], [parked[seed] for seed in self._seeds]
         return np.array(found[0]), np.array(found[1])
+
+
+def made_places() -> list[Scenario]:
+    """Return scenarios on made lots with real weeks: car parks with rows of bays, and towns with cars along streets."""
+    lots = [grid_lot(rows, columns) for rows, columns in GRIDS]
+    lots += [city_lot(slots, seed=number) for number, slots in enumerate(CITIES)]
+    names = [f"grid {rows} x {columns}" for rows, columns in GRIDS] + [f"town {slots}" for slots in CITIES]
+    made = []
+    for number, (lot, name) in enumerate(zip(lots, names, strict=True)):
+        occupancy = real_week_occupancy(lot, fuller_than=FULLER_THAN[number % len(FULLER_THAN)])
+        made.append(make_scenario(lot, name=name, occupancy=occupancy, day_error=DAY_ERROR))
+    return made
+
+
+def varied(scenarios: Sequence[Scenario], seed: int) -> list[Scenario]:
+    """Return the scenarios with other speeds and costs, drawn within a factor of two of the usual ones.
+
+    Args:
+        scenarios: the scenarios.
+        seed: seed of the draws.
+    """
+    rng = np.random.default_rng(seed)
+    made = []
+    for scenario in scenarios:
+        drive, walk, failure = 2.0 ** rng.uniform(-0.5, 0.8, 3)
+        changes = {"v_drive": 10.0 * KMH * drive, "v_walk": 4.0 * KMH * walk, "failure_s": 10.0 * failure}
+        made.append(scenario.replace(**changes))
+    return made

@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from parkenv.studies.training.network_data import Labelled, Pairs
+from parkenv.studies.training.network.data import Labelled, Pairs
 from planners.network.features import IS_SLOT, LOOKAHEAD
 from planners.network.policy import NetworkCard, NetworkPolicy, feature_masks
 

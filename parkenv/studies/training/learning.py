@@ -1,14 +1,9 @@
-"""Train one agent with one seed: learn, evaluate in held-out worlds, write checkpoints.
-
-Subclasses of `Training` define the task and its score: `parkenv.studies.training.search_training` and
-`parkenv.studies.training.drive_training`.
-"""
+"""Training with stable-baselines3: learn, evaluate in held-out worlds, write checkpoints."""
 
 from __future__ import annotations
 
 import time
-from abc import ABC, abstractmethod
-from dataclasses import dataclass, field
+from abc import abstractmethod
 from pathlib import Path
 from typing import Any
 
@@ -18,86 +13,31 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_writing import write_csv
 from parkenv.studies.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.studies.training.configs import TrainingConfig
 from parkenv.studies.training.curve_file import CURVE, Row, read_curve, require_columns
+from parkenv.studies.training.spec import RLTrainingSpec
+from parkenv.studies.training.training import MODEL, TRAINING_SEEDS, Training
 from planners.model_file import algorithm_class, save_model
 
-TRAINING_SEEDS = 10_000_000
-"""World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
-MODEL, CHECKPOINT = "model.safetensors", "checkpoint.pt"
+CHECKPOINT = "checkpoint.pt"
 
 
-@dataclass(frozen=True, eq=False)
-class AnyTraining(ABC):
-    """Base class of all trainings: what is trained, and for how long.
+class RLTraining(Training):
+    """Base class of trainings with stable-baselines3."""
 
-    Args:
-        algorithm: name of the algorithm.
-        steps: decisions in total.
-        evaluate_every: decisions between evaluations.
-        command: command line of the training, for the model's card.
-
-    Raises:
-        InputError: a number out of range.
-    """
-
-    algorithm: str
-    steps: int
-    evaluate_every: int
-    command: tuple[str, ...] = field(default=(), kw_only=True)
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "evaluate_every"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}, want at least 1")
-
-    @property
-    @abstractmethod
-    def metrics(self) -> tuple[str, ...]:
-        """Names of the results of an evaluation; columns of `curve.csv`."""
-
-    @property
-    def columns(self) -> tuple[str, ...]:
-        """All columns of `curve.csv`."""
-        return ("steps", *self.metrics, "wall_s")
-
-    @abstractmethod
-    def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
-        """Train with one seed; write the model and `curve.csv` to a folder.
-
-        Args:
-            seed: seed of the network and of the worlds.
-            folder: output folder, created if missing.
-            tensorboard: whether to write a log for TensorBoard.
-
-        Returns:
-            The rows of `curve.csv`.
-        """
-
-
-class Training(AnyTraining):
-    """Base class of trainings with stable-baselines3.
-
-    Raises:
-        InputError: an unknown algorithm, or a number out of range.
-    """
-
-    def __post_init__(self) -> None:
-        _ = self.config
-        super().__post_init__()
+    spec: RLTrainingSpec
 
     @property
     @abstractmethod
     def config(self) -> TrainingConfig:
-        """Training config of the algorithm.
+        """Training config of the algorithm."""
 
-        Raises:
-            InputError: the algorithm has no config for this task.
-        """
+    @property
+    @abstractmethod
+    def evaluate_every(self) -> int:
+        """Decisions between evaluations."""
 
     @abstractmethod
     def make_env(self) -> VecEnv:
@@ -115,7 +55,7 @@ class Training(AnyTraining):
     def description(self) -> dict[str, Any]:
         """Return `scenarios` and `settings` for `planners.model_file.save_model`."""
 
-    def settings(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         """Return the arguments of the algorithm's constructor, without the learning rate."""
         return {name: value for name, value in self.config.settings.items() if name != "learning_rate"}
 
@@ -135,7 +75,7 @@ class Training(AnyTraining):
         """Called between rollouts, before a checkpoint; subclasses may bring the environment to a simpler state."""
         del model
 
-    def train(self, seed: int, folder: Path, *, tensorboard: bool = False) -> list[Row]:
+    def train(self, seed: int, folder: Path) -> list[Row]:
         """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
         `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations; the checkpoint is
@@ -144,7 +84,6 @@ class Training(AnyTraining):
         Args:
             seed: seed of the network and of the worlds.
             folder: output folder, created if missing.
-            tensorboard: whether to write a log for TensorBoard.
 
         Returns:
             The rows of `curve.csv`.
@@ -160,10 +99,10 @@ class Training(AnyTraining):
             learning_rate=LinearSchedule(rate, rate * self.config.final_learning_rate, 1.0),
             seed=seed,
             device="cpu",
-            tensorboard_log=str(folder / "tensorboard") if tensorboard else None,
-            **self.settings(),
+            tensorboard_log=str(folder / "tensorboard") if self.spec.tensorboard else None,
+            **self.arguments(),
         )
-        if not tensorboard:
+        if not self.spec.tensorboard:
             # Otherwise stable-baselines3 makes a new folder for logs in the system's folder of temporary files.
             model.set_logger(Logger(None, []))
         # stable-baselines3 has seeded the environment with the network's seed.
@@ -186,42 +125,10 @@ class Training(AnyTraining):
         return curve
 
 
-@dataclass(frozen=True, eq=False)
-class Trained:
-    """Result of a training, as bytes, so that a worker on another machine can return it.
-
-    Attributes:
-        curve: rows of `curve.csv`.
-        model: content of the model file.
-    """
-
-    curve: list[Row]
-    model: bytes
-
-    def save(self, folder: Path) -> None:
-        """Write both files to a folder."""
-        folder.mkdir(parents=True, exist_ok=True)
-        write_csv(folder / CURVE, list(self.curve[0]), self.curve)
-        with atomic_write(folder / MODEL) as beside:
-            beside.write_bytes(self.model)
-
-
-def train_one(training: AnyTraining, seed: int, folder: Path, tensorboard: bool = False) -> Trained:
-    """Train with one seed on a single thread, so that one training per core can run in parallel."""
-    import torch
-    from numba import get_num_threads
-
-    # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
-    get_num_threads()
-    torch.set_num_threads(1)
-    curve = training.train(seed, folder, tensorboard=tensorboard)
-    return Trained(curve, (folder / MODEL).read_bytes())
-
-
 class _Evaluator(BaseCallback):  # type: ignore[misc]
     """Callback that evaluates and saves the model during training."""
 
-    def __init__(self, training: Training, folder: Path, curve: list[Row]) -> None:
+    def __init__(self, training: RLTraining, folder: Path, curve: list[Row]) -> None:
         super().__init__()
         self.subject, self.folder, self.curve = training, folder, curve
         self._start = time.monotonic() - (curve[-1]["wall_s"] if curve else 0.0)

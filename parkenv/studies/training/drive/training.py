@@ -3,60 +3,93 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.stats import binomtest
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.studies.training.configs import DRIVE_CONFIGS, DriveTrainingConfig, config_of
-from parkenv.studies.training.curve_file import Row
-from parkenv.studies.training.drive_batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
-from parkenv.studies.training.drive_training_env import (
+from parkenv.scenarios.build import build
+from parkenv.show.figures.learning_curves import save_success_curves
+from parkenv.studies.training.configs import DRIVE_CONFIGS, DriveTrainingConfig
+from parkenv.studies.training.curve_file import Row, across_seeds
+from parkenv.studies.training.drive.batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
+from parkenv.studies.training.drive.env import (
     DECISION_S,
     DriveTrainingEnv,
     SlotGroup,
+    TerminalGoalReplayBuffer,
     slot_groups,
 )
-from parkenv.studies.training.rl_training import Training
-from parkenv.studies.trips.parking_runs import ParkingCase, park_all
+from parkenv.studies.training.learning import RLTraining
+from parkenv.studies.training.spec import DriveTrainingSpec
+from parkenv.studies.training.training import Status, Tested, Trained
+from parkenv.studies.trips.parking_runs import ParkingCase, park_all, parking_table
 from parkenv.studies.workers import Workers
 from parkenv.world.lot import ParkingLot
+from planners.goal_features import GoalFeatures
+from planners.names import PARKING_PLANNER
 
 _MOST_DECISIONS = round(60.0 / DECISION_S)  # a minute, as in the environment
 
 
-@dataclass(frozen=True, eq=False)
-class DriveTraining(Training):
-    """Training of an agent that drives into slots; its score is the success rate.
+class DriveTraining(RLTraining):
+    """Training of an agent that drives into slots, of every kind on the lots equally often."""
 
-    Args:
-        algorithm: one of `DRIVE_CONFIGS`.
-        steps: decisions in total.
-        evaluate_every: decisions between evaluations.
-        lots: lots to train on; every kind of slot on them is used equally often.
-        evaluation_seeds: seeds of the held-out tasks, the same for each kind and lot.
-
-    Raises:
-        InputError: an unknown algorithm, a number out of range, or a lot without a slot that the car fits into.
-    """
-
-    lots: tuple[ParkingLot, ...]
-    evaluation_seeds: range
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _ = self.groups
+    spec: DriveTrainingSpec
+    heading = "Parkings that succeed, contacts, median s of those, in held-out tasks"
+    table_by = ("kind",)
 
     @property
     def config(self) -> DriveTrainingConfig:
-        """Training config of the algorithm."""
-        return config_of(self.algorithm, DRIVE_CONFIGS, "drive")
+        """See `RLTraining`."""
+        return DRIVE_CONFIGS[self.algorithm]
+
+    @property
+    def steps(self) -> int:
+        """See `Training`."""
+        return self.spec.steps or self.config.steps
+
+    @property
+    def evaluate_every(self) -> int:
+        """See `RLTraining`."""
+        return self.spec.evaluate_every or max(1, self.steps // 20)
+
+    @cached_property
+    def lots(self) -> tuple[ParkingLot, ...]:
+        """Lots to train on."""
+        return tuple(build(scenario).lot for scenario in self.scenarios)
+
+    @cached_property
+    def tested(self) -> list[ParkingLot]:
+        """Lots to test on."""
+        return [build(scenario).lot for scenario in self.spec.test_on or self.scenarios]
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """See `Training`."""
+        return tuple(f"{kind}_success" for kind in self.kinds)
+
+    def check(self) -> None:
+        """See `Training`."""
+        super().check()
+        for lots in (self.lots, self.tested):
+            slot_groups(lots)
+
+    def settings(self) -> Row:
+        """See `Training`."""
+        lots = [lot.name for lot in self.lots]
+        return super().settings() | {"lot": lots, "steps": self.steps, "evaluate_every": self.evaluate_every}
+
+    def evaluation_settings(self, settings: Row) -> Row:
+        """See `Training`."""
+        return {name: settings.get(name) for name in ("env", "lot", "evaluation_episodes")}
 
     @cached_property
     def groups(self) -> tuple[SlotGroup, ...]:
@@ -108,15 +141,9 @@ class DriveTraining(Training):
         """Return the success rate, then minus the mean time to break ties."""
         return (row["success"], -row["time_s"] if row["time_s"] == row["time_s"] else -np.inf)
 
-    def settings(self) -> dict[str, Any]:
+    def arguments(self) -> dict[str, Any]:
         """Return the constructor's arguments: goal features and, for sparse rewards, hindsight experience replay."""
-        # Imported here because they need torch, which is not needed to describe a training.
-        import torch
-
-        from parkenv.studies.training.drive_replay_buffer import TerminalGoalReplayBuffer
-        from planners.goal_features import GoalFeatures
-
-        settings = super().settings()
+        settings = super().arguments()
         settings["policy_kwargs"] = settings["policy_kwargs"] | {
             "features_extractor_class": GoalFeatures,
             "activation_fn": torch.nn.ReLU,
@@ -141,6 +168,50 @@ class DriveTraining(Training):
                 PreparedTask(drawn.draw(int(world_key(seed, 0)))) for seed in self.evaluation_seeds
             ]
         return tasks
+
+    def score_text(self, row: Row) -> str:
+        """See `Training`."""
+        return f"{row['success']:.0%} parked"
+
+    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+        """See `Training`."""
+        if not self.spec.agents:
+            return {}, []
+        rows = list[Row]()
+        with status("The planner parks in the same tasks"):
+            parkings = parked_on(self.lots, self.evaluation_seeds, workers, PARKING_PLANNER)
+            for lot in self.tested:
+                table = parking_table(parked_on([lot], self.test_seeds, workers, PARKING_PLANNER))
+                rows += [{"agent": PARKING_PLANNER, "scenario": lot.name, **row} for row in table]
+        return {row["kind"]: row["success"] for row in parking_table(parkings)}, rows
+
+    def test(self, model: Path, workers: Workers) -> Tested:
+        """See `Training`."""
+        parkings, transfer = list[Row](), list[Row]()
+        for lot in self.tested:
+            some = parked_on([lot], self.test_seeds, workers, f"{self.algorithm}:{model}")
+            parkings += some
+            transfer += [{"test_scenario": lot.name, **row} for row in parking_table(some)]
+        total = parking_table(parkings)[-1]
+        own = {c: total[c] for c in ("success", "success_ci95", "contacts", "time_s")}
+        return Tested(",".join(lot.name for lot in self.tested), own, transfer)
+
+    def test_text(self, row: Row) -> str:
+        """See `Training`."""
+        low, high = row["success_ci95"]
+        return f"{row['success']:.1%} [{low:.1%}, {high:.1%}], {row['contacts']}, {row['time_s']:.1f}"
+
+    def across_seeds(self, curves: list[list[Row]]) -> dict[str, list[dict[str, float]]]:
+        """See `Training`."""
+        return {kind: across_seeds(curves, f"{kind}_success") for kind in self.kinds}
+
+    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+        """See `Training`."""
+        lots = " and ".join(lot.name for lot in self.lots)
+        title = f"{lots}: {self.evaluation_episodes} parkings of each kind in held-out tasks"
+        drawn = {self.algorithm: trained.curves} | trained.beside
+        means = {label: self.across_seeds(its) for label, its in drawn.items()}
+        save_success_curves(drawn, means, lines, title, figure)
 
 
 def evaluate_parking(

@@ -1,4 +1,4 @@
-"""Training environment for parking agents: a batch of drives for stable-baselines3, with a curriculum."""
+"""Training environment for parking agents: a batch of drives with a curriculum, and its replay buffer."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 from gymnasium import spaces
 from numpy.typing import ArrayLike, NDArray
+from stable_baselines3.common.buffers import DictReplayBufferSamples
+from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
@@ -19,7 +22,7 @@ from parkenv.envs.drive_goals import STANDING, goal_errors
 from parkenv.envs.sb3 import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.studies.training.configs import WAY_IN, DriveTrainingConfig
-from parkenv.studies.training.drive_batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
+from parkenv.studies.training.drive.batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
 from parkenv.world.lot import ParkingLot
 from planners.driving.hybrid_astar import plan_path
 from planners.driving.policy_interface import ACTION_REPEAT, OBSERVATION_SIZE
@@ -286,3 +289,27 @@ class DriveTrainingEnv(SharedVecEnv):
             task = self._tasks[key].draw(seed)
             made[seed] = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
         return made[seed]
+
+
+class TerminalGoalReplayBuffer(HerReplayBuffer):  # type: ignore[misc]
+    """stable-baselines3's hindsight experience replay with terminal goals.
+
+    In the base class, a relabelled episode continues after its goal. A drive ends there because the car has parked.
+    Moreover, most relabelled goals cannot be held: the car passes through them at speed.
+    """
+
+    @property
+    def contacts(self) -> NDArray[np.bool_]:
+        """Whether each transition ended in a contact, (size, n_envs): the part of `info` that rewards depend on."""
+        return np.array([[bool(info.get("contact")) for info in row] for row in self.infos])
+
+    @contacts.setter
+    def contacts(self, values: NDArray[np.bool_]) -> None:
+        self.infos = np.array([[{"contact": value} for value in row] for row in values.tolist()])
+
+    def _get_virtual_samples(
+        self, batch_indices: NDArray[np.int64], env_indices: NDArray[np.int64], env: Any = None
+    ) -> DictReplayBufferSamples:
+        samples = super()._get_virtual_samples(batch_indices, env_indices, env)
+        # A sparse reward is 0 only where the goal is reached.
+        return samples._replace(dones=torch.maximum(samples.dones, (samples.rewards == 0.0).float()))

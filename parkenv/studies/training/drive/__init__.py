@@ -1,0 +1,1 @@
+"""Training of parking agents for `parkenv/Drive-v1`."""

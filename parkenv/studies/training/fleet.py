@@ -1,0 +1,195 @@
+"""Training in a fleet: one network for all cars; the score is the mean total time of those that it drives."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from parkenv.engine.fleet import DriverKind
+from parkenv.engine.fleet_rules import RULES
+from parkenv.envs.sb3 import FleetVecEnv, network_rule
+from parkenv.errors import InputError
+from parkenv.scenarios.build import build
+from parkenv.show.figures.learning_curves import save_learning_curves
+from parkenv.show.plurals import plural
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.drivers import MixedFleet, demand_in, driver_of
+from parkenv.studies.training.configs import FLEET_CONFIGS, REWARD_SCALE, TrainingConfig
+from parkenv.studies.training.curve_file import Row
+from parkenv.studies.training.learning import RLTraining
+from parkenv.studies.training.spec import FleetTrainingSpec
+from parkenv.studies.training.training import EVALUATION_SEED, TEST_SEED, Status, Tested, Trained
+from parkenv.studies.workers import Workers
+from parkenv.world.scenario import Scenario
+
+FEW = 0.1
+"""Share of the cars that a model drives in tests among other agents."""
+
+
+class FleetTraining(RLTraining):
+    """Training of one network that drives all cars of a fleet, or a share of them."""
+
+    spec: FleetTrainingSpec
+    heading = "Mean total time, s, of a driver's cars and [of the others], {episodes} held-out days"
+
+    @property
+    def config(self) -> TrainingConfig:
+        """See `RLTraining`."""
+        return FLEET_CONFIGS[self.algorithm]
+
+    @property
+    def steps(self) -> int:
+        """Decisions of the cars that are learned from, in total."""
+        return self.spec.steps
+
+    @property
+    def evaluate_every(self) -> int:
+        """See `RLTraining`."""
+        return self.spec.evaluate_every or max(1, self.steps // 10)
+
+    @cached_property
+    def scenario(self) -> Scenario:
+        """The scenario to train in."""
+        if len(self.scenarios) != 1:
+            raise InputError(f"--scenario names {len(self.scenarios)} scenarios, want one with --env fleet")
+        return build(self.scenarios[0])
+
+    @cached_property
+    def fleet(self) -> MixedFleet:
+        """The fleet to train in."""
+        spec = self.spec
+        demand = demand_in(self.scenario, spec.arrivals_per_hour, spec.stay_s, spec.patience_s)
+        share = 1.0 if spec.among is None else spec.learners or FEW
+        return MixedFleet(self.scenario, demand, spec.knows, share, spec.among)
+
+    @cached_property
+    def tests(self) -> list[MixedFleet]:
+        """The fleets of the tests in the end: that of the training, every car, and few among others."""
+        whole = replace(self.fleet, share=1.0, among=None)
+        few = [replace(self.fleet, share=FEW, among=agent) for agent in self.spec.test_among]
+        return list(dict.fromkeys([self.fleet, whole, *few]))
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """See `Training`."""
+        return ("total_s",)
+
+    def check(self) -> None:
+        """See `Training`."""
+        super().check()
+        among = self.spec.among
+        if among is not None and driver_of(among, self.scenario)[0] is None:
+            raise InputError(
+                f"--among is {among.label!r}, want a compiled driver: {', '.join(RULES)}, or a model"
+            )
+        for agent in (*self.spec.agents, *self.spec.test_among):
+            driver_of(agent, self.scenario)
+        _ = self.fleet
+
+    def settings(self) -> Row:
+        """See `Training`."""
+        return super().settings() | {
+            "scenario": [self.scenario.name], "evaluate_every": self.evaluate_every, "fleet": self.fleet.name,
+            "demand": str(self.fleet.demand),
+        }  # fmt: skip
+
+    def evaluation_settings(self, settings: Row) -> Row:
+        """See `Training`."""
+        names = ("env", "scenario", "fleet", "demand", "evaluation_episodes")
+        return {name: settings.get(name) for name in names}
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Mean total time, s, its 95 % interval over days, fraction of cars that parked, search time, s."""
+        return ("total_s", "low_s", "high_s", "parked_fraction", "search_s")
+
+    def make_env(self) -> FleetVecEnv:
+        """Make the worlds."""
+        fleet = self.fleet
+        kinds = [DriverKind(fleet.share, None, fleet.knows, shares=fleet.knows == "shared")]
+        if fleet.among is not None:
+            kinds.append(DriverKind(1.0 - fleet.share, driver_of(fleet.among, fleet.scenario)[0]))
+        return FleetVecEnv(
+            self.config.n_envs, fleet.scenario, fleet.demand, kinds, REWARD_SCALE, self.spec.k, fleet.max_steps,
+            leave_full_lot=False,
+        )  # fmt: skip
+
+    def connect(self, model: Any) -> None:
+        """Let the other cars of the worlds follow the model's policy."""
+        model.env.follow(model.policy)
+
+    def before_rollout(self, model: Any) -> None:
+        """Hand the current weights to the other cars."""
+        model.env.follow(model.policy)
+
+    def before_checkpoint(self, model: Any) -> None:
+        """Begin all worlds anew: a checkpoint then needs no more than the numbers of their days."""
+        model._last_obs = model.env.reset()
+        model._last_episode_starts = np.ones(model.n_envs, dtype=np.bool_)
+
+    def evaluate(self, policy: Any, env: VecEnv) -> Row:
+        """Run the held-out days."""
+        del env
+        row = self.fleet.row(
+            network_rule(policy, self.spec.k, sampled=True), EVALUATION_SEED, self.evaluation_episodes
+        )
+        low, high = row["total_s_ci95"]
+        found = (row["total_s"], low, high, row["parked_fraction"], row["search_s"])
+        return dict(zip(self.metrics, found, strict=True))
+
+    def score(self, row: Row) -> tuple[float, ...]:
+        """Return minus the mean total time."""
+        return (-row["total_s"],)
+
+    def description(self) -> dict[str, Any]:
+        """Return scenario and settings for the model file."""
+        config, fleet = self.config, self.fleet
+        settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
+        settings |= {"fleet": fleet.name, "knows": fleet.knows, "demand": str(fleet.demand)}
+        return {"scenarios": [fleet.scenario.name], "settings": settings}
+
+    def score_text(self, row: Row) -> str:
+        """See `Training`."""
+        return f"{row['total_s']:.1f} s"
+
+    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+        """See `Training`."""
+        lines, rows, days = dict[str, float](), list[Row](), self.evaluation_episodes
+        for agent in self.spec.agents:
+            with status(f"{agent.label} drives on the same days"):
+                lines[agent.label] = self.fleet.row(agent, EVALUATION_SEED, days, workers)["total_s"]
+                named = {"agent": agent.label}
+                rows += [
+                    named | {"scenario": test.name, **test.row(agent, TEST_SEED, 2 * days, workers)}
+                    for test in self.tests
+                ]
+        return lines, rows
+
+    def test(self, model: Path, workers: Workers) -> Tested:
+        """See `Training`."""
+        member, days = AgentSpec(name=f"{self.algorithm}:{model}"), 2 * self.evaluation_episodes
+        transfer = [
+            {"test_scenario": test.name, **test.row(member, TEST_SEED, days, workers)} for test in self.tests
+        ]
+        own = {c: transfer[0][c] for c in ("total_s", "total_s_ci95", "search_s")}
+        return Tested(self.scenario.name, own, transfer)
+
+    def test_text(self, row: Row) -> str:
+        """See `Training`."""
+        low, high = row["total_s_ci95"]
+        others = "" if row["others_s"] != row["others_s"] else f"; others {row['others_s']:.1f}"
+        return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]{others}"
+
+    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+        """See `Training`."""
+        rate, days = self.spec.arrivals_per_hour, plural(self.evaluation_episodes, "held-out day")
+        title = f"{self.scenario.name}, {rate:g} cars an hour, {self.fleet.name}: {days}"
+        drawn = {self.algorithm: trained.curves} | trained.beside
+        means = {label: self.across_seeds(its) for label, its in drawn.items()}
+        save_learning_curves(drawn, means, lines, title, figure)

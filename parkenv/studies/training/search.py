@@ -1,0 +1,394 @@
+"""Training for `parkenv/Search-v2`: the score is the mean total time."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from gymnasium.vector import AutoresetMode
+from numpy.typing import NDArray
+from stable_baselines3.common.vec_env.base_vec_env import VecEnv
+
+from parkenv.envs.sb3 import SearchVecEnv, search_batch
+from parkenv.errors import InputError
+from parkenv.scenarios.build import build
+from parkenv.scenarios.places import (
+    by_size,
+    lot_share,
+    open_places,
+    place_of_episode,
+    require_different_names,
+    split_places,
+)
+from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.figures.learning_curves import save_learning_curves
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.benchmark.suite import suite_lots
+from parkenv.studies.compare.cases import rows_of
+from parkenv.studies.simulate import charge_truncation
+from parkenv.studies.statistics import mean_interval
+from parkenv.studies.training.cloning import Demonstrations, clone, require_cloneable
+from parkenv.studies.training.configs import (
+    MAX_STEPS,
+    REWARD_SCALE,
+    SCAN_CONFIGS,
+    SEARCH_CONFIGS,
+    TrainingConfig,
+)
+from parkenv.studies.training.curve_file import Row
+from parkenv.studies.training.learning import RLTraining
+from parkenv.studies.training.spec import ScanTrainingSpec, SearchTrainingSpec
+from parkenv.studies.training.training import Status, Tested, Trained, name_of
+from parkenv.studies.workers import Workers
+from parkenv.world.scenario import Scenario
+from planners.agent import make_agent
+from planners.learned import LearnedAgent
+from planners.model_file import SEARCH_OBSERVATIONS, observation_of
+
+METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
+HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
+DEMONSTRATION_SEED = 5_000_000
+"""First world seed of the demonstrations."""
+PLANNERS = tuple(
+    AgentSpec(name=name)
+    for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
+)
+"""Agents to compare with, if none are named."""
+PLANNERS_OF_PLACES = tuple(spec for spec in PLANNERS if spec.name not in ("mdp-tuned", "greedy-goal"))
+"""The same with held-out places: those that need no time on each lot."""
+
+
+class SearchTraining(RLTraining):
+    """Training of a search agent in one scenario or several; the score is the mean total time."""
+
+    spec: SearchTrainingSpec | ScanTrainingSpec
+    heading = "Mean total time, s, in held-out worlds"
+    demonstrations: Demonstrations | None = None
+    """Cloned before training; made by `begin`."""
+
+    @property
+    def folder(self) -> str:
+        """See `Training`."""
+        return f"scan-{self.algorithm}" if self.spec.observation == "scan" else super().folder
+
+    @property
+    def config(self) -> TrainingConfig:
+        """See `RLTraining`."""
+        configs = SCAN_CONFIGS if self.spec.observation == "scan" else SEARCH_CONFIGS
+        return configs[self.algorithm]
+
+    @property
+    def steps(self) -> int:
+        """See `Training`."""
+        return self.spec.steps
+
+    @property
+    def evaluate_every(self) -> int:
+        """See `RLTraining`."""
+        return self.spec.evaluate_every
+
+    @property
+    def given_scenarios(self) -> tuple[ScenarioSpec, ...]:
+        """See `Training`."""
+        return (*self.scenarios, *(self.spec.evaluate_on or ()))
+
+    @property
+    def holds_out(self) -> bool:
+        """Whether evaluations are also in places that are not trained in."""
+        return self.spec.held_out is not None or self.spec.evaluate_on is not None
+
+    @property
+    def compared(self) -> tuple[AgentSpec, ...]:
+        """Agents to compare with."""
+        usual = PLANNERS_OF_PLACES if self.holds_out else PLANNERS
+        return usual if self.spec.agents is None else self.spec.agents
+
+    @cached_property
+    def sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
+        """Scenarios to train in, and places to evaluate in and not to train in."""
+        return self.build_sides()
+
+    def build_sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
+        """Build `sides` from the specification."""
+        given = [build(scenario) for scenario in self.scenarios]
+        if self.spec.held_out is not None:
+            sides = split_places(given, self.spec.held_out, suite_lots())
+        else:
+            sides = given, [build(scenario) for scenario in self.spec.evaluate_on or ()]
+        require_apart(*sides)
+        require_trainable(sides[0])
+        return sides
+
+    @cached_property
+    def tests(self) -> dict[str, Sequence[Scenario]]:
+        """The tests in the end, by name: each in one scenario, or in many of which every search draws one."""
+        learned, held_out = self.sides
+        if self.spec.test_on is None and self.holds_out:
+            return {f"{_places(learned)} trained on": learned, f"{_places(held_out)} held out": held_out}
+        tested = learned if self.spec.test_on is None else [build(one) for one in self.spec.test_on]
+        return {scenario.name: [scenario] for scenario in tested}
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked; also held out."""
+        return METRICS + (HELD_OUT if self.sides[1] else ())
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """See `Training`."""
+        return ("total_s", "held_out_s") if self.holds_out else ("total_s",)
+
+    @property
+    def announcement(self) -> str | None:
+        """See `Training`."""
+        if not self.holds_out:
+            return None
+        learned, held_out = self.sides
+        names = ", ".join(scenario.name for scenario in held_out)
+        return f"Trained on {_places(learned)}, and evaluated on {_places(held_out)} held out: {names}"
+
+    def check(self) -> None:
+        """See `Training`."""
+        super().check()
+        learned = self.sides[0]
+        if self.spec.observation == "scan":
+            # What gives no scans in a batch is refused before training, not at the tests in the end.
+            for place in (*learned, *itertools.chain(*self.tests.values())):
+                search_batch(1, learned if place in learned else place, "scan", self.spec.k)
+        if self.spec.clone is not None:
+            require_cloneable(self.algorithm, self.spec.clone, learned[0])
+        for world in (learned[0], *(places[0] for places in self.tests.values())):
+            for agent in self.compared:
+                make_agent(agent.name, world, **agent.options)
+
+    def settings(self) -> Row:
+        """See `Training`."""
+        learned, held_out = self.sides
+        names = {
+            "scenario": [world.name for world in learned],
+            "held_out": [world.name for world in held_out],
+        }
+        return super().settings() | names
+
+    def evaluation_settings(self, settings: Row) -> Row:
+        """See `Training`."""
+        first, *others = settings.get("scenario") or [None]
+        return {
+            "scenario": [first, *others] if others else first,
+            "held_out": settings.get("held_out") or [],
+            "evaluation_episodes": settings.get("evaluation_episodes"),
+        }
+
+    def begin(self, status: Status) -> None:
+        """Record the searches of the planner to clone."""
+        planner = self.spec.clone
+        if planner is not None:
+            count = self.spec.demonstrations or 2000
+            seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
+            with status(f"Recording {count} searches of {planner}"):
+                self.demonstrations = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
+
+    def make_env(self) -> SearchVecEnv:
+        """Make a batch of search environments over all scenarios."""
+        places = self.sides[0] if self.spec.curriculum is None else by_size(self.sides[0])
+        env = SearchVecEnv(
+            self.config.n_envs, places, REWARD_SCALE, self.spec.k, self.spec.observation, MAX_STEPS
+        )
+        self._open_places(env, 0.0)
+        return env
+
+    def before_rollout(self, model: Any) -> None:
+        """Add the places that the curriculum has come to."""
+        self._open_places(model.env, model.num_timesteps / self.steps)
+
+    def _open_places(self, env: SearchVecEnv, progress: float) -> None:
+        if self.spec.curriculum is not None:
+            env.batch.n_places = open_places(len(self.sides[0]), progress)
+
+    def prepare(self, model: Any, seed: int) -> None:
+        """Clone the demonstrations, if any."""
+        if self.demonstrations is not None:
+            clone(model, self.demonstrations, seed)
+
+    def evaluate(self, policy: Any, env: VecEnv) -> Row:
+        """Run one episode in each held-out world, in the places trained on and in those held out."""
+        del env
+        found: list[float] = []
+        for places in filter(None, self.sides):
+            times, parked = episode_times(policy, places, self.evaluation_seeds)
+            found += [*mean_interval(times), float(parked.mean())]
+        return dict(zip(self.metrics, found, strict=True))
+
+    def score(self, row: Row) -> tuple[float, ...]:
+        """Return minus the mean total time."""
+        return (-row["total_s"],)
+
+    def score_text(self, row: Row) -> str:
+        """See `Training`."""
+        held_out = f", held out {row['held_out_s']:.1f} s" if self.holds_out else ""
+        return f"{row['total_s']:.1f} s{held_out}"
+
+    def description(self) -> dict[str, Any]:
+        """Return scenarios and settings for the model file."""
+        config, (learned, held_out) = self.config, self.sides
+        settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
+        settings |= {"clone": self.spec.clone, "curriculum": self.spec.curriculum}
+        return {
+            "scenarios": [place.name for place in learned],
+            "held_out": [place.name for place in held_out],
+            "settings": settings,
+        }
+
+    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+        """See `Training`."""
+        if not self.compared:
+            return {}, []
+        learned, held_out = self.sides
+        rows = list[Row]()
+        with status("Planners search in the same worlds"):
+            evaluated = rows_of(self.compared, held_out or learned, self.evaluation_seeds, workers)
+            for name, places in self.tests.items():
+                rows += rows_of(self.compared, places, self.test_seeds, workers, name)
+        lines = {row["agent"]: row["total_s"] for row in evaluated}
+        return lines | {"clairvoyant bound": evaluated[0]["bound_s"]}, rows
+
+    def test(self, model: Path, workers: Workers) -> Tested:
+        """See `Training`."""
+        del workers
+        transfer, by_place = list[Row](), list[Row]()
+        for name, places in self.tests.items():
+            times, parked = self.times_of(model, places)
+            transfer.append({"test_scenario": name, **times_row(times, parked)})
+            if len(places) > 1:
+                rows = self._rows_by_place(places, times, parked)
+                by_place += [{"test_scenario": name} | row for row in rows]
+        # The first test; of those on either side of a split, the one on held-out places.
+        main = transfer[-1 if self.holds_out and self.spec.test_on is None else 0]
+        own = {c: main[c] for c in ("total_s", "total_s_ci95")}
+        return Tested(main["test_scenario"], own, transfer, by_place)
+
+    def times_of(
+        self, model: Path, places: Sequence[Scenario]
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+        """Test a model: return the times of the test's episodes, s, and whether the car parked."""
+        agent = LearnedAgent(self.sides[0][0], self.algorithm, model)
+        return episode_times(agent.model, places, self.test_seeds)
+
+    def test_text(self, row: Row) -> str:
+        """See `Training`."""
+        low, high = row["total_s_ci95"]
+        return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]"
+
+    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+        """See `Training`."""
+        (learned, held_out), name, curves = self.sides, name_of(self.settings()), trained.curves
+        where, drawn = learned[0].name if len(learned) == 1 else _places(learned), {name: curves}
+        if self.holds_out:
+            where = f"{_places(held_out)} held out"
+            apart = [[row | {"total_s": row["held_out_s"]} for row in curve] for curve in curves]
+            drawn = {f"{name}, {_places(learned)} trained on": curves, f"{name}, held out": apart}
+        title = f"{where}: {self.evaluation_episodes} searches in held-out worlds"
+        drawn |= trained.beside
+        means = {label: self.across_seeds(its) for label, its in drawn.items()}
+        save_learning_curves(drawn, means, lines, title, figure)
+
+    def _rows_by_place(
+        self, places: Sequence[Scenario], times: NDArray[np.float64], parked: NDArray[np.bool_]
+    ) -> list[Row]:
+        """Return a row of the test for each place that a search was in."""
+        place_of = np.array([place_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
+        return [
+            {"place": place.name, "slots": place.lot.n_slots, **times_row(times[its], parked[its])}
+            for i, place in enumerate(places)
+            if (its := place_of == i).any()
+        ]
+
+
+def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
+    """Check that no place is on both sides.
+
+    Raises:
+        InputError: two places have one name, or a held-out lot is also one to train on.
+    """
+    if not held_out:
+        return
+    require_different_names([*learned, *held_out])
+    shares = {lot_share(scenario.lot): scenario.name for scenario in learned}
+    for scenario in held_out:
+        if (same := shares.get(lot_share(scenario.lot))) is not None:
+            raise InputError(
+                f"evaluate_on has {scenario.name!r}, whose lot is that of {same!r}, which is trained on"
+            )
+
+
+def require_trainable(learned: Sequence[Scenario]) -> None:
+    """Check that none of the places to train on is one of a benchmark suite.
+
+    Raises:
+        InputError: one is.
+    """
+    kept = suite_lots()
+    for scenario in learned:
+        if (name := kept.get(lot_share(scenario.lot))) is not None:
+            raise InputError(
+                f"scenario {scenario.name!r} is {name} of benchmark suite v2, which no agent is trained on: leave it "
+                "out, or add --held-out"
+            )
+
+
+def _places(scenarios: Sequence[Scenario]) -> str:
+    return f"{len(scenarios)} place{'s' * (len(scenarios) != 1)}"
+
+
+def search_times(agent: LearnedAgent, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Row:
+    """Run a model, and return its total times as columns of `parkenv compare`."""
+    return times_row(*episode_times(agent.model, places, seeds))
+
+
+def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
+    """Return the total times of episodes as columns of `parkenv compare`."""
+    mean, low, high = mean_interval(times)
+    return {
+        "episodes": len(times),
+        "parked_fraction": float(parked.mean()),
+        "total_s": mean,
+        "total_s_ci95": [low, high],
+    }
+
+
+def episode_times(
+    model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int]
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
+
+    An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
+
+    Args:
+        model: a stable-baselines3 or sb3-contrib model of the `local` or the `scan` observation.
+        places: scenario to search in; or several, of which each seed draws one.
+        seeds: one episode each.
+    """
+    n = len(seeds)
+    _, version, k = observation_of(model.observation_space)
+    observation = SEARCH_OBSERVATIONS[version][0]
+    batch = search_batch(n, places, observation, k, MAX_STEPS, AutoresetMode.NEXT_STEP)
+    seen, _ = batch.reset(seed=list(seeds))
+    give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
+    times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)
+    state, start = None, np.ones(n, dtype=np.bool_)
+    masked = "action_masks" in model.predict.__code__.co_varnames
+    while np.isnan(times).any():
+        masks = {"action_masks": seen["action_mask"]} if masked else {}
+        actions, state = model.predict(seen, state=state, episode_start=start, deterministic=True, **masks)
+        seen, _, terminated, truncated, info = batch.step(actions)
+        start = terminated | truncated
+        first = start & np.isnan(times)
+        if first.any():
+            charge_truncation(info, give_up_s, truncated & ~terminated)
+            times[first] = info["total_s"][first]
+            parked[first] = info["parked"][first]
+    return times, parked

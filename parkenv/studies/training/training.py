@@ -1,0 +1,327 @@
+"""What all kinds of training have: seeds of evaluations, checks, settings, and the report of the models."""
+
+from __future__ import annotations
+
+import os
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from importlib import import_module
+from pathlib import Path
+from typing import Any, ClassVar, NamedTuple
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.csv_writing import write_csv
+from parkenv.files.spec_file import Several, Spec
+from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.figures.learning_curves import COLORS
+from parkenv.studies.fingerprints import fingerprints, flat_tables
+from parkenv.studies.results import SETTINGS, read_settings
+from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve
+from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.workers import Workers
+
+EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
+"""First world seeds of the evaluations during training, and of the final test."""
+TRAINING_SEEDS = 10_000_000
+"""World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
+MODEL, FIGURE = "model.safetensors", "learning_curve.png"
+_OUTSIDE = {
+    "kind", "jobs", "backend", "address", "trainings", "seed", "agents", "tensorboard", "scenarios", "held_out",
+    "evaluate_on", "test_on", "test_among",
+}  # fmt: skip
+"""Fields of a specification that do not change its trainings, or that `settings` gives in other words."""
+
+Status = Callable[[str], AbstractContextManager[Any]]
+"""Shows what is going on during a block."""
+Table = tuple[str, list[str], list[list[str]]]
+"""Title, headings and rows."""
+
+
+class Trained(NamedTuple):
+    """Trainings that have ended.
+
+    Attributes:
+        curves: rows of `curve.csv`, by training.
+        models: model files by seed.
+        beside: curves of other trainings, by name.
+    """
+
+    curves: list[list[Row]]
+    models: dict[int, Path]
+    beside: dict[str, list[list[Row]]]
+
+
+class Tested(NamedTuple):
+    """The test of one model.
+
+    Attributes:
+        scenario: what it was tested in, for its row of the summary.
+        own: columns of this row.
+        transfer: a row for each test.
+        places: a row for each place of tests that are in many.
+    """
+
+    scenario: str
+    own: Row
+    transfer: list[Row]
+    places: Sequence[Row] = ()
+
+
+class Training(ABC):
+    """A kind of training: what is trained, how it is evaluated, and the report of its models.
+
+    Args:
+        spec: specification of the training.
+        command: command line, for the model's card.
+    """
+
+    heading: ClassVar[str]
+    """Of the table of tests; `{episodes}` is their number."""
+    table_by: ClassVar[tuple[str, ...]] = ()
+    """Columns of a test beside its name that have a column each in the table of tests."""
+
+    def __init__(self, spec: TrainingSpec, command: tuple[str, ...] = ()) -> None:
+        self.spec, self.command = spec, command
+        self.algorithm = spec.algorithm
+        self.scenarios = spec.scenarios or ()
+        self.evaluation_episodes = spec.evaluation_episodes
+        self.evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
+        self.test_seeds = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
+
+    @property
+    def folder(self) -> str:
+        """Default name of the output folder."""
+        return self.algorithm if self.spec.env == "search" else f"{self.spec.env}-{self.algorithm}"
+
+    @property
+    @abstractmethod
+    def steps(self) -> int:
+        """Decisions of a training."""
+
+    @property
+    def given_scenarios(self) -> tuple[ScenarioSpec, ...]:
+        """All scenarios that are trained or evaluated on."""
+        return self.scenarios
+
+    @property
+    @abstractmethod
+    def metrics(self) -> tuple[str, ...]:
+        """Names of the results of an evaluation; columns of `curve.csv`."""
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """All columns of `curve.csv`."""
+        return ("steps", *self.metrics, "wall_s")
+
+    @property
+    @abstractmethod
+    def measures(self) -> tuple[str, ...]:
+        """Columns of `curve.csv` to draw."""
+
+    @property
+    def announcement(self) -> str | None:
+        """What is said before the training begins."""
+        return None
+
+    @abstractmethod
+    def check(self) -> None:
+        """Check, before training, that everything can be trained, tested and drawn.
+
+        Raises:
+            InputError: an invalid option, or a missing package.
+        """
+        from planners.model_file import algorithm_class
+
+        algorithm_class(self.algorithm)
+
+    def settings(self) -> Row:
+        """Return the settings that a resumed training must share with this one."""
+        given = self.given_scenarios
+        return {
+            **self.spec.model_dump(mode="json", exclude=_OUTSIDE),
+            "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in given},
+            "files": fingerprints([file for s in given for file in s.files()]),
+        }
+
+    @abstractmethod
+    def evaluation_settings(self, settings: Row) -> Row:
+        """Return the settings that evaluations depend on: curves are comparable if these are equal."""
+
+    def begin(self, status: Status) -> None:
+        """Make what the trainings with all seeds share."""
+        del status
+
+    @abstractmethod
+    def train(self, seed: int, folder: Path) -> list[Row]:
+        """Train with one seed; write the model and `curve.csv` to a folder.
+
+        Args:
+            seed: seed of the network and of the worlds.
+            folder: output folder, created if missing.
+
+        Returns:
+            The rows of `curve.csv`.
+        """
+
+    @abstractmethod
+    def score_text(self, row: Row) -> str:
+        """Return the score of an evaluation as text for the progress bar."""
+
+    def report(self, status: Status, workers: Workers, trained: Trained, figure: Path) -> tuple[Row, Table]:
+        """Test the models and draw the figure; return the entries of the summary, and a table to print."""
+        lines, planners = self.planners(status, workers)
+        rows, transfer, places = list[Row](), list[Row](), list[Row]()
+        with status("Testing"):
+            for (seed, model), curve in zip(trained.models.items(), trained.curves, strict=True):
+                of_model, last = {"agent": self.algorithm, "seed": seed}, curve[-1]
+                tested = self.test(model, workers)
+                transfer += [of_model | row for row in tested.transfer]
+                places += [of_model | row for row in tested.places]
+                rows.append({
+                    "agent": self.algorithm, "scenario": tested.scenario, "seed": seed, "steps": last["steps"],
+                    **tested.own, "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
+                })  # fmt: skip
+        self.draw(trained, lines, figure)
+        summary = {
+            "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
+            **({"places": places} if places else {}),
+            "curve": self.across_seeds(trained.curves),
+            "beside": {name: self.across_seeds(its) for name, its in trained.beside.items()},
+        }  # fmt: skip
+        return summary, self._table(transfer, planners)
+
+    @abstractmethod
+    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+        """Run the agents to compare with; return their scores in the evaluations by name, and their rows of tests."""
+
+    @abstractmethod
+    def test(self, model: Path, workers: Workers) -> Tested:
+        """Test a model."""
+
+    @abstractmethod
+    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+        """Draw the learning curves, and scores of planners as lines."""
+
+    def across_seeds(self, curves: list[list[Row]]) -> Any:
+        """Return the mean of the curves, for the summary."""
+        return across_seeds(curves)
+
+    @abstractmethod
+    def test_text(self, row: Row) -> str:
+        """Return a test as text for the table."""
+
+    def _table(self, transfer: Sequence[Row], planners: Sequence[Row]) -> Table:
+        """Return a table with a column for each test, and a row for each model and planner."""
+        by = self.table_by
+        columns = list(dict.fromkeys((row["test_scenario"], *(row[name] for name in by)) for row in transfer))
+        found: dict[str, dict[tuple[Any, ...], Row]] = {}
+        for row in transfer:
+            key = (row["test_scenario"], *(row[name] for name in by))
+            found.setdefault(f"{self.algorithm}, seed {row['seed']}", {})[key] = row
+        for row in planners:
+            found.setdefault(row["agent"], {})[(row["scenario"], *(row[name] for name in by))] = row
+        rows = [[agent, *(self.test_text(its[column]) for column in columns)] for agent, its in found.items()]
+        heading = self.heading.format(episodes=len(self.test_seeds))
+        return heading, ["", *(" ".join(column) for column in columns)], rows
+
+
+class TrainedModel(NamedTuple):
+    """Result of a training, as bytes, so that a worker on another machine can return it.
+
+    Attributes:
+        curve: rows of `curve.csv`.
+        model: content of the model file.
+    """
+
+    curve: list[Row]
+    model: bytes
+
+    def save(self, folder: Path) -> None:
+        """Write both files to a folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        write_csv(folder / CURVE, list(self.curve[0]), self.curve)
+        with atomic_write(folder / MODEL) as beside:
+            beside.write_bytes(self.model)
+
+
+def train_one(training: Training, seed: int, folder: Path) -> TrainedModel:
+    """Train with one seed on a single thread, so that one training per core can run in parallel."""
+    import torch
+    from numba import get_num_threads
+
+    # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
+    get_num_threads()
+    torch.set_num_threads(1)
+    curve = training.train(seed, folder)
+    return TrainedModel(curve, (folder / MODEL).read_bytes())
+
+
+def training_of(spec: TrainingSpec, command: tuple[str, ...] = ()) -> Training:
+    """Return the training of a specification."""
+    module, _, name = spec.trained_by.partition(":")
+    made: Training = getattr(import_module(f"parkenv.studies.training.{module}"), name)(spec, command)
+    return made
+
+
+class _Naming(Spec, extra="ignore"):
+    """The settings that a training is named after."""
+
+    algorithm: str
+    scenario: Several[str] | None = None
+    clone: str | None = None
+    observation: str = "local"
+
+
+def name_of(settings: Row, source: str = "settings") -> str:
+    """Return the name of a training in a figure with others.
+
+    Raises:
+        InputError: a setting is of another kind; the message starts with `source`.
+    """
+    its = _Naming.parse(settings, source)
+    scenarios = its.scenario or ()
+    name = f"{its.algorithm}{' on scans' if its.observation == 'scan' else ''}"
+    name += f" on {', '.join(scenarios)}" if len(scenarios) > 1 else ""
+    return f"{name} after cloning {its.clone}" if its.clone else name
+
+
+def curves_beside(folders: Sequence[str], out: Path, training: Training) -> dict[str, list[list[Row]]]:
+    """Read the curves of other trainings: the rows of `curve.csv` of each seed, by name.
+
+    Args:
+        folders: output folders of `parkenv train` (`--beside`).
+        out: folder of the training to draw them with.
+        training: that training.
+
+    Raises:
+        InputError: a folder has no training, or one with other evaluations; a folder is given twice; or there are too
+            many to tell apart.
+    """
+    if len(folders) >= len(COLORS):
+        raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")
+    own, known = training.settings(), {os.path.realpath(out)}
+    beside: dict[str, list[list[Row]]] = {}
+    for folder in map(Path, folders):
+        if os.path.realpath(folder) in known:
+            raise InputError(f"--beside: {folder} is already drawn")
+        known.add(os.path.realpath(folder))
+        settings = read_settings(folder)
+        columns = ("steps", *training.measures)
+        curves = [read_curve(its, columns) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
+        curves = [curve for curve in curves if curve]
+        if settings is None or not curves or "algorithm" not in settings:
+            raise InputError(f"--beside: {folder} holds no training")
+        label = name_of(settings, str(folder / SETTINGS))
+        theirs = training.evaluation_settings(settings)
+        for name, value in training.evaluation_settings(own).items():
+            if theirs[name] != value:
+                raise InputError(
+                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their evaluations cannot "
+                    "be compared"
+                )
+        if label == name_of(own) or label in beside:
+            label = f"{label} ({folder})"
+        beside[label] = curves
+    return beside
