@@ -18,7 +18,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.commute.runs import TRIP, CommuteRun, calendar
 from parkenv.studies.commute.study import Commute
 from parkenv.studies.results import DECISIONS
-from parkenv.studies.study import run
+from parkenv.studies.runner import run
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.occupancy.recorded import RecordedOccupancy

@@ -13,7 +13,7 @@ from scipy import stats
 
 from parkenv import InputError, SensorModel
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.studies.results import KEY_COLUMNS, OUTCOME_COLUMNS, ResultFolder
+from parkenv.studies.results import KEY_COLUMNS, OUTCOME_COLUMNS, Results
 from parkenv.studies.statistics import mean_interval, summarize
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
@@ -337,7 +337,7 @@ def test_a_finished_folder_may_be_used_again_and_a_foreign_one_is_refused(tmp_pa
     assert kept == ["greedy-drive"] * 5 + ["greedy-goal"] * 12, "what was there stays"
     (tmp_path / "episodes.csv").write_text("a,b\n1,2\n")
     with pytest.raises(InputError, match="not written by this version"):
-        ResultFolder(tmp_path).claim(json.loads((tmp_path / "settings.json").read_text()), resume=True)
+        Results(tmp_path).claim(json.loads((tmp_path / "settings.json").read_text()), resume=True)
 
 
 def test_going_on_notices_that_an_agent_of_your_own_has_changed(tmp_path):

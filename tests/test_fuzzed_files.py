@@ -35,7 +35,7 @@ from parkenv.studies.benchmark.suite import Suite, check_result
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.report.run_folder import RunFolder
-from parkenv.studies.results import ResultFolder, decision_s
+from parkenv.studies.results import Results, decision_s
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.sensing.surveys import detection_by_distance
 from parkenv.studies.trips.calibration_study import CalibrationStudy
@@ -97,7 +97,7 @@ def scenario(path):
 
 
 def resumed(path):
-    folder = ResultFolder(path.parent)
+    folder = Results(path.parent)
     folder.claim({"seed": 0, "agents": {}}, resume=True)
     for row in folder.rows().values():
         decision_s(row)

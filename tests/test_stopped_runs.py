@@ -21,7 +21,7 @@ from parkenv.errors import InputError
 from parkenv.files import atomic_write
 from parkenv.files.atomic_write import append_text
 from parkenv.files.folder_lock import LOCK, folder_lock
-from parkenv.studies import study, workers
+from parkenv.studies import runner, workers
 from parkenv.studies.workers import Workers
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
@@ -330,7 +330,7 @@ def test_a_comparison_on_a_full_disk_ends_in_a_line_and_is_resumed(tmp_path, mon
 
     with monkeypatch.context() as patched:
         patched.setattr(atomic_write.os, "fsync", full)
-        patched.setattr(study, "SYNC_S", 0.0)
+        patched.setattr(runner, "SYNC_S", 0.0)
         done = parkenv(*arguments, out)
     assert (done.returncode, len(done.stderr.splitlines())) == (2, 1)
     assert f"{out / 'episodes.csv'}: cannot be written: No space left on device" in done.stderr

@@ -14,7 +14,7 @@ from toy_study import Toy
 
 from parkenv import InputError
 from parkenv.studies import study as studies
-from parkenv.studies.study import Interrupted, open_run, run
+from parkenv.studies.runner import Interrupted, open_run, run
 from parkenv.studies.workers import Workers
 
 TOY = Toy(jobs=1)
@@ -114,7 +114,7 @@ def test_a_killed_run_is_resumed_to_the_same_files(tmp_path, number):
     out = tmp_path / "killed"
     script = (
         "import sys, time; from pathlib import Path; from toy_study import Toy\n"
-        "from parkenv.cli.stop_signals import stop_signals; from parkenv.studies.study import run\n"
+        "from parkenv.cli.stop_signals import stop_signals; from parkenv.studies.runner import run\n"
         "with stop_signals(): run(Toy(numbers=400, pause_s=0.02, jobs=2), Path(sys.argv[1]))\n"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])

@@ -14,10 +14,10 @@ from parkenv.mapping.survey import Survey, SurveySettings, drive_together
 from parkenv.mapping.survey_score import METHODS
 from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.runner import run
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.sensing.survey_study import SurveyStudy
 from parkenv.studies.sensing.surveys import map_error
-from parkenv.studies.study import run
 from parkenv.world.occupancy.process import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig

@@ -24,8 +24,8 @@ from parkenv.lots import packaged_lot
 from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.runner import run
 from parkenv.studies.simulate import Observer
-from parkenv.studies.study import run
 from parkenv.studies.trips.calibration import calibrate
 from parkenv.studies.trips.calibration_study import CalibrationStudy
 from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv

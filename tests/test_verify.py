@@ -8,7 +8,7 @@ import pytest
 from command_line import parkenv
 
 from parkenv.errors import InputError
-from parkenv.studies.study import run
+from parkenv.studies.runner import run
 from parkenv.studies.verify import line, looks
 from parkenv.studies.verify.line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
 from parkenv.studies.verify.rows import certain_row, disagreeing, mean_row

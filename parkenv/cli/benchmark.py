@@ -15,7 +15,7 @@ from parkenv.errors import InputError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
 
 PLACES = "-places"
 """End of the name of a suite of places."""

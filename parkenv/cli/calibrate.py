@@ -14,7 +14,7 @@ from parkenv.files.known_names import RigName
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
 
 
 def calibrate(

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
     from parkenv.studies.compare.cases import Case
     from parkenv.studies.compare.comparison import Comparison
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
 
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Default occupancy levels of a comparison."""

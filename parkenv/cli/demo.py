@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from parkenv.studies.demo.study import Demo
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
 
 NEXT = (
     (

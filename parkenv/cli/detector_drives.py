@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
 
 
 def show(console: Console, result: Result) -> None:

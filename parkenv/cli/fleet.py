@@ -14,7 +14,7 @@ from parkenv.studies.results import Row
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
 
 
 def fleet(

@@ -2,27 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
-from parkenv.cli.tables import make_console, progress_bar
+from parkenv.cli.tables import make_console, stages
 from parkenv.cli.trust import require_trust
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError
 
 if TYPE_CHECKING:
-    from parkenv.studies.fleet.setting import Setting
-    from parkenv.studies.fleet.study import FleetStudy
-    from parkenv.studies.report.fleet_recording import FleetDay
-    from parkenv.studies.report.repetition import Cases
     from parkenv.studies.study import ExecutionSpec
-
-PAGE = "report.html"
-EPISODES, SENSED, DAYS = 20, 4, 8
-"""Default number of replayed searches: in general, and with rendered sensors at every step; of days with many cars."""
 
 
 @dataclass(frozen=True)
@@ -84,33 +75,19 @@ def make_report(
     stage: str = "Running again",
     trust: bool = True,
 ) -> Path:
-    """Write the page, and return its path.
+    """Write the page with a progress bar, and return its path.
 
-    The arguments are those of `report`; `drives` are survey drives that are already recorded (None: `replays.sessions`
-    of them are driven again), and `stage` describes the progress bar.
+    The arguments are those of `report`; see `ReportOptions` for `drives`, and `stage` describes the progress bar.
 
     Raises:
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
             are not trusted.
     """
-    from parkenv.files.atomic_write import make_folder
-    from parkenv.show.report.page import write_page
-    from parkenv.studies.replays import Replays as Repeated
-    from parkenv.studies.report.fleet_recording import choose_days, differing_days
-    from parkenv.studies.report.repetition import (
-        differences,
-        drawable,
-        drawable_settings,
-        repeat_drive,
-        replays_of,
-    )
+    from parkenv.studies.agent_spec import split_agents
     from parkenv.studies.report.run_folder import RunFolder
-    from parkenv.studies.report.search_recording import choose, record
+    from parkenv.studies.report.write import ReportOptions, write_report
 
     run = RunFolder.read(folder)
-    make_folder(folder if out is None else out.parent)
-    console = make_console()
-    repeated = Repeated()
     notes: list[str] = []
     spec = None
     try:
@@ -120,87 +97,20 @@ def make_report(
     if spec is not None:
         # The page is made on the machines of this command, not of the run.
         require_trust(spec.changed(address=None), folder, trust)
-    try:
-        repeated = replays_of(run, spec)
-    except (InputError, OSError) as error:
-        # The page still has tables and figures.
-        notes.append(f"There is no replay: {error}")
-    sensed = any(case.rig is not None for case, _ in repeated.searches)
-    wanted = replays.episodes if replays.episodes is not None else SENSED if sensed else EPISODES
-    days: list[FleetDay] = []
-    cases: Cases = []
-    if (fleets := repeated.fleet) is not None:
-        settings, too_large = drawable_settings(fleets, _chosen_settings(fleets, replays.agents))
-        wanted = replays.episodes if replays.episodes is not None else DAYS
-        numbers = replays.replay and _numbers_of(range(fleets.days), replays.replay)
-        days = choose_days(fleets, settings, wanted, numbers or None)
-    else:
-        cases, too_large = drawable(_chosen([*repeated.searches], replays.replay, replays.agents))
-    notes += too_large
-    encounters = choose(cases, wanted) if wanted else []
-    again = range(min(replays.sessions, repeated.sessions) if drives is None else 0)
-    counted = run.totals() if encounters else {}
-    tasks: list[Callable[[], dict[str, Any]]] = []
-    for encounter in encounters:
-        keys = [case.key(encounter.seed) for case in encounter.cases]
-        tasks.append(partial(record, encounter, {k: counted[k] for k in keys if k in counted}))
-    if repeated.survey is not None:
-        frames = replays.frames // max(len(again), 1)
-        tasks += [partial(repeat_drive, *repeated.survey, number, frames) for number in again]
-    day_totals = run.day_totals() if days else {}
-    tasks += [partial(one.record, day_totals) for one in days]
-    with args.workers_of(machines) as workers, progress_bar(console) as progress:
-        bar = progress.add_task(stage, total=len(tasks))
-        done: list[dict[str, Any]] = []
-        for one in workers.in_order(tasks):
-            done.append(one)
-            progress.advance(bar)
-    watched, rest = done[: len(encounters)], done[len(encounters) :]
-    driven, shown = rest[: len(again)], rest[len(again) :]
-    notes += differences(watched) + differing_days(shown)
-    path = out or folder / PAGE
-    write_page(run.page_data(watched, driven if drives is None else drives, shown, notes), path, run.figures)
+    options = ReportOptions(
+        replays.episodes,
+        None if replays.replay is None else args.numbers("--replay", replays.replay),
+        None if replays.agents is None else split_agents(replays.agents),
+        replays.sessions,
+        replays.frames,
+        drives,
+    )
+    console = make_console()
+    with args.workers_of(machines) as workers, stages(console) as progress:
+        path, notes = write_report(
+            run, spec, options, out=out, notes=notes, workers=workers, progress=progress, doing=stage
+        )
     for note in notes:
         console.print(f"Note: {note}")
     console.print(f"Written: {path}, {path.stat().st_size / 1e6:.1f} MB")
     return path
-
-
-def _chosen_settings(fleets: FleetStudy, agents: str | None) -> list[Setting]:
-    """Return the settings with the agents selected by `--agents`."""
-    if agents is None:
-        return fleets.fleet_settings
-    names = _agents_of(list(dict.fromkeys(one.agent.label for one in fleets.fleet_settings)), agents)
-    return [one for one in fleets.fleet_settings if one.agent.label in names]
-
-
-def _chosen(cases: Cases, replay: str | None, agents: str | None) -> Cases:
-    """Return the searches selected by `--replay` and `--agents`."""
-    if agents is not None:
-        names = _agents_of(list(dict.fromkeys(case.label for case, _ in cases)), agents)
-        cases = [(case, numbers) for case, numbers in cases if case.label in names]
-    if replay is not None:
-        wanted = _numbers_of(cases[0][1] if cases else (), replay)
-        cases = [(case, wanted) for case, _ in cases]
-    return cases
-
-
-def _agents_of(known: Sequence[str], agents: str) -> list[str]:
-    """Return the agents that `--agents` names."""
-    from parkenv.studies.agent_spec import split_agents
-
-    for name in (names := split_agents(agents)):
-        if name not in known:
-            raise InputError(f"--agents has {name!r}; {nearest(name, known)}")
-    return names
-
-
-def _numbers_of(known: Sequence[int], replay: str) -> list[int]:
-    """Return the seeds or days that `--replay` names."""
-    theirs = f"{known[0]} to {known[-1]}" if known else "none"
-    wanted: list[int] = []
-    for number in args.numbers("--replay", replay):
-        if number not in known:
-            raise InputError(f"--replay has {number:g}; this run's are {theirs}")
-        wanted.append(int(number))
-    return wanted

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from parkenv.cli import arguments as args
 from parkenv.cli.report import make_report
-from parkenv.cli.tables import command_line, make_console, progress_bar
+from parkenv.cli.tables import command_line, make_console, stages
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import TaskID
 
-    from parkenv.studies.study import Result, Study
+    from parkenv.studies.runner import Result
+    from parkenv.studies.study import Study
 
 
 def run_study(
@@ -32,20 +32,13 @@ def run_study(
         InputError: the study cannot be run, or the folder cannot be used.
         KeyboardInterrupt: the run was interrupted; what is finished is printed and in the folder.
     """
-    from parkenv.studies.study import Interrupted, run
+    from parkenv.studies.runner import Interrupted, run
 
     console = make_console()
-    bars: dict[str, TaskID] = {}
     try:
-        with progress_bar(console, study.unit) as progress:
-
-            def advance(doing: str, done: int, total: int) -> None:
-                if doing not in bars:
-                    bars[doing] = progress.add_task(doing, total=total)
-                progress.update(bars[doing], completed=done)
-
+        with stages(console, study.unit) as progress:
             result = run(
-                study, out, resume=folder.resume, overwrite=folder.overwrite, progress=advance,
+                study, out, resume=folder.resume, overwrite=folder.overwrite, progress=progress,
                 command=command_line(),
             )  # fmt: skip
     except KeyboardInterrupt as stopped:

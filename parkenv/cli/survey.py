@@ -15,8 +15,8 @@ from parkenv.show.plurals import plural
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from parkenv.studies.runner import Result
     from parkenv.studies.sensing.survey_study import SurveyStudy
-    from parkenv.studies.study import Result
 
 MOST_ROWS = 12
 """Slots in the table of a map; files have all."""

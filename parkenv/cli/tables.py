@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ from parkenv.files.file_names import is_plain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress
+    from rich.progress import Progress, TaskID
     from rich.table import Table
 
 WIDE = 200
@@ -61,7 +62,6 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
         BarColumn,
         MofNCompleteColumn,
         Progress,
-        TaskID,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
@@ -85,6 +85,20 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
         console=console,
         disable=not console.is_terminal or console.is_dumb_terminal,
     )
+
+
+@contextmanager
+def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar for each stage of a run during the block; yield a `parkenv.studies.study.Progress`."""
+    bars: dict[str, TaskID] = {}
+    with progress_bar(console, unit) as progress:
+
+        def advance(doing: str, done: int, total: int) -> None:
+            if doing not in bars:
+                bars[doing] = progress.add_task(doing, total=total)
+            progress.update(bars[doing], completed=done)
+
+        yield advance
 
 
 def command_line() -> list[str]:

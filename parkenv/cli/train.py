@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.report import PAGE, make_report
+from parkenv.cli.report import make_report
 from parkenv.cli.single_writer import writing_into
 from parkenv.cli.tables import command_line, make_console, make_table, save_summary
 from parkenv.errors import InputError
@@ -224,7 +224,7 @@ def _claim(out: Path, settings: Row, overwrite: bool) -> None:
     """Write the settings of the new training, and remove the results of the previous one."""
     import shutil
 
-    from parkenv.studies.results import SUMMARY, write_settings
+    from parkenv.studies.results import PAGE, SUMMARY, write_settings
     from parkenv.studies.training.training import FIGURE
 
     # Delete the summary: a folder without one holds an unfinished training.

@@ -15,7 +15,7 @@ from parkenv.files.known_names import VERIFY_CASES
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.study import Result
+    from parkenv.studies.runner import Result
     from parkenv.studies.verify.rows import Row
 
 

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write, make_folder
@@ -28,6 +28,9 @@ from parkenv.files.typed_csv import (
     wholes,
 )
 from parkenv.show.columns import SETTING_AXES
+
+if TYPE_CHECKING:
+    from parkenv.studies.study import Cell, Study
 
 Row = dict[str, Any]
 Key = tuple[Any, ...]
@@ -76,6 +79,7 @@ SPEC_FILE = "experiment.json"
 SETTINGS = "settings.json"
 SUMMARY = "summary.json"
 SUMMARY_PARTIAL = "summary.partial.json"
+PAGE = "report.html"
 
 
 class Table(ABC):
@@ -303,16 +307,20 @@ def episode_key(row: Mapping[str, Any]) -> Key:
     return EPISODES.key(row)
 
 
-class ResultFolder:
-    """Collects rows as they finish.
+class Results:
+    """Finished rows of a study, in memory and in its folder.
 
     Args:
         path: the folder.
         tables: its tables, the most important first.
+
+    Attributes:
+        kept: what this run has found besides, for figures.
     """
 
     def __init__(self, path: Path, tables: Sequence[Table] = (EPISODES,)) -> None:
         self.path, self._tables = path, tables
+        self.kept: dict[str, Any] = {}
         self._rows: dict[str, dict[Key, Row]] = {table.file: {} for table in tables}
 
     def read(self) -> None:
@@ -382,6 +390,11 @@ class ResultFolder:
     def rows(self, table: Table = EPISODES) -> Mapping[Key, Row]:
         """Return the finished rows of a table, by key."""
         return self._rows[table.file]
+
+    def of(self, study: Study, cell: Cell) -> list[Row]:
+        """Return the finished rows of a cell, in the order of its items."""
+        rows = self.rows(study.table)
+        return [rows[key] for item in cell.items for key in study.keys(cell.work, item) if key in rows]
 
     def drop(self, keys: Iterable[Key], table: Table = EPISODES) -> None:
         """Forget rows, which run again."""

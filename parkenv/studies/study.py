@@ -1,49 +1,29 @@
-"""Studies: a specification that says what to run, and the one runner of all kinds of studies.
+"""Studies: specifications that say what to run, and what to make of the rows; `parkenv.studies.runner` runs them.
 
-A study has *cells*, such as an agent in a setting, and a cell has *items*, such as seeds or days. `run` gives blocks of
-items to worker processes and appends the rows that come back to the tables in the folder, so that an interrupted run
-loses nothing that is finished and a resumed one equals an unbroken one.
-
-A new kind of study is a subclass with fields and a few methods, and a line in `STUDIES`. Its module is imported to
-parse a file or an option, so methods import what they run.
+A study has *cells*, such as an agent in a setting, and a cell has *items*, such as seeds or days. A new kind of study
+is a subclass with fields and a few methods, and a line in `STUDIES`. Its module is imported to parse a file or an
+option, so methods import what they run.
 """
 
 from __future__ import annotations
 
-import math
-import re
-import shutil
-import time
-import warnings
-import weakref
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass
-from functools import partial
 from importlib import import_module
 from pathlib import Path
-from tempfile import mkdtemp
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
-from uuid import uuid4
 
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.errors import InputError, nearest
-from parkenv.files.folder_lock import only_writer
 from parkenv.files.known_names import BackendName
-from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Option
 from parkenv.files.spec_file import Spec, read_tables
 from parkenv.studies.results import (
     EPISODES,
-    SETTINGS,
-    SPEC_FILE,
-    SUMMARY,
     GoesOn,
     Key,
-    ResultFolder,
+    Results,
     Row,
     Table,
 )
@@ -51,6 +31,8 @@ from parkenv.studies.workers import Task, Workers
 
 if TYPE_CHECKING:
     from parkenv.studies.replays import Replays
+    from parkenv.studies.results import Results
+    from parkenv.studies.runner import Result
 
 STUDIES: Mapping[str, str] = {
     "compare": "parkenv.studies.compare.comparison:Comparison",
@@ -65,8 +47,7 @@ STUDIES: Mapping[str, str] = {
     "train": "parkenv.studies.training.spec:TrainingSpec",
 }
 """`MODULE:CLASS` of each kind of study, by the key `kind` of its files."""
-SYNC_S = 1.0
-"""Least time between two flushes of finished rows to disk if they come faster, s."""
+
 
 Progress = Callable[[str, int, int], None]
 """Called with what is going on, how much of it is finished, and of how much."""
@@ -222,83 +203,6 @@ class Stage(NamedTuple):
     cells: Sequence[Cell]
 
 
-class Results(ResultFolder):
-    """Finished rows of a study, in memory and in its folder.
-
-    Attributes:
-        kept: what this run has found besides, for figures.
-    """
-
-    def __init__(self, path: Path, tables: Sequence[Table]) -> None:
-        super().__init__(path, tables)
-        self.kept: dict[str, Any] = {}
-
-    def of(self, study: Study, cell: Cell) -> list[Row]:
-        """Return the finished rows of a cell, in the order of its items."""
-        rows = self.rows(study.table)
-        return [rows[key] for item in cell.items for key in study.keys(cell.work, item) if key in rows]
-
-
-@dataclass(frozen=True, eq=False)
-class Result:
-    """What a study has found.
-
-    Attributes:
-        study: the study.
-        results: its finished rows, and their folder.
-        summary: content of `summary.json`; NaN where that has null.
-    """
-
-    study: Study
-    results: Results
-    summary: Row
-
-    @property
-    def folder(self) -> Path:
-        """The folder with the tables; removed with this result if none was given."""
-        return self.results.path
-
-    @property
-    def rows(self) -> list[Row]:
-        """Rows of the summary, such as one for each agent in each setting."""
-        rows: list[Row] = self.summary["rows"]
-        return rows
-
-    @property
-    def complete(self) -> bool:
-        """Whether everything is finished."""
-        return bool(self.summary["complete"])
-
-    def frame(self) -> Any:
-        """Return `rows` as a pandas `DataFrame`.
-
-        Raises:
-            InputError: pandas is not installed.
-        """
-        try:
-            pandas = import_module("pandas")
-        except ImportError as error:
-            raise InputError("frame() needs pandas: pip install pandas") from error
-        return pandas.DataFrame(self.rows)
-
-    def figures(self) -> list[Path]:
-        """Draw all figures into the folder; return the PNG files there."""
-        _draw(self, lambda *_: None)
-        return sorted(self.folder.glob("*.png"))
-
-
-class Interrupted(KeyboardInterrupt):
-    """A run was interrupted (Ctrl-C); finished rows are in its folder.
-
-    Attributes:
-        result: what is finished.
-    """
-
-    def __init__(self, result: Result) -> None:
-        super().__init__()
-        self.result = result
-
-
 def study_class(kind: object, source: str = "") -> type[Any]:
     """Return the class of a kind of study.
 
@@ -321,181 +225,3 @@ def read_study(file: Path) -> Any:
     tables = read_tables(file)
     study = study_class(tables.get("kind", "compare"), str(file))
     return study.parse(tables, str(file), file.parent).of_file(file)
-
-
-def run(
-    study: Study,
-    folder: Path | str | None = None,
-    *,
-    resume: bool = False,
-    overwrite: bool = False,
-    progress: Progress = lambda *_: None,
-    workers: Workers | None = None,
-    command: Sequence[str] | None = None,
-) -> Result:
-    """Run a study; skip what its folder already holds.
-
-    The folder gets the specification (`experiment.json`), the settings (`settings.json`), the tables, the figures and
-    the summary (`summary.json`).
-
-    Args:
-        study: the study.
-        folder: where the results go; None for a temporary folder that lasts as long as the result.
-        resume: continue an earlier run.
-        overwrite: replace the results of another run.
-        progress: called as rows finish; see `Progress`.
-        workers: where tasks run, if not as the study says; results do not depend on it.
-        command: command line to record in the summary.
-
-    Raises:
-        InputError: the study cannot be run, or the folder cannot be used.
-        Interrupted: Ctrl-C; the exception holds the result so far.
-    """
-    study.check()
-    if folder is None:
-        path = Path(mkdtemp(prefix="parkenv-"))
-        try:
-            result = run(study, path, progress=progress, workers=workers, command=command)
-        except Interrupted as stopped:
-            weakref.finalize(stopped.result, shutil.rmtree, path)
-            raise
-        except BaseException:
-            shutil.rmtree(path)
-            raise
-        weakref.finalize(result, shutil.rmtree, path)
-        return result
-    path = Path(folder)
-    with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
-        results = Results(path, study.all_tables or (study.table,))
-        settings, continues = results.claim(
-            study.settings(), study.kind, resume=resume, overwrite=overwrite, goes_on=study.goes_on
-        )
-        study.prepare(results, continues=continues)
-        results.begin(settings)
-        study.write(path / SPEC_FILE)
-        done: list[Stage] = []
-        try:
-            _run_all("Compiling, once per installation", study.warm_up(), used, progress)
-            for stage in study.stages(results):
-                done.append(stage)
-                _run_stage(stage, results, used, progress)
-            interrupted = False
-        except KeyboardInterrupt:
-            interrupted = True
-        _put_in_order(done, results)
-        head = {
-            "command": list(command or ("parkenv", study.kind)),
-            "version": __version__,
-            "seed": getattr(study, "seed", None),
-        }
-        summary = head | {"complete": not interrupted} | study.summarise(results)
-        result = Result(study, results, summary)
-        if interrupted:
-            results.finish(summary, complete=False)
-            raise Interrupted(result)
-        if getattr(study, "figures", True):
-            _draw(result, progress)
-        results.finish(summary)
-    return result
-
-
-def open_run(folder: Path | str) -> Result:
-    """Read the finished run in a folder.
-
-    Raises:
-        InputError: there is none, or a file is damaged.
-    """
-    path = Path(folder)
-    for name in (SPEC_FILE, SETTINGS, SUMMARY):
-        if not (path / name).exists():
-            raise InputError(f"{path}: holds no finished run: no {name}")
-    study = read_study(path / SPEC_FILE)
-    results = Results(path, study.all_tables or (study.table,))
-    results.read()
-    return Result(study, results, read_json(path / SUMMARY))
-
-
-def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
-    """Put the rows of all stages in the order of their cells; a cell may be in several stages."""
-    order: dict[Table, dict[int, list[Key]]] = {}
-    for _, study, cells in stages:
-        of_table = order.setdefault(study.table, {})
-        for work, items in cells:
-            of_table.setdefault(id(work), []).extend(key for item in items for key in study.keys(work, item))
-    for table, of_cells in order.items():
-        results.put_in_order([key for keys in of_cells.values() for key in keys], table)
-
-
-def _draw(result: Result, progress: Progress) -> None:
-    """Write the outputs, in processes of this machine: only they can write the folder."""
-    with Workers(result.study.jobs or None) as workers:
-        _run_all("Drawing figures", result.study.outputs(result), workers, progress)
-
-
-def _run_all(doing: str, tasks: Sequence[Task[object]], workers: Workers, progress: Progress) -> None:
-    if tasks:
-        progress(doing, 0, len(tasks))
-    for number, _ in enumerate(workers.results(tasks), start=1):
-        progress(doing, number, len(tasks))
-
-
-def _run_stage(stage: Stage, results: Results, workers: Workers, progress: Progress) -> None:
-    """Run what the results do not hold yet, and add it.
-
-    Raises:
-        KeyboardInterrupt: passed on; finished rows are in the folder.
-    """
-    doing, study, cells = stage
-    finished = results.rows(study.table)
-    blocks: list[tuple[Any, Sequence[Any]]] = []
-    total = missing = 0
-    for work, items in cells:
-        left = []
-        for item in items:
-            keys = study.keys(work, item)
-            total += len(keys)
-            if any(key not in finished for key in keys):
-                missing += len(keys)
-                left.append(item)
-        blocks += [(work, left[i : i + study.block]) for i in range(0, len(left), study.block)]
-    done = total - missing
-    progress(doing, done, total)
-    token = "" if workers.in_process else uuid4().hex
-    tasks = [
-        partial(_run_block, token, study, study.enough(work, block, results), block) for work, block in blocks
-    ]
-    shown: set[tuple[str, str]] = set()
-    synced = -math.inf
-    numbered = enumerate(workers.in_order(tasks)) if study.keeps_order else workers.results(tasks)
-    for number, (rows, messages) in numbered:
-        work = blocks[number][0]
-        study.keep(work, rows, results)
-        # A row may take a millisecond, and a flush to disk a second.
-        sync = time.monotonic() >= synced + SYNC_S
-        results.add(rows, study.table, sync=sync)
-        synced = time.monotonic() if sync else synced
-        done += len(rows)
-        progress(doing, done, total)
-        for message in messages:
-            # Numbers in the text differ between items.
-            topic = study.label(work), re.sub(r"\d+", "", message)
-            if topic not in shown:
-                shown.add(topic)
-                warnings.warn(f"{topic[0]}: {message}", stacklevel=2)
-
-
-_KEPT: dict[str, Study] = {}
-"""The study of a worker process, by its token: it keeps its scenarios for the next block."""
-
-
-def _run_block(token: str, study: Study, work: Any, items: Sequence[Any]) -> tuple[list[Row], list[str]]:
-    """Run a block; return its rows and its warnings, which would not reach the user in order from a worker process."""
-    if token:
-        if token not in _KEPT:
-            _KEPT.clear()
-            _KEPT[token] = study
-        study = _KEPT[token]
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("default")
-        rows = study.run(work, items)
-    return rows, [str(w.message) for w in caught]

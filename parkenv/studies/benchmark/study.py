@@ -11,12 +11,13 @@ from parkenv import __version__
 from parkenv.files.spec_file import Several
 from parkenv.studies.agent_spec import AgentItem, AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
-from parkenv.studies.results import Row, write_summary
-from parkenv.studies.study import Cell, Result, Results
+from parkenv.studies.results import Results, Row, write_summary
+from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.studies.benchmark.suite import Suite
+    from parkenv.studies.runner import Result
 
 RESULT = "result.json"
 AGENTS = ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")

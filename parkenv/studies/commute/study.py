@@ -16,13 +16,14 @@ from parkenv.files.spec_file import Axis, Several
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentItem, AgentSpec
 from parkenv.studies.fields import MAX_EPISODES, Scenarios, Seed, listed, require_distinct_names
-from parkenv.studies.results import OUTCOME_COLUMNS, CsvTable, Key, Row
-from parkenv.studies.study import Cell, Result, Results, Stage, Study
+from parkenv.studies.results import OUTCOME_COLUMNS, CsvTable, Key, Results, Row
+from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.trips import Trip
     from parkenv.studies.commute.runs import CommuteRun, Day
+    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 MAX_DAYS = 3_650

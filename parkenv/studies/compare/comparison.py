@@ -29,14 +29,15 @@ from parkenv.studies.fields import (
     Values,
     require_distinct_names,
 )
-from parkenv.studies.results import Row
-from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.results import Results, Row
+from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.compare.cases import Case
     from parkenv.studies.replays import Replays
+    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 DEFAULT_AGENTS = (

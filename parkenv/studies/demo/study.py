@@ -15,16 +15,17 @@ from parkenv.files.known_names import RigName
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.comparison import CaseStudy
 from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, ScenarioItem, Seed
-from parkenv.studies.results import EPISODES, Row, Table
+from parkenv.studies.results import EPISODES, Results, Row, Table
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
-from parkenv.studies.study import Cell, Result, Results, Stage
+from parkenv.studies.study import Cell, Stage
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SessionResult
     from parkenv.studies.replays import Replays
+    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 AGENTS = ("mdp", "belief", "first-free", "greedy-drive", "oracle")

@@ -29,8 +29,8 @@ from parkenv.studies.fields import (
     require_distinct_names,
 )
 from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS, Setting
-from parkenv.studies.results import CsvTable, Row
-from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.results import CsvTable, Results, Row
+from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.fleet.measures import Roads
     from parkenv.studies.replays import Replays
+    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 MAX_SETTINGS = 10_000

@@ -15,13 +15,14 @@ from parkenv.files.known_names import RigName
 from parkenv.files.spec_file import Axis, DetectorName
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.fields import CaptureDistance, ScenarioItem, Seed
-from parkenv.studies.results import Key, Row
+from parkenv.studies.results import Key, Results, Row
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSION_COLUMNS, SessionTable
 from parkenv.studies.sensing.survey_study import DRIVEN, SurveyStudy
-from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
+    from parkenv.studies.runner import Result
     from parkenv.studies.sensing.detector_surveys import DetectorSurvey, SurveyedDrive
 
 

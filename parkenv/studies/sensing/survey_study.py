@@ -14,14 +14,15 @@ from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import Hours, scenario_spec
 from parkenv.studies.fields import BUSY, CaptureDistance, Detector, ScenarioItem, Seed
-from parkenv.studies.results import Key, Row
+from parkenv.studies.results import Key, Results, Row
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
-from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
     from parkenv.studies.replays import Replays
+    from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
 PICTURES = 4

@@ -16,13 +16,14 @@ from parkenv.files.known_names import RigName
 from parkenv.scenarios.spec import Speed, scenario_spec
 from parkenv.studies.agent_spec import AgentItem, AgentSpec
 from parkenv.studies.fields import Detector, OneScenario, Seed
-from parkenv.studies.results import JsonTable, Row
-from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.results import JsonTable, Results, Row
+from parkenv.studies.study import Cell, Study
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
+    from parkenv.studies.runner import Result
     from parkenv.studies.trips.driven_search import DrivenSearch
     from parkenv.studies.trips.vehicle_controller import DrivingStyle
     from parkenv.world.scenario import Scenario

@@ -15,10 +15,11 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import VERIFY_CASES
 from parkenv.files.spec_file import Axis
 from parkenv.studies.fields import Seed
-from parkenv.studies.results import JsonTable, Row
-from parkenv.studies.study import Cell, Result, Results, Study
+from parkenv.studies.results import JsonTable, Results, Row
+from parkenv.studies.study import Cell, Study
 
 if TYPE_CHECKING:
+    from parkenv.studies.runner import Result
     from parkenv.studies.verify import rows as statements
     from parkenv.studies.workers import Task
 
