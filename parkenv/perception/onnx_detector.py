@@ -21,6 +21,7 @@ from parkenv.perception.car_regions import END_ASPECT, END_CAR, END_WIDEST, SIDE
 from parkenv.perception.detector import LEAST_PROBABILITY, Detections
 from parkenv.perception.hog_detector import as_grey, best_boxes
 from parkenv.perception.onnx_outputs import (
+    LAYOUTS,
     Layout,
     Scores,
     class_columns,
@@ -38,7 +39,6 @@ CAR_NAMES = ("car", "cars", "van", "truck", "bus", "pickup", "suv", "vehicle", "
 """Names of classes that count as cars where the file names its classes: whatever takes a slot."""
 _COCO = {1: (0,), 80: (2, 5, 7), 91: (3, 6, 8), 92: (3, 6, 8)}
 """Cars (car, bus, truck) by the number of class scores: a single class, COCO's 80, and DETR's numbering of them."""
-_IMAGENET = ((123.675, 116.28, 103.53), (58.395, 57.12, 57.375))
 _NAME = re.compile(r"(\d{1,6})['\"]?\s*:\s*['\"]([^'\"]{1,80})['\"]", re.ASCII)
 _IMGSZ = re.compile(r"\[\s*(\d{1,5})\s*,\s*(\d{1,5})\s*\]", re.ASCII)
 
@@ -319,25 +319,28 @@ def _planned(file: OnnxFile, settings: OnnxSettings, run: Any, *, is_known: bool
         classes = class_columns(layout, shapes, grid)
     except InputError as error:
         raise InputError(f"{file.name}: layout {layout!r} does not fit {described}: {error}") from error
-    mean, std = _IMAGENET if layout == "detr" and channels == "rgb" else ((0.0,), (255.0,))
-    many = layout == "detr"
+    rule = LAYOUTS[layout]
+    # Means and deviations of colours say nothing of other channels.
+    usual = rule if channels == "rgb" else LAYOUTS["yolo"]
+    scores: Scores = "probabilities"
+    if layout == "detr":
+        scores = "softmax" if classes in (2, 92) else "logits"
     return _Plan(
         layout=layout,
         outputs=names,
         size=size,
-        letterbox=(s.resize or ("stretch" if many else "letterbox")) == "letterbox",
+        letterbox=(s.resize or rule.resize) == "letterbox",
         enlarge=s.enlarge,
         mirror=s.mirror,
         pad=s.pad,
         channels=channels,
-        mean=_per_channel("mean", s.mean or mean, count, beside),
-        std=_per_channel("std", s.std or std, count, beside),
-        corners=(s.box or ("corners" if layout in ("boxes", "centers") else "center")) == "corners",
-        fractions=(s.unit or ("fractions" if many else "pixels")) == "fractions",
-        scores=s.scores
-        or ("probabilities" if not many else "softmax" if classes in (2, 92) else "logits"),
+        mean=_per_channel("mean", s.mean or usual.mean, count, beside),
+        std=_per_channel("std", s.std or usual.std, count, beside),
+        corners=(s.box or rule.box) == "corners",
+        fractions=(s.unit or rule.unit) == "fractions",
+        scores=s.scores or scores,
         cars=() if layout == "centers" else _cars(file, s, classes, named, beside),
-        overlap=s.overlap or (1.0 if layout == "boxes" else 0.5),
+        overlap=s.overlap or rule.overlap,
         grid=grid,
     )  # fmt: skip
 

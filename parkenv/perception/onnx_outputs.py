@@ -17,6 +17,30 @@ Float32Array = NDArray[np.float32]
 Layout = Literal["yolo", "yolo5", "boxes", "detr", "centers"]
 Scores = Literal["probabilities", "logits", "softmax"]
 
+
+class LayoutRule(NamedTuple):
+    """What a layout is, and the settings that networks of it usually have."""
+
+    wants: str  # its outputs, for messages
+    before: int = 0  # numbers of a candidate before its class scores
+    resize: Literal["letterbox", "stretch"] = "letterbox"
+    box: Literal["center", "corners"] = "center"
+    unit: Literal["pixels", "fractions"] = "pixels"
+    overlap: float = 0.5
+    mean: tuple[float, ...] = (0.0,)  # of three channels
+    std: tuple[float, ...] = (255.0,)
+
+
+LAYOUTS: dict[Layout, LayoutRule] = {
+    "yolo": LayoutRule("one output (1, 4 + classes, n)", before=4),
+    "yolo5": LayoutRule("one output (1, n, 5 + classes)", before=5),
+    "boxes": LayoutRule("one output (1, n, 6)", box="corners", overlap=1.0),
+    "detr": LayoutRule(
+        "scores (1, n, classes) and boxes (1, n, 4)", resize="stretch", unit="fractions",
+        mean=(123.675, 116.28, 103.53), std=(58.395, 57.12, 57.375),
+    ),
+    "centers": LayoutRule("one output (1, 9, rows, columns)", box="corners"),
+}  # fmt: skip
 BOXES_MOST = 1_000  # most rows of a network that suppresses non-maxima itself
 _STRIDES = (8, 16, 32, 64)
 _CENTER_NUMBERS = 9
@@ -70,26 +94,21 @@ def class_columns(layout: Layout, shapes: Sequence[tuple[int, ...]], grid: bool)
     Raises:
         InputError: the layout does not fit the shapes; the message says what it wants.
     """
+    rule = LAYOUTS[layout]
     if layout == "centers":
-        if len(shapes) == 1 and _is_centers(shapes[0]):
-            return None
-        raise InputError(f"want one output (1, {_CENTER_NUMBERS}, rows, columns)")
-    fits = all(len(shape) == 3 and shape[0] == 1 for shape in shapes)
-    if layout == "detr":
-        if fits and len(shapes) == 2 and shapes[0][1] == shapes[1][1] and shapes[1][2] == 4:
-            return shapes[0][2]
-        raise InputError("want scores (1, n, classes) and boxes (1, n, 4)")
-    if fits and len(shapes) == 1:
-        _, rows, columns = shapes[0]
-        width = rows if layout == "yolo" and grid else columns
-        if layout == "boxes" and width == 6:
-            return None
-        if layout == "yolo" and width > 4:
-            return width - 4
-        if layout == "yolo5" and width > 5:
-            return width - 5
-    wanted = {"yolo": "(1, 4 + classes, n)", "yolo5": "(1, n, 5 + classes)", "boxes": "(1, n, 6)"}
-    raise InputError(f"want one output {wanted[layout]}")
+        fits, classes = len(shapes) == 1 and _is_centers(shapes[0]), None
+    elif layout == "detr":
+        fits = len(shapes) == 2 and shapes[0][:2] == shapes[1][:2] and shapes[1][2:] == (4,)
+        classes = shapes[0][-1]
+    else:
+        width = shapes[0][1 if layout == "yolo" and grid else -1]
+        fits = len(shapes) == 1 and (width == 6 if layout == "boxes" else width > rule.before)
+        classes = None if layout == "boxes" else width - rule.before
+    if layout != "centers":
+        fits = fits and all(len(shape) == 3 and shape[0] == 1 for shape in shapes)
+    if not fits:
+        raise InputError(f"want {rule.wants}")
+    return classes
 
 
 def decode(
