@@ -319,7 +319,8 @@ FORMATS = [
     Format("turbo.geojson", json.loads(car_park().geojson()), mutated_json, imported),
     Format(
         "slots.csv",
-        "id,x,y,yaw\n" + "".join(f"s{i}{j},{2.5 * i},{j},{0.3 * j - 1.57}\n" for i in range(9) for j in (0, 11)),
+        "id,x,y,yaw\n"
+        + "".join(f"s{i}{j},{2.5 * i},{j},{0.3 * j - 1.57}\n" for i in range(9) for j in (0, 11)),
         mutated_text,
         imported,
     ),

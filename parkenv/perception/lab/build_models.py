@@ -17,7 +17,7 @@ from parkenv.perception.hog import Descriptor
 from parkenv.perception.lab.simulated_photos import FRAMES, SimulatedPhoto, simulated_photos
 from parkenv.perception.lab.training import TrainingSettings, train
 
-FOLDER = Path(__file__).parent / "models"
+FOLDER = Path(__file__).parents[1] / "models"
 
 
 def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], None]) -> dict[str, CarModel]:
