@@ -34,37 +34,21 @@ def has_lines(path, count):
         time.sleep(0.02)
 
 
-@pytest.mark.parametrize(
-    ("name", "number", "file", "lines"),
-    [
-        ("compare", signal.SIGTERM, "episodes.csv", 5),
-        ("fleet", signal.SIGTERM, "days.csv", 5),
-        ("calibrate", signal.SIGKILL, "trips.jsonl", 2),
-    ],
-)
-def test_a_stopped_run_leaves_no_process_and_is_resumed_to_the_same_result(
-    tmp_path, name, number, file, lines
-):
+def test_a_stopped_command_leaves_no_process_and_is_resumed_to_the_same_result(tmp_path):
     out = tmp_path / "out"
-    run = Run(name, out)
-    has_lines(out / file, lines)
-    code, output, errors = run.stop(number)
+    command = Run("compare", out)
+    has_lines(out / "episodes.csv", 5)
+    code, output, errors = command.stop(signal.SIGTERM)
     assert "Traceback" not in errors
-    if number == signal.SIGTERM:
-        assert code == 143
-        assert f"parkenv run {out} --resume goes on" in " ".join(output.split())
-        summary = json.loads((out / "summary.partial.json").read_text())
-        counted = "days" if name == "fleet" else "episodes"
-        episodes = sum(row[counted] for row in summary["rows"])
-        assert (summary["complete"], episodes) == (False, len((out / file).read_text().splitlines()) - 1)
-    else:
-        assert code == -signal.SIGKILL
-    kept = (out / file).read_text().splitlines()
-    assert len(kept) > lines
-    resume(name, out)
-    assert set(kept[1:-1]) <= set((out / file).read_text().splitlines())
-    finished(name, tmp_path / "whole")
-    assert result_of(name, out) == result_of(name, tmp_path / "whole")
+    assert code == 143
+    assert f"parkenv run {out} --resume goes on" in " ".join(output.split())
+    summary = json.loads((out / "summary.partial.json").read_text())
+    kept = (out / "episodes.csv").read_text().splitlines()
+    assert (summary["complete"], sum(row["episodes"] for row in summary["rows"])) == (False, len(kept) - 1)
+    resume("compare", out)
+    assert set(kept) <= set((out / "episodes.csv").read_text().splitlines())
+    finished("compare", tmp_path / "whole")
+    assert result_of("compare", out) == result_of("compare", tmp_path / "whole")
 
 
 @pytest.mark.slow

@@ -134,7 +134,7 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
 
 def rows_of(
     agents: Sequence[AgentSpec],
-    places: Scenario | Sequence[Scenario],
+    scenarios: Scenario | Sequence[Scenario],
     seeds: Sequence[int],
     workers: Workers,
     name: str | None = None,
@@ -143,15 +143,15 @@ def rows_of(
 
     Args:
         agents: the agents.
-        places: a scenario; or several, of which each seed draws one as the environment does.
+        scenarios: a scenario; or several, of which each seed draws one as the environment does.
         seeds: one search each.
         workers: where they run.
-        name: name of the places in the rows; that of the first if absent.
+        name: name of the scenarios in the rows; that of the first if absent.
     """
-    places = [places] if isinstance(places, Scenario) else places
+    several = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     work: list[tuple[Case, Sequence[int]]] = []
-    for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
-        cases = [Case(place, agent.name, options=agent.options) for agent in agents]
+    for scenario, its in zip(several, seeds_by_place(seeds, len(several)), strict=True):
+        cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
         require_distinct(cases)
         work += [(case, its[i : i + BLOCK]) for case in cases for i in range(0, len(its), BLOCK)]
     episodes: dict[str, list[Row]] = {case.label: [] for case in cases}
@@ -159,7 +159,7 @@ def rows_of(
         episodes[work[number][0].label] += rows
     by_seed = {label: sorted(rows, key=lambda row: row["seed"]) for label, rows in episodes.items()}
     first = by_seed[cases[0].label]
-    columns = {"scenario": places[0].name if name is None else name}
+    columns = {"scenario": several[0].name if name is None else name}
     return [
         summarize(case.columns | columns, by_seed[case.label], None if i == 0 else first)
         for i, case in enumerate(cases)
@@ -223,9 +223,9 @@ def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float])
     """
     bins: dict[tuple[Any, ...], list[Mapping[str, Any]]] = defaultdict(list)
     for row in rows:
-        place = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
-        if 0 <= place < len(edges) - 1:
-            bins[row["agent"], row["failure_cost_s"], place].append(row)
+        number = int(np.searchsorted(edges, row["occupancy"], side="right")) - 1
+        if 0 <= number < len(edges) - 1:
+            bins[row["agent"], row["failure_cost_s"], number].append(row)
     result = []
     for (agent, failure, _), inside in sorted(bins.items(), key=lambda item: item[0][1:]):
         mean, low, high = mean_interval([r["total_s"] for r in inside])
