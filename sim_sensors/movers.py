@@ -40,16 +40,14 @@ class Movers:
             object.__setattr__(self, name, pose)
             numbers = np.array(getattr(self, rows), dtype=np.int64)
             if numbers.shape != (len(pose),) or numbers.min(initial=0) < 0:
-                raise SensorError(
-                    f"{rows}: wanted ({len(pose)},) integers of 0 or more, got {numbers.tolist()}"
-                )
+                raise SensorError(f"{rows} is {numbers.tolist()}, want ({len(pose)},) integers of 0 or more")
             object.__setattr__(self, rows, numbers)
         stride = floats("walker_stride", np.reshape(self.walker_stride, (-1, 1)), 1)[:, 0]
         if len(stride) != self.n_walkers:
-            raise SensorError(f"walker_stride: wanted {self.n_walkers} phases, got {len(stride)}")
+            raise SensorError(f"walker_stride has {len(stride)} phases, want {self.n_walkers}")
         object.__setattr__(self, "walker_stride", stride)
         if self.walker_look.max(initial=0) >= LOOKS:
-            raise SensorError(f"walker_look: wanted 0 to {LOOKS - 1}, got {self.walker_look.tolist()}")
+            raise SensorError(f"walker_look is {self.walker_look.tolist()}, want 0 to {LOOKS - 1}")
 
     @property
     def n_vehicles(self) -> int:

@@ -154,11 +154,9 @@ class Scene:
         pose = floats("vehicle_pose", self.vehicle_pose, 3)
         model = np.array(self.vehicle_model, dtype=np.int64)
         if model.shape != (len(pose),):
-            raise SensorError(f"vehicle_model: wanted shape ({len(pose)},), got {model.shape}")
+            raise SensorError(f"vehicle_model has shape {model.shape}, want ({len(pose)},)")
         if len(model) and not (model.min() >= NO_VEHICLE and model.max() < len(self.fleet.models)):
-            raise SensorError(
-                f"vehicle_model: wanted -1 to {len(self.fleet.models) - 1}, got {model.tolist()}"
-            )
+            raise SensorError(f"vehicle_model is {model.tolist()}, want -1 to {len(self.fleet.models) - 1}")
         self._set(pose, model, self.fleet)
         pairs = overlapping(pose[self.present], self.fleet.sizes[model[self.present]])
         if len(pairs):
@@ -200,12 +198,12 @@ class Scene:
         pose = floats("poses", poses, 3)
         seed = np.asarray(seeds)
         if seed.shape != (len(pose),) or (len(pose) and not np.issubdtype(seed.dtype, np.integer)):
-            raise SensorError(f"seeds: wanted ({len(pose)},) integers, got {seed.shape} of {seed.dtype}")
+            raise SensorError(f"seeds has shape {seed.shape} of {seed.dtype}, want ({len(pose)},) integers")
         models: dict[VehicleModel, int] = {}
         index = []
         for name, column in (("bodies", bodies), ("paints", paints)):
             if column is not None and len(column) != len(pose):
-                raise SensorError(f"{name}: wanted {len(pose)} entries, got {len(column)}")
+                raise SensorError(f"{name} has {len(column)} entries, want {len(pose)}")
         for i, number in enumerate(seed.tolist()):
             model = VehicleModel.from_seed(None if bodies is None else bodies[i], number)
             paint = None if paints is None else paints[i]
@@ -351,7 +349,7 @@ class Scene:
                 fleet = fleet.with_model(model)
             number = fleet.models.index(model)
         if number == NO_VEHICLE:
-            raise SensorError(f"model: place {i} is empty, wanted a model for it")
+            raise SensorError(f"model: place {i} is empty, want a model for it")
         return self._changed(i, self.vehicle_pose[i] if pose is None else pose, number, fleet)
 
     def without_vehicle(self, i: int) -> Scene:
@@ -370,7 +368,7 @@ class Scene:
         """
         if movers is not None and movers.vehicle_model.max(initial=0) >= len(self.fleet.models):
             raise SensorError(
-                f"vehicle_model: wanted 0 to {len(self.fleet.models) - 1}, got {movers.vehicle_model.tolist()}"
+                f"vehicle_model is {movers.vehicle_model.tolist()}, want 0 to {len(self.fleet.models) - 1}"
             )
         if movers is self.movers:
             return self
@@ -381,7 +379,7 @@ class Scene:
 
     def _check_place(self, i: int) -> None:
         if not 0 <= i < self.n_vehicles:
-            raise SensorError(f"place: wanted 0 to {self.n_vehicles - 1}, got {i}")
+            raise SensorError(f"place is {i}, want 0 to {self.n_vehicles - 1}")
 
     def _changed(self, i: int, pose: ArrayLike, number: int, fleet: Fleet) -> Scene:
         new_pose, new_model = self.vehicle_pose.copy(), self.vehicle_model.copy()

@@ -197,7 +197,7 @@ def _ears(corner: FloatArray) -> list[tuple[int, int, int]]:
                 left.pop(at)
                 break
         else:
-            raise SensorError(f"outline: wanted a simple polygon, got {corner.tolist()}")
+            raise SensorError(f"outline is {corner.tolist()}, want a simple polygon")
     return [*triangles, (left[0], left[1], left[2])]
 
 

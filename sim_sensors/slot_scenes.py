@@ -45,9 +45,9 @@ class ParkingManners:
         for name in ("lateral_m", "along_m", "yaw_rad", "door_room_m", "overhang_m"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0):
-                raise SensorError(f"{name}: wanted a finite number of 0 or more, got {value}")
+                raise SensorError(f"{name} is {value}, want a finite number of 0 or more")
         if not 0.0 <= self.nose_out <= 1.0:
-            raise SensorError(f"nose_out: wanted a share from 0 to 1, got {self.nose_out}")
+            raise SensorError(f"nose_out is {self.nose_out}, want a share from 0 to 1")
 
 
 @lru_cache(maxsize=4)
@@ -94,26 +94,24 @@ class SlotLot:
         for name in ("slot_yaw", "slot_length", "slot_width"):
             value = np.asarray(getattr(self, name), dtype=np.float64)
             if value.shape not in ((), (n,)):
-                raise SensorError(f"{name}: wanted shape ({n},), got {value.shape}")
+                raise SensorError(f"{name} has shape {value.shape}, want ({n},)")
             column = floats(name, np.broadcast_to(value, (n,)).reshape(-1, 1), 1)[:, 0]
             if name != "slot_yaw" and (column <= 0).any():
-                raise SensorError(f"{name}: wanted lengths above 0 m, got {column.min()}")
+                raise SensorError(f"{name} is {column.min()}, want lengths above 0 m")
             object.__setattr__(self, name, column)
         if np.asarray(self.kerbside).shape not in ((), (n,)):
-            raise SensorError(f"kerbside: wanted shape ({n},), got {np.asarray(self.kerbside).shape}")
+            raise SensorError(f"kerbside has shape {np.asarray(self.kerbside).shape}, want ({n},)")
         object.__setattr__(self, "kerbside", np.broadcast_to(np.asarray(self.kerbside, dtype=bool), (n,)))
         if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise SensorError(f"seed: wanted an integer, 0 or more, got {self.seed!r}")
+            raise SensorError(f"seed is {self.seed!r}, want an integer, 0 or more")
         if self.n_models < 1:
-            raise SensorError(f"n_models: wanted 1 or more, got {self.n_models}")
+            raise SensorError(f"n_models is {self.n_models}, want 1 or more")
         if self.surroundings is None:
             object.__setattr__(self, "surroundings", slot_surroundings(self))
         lonely = [i for i in range(n) if not len(self.fitting[i])]
         if lonely:
             length, width = self._column("slot_length")[lonely[0]], self._column("slot_width")[lonely[0]]
-            raise SensorError(
-                f"slot {lonely[0]}: no vehicle fits {length} m × {width} m, wanted a larger slot"
-            )
+            raise SensorError(f"slot {lonely[0]}: no vehicle fits {length} m × {width} m, want a larger slot")
 
     def _column(self, name: str) -> FloatArray:
         return np.asarray(getattr(self, name))
@@ -178,14 +176,14 @@ class SlotLot:
         n = len(self._column("slot_xy"))
         taken = np.asarray(occupied)
         if taken.shape != (n,) or taken.dtype != bool:
-            raise SensorError(f"occupied: wanted ({n},) bool, got {taken.shape} of {taken.dtype}")
+            raise SensorError(f"occupied has shape {taken.shape} of {taken.dtype}, want ({n},) bool")
         number = np.asarray(arrivals)
         if (
             number.shape not in ((), (n,))
             or not np.issubdtype(number.dtype, np.integer)
             or (number < 0).any()
         ):
-            raise SensorError(f"arrivals: wanted ({n},) integers of 0 or more, got {arrivals!r}")
+            raise SensorError(f"arrivals is {arrivals!r}, want ({n},) integers of 0 or more")
         number = np.broadcast_to(number, (n,))
         pose = np.column_stack([self._column("slot_xy"), self._column("slot_yaw")])
         model = np.full(n, NO_VEHICLE, dtype=np.int64)

@@ -37,14 +37,14 @@ def floats(name: str, value: ArrayLike, columns: int) -> FloatArray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise SensorError(f"{name}: wanted (n, {columns}) numbers, got {value!r}") from error
+        raise SensorError(f"{name} is {value!r}, want (n, {columns}) numbers") from error
     if array.size == 0:
         array = array.reshape(0, columns)
     if array.ndim != 2 or array.shape[1] != columns:
-        raise SensorError(f"{name}: wanted shape (n, {columns}), got {array.shape}")
+        raise SensorError(f"{name} has shape {array.shape}, want (n, {columns})")
     if not np.isfinite(array).all():
         row, column = np.argwhere(~np.isfinite(array))[0]
-        raise SensorError(f"{name}[{row}, {column}]: wanted a finite number, got {array[row, column]}")
+        raise SensorError(f"{name}[{row}, {column}] is {array[row, column]}, want a finite number")
     array.setflags(write=False)
     return array
 
@@ -84,7 +84,7 @@ class Surroundings:
 
     def __post_init__(self) -> None:
         if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise SensorError(f"seed: wanted an integer, 0 or more, got {self.seed!r}")
+            raise SensorError(f"seed is {self.seed!r}, want an integer, 0 or more")
         tables = {"markings": 5, "walls": 5, "trees": 3, "lamp_posts": 3, "pedestrians": 4}
         for name, columns in tables.items():
             object.__setattr__(self, name, floats(name, getattr(self, name), columns))
@@ -93,7 +93,7 @@ class Surroundings:
             short = [i for i, row in enumerate(rows) if len(row) < least]
             if short:
                 raise SensorError(
-                    f"{name}[{short[0]}]: wanted {least} or more points, got {len(rows[short[0]])}"
+                    f"{name}[{short[0]}] has {len(rows[short[0]])} points, want {least} or more"
                 )
             object.__setattr__(self, name, rows)
         heights = (
@@ -101,21 +101,21 @@ class Surroundings:
         )
         heights = floats("building_heights", np.reshape(heights, (-1, 1)), 1)[:, 0]
         if len(heights) != len(self.buildings):
-            raise SensorError(f"building_heights: wanted {len(self.buildings)} heights, got {len(heights)}")
+            raise SensorError(f"building_heights has {len(heights)} heights, want {len(self.buildings)}")
         object.__setattr__(self, "building_heights", heights)
         least_values = (("building_heights", heights, 2.4), ("trees", self._table("trees")[:, 2], 1.5))
         for name, column, low in least_values:
             if (column < low).any():
-                raise SensorError(f"{name}: wanted heights of {low} m or more, got {column.min()}")
+                raise SensorError(f"{name} is {column.min()}, want heights of {low} m or more")
         for name in ("markings", "walls"):
             table = self._table(name)
             what = "width" if name == "markings" else "height"
             if (table[:, 4] <= 0).any():
-                raise SensorError(f"{name}: wanted a {what} above 0 m, got {table[:, 4].min()}")
+                raise SensorError(f"{name} is {table[:, 4].min()}, want a {what} above 0 m")
             length = np.hypot(*(table[:, 2:4] - table[:, :2]).T)
             if (length < 1e-6).any():
                 raise SensorError(
-                    f"{name}[{int(np.argmin(length))}]: wanted two ends apart, got a length of 0 m"
+                    f"{name}[{int(np.argmin(length))}] has a length of 0 m, want two ends apart"
                 )
         object.__setattr__(
             self, "_outlines", tuple(_counter_clockwise(np.asarray(b)) for b in self.buildings)
@@ -188,5 +188,5 @@ def _counter_clockwise(outline: FloatArray) -> FloatArray:
     x, y = outline.T
     area = float(np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)) / 2
     if abs(area) < 1e-3:
-        raise SensorError(f"buildings: wanted an outline with an area, got {outline.tolist()}")
+        raise SensorError(f"buildings is {outline.tolist()}, want an outline with an area")
     return outline if area > 0 else outline[::-1].copy()

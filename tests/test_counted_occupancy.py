@@ -92,7 +92,7 @@ def test_only_days_that_were_counted_throughout_are_replayed():
 def test_wrong_shapes_and_days_are_refused():
     with pytest.raises(InputError, match=r"level has shape \(2, 23\), want \(2, 24\)"):
         counted(level=np.zeros((2, 23)))
-    with pytest.raises(InputError, match="wanted a counted day"):
+    with pytest.raises(InputError, match="want a counted day"):
         counted().forecast(Arrival(0.0, "2024-01-03"))
 
 

@@ -47,9 +47,9 @@ def test_sizes_out_of_range_are_refused(value):
 
 def test_a_process_with_a_slope_needs_the_nearness_of_its_slots():
     process = OccupancyProcess.from_demand(np.zeros(3), np.zeros(168))
-    with pytest.raises(InputError, match=r"OccupancyProcess.nearness: got None, wanted numbers"):
+    with pytest.raises(InputError, match=r"OccupancyProcess.nearness is None, want numbers"):
         process.with_day_error(DayError(0.0, 0.5))
-    with pytest.raises(InputError, match=r"OccupancyProcess.nearness: wanted numbers from -1 to 1"):
+    with pytest.raises(InputError, match=r"OccupancyProcess.nearness: want numbers from -1 to 1"):
         dataclasses.replace(process, nearness=[0.0, 1.0, 2.0])
 
 

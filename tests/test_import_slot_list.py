@@ -291,7 +291,7 @@ FAULTS = [
     ("x\n1", "columns are 'x'"),
     ("x,y,lat,lon\n1,2,3,4", "columns are 'x,y,lat,lon'"),
     ("x,x,y\n1,1,2", "columns are 'x,x,y'"),
-    ("x,y\n1,2\n3", "line 3: got 1 fields, want 2"),
+    ("x,y\n1,2\n3", "line 3: has 1 fields, want 2"),
     ("x,y\n1,2\n3,nan", "row 3: y is 'nan', want a number"),
     ("x,y\n1,2\n3,four", "row 3: y is 'four', want a number"),
     ("x,y\n1,2\n3,inf", "row 3: y is 'inf', want a number"),

@@ -295,37 +295,37 @@ def test_equal_seeds_give_equal_scans_on_any_number_of_threads():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ScanPlane([SQUARE * np.nan]), r"footprints\[0, 0, 0\]: wanted a finite number, got nan"),
-        (lambda: ScanPlane([SQUARE * [0, 1]]), r"footprints\[0\]: wanted "),
-        (lambda: ScanPlane([SQUARE, SQUARE * [1, 0]]), r"footprints\[1\]: wanted "),
-        (lambda: ScanPlane([[[0, 0], [1, 1], [2, 2]]]), r"footprints\[0\]: wanted an area above zero"),
-        (lambda: ScanPlane([[[0, 0], [4, 0], [1, 1], [0, 4]]]), r"footprints\[0\]: wanted a convex outline"),
+        (lambda: ScanPlane([SQUARE * np.nan]), r"footprints\[0, 0, 0\] is nan, want a finite number"),
+        (lambda: ScanPlane([SQUARE * [0, 1]]), r"footprints\[0\] .*want "),
+        (lambda: ScanPlane([SQUARE, SQUARE * [1, 0]]), r"footprints\[1\] .*want "),
+        (lambda: ScanPlane([[[0, 0], [1, 1], [2, 2]]]), r"footprints\[0\] .*want an area above zero"),
+        (lambda: ScanPlane([[[0, 0], [4, 0], [1, 1], [0, 4]]]), r"footprints\[0\] .*want a convex outline"),
         (
             lambda: ScanPlane([regular_polygon(5)[[0, 2, 4, 1, 3]]]),
-            r"footprints\[0\]: wanted a convex outline",
+            r"footprints\[0\] .*want a convex outline",
         ),
-        (lambda: ScanPlane([SQUARE], [2]), r"n_corners\[0\]: wanted 3 to 4"),
-        (lambda: ScanPlane([SQUARE], [4, 4]), r"n_corners: wanted \(1,\) integers"),
-        (lambda: ScanPlane([SQUARE], ids=[-3]), "ids: wanted 0 or more, got -3"),
-        (lambda: ScanPlane([SQUARE], walls=[[[1, 1], [1, 1]]]), r"walls\[0\]: wanted two ends apart"),
-        (lambda: ScanPlane(SQUARE), r"footprints: wanted shape \(any, any, 2\), got \(4, 2\)"),
-        (lambda: ScanPlane([["a"]]), "footprints: wanted numbers"),
-        (lambda: ScanPlane([SQUARE]).replace(1, SQUARE), "index: wanted 0 to 0, got 1"),
-        (lambda: ScanPlane([SQUARE]).replace(0, regular_polygon(9)), "corners: wanted at most 4, got 9"),
-        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, math.nan, 0)), "pose: wanted finite x, y and yaw"),
-        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0)), r"pose: wanted shape \(3,\), got \(2,\)"),
+        (lambda: ScanPlane([SQUARE], [2]), r"n_corners\[0\] .*want 3 to 4"),
+        (lambda: ScanPlane([SQUARE], [4, 4]), r"n_corners .*want \(1,\) integers"),
+        (lambda: ScanPlane([SQUARE], ids=[-3]), "ids is -3, want 0 or more"),
+        (lambda: ScanPlane([SQUARE], walls=[[[1, 1], [1, 1]]]), r"walls\[0\] .*want two ends apart"),
+        (lambda: ScanPlane(SQUARE), r"footprints has shape \(4, 2\), want \(any, any, 2\)"),
+        (lambda: ScanPlane([["a"]]), "footprints .*want numbers"),
+        (lambda: ScanPlane([SQUARE]).replace(1, SQUARE), "index is 1, want 0 to 0"),
+        (lambda: ScanPlane([SQUARE]).replace(0, regular_polygon(9)), "corners has 9 rows, want at most 4"),
+        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, math.nan, 0)), "pose .*want finite x, y and yaw"),
+        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0)), r"pose has shape \(2,\), want \(3,\)"),
         (
             lambda: LASER.scan_batch(ScanPlane([SQUARE]), (0, 0, 0)),
-            r"poses: wanted shape \(b, 3\), got \(3,\)",
+            r"poses has shape \(3,\), want \(b, 3\)",
         ),
-        (lambda: LASER.scan_batch(ScanPlane([SQUARE]), [(0, 0, math.inf)]), "poses: wanted finite"),
-        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0, 0), exclude=1.5), "exclude: wanted an id"),
-        (lambda: LaserScanner(n_beams=0), "n_beams: wanted an integer of 1 or more, got 0"),
-        (lambda: LaserScanner(step=0.1), "step: wanted above 0 and 1081 beams within one turn"),
-        (lambda: LaserScanner(start=math.nan), "start: wanted a finite number, got nan"),
-        (lambda: LaserScanner(max_range=-1.0), "max_range: wanted above 0 m, got -1.0"),
-        (lambda: LaserScanner(noise_sd=-0.1), "noise_sd: wanted 0 m or more, got -0.1"),
-        (lambda: LaserScanner(dropout=1.1), "dropout: wanted 0 to 1, got 1.1"),
+        (lambda: LASER.scan_batch(ScanPlane([SQUARE]), [(0, 0, math.inf)]), "poses .*want finite"),
+        (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0, 0), exclude=1.5), "exclude .*want an id"),
+        (lambda: LaserScanner(n_beams=0), "n_beams is 0, want an integer of 1 or more"),
+        (lambda: LaserScanner(step=0.1), "step .*want above 0 and 1081 beams within one turn"),
+        (lambda: LaserScanner(start=math.nan), "start is nan, want a finite number"),
+        (lambda: LaserScanner(max_range=-1.0), "max_range is -1.0, want above 0 m"),
+        (lambda: LaserScanner(noise_sd=-0.1), "noise_sd is -0.1, want 0 m or more"),
+        (lambda: LaserScanner(dropout=1.1), "dropout is 1.1, want 0 to 1"),
     ],
 )
 def test_bad_input_is_named(make, message):
@@ -335,6 +335,6 @@ def test_bad_input_is_named(make, message):
 
 def test_a_refused_change_changes_nothing():
     plane = ScanPlane([SQUARE])
-    with pytest.raises(SensorError, match="wanted a convex outline"):
+    with pytest.raises(SensorError, match="want a convex outline"):
         plane.replace(0, [[0, 0], [4, 0], [1, 1], [0, 4]])
     np.testing.assert_array_equal(plane.footprints[0][0], SQUARE)

@@ -70,7 +70,7 @@ def test_world_keys_accept_big_seeds_and_tell_them_apart(seed, episode):
 
 
 def test_world_key_refuses_negative_seeds():
-    with pytest.raises(InputError, match=r"seed: got -1, wanted an integer >= 0"):
+    with pytest.raises(InputError, match=r"seed is -1, want an integer >= 0"):
         world_key(-1, 0)
 
 
@@ -275,15 +275,15 @@ def change(**fields):
             lambda c: {k: v for k, v in c.items() if k != "arrival_factor"},
             "missing or unknown fields: arrival_factor",
         ),
-        (change(arrival_profile=[1e-4]), r"arrival_profile: got shape \(1,\), wanted \(168,\)"),
+        (change(arrival_profile=[1e-4]), r"arrival_profile has shape \(1,\), want \(168,\)"),
         (
             change(arrival_factor=[1.0] * 19 + [-1.0]),
-            r"arrival_factor\[19\]: got -1.0, wanted a finite number >= 0",
+            r"arrival_factor\[19\] is -1.0, want a finite number >= 0",
         ),
-        (change(departure_factor=[1.0, math.nan] * 10), r"departure_factor\[1\]: got nan"),
-        (change(arrival_factor=[[1.0], 2.0]), "arrival_factor: .*wanted numbers"),
-        (change(arrival_factor=[]), r"arrival_factor: got shape \(0,\)"),
-        (change(arrival_factor=[1e12] * 20), "wanted factor .* profile <= 1000"),
+        (change(departure_factor=[1.0, math.nan] * 10), r"departure_factor\[1\] is nan"),
+        (change(arrival_factor=[[1.0], 2.0]), "arrival_factor: .*want numbers"),
+        (change(arrival_factor=[]), r"arrival_factor has shape \(0,\)"),
+        (change(arrival_factor=[1e12] * 20), "want factor .* profile <= 1000"),
         (lambda c: [], "want an occupancy process, a JSON object"),
     ],
 )
@@ -331,26 +331,26 @@ def test_window_parse():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: ArrivalWindow.parse("8-13"), "arrival hours: got '8-13', wanted HH:MM-HH:MM"),
-        (lambda: ArrivalWindow.parse("13:00-08:00"), "end_s: got 28800.0"),
-        (lambda: ArrivalWindow.parse("25:00-26:00"), "start_s: got 90000.0"),
-        (lambda: ArrivalWindow.parse("08:00-09:00", "monday"), "arrival days: got 'monday', wanted weekdays"),
-        (lambda: ArrivalWindow.parse("08:00-09:00", "mon,mon"), "weekdays: got"),
-        (lambda: ArrivalWindow(weekdays=()), "weekdays: got"),
-        (lambda: ArrivalWindow(start_s=math.nan), "start_s: got nan"),
-        (lambda: busy_process().at_mean_occupancy(1.0, 0.0), "got 1.0, wanted a number between 0 and 1"),
+        (lambda: ArrivalWindow.parse("8-13"), "arrival hours are '8-13', want HH:MM-HH:MM"),
+        (lambda: ArrivalWindow.parse("13:00-08:00"), "end_s is 28800.0"),
+        (lambda: ArrivalWindow.parse("25:00-26:00"), "start_s is 90000.0"),
+        (lambda: ArrivalWindow.parse("08:00-09:00", "monday"), "arrival days are 'monday', want weekdays"),
+        (lambda: ArrivalWindow.parse("08:00-09:00", "mon,mon"), "weekdays is"),
+        (lambda: ArrivalWindow(weekdays=()), "weekdays is"),
+        (lambda: ArrivalWindow(start_s=math.nan), "start_s is nan"),
+        (lambda: busy_process().at_mean_occupancy(1.0, 0.0), "is 1.0, want a number between 0 and 1"),
         (
             lambda: constant_process(2, 0.0, 1e-4).at_mean_occupancy(0.5, 0.0),
             "cannot be reached by scaling the arrival rates",
         ),
-        (lambda: OccupancyProcess.from_demand([1.0], np.zeros(168), -1.0), "mean_stay_s: got -1.0"),
-        (lambda: OccupancyProcess.from_demand([math.nan], np.zeros(168)), "attraction: wanted finite logits"),
+        (lambda: OccupancyProcess.from_demand([1.0], np.zeros(168), -1.0), "mean_stay_s is -1.0"),
+        (lambda: OccupancyProcess.from_demand([math.nan], np.zeros(168)), "attraction: want finite logits"),
         (
             lambda: busy_process().world(KEY, NINE).occupied([0], 0.0),
-            "time: got 0.0, wanted finite seconds at or after",
+            "time is 0.0, want finite seconds at or after",
         ),
-        (lambda: busy_process().world(KEY, NINE).occupied([0], math.inf), "time: got inf"),
-        (lambda: busy_process().world(KEY, Arrival(math.nan)), "Arrival.time: got nan"),
+        (lambda: busy_process().world(KEY, NINE).occupied([0], math.inf), "time is inf"),
+        (lambda: busy_process().world(KEY, Arrival(math.nan)), "Arrival.time is nan"),
     ],
 )
 def test_bad_input_is_refused_in_words(make, message):
@@ -378,5 +378,5 @@ def test_addresses_of_arrays_of_another_type_are_refused():
     """Compiled code would misread them."""
     assert address_of(np.zeros(3), np.float64) > 0
     for wrong in (np.zeros(3, np.float32), np.zeros((3, 2))[:, 0]):
-        with pytest.raises(TypeError, match=r"wanted .*float64"):
+        with pytest.raises(TypeError, match=r"want .*float64"):
             address_of(wrong, np.float64)

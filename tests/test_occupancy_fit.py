@@ -79,9 +79,9 @@ def test_what_never_happens_gets_the_lowest_rate():
 @pytest.mark.parametrize(
     ("dt", "start", "message"),
     [
-        ([], [], r"intervals: got shapes \(0,\)"),
-        ([1.0, 2.0], [1], "intervals: got shapes"),
-        ([0.0], [1], "intervals: dt: wanted finite seconds > 0"),
+        ([], [], r"intervals have shapes \(0,\)"),
+        ([1.0, 2.0], [1], "intervals have shapes"),
+        ([0.0], [1], "intervals: dt: want finite seconds > 0"),
     ],
 )
 def test_bad_looks_are_refused(dt, start, message):
@@ -193,7 +193,7 @@ def test_nothing_to_fit_is_refused():
     log = OccupancyLog(("a",), ("2024-01-01",), [0, 0], [0, 0], [0.0, 9000.0], [0, 1])
     with pytest.raises(InputError, match="no two observations of a slot on one day within 7200 s"):
         fit_process(log)
-    with pytest.raises(InputError, match=r"prior_sd: got 0\.0"):
+    with pytest.raises(InputError, match=r"prior_sd is 0\.0"):
         fit_process(log, prior_sd=0.0)
 
 

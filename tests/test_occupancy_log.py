@@ -80,12 +80,12 @@ def test_several_logs_are_one_by_date(tmp_path):
     assert log.slot.tolist() == [0, 1, 0, 1]
     assert log.occupied.tolist() == [True, False, False, True]
     with pytest.raises(
-        InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, wanted different days"
+        InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, want different days"
     ):
         OccupancyLog.read_all([first, first])
     other = write(tmp_path, HEADER + "2024-01-03 07:00,1,c,sunny,0\n", "other.csv")
     with pytest.raises(
-        InputError, match=r"other.csv: slot_id: 'a' is in one of this log and .* only, wanted the same"
+        InputError, match=r"other.csv: slot_id: 'a' is in one of this log and .* only, want the same"
     ):
         OccupancyLog.read_all([first, other])
 
@@ -99,20 +99,20 @@ def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tm
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "empty, wanted a header"),
+        ("", "empty, want a header"),
         (HEADER, "no observations"),
         (
             "datetime,slot_id,occupied,colour\n",
-            "column 'colour' is unknown, wanted some of datetime, camera,",
+            "column 'colour' is unknown, want some of datetime, camera,",
         ),
         ("datetime,slot_id\n", "column 'occupied' is missing"),
         ("datetime,slot_id,slot_id,occupied\n", "column 'slot_id' stands there twice"),
-        (HEADER + "2024-01-01 07:00,1,a,sunny,2\n", "line 2: occupied: got '2', wanted 0 or 1"),
-        (HEADER + "yesterday,1,a,sunny,1\n", "line 2: datetime: got 'yesterday', wanted local date and time"),
-        (HEADER + "2024-01-01,1,a,sunny,1\n", "line 2: datetime: got '2024-01-01'"),
-        (HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n", r"line 2: datetime: got '2024-01-01 07:00\+01:00'"),
+        (HEADER + "2024-01-01 07:00,1,a,sunny,2\n", "line 2: occupied is '2', want 0 or 1"),
+        (HEADER + "yesterday,1,a,sunny,1\n", "line 2: datetime is 'yesterday', want local date and time"),
+        (HEADER + "2024-01-01,1,a,sunny,1\n", "line 2: datetime is '2024-01-01'"),
+        (HEADER + "2024-01-01 07:00+01:00,1,a,sunny,1\n", r"line 2: datetime is '2024-01-01 07:00\+01:00'"),
         (HEADER + "2024-01-01 07:00,1,,sunny,1\n", "line 2: slot_id: empty"),
-        (HEADER + "2024-01-01 07:00,1,a\n", "line 2: got 3 fields, want 5"),
+        (HEADER + "2024-01-01 07:00,1,a\n", "line 2: has 3 fields, want 5"),
         (
             HEADER
             + "2024-01-01 07:05,1,a,sunny,1\n2024-01-01 07:00,1,b,sunny,1\n2024-01-01 07:04,1,a,sunny,1\n",
@@ -145,11 +145,11 @@ def test_torn_missing_and_falsely_named_files_are_refused(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"slot": [4]}, "slot: wanted indices from 0 to 0"),
-        ({"second": [86_400.0]}, "second: wanted seconds of the day"),
+        ({"slot": [4]}, "slot: want indices from 0 to 0"),
+        ({"second": [86_400.0]}, "second: want seconds of the day"),
         ({"second": [1.0, 2.0]}, "of one length"),
-        ({"days": ("1 May",)}, "days: wanted different ISO dates"),
-        ({"max_gap_s": 0.0}, "max_gap_s: got 0.0"),
+        ({"days": ("1 May",)}, "days: want different ISO dates"),
+        ({"max_gap_s": 0.0}, "max_gap_s is 0.0"),
         ({"slot": []}, "no observations"),
     ],
 )
@@ -232,7 +232,7 @@ def test_mean_occupancy_weighs_time_between_the_first_and_the_last_look():
     assert log.mean_occupancy("weekday") == pytest.approx([0.25, math.nan], nan_ok=True)
     assert log.mean_occupancy("weekday", (7, 8))[0] == pytest.approx(0.5)
     assert np.isnan(log.mean_occupancy("weekend")).all()
-    with pytest.raises(InputError, match="class of day: got 'sunday'"):
+    with pytest.raises(InputError, match="class of day is 'sunday'"):
         log.mean_occupancy("sunday")
 
 
@@ -362,11 +362,11 @@ def test_copies_of_a_world_answer_alike():
             lambda m: m.draw_arrival(ArrivalWindow.parse("08:00-09:00", "tue,sun"), 0),
             "no recorded day is one of tue,sun",
         ),
-        (lambda m: m.world(0, Arrival(0.0)), "Arrival.day: got '', wanted a recorded day"),
-        (lambda m: m.world(0, Arrival(DAY_S, MONDAYS[0])), "Arrival.time: got 86400.0"),
-        (lambda m: m.world(0, at(MONDAYS[0], 9)).occupied([0], 8 * HOUR_S), "time: got 28800.0"),
-        (lambda m: RecordedOccupancy(m.log, [math.nan]), "walk_m: got shape"),
-        (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: wanted"),
+        (lambda m: m.world(0, Arrival(0.0)), "Arrival.day is '', want a recorded day"),
+        (lambda m: m.world(0, Arrival(DAY_S, MONDAYS[0])), "Arrival.time is 86400.0"),
+        (lambda m: m.world(0, at(MONDAYS[0], 9)).occupied([0], 8 * HOUR_S), "time is 28800.0"),
+        (lambda m: RecordedOccupancy(m.log, [math.nan]), "walk_m has shape"),
+        (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: want"),
         (
             lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"),
             "forecast_from is 'past', want replay_from with it",
@@ -375,7 +375,7 @@ def test_copies_of_a_world_answer_alike():
             lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 1, 1), "rolling").mapped_log(
                 MONDAYS[0]
             ),
-            "replays 1 of 5 recorded weekday days, wanted at least one before 2024-01-01 to forecast from",
+            "replays 1 of 5 recorded weekday days, want at least one before 2024-01-01 to forecast from",
         ),
         (
             lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 2, 1)).days_in(ArrivalWindow()),
@@ -385,11 +385,11 @@ def test_copies_of_a_world_answer_alike():
             lambda m: RecordedOccupancy(m.log, np.zeros(9), None, date(2024, 1, 22), "past").mapped_log(
                 MONDAYS[4]
             ),
-            "was recorded on 2 days of the class from 2024-01-22 on; wanted a smaller lot",
+            "was recorded on 2 days of the class from 2024-01-22 on; want a smaller lot",
         ),
         (
             lambda m: RecordedOccupancy(m.log, np.zeros(8)).forecast(at(SATURDAYS[0], 9)),
-            "replays 2 of 2 recorded weekend days, wanted at least one more",
+            "replays 2 of 2 recorded weekend days, want at least one more",
         ),
         (
             lambda m: RecordedOccupancy(m.log, np.zeros(80)).forecast(at(MONDAYS[0], 9)),
@@ -424,8 +424,8 @@ def test_a_mapping_is_read_and_used(tmp_path):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("slot_id,log_slot_id\nZ,s0\n", "line 2: slot_id: got 'Z', wanted a slot of the lot"),
-        ("slot_id,log_slot_id\nA,s9\n", "line 2: log_slot_id: got 's9', wanted a slot of occupancy log"),
+        ("slot_id,log_slot_id\nZ,s0\n", "line 2: slot_id is 'Z', want a slot of the lot"),
+        ("slot_id,log_slot_id\nA,s9\n", "line 2: log_slot_id is 's9', want a slot of occupancy log"),
         ("slot_id,log_slot_id\nA,s0\nA,s1\n", "line 3: slot_id: 'A' a second time"),
         ("slot_id,log_slot_id\nA,s0\n", "slot_id: 1 slots of the lot have no line, the first is 'B'"),
         ("slot_id,log\nA,s0\n", "column 'log' is unknown"),

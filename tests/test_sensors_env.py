@@ -369,11 +369,11 @@ def test_moving_shadows_are_those_of_a_scene_made_anew():
     ("movers", "words"),
     [
         ({"vehicle_pose": [[0.0, np.nan, 0.0]], "vehicle_model": [0]}, r"vehicle_pose\[0, 1\]"),
-        ({"vehicle_pose": [[0.0, 0.0, 0.0]]}, "vehicle_model: wanted"),
-        ({"walker_pose": [[0.0, 0.0, 0.0]], "walker_look": [0]}, "walker_stride: wanted 1 phases"),
+        ({"vehicle_pose": [[0.0, 0.0, 0.0]]}, "vehicle_model .*want"),
+        ({"walker_pose": [[0.0, 0.0, 0.0]], "walker_look": [0]}, "walker_stride .*want 1 phases"),
         (
             {"walker_pose": [[0.0, 0.0, 0.0]], "walker_look": [99], "walker_stride": [0.0]},
-            "walker_look: wanted 0 to 11",
+            "walker_look .*want 0 to 11",
         ),
     ],
 )
@@ -385,7 +385,7 @@ def test_bad_movers_are_named(movers, words):
 def test_a_mover_of_a_model_that_the_fleet_lacks_is_refused():
     lot = make_scenario("mini").lot
     scene = slot_lot(lot).scene(np.zeros(lot.n_slots, bool))
-    with pytest.raises(SensorError, match="vehicle_model: wanted 0 to 99"):
+    with pytest.raises(SensorError, match=r"vehicle_model .*want 0 to 99"):
         scene.with_movers(Movers(np.zeros((1, 3)), np.array([100])))
 
 

@@ -681,7 +681,7 @@ def curve_of_another_kind(folder):
         ({}, lambda folder: shutil.rmtree(folder / "seed_0"), "holds no training"),
         ({}, torn_settings, "settings.json: not JSON"),
         ({}, settings_of_another_kind, "want the settings of a command"),
-        ({}, torn_curve, "curve.csv: line 2: got 1 fields"),
+        ({}, torn_curve, "curve.csv: line 2: has 1 fields"),
         ({}, curve_of_another_kind, "curve.csv: has no column 'total_s', want steps, total_s"),
     ],
 )

@@ -215,12 +215,12 @@ def test_seeds_give_different_cars_and_paint_changes_nothing_but_colour():
 @pytest.mark.parametrize(
     ("change", "match"),
     [
-        ({"body": "tank"}, "body: wanted one of hatchback"),
-        ({"size": (0.0, 1.8, 1.5)}, "size: wanted a length of 3.2 to 6.0 m, got 0.0"),
-        ({"size": (4.2, float("nan"), 1.5)}, "size: wanted a width"),
+        ({"body": "tank"}, "body .*want one of hatchback"),
+        ({"size": (0.0, 1.8, 1.5)}, "size is 0.0, want a length of 3.2 to 6.0 m"),
+        ({"size": (4.2, float("nan"), 1.5)}, "size .*want a width"),
         ({"paint": (10, 20, 300)}, "paint"),
-        ({"seed": -1}, "seed: wanted an integer"),
-        ({"seed": 1.5}, "seed: wanted an integer"),
+        ({"seed": -1}, "seed .*want an integer"),
+        ({"seed": 1.5}, "seed .*want an integer"),
     ],
 )
 def test_bad_models_are_refused(change, match):

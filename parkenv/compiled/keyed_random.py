@@ -123,7 +123,7 @@ def world_key(seed: int, episode: int) -> np.uint64:
 def _with_words(state: np.uint64, name: str, given: int) -> np.uint64:
     number = operator.index(given)
     if number < 0:
-        raise InputError(f"{name}: got {number}, wanted an integer >= 0")
+        raise InputError(f"{name} is {number}, want an integer >= 0")
     n_words = max(1, -(-number.bit_length() // _WORD_BITS))
     for word in (n_words, *((number >> (_WORD_BITS * i)) & _WORD for i in range(n_words))):
         state = np.uint64(_absorbed(state, np.uint64(word)))

@@ -33,9 +33,7 @@ def address_of(array: NDArray[Any], dtype: Any) -> int:
         TypeError: the array has another type or is not contiguous; compiled code would misread it.
     """
     if array.dtype != np.dtype(dtype) or not array.flags.c_contiguous:
-        raise TypeError(
-            f"array of {array.dtype}, contiguous {array.flags.c_contiguous}; wanted {dtype}, True"
-        )
+        raise TypeError(f"array of {array.dtype}, contiguous {array.flags.c_contiguous}; want {dtype}, True")
     return int(array.ctypes.data)
 
 

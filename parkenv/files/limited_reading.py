@@ -223,7 +223,7 @@ def csv_rows(
             for row in reader:
                 width = width or len(row)
                 if row and len(row) != width:
-                    raise InputError(f"{path}: line {reader.line_num}: got {len(row)} fields, want {width}")
+                    raise InputError(f"{path}: line {reader.line_num}: has {len(row)} fields, want {width}")
                 if row:
                     yield reader.line_num, row
         except csv.Error as error:

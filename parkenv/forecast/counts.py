@@ -187,7 +187,7 @@ def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
                     numbers[text] = float(text) if text.strip() else math.nan
         except (ValueError, OverflowError):
             raise InputError(
-                f"{path}: line {line}: want an ISO time and numbers, got {','.join(row)!r:.80}"
+                f"{path}: line {line} is {','.join(row)!r:.80}, want an ISO time and numbers"
             ) from None
         table.append((names.setdefault(name, len(names)), *times[moment], numbers[capacity], numbers[free]))
     if not table:

@@ -410,7 +410,7 @@ class _RecordedCars(NamedTuple):
 
 def _cars_of(log: OccupancyLog, kind: str) -> _RecordedCars:
     if kind not in ("weekday", "weekend"):
-        raise InputError(f"class of day: got {kind!r}, wanted weekday or weekend")
+        raise InputError(f"class of day is {kind!r}, want weekday or weekend")
     grid = np.arange(DAY_PERIODS) * PERIOD_S
     arrived, seen = np.zeros(DAY_PERIODS), np.zeros(DAY_PERIODS)
     stays, ended = [], []

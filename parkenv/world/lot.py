@@ -294,7 +294,7 @@ def _frozen(values: ArrayLike, name: str) -> FloatArray:
     try:
         array = np.array(values, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{name}: want numbers, got {values!r:.60}") from error
+        raise InputError(f"{name} is {values!r:.60}, want numbers") from error
     array.flags.writeable = False
     return array
 

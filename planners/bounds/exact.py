@@ -106,7 +106,7 @@ class ExactSolution:
         require_small(problem)
         p = np.asarray(p_occupied, dtype=np.float64)
         if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
-            raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
+            raise InputError(f"p_occupied has shape {p.shape}, want {n} probabilities")
         days = Days.of(p, problem.walk_s, day_error)
         self._lot = _small_lot(problem, days, table or RoadTable.of(problem))
         seen_bits = 0 if seen is None else bits_of(seen)

@@ -65,9 +65,9 @@ class ChangingSolution:
         lot, n = problem.lot, problem.lot.n_slots
         p, r = np.asarray(p_occupied, dtype=np.float64), np.asarray(rate, dtype=np.float64)
         if p.shape != (n,) or not ((p > 0.0) & (p < 1.0)).all():
-            raise InputError(f"p_occupied: want {n} probabilities between 0 and 1, got shape {p.shape}")
+            raise InputError(f"p_occupied has shape {p.shape}, want {n} probabilities between 0 and 1")
         if r.shape != (n,) or not ((r > 0.0) & np.isfinite(r)).all():
-            raise InputError(f"rate: want {n} finite rates above 0, got shape {r.shape}")
+            raise InputError(f"rate has shape {r.shape}, want {n} finite rates above 0")
         if not (step_s > 0.0 and math.isfinite(step_s)) or memory_steps < 2:
             raise InputError(
                 f"step_s is {step_s} and memory_steps {memory_steps}, want seconds above 0 and at least 2"

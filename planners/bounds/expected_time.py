@@ -54,7 +54,7 @@ def expected_time(
     n = problem.lot.n_slots
     p = np.asarray(p_occupied, dtype=np.float64)
     if p.shape != (n,) or not ((p >= 0.0) & (p <= 1.0)).all():
-        raise InputError(f"p_occupied: want {n} probabilities, got shape {p.shape}")
+        raise InputError(f"p_occupied has shape {p.shape}, want {n} probabilities")
     if not problem.sensor_model.perfect:
         raise InputError("expected_time requires a sensor model without errors")
     days = Days.of(p, problem.walk_s, day_error)

@@ -82,7 +82,7 @@ def tune_failure_cost(
     p = np.asarray(p_occupied, dtype=np.float64)
     compared = np.asarray(costs, dtype=np.float64)
     if p.shape != (problem.lot.n_slots,) or not ((p >= 0.0) & (p <= 1.0)).all():
-        raise InputError(f"p_occupied: want {problem.lot.n_slots} probabilities, got shape {p.shape}")
+        raise InputError(f"p_occupied has shape {p.shape}, want {problem.lot.n_slots} probabilities")
     if not len(compared) or not (np.isfinite(compared) & (compared > 0.0)).all():
         raise InputError(f"costs are {list(costs)}, want finite seconds above 0")
     if worlds < 1:

@@ -199,11 +199,11 @@ class ScanPlane:
         wall = _as_floats("walls", np.empty((0, 2, 2)) if walls is None else walls, (None, 2, 2))
         self.ids = np.arange(n) if ids is None else _as_ints("ids", ids, n)
         if n and self.ids.min() < 0:
-            raise SensorError(f"ids: wanted 0 or more, got {self.ids.min()}")
+            raise SensorError(f"ids is {self.ids.min()}, want 0 or more")
         length = np.hypot(*(wall[:, 1] - wall[:, 0]).T)
         if (length < SHORTEST_EDGE_M).any():
             i = int(np.argmax(length < SHORTEST_EDGE_M))
-            raise SensorError(f"walls[{i}]: wanted two ends apart, got {wall[i].tolist()}")
+            raise SensorError(f"walls[{i}] is {wall[i].tolist()}, want two ends apart")
         self.n_footprints, self.n_walls, self.k_max = n, len(wall), max(k_max, QUAD)
         self._wall = wall
         self._corners = np.zeros((n, self.k_max, 2))
@@ -238,10 +238,10 @@ class ScanPlane:
             SensorError: the footprint does not exist, or the corners are invalid.
         """
         if not 0 <= index < self.n_footprints:
-            raise SensorError(f"index: wanted 0 to {self.n_footprints - 1}, got {index}")
+            raise SensorError(f"index is {index}, want 0 to {self.n_footprints - 1}")
         new = _as_floats("corners", np.empty((0, 2)) if corners is None else corners, (None, 2))
         if len(new) > self.k_max:
-            raise SensorError(f"corners: wanted at most {self.k_max}, got {len(new)}")
+            raise SensorError(f"corners has {len(new)} rows, want at most {self.k_max}")
         shape, count = _normalised("corners", new[None], np.array([len(new)]))
         self._corners[index] = 0.0
         self._corners[index, : len(new)], self._n_corners[index] = shape[0], count[0]
@@ -271,7 +271,7 @@ class ScanPlane:
         place = others._place[:n].copy()
         if (place == NOWHERE).any():
             raise SensorError(
-                f"footprints[{int(np.argmin(place))}]: wanted more than {QUAD} corners, got {self._n_corners[:n].min()}"
+                f"footprints[{int(np.argmin(place))}] has {self._n_corners[:n].min()} corners, want more than {QUAD}"
             )
         others.cells.x[place] = others.cells.y[place] = FAR
         return quads.cells, others.cells, place
@@ -324,24 +324,24 @@ def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Fl
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise SensorError(f"{name}: wanted numbers, got {value!r}") from error
+        raise SensorError(f"{name} is {value!r}, want numbers") from error
     if array.size == 0 and array.ndim < len(shape):
         array = array.reshape([length or 0 for length in shape])
     if array.ndim != len(shape) or any(
         w is not None and w != g for w, g in zip(shape, array.shape, strict=True)
     ):
         wanted = ", ".join("any" if length is None else str(length) for length in shape)
-        raise SensorError(f"{name}: wanted shape ({wanted}), got {array.shape}")
+        raise SensorError(f"{name} has shape {array.shape}, want ({wanted})")
     if not np.isfinite(array).all():
         row = np.argwhere(~np.isfinite(array))[0]
-        raise SensorError(f"{name}{row.tolist()}: wanted a finite number, got {array[tuple(row)]}")
+        raise SensorError(f"{name}{row.tolist()} is {array[tuple(row)]}, want a finite number")
     return array
 
 
 def _as_ints(name: str, value: ArrayLike, n: int) -> IntArray:
     array = np.asarray(value)
     if array.shape != (n,) or (n and not np.issubdtype(array.dtype, np.integer)):
-        raise SensorError(f"{name}: wanted ({n},) integers, got {array.shape} of {array.dtype}")
+        raise SensorError(f"{name} has shape {array.shape} of {array.dtype}, want ({n},) integers")
     return array.astype(np.int64)
 
 
@@ -375,7 +375,7 @@ def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[
     wrong = (n_corners < 3) & (n_corners != 0) | (n_corners > k_max)
     if wrong.any():
         i = int(np.argmax(wrong))
-        raise SensorError(f"n_corners[{i}]: wanted 3 to {k_max}, or 0 for none, got {n_corners[i]}")
+        raise SensorError(f"n_corners[{i}] is {n_corners[i]}, want 3 to {k_max}, or 0 for none")
     kept, count = np.zeros_like(corners), n_corners.copy()
     for k in np.unique(n_corners[n_corners > 0]):
         group = np.flatnonzero(n_corners == k)
@@ -409,4 +409,4 @@ def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[
 def _refuse(name: str, wanted: str, group: IntArray, outline: Float64Array, wrong: NDArray[np.bool_]) -> None:
     if wrong.any():
         i = int(np.argmax(wrong.any(1)))
-        raise SensorError(f"{name}[{group[i]}]: wanted {wanted}, got {outline[i].round(4).tolist()}")
+        raise SensorError(f"{name}[{group[i]}] is {outline[i].round(4).tolist()}, want {wanted}")

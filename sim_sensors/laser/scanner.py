@@ -59,21 +59,21 @@ class LaserScanner:
             or not isinstance(self.n_beams, int | np.integer)
             or self.n_beams < 1
         ):
-            raise SensorError(f"n_beams: wanted an integer of 1 or more, got {self.n_beams!r}")
+            raise SensorError(f"n_beams is {self.n_beams!r}, want an integer of 1 or more")
         for name in ("start", "step", "max_range", "noise_sd", "dropout"):
             value = getattr(self, name)
             if not isinstance(value, int | float | np.number) or not math.isfinite(value):
-                raise SensorError(f"{name}: wanted a finite number, got {value!r}")
+                raise SensorError(f"{name} is {value!r}, want a finite number")
         if self.step <= 0 or (self.n_beams - 1) * self.step >= 2 * math.pi:
             raise SensorError(
-                f"step: wanted above 0 and {self.n_beams} beams within one turn, got {self.step} rad"
+                f"step is {self.step} rad, want above 0 and {self.n_beams} beams within one turn"
             )
         if self.max_range <= 0:
-            raise SensorError(f"max_range: wanted above 0 m, got {self.max_range}")
+            raise SensorError(f"max_range is {self.max_range}, want above 0 m")
         if self.noise_sd < 0:
-            raise SensorError(f"noise_sd: wanted 0 m or more, got {self.noise_sd}")
+            raise SensorError(f"noise_sd is {self.noise_sd}, want 0 m or more")
         if not 0 <= self.dropout <= 1:
-            raise SensorError(f"dropout: wanted 0 to 1, got {self.dropout}")
+            raise SensorError(f"dropout is {self.dropout}, want 0 to 1")
 
     @cached_property
     def angles(self) -> NDArray[np.float64]:
@@ -183,7 +183,7 @@ class LaserScanner:
         if exclude is not None:
             given = np.asarray(exclude)
             if given.shape not in ((), (b,)) or not np.issubdtype(given.dtype, np.integer):
-                raise SensorError(f"exclude: wanted an id or ({b},) of them, got {exclude!r}")
+                raise SensorError(f"exclude is {exclude!r}, want an id or ({b},) of them")
             excluded[:] = given
         # The first offset of a pair is for the noise, the second for the dropouts.
         n_draws = 0 if rng is None else -(-self.n_beams // BEAMS_PER_DRAW)
@@ -213,13 +213,13 @@ def _poses(value: ArrayLike, name: str, ndim: int) -> NDArray[np.float64]:
     try:
         poses = np.ascontiguousarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise SensorError(f"{name}: wanted numbers, got {value!r}") from error
+        raise SensorError(f"{name} is {value!r}, want numbers") from error
     if poses.ndim != ndim or poses.shape[-1] != 3:
-        raise SensorError(f"{name}: wanted shape {'(3,)' if ndim == 1 else '(b, 3)'}, got {poses.shape}")
+        raise SensorError(f"{name} has shape {poses.shape}, want {'(3,)' if ndim == 1 else '(b, 3)'}")
     poses = poses.reshape(-1, 3)
     if not np.isfinite(poses).all():
         i = int(np.argmin(np.isfinite(poses).all(1)))
-        raise SensorError(f"{name}: wanted finite x, y and yaw, got {poses[i].tolist()}")
+        raise SensorError(f"{name} is {poses[i].tolist()}, want finite x, y and yaw")
     return poses
 
 

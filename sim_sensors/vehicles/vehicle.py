@@ -54,15 +54,15 @@ class VehicleModel:
 
     def __post_init__(self) -> None:
         if self.body not in BODIES:
-            raise SensorError(f"body: wanted one of {', '.join(BODIES)}, got {self.body!r}")
+            raise SensorError(f"body is {self.body!r}, want one of {', '.join(BODIES)}")
         if isinstance(self.seed, bool) or not isinstance(self.seed, (int, np.integer)) or self.seed < 0:
-            raise SensorError(f"seed: wanted an integer, 0 or more, got {self.seed!r}")
+            raise SensorError(f"seed is {self.seed!r}, want an integer, 0 or more")
         limits = ((3.2, 6.0), (1.5, 2.2), (1.3, 2.2))
         for name, value, (low, high) in zip(("length", "width", "height"), self.size, limits, strict=True):
             if not low <= value <= high:
-                raise SensorError(f"size: wanted a {name} of {low} to {high} m, got {value}")
+                raise SensorError(f"size is {value}, want a {name} of {low} to {high} m")
         if len(self.paint) != 3 or not all(0 <= c <= 255 for c in self.paint):
-            raise SensorError(f"paint: wanted three numbers from 0 to 255, got {self.paint!r}")
+            raise SensorError(f"paint is {self.paint!r}, want three numbers from 0 to 255")
 
     @classmethod
     def from_seed(cls, body: str | None, seed: int) -> VehicleModel:
@@ -73,9 +73,9 @@ class VehicleModel:
             seed: 0 or more.
         """
         if body is not None and body not in BODIES:
-            raise SensorError(f"body: wanted one of {', '.join(BODIES)}, got {body!r}")
+            raise SensorError(f"body is {body!r}, want one of {', '.join(BODIES)}")
         if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or seed < 0:
-            raise SensorError(f"seed: wanted an integer, 0 or more, got {seed!r}")
+            raise SensorError(f"seed is {seed!r}, want an integer, 0 or more")
         rng = np.random.default_rng([int(seed), 1])
         drawn = draw_body(rng)
         chosen = drawn if body is None else body
@@ -115,7 +115,7 @@ class VehicleModel:
             level: `DETAILED` (0), about 3,800 triangles, or `COARSE` (1), about 560.
         """
         if level not in (DETAILED, COARSE):
-            raise SensorError(f"level: wanted 0 (detailed) or 1 (coarse), got {level!r}")
+            raise SensorError(f"level is {level!r}, want 0 (detailed) or 1 (coarse)")
         shape = _shape(self.painted((0, 0, 0)), level)
         return shape.dyed(*self._palette())
 

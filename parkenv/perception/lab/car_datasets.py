@@ -60,7 +60,7 @@ def read_uiuc_training(folder: Path) -> Crops:
     )
     if not crops.positives or not crops.negatives:
         raise InputError(
-            f"{folder}: wanted TrainImages/pos-N.pgm and neg-N.pgm, got {len(images)} other images"
+            f"{folder}: has {len(images)} other images, want TrainImages/pos-N.pgm and neg-N.pgm"
         )
     return crops
 

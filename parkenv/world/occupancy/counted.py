@@ -139,7 +139,7 @@ class CountedOccupancy:
         try:
             return self.days.index(day)
         except ValueError:
-            raise InputError(f"Arrival.day: got {day!r}, wanted a counted day of {self.source}") from None
+            raise InputError(f"Arrival.day is {day!r}, want a counted day of {self.source}") from None
 
 
 def level_of_mean(attraction: FloatArray, mean: float) -> float:

@@ -66,9 +66,9 @@ def fit_constant_rates(dt: ArrayLike, start: ArrayLike, end: ArrayLike) -> tuple
     """
     dt, start, end = np.asarray(dt, float), np.asarray(start, bool), np.asarray(end, bool)
     if not dt.shape == start.shape == end.shape == (dt.size,) or not dt.size:
-        raise InputError(f"intervals: got shapes {dt.shape}, {start.shape}, {end.shape}, wanted (k,), k > 0")
+        raise InputError(f"intervals have shapes {dt.shape}, {start.shape}, {end.shape}, want (k,), k > 0")
     if not np.all((dt > 0) & np.isfinite(dt)):
-        raise InputError("intervals: dt: wanted finite seconds > 0")
+        raise InputError("intervals: dt: want finite seconds > 0")
     gaps, which = np.unique(dt, return_inverse=True)
     n = np.bincount(which * 4 + start * 2 + end, minlength=4 * gaps.size).reshape(-1, 2, 2).T
     (stay_free, leave), (take, stay) = n  # n[end, start, gap]
@@ -257,7 +257,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
         InputError: no two observations of a slot on one day within `max_gap_s`.
     """
     if not prior_sd > 0:
-        raise InputError(f"prior_sd: got {prior_sd}, wanted a number > 0")
+        raise InputError(f"prior_sd is {prior_sd}, want a number > 0")
     pairs = log.intervals(max_gap_s)
     if not pairs.slot.size:
         raise InputError(f"{log.source}: no two observations of a slot on one day within {max_gap_s:g} s")

@@ -111,23 +111,23 @@ class OccupancyLog:
         slot, day = np.asarray(self.slot, np.int64), np.asarray(self.day, np.int64)
         second, occupied = np.asarray(self.second, float), np.asarray(self.occupied, bool)
         if not slot.size:
-            raise InputError(f"{self.source}: no observations, wanted at least one")
+            raise InputError(f"{self.source}: no observations, want at least one")
         if not slot.shape == day.shape == second.shape == occupied.shape == (slot.size,):
-            raise InputError(f"{self.source}: wanted slot, day, second and occupied of one length")
+            raise InputError(f"{self.source}: want slot, day, second and occupied of one length")
         if len(self.slot_ids) * len(self.days) > MAX_RECORDS:
             raise InputError(
                 f"{self.source}: has {len(self.slot_ids):,} slots on {len(self.days):,} days, "
-                f"wanted at most {MAX_RECORDS:,} slots times days"
+                f"want at most {MAX_RECORDS:,} slots times days"
             )
         for name, index, size in (("slot", slot, len(self.slot_ids)), ("day", day, len(self.days))):
             if index.min() < 0 or index.max() >= size:
-                raise InputError(f"{self.source}: {name}: wanted indices from 0 to {size - 1}")
+                raise InputError(f"{self.source}: {name}: want indices from 0 to {size - 1}")
         if list(self.days) != sorted({day for day in self.days if _is_date(day)}):
-            raise InputError(f"{self.source}: days: wanted different ISO dates in order")
+            raise InputError(f"{self.source}: days: want different ISO dates in order")
         if not np.all((second >= 0) & (second < DAY_S)):
-            raise InputError(f"{self.source}: second: wanted seconds of the day in [0, 86400)")
+            raise InputError(f"{self.source}: second: want seconds of the day in [0, 86400)")
         if not self.max_gap_s > 0:
-            raise InputError(f"max_gap_s: got {self.max_gap_s}, wanted seconds > 0")
+            raise InputError(f"max_gap_s is {self.max_gap_s}, want seconds > 0")
         order = np.lexsort((second, slot, day))
         record = (day * len(self.slot_ids) + slot)[order]
         stands = np.append((np.diff(record) > 0) | (np.diff(second[order]) > 0), True)
@@ -169,18 +169,18 @@ class OccupancyLog:
             if moment is None:
                 moment = moments[text] = _moment(path, line, text)
             if not slot_id:
-                raise InputError(f"{path}: line {line}: slot_id: empty, wanted a slot's name")
+                raise InputError(f"{path}: line {line}: slot_id: empty, want a slot's name")
             if taken not in ("0", "1"):
-                raise InputError(f"{path}: line {line}: occupied: got {taken!r}, wanted 0 or 1")
+                raise InputError(f"{path}: line {line}: occupied is {taken!r}, want 0 or 1")
             if moment < latest.get(slot_id, moment):
                 raise InputError(
                     f"{path}: line {line}: datetime: {text} of slot {slot_id} is before its line above,"
-                    f" {latest[slot_id]}; wanted observations in order of time"
+                    f" {latest[slot_id]}; want observations in order of time"
                 )
             latest[slot_id] = moment
             found.append((slots.setdefault(slot_id, len(slots)), moment, taken == "1"))
         if not found:
-            raise InputError(f"{path}: no observations, wanted at least one line below the header")
+            raise InputError(f"{path}: no observations, want at least one line below the header")
         dates = [moment.date().isoformat() for _, moment, _ in found]
         days = sorted(set(dates))
         day_index = {day: i for i, day in enumerate(days)}
@@ -213,11 +213,11 @@ class OccupancyLog:
         if odd:
             raise InputError(
                 f"{other.source}: slot_id: {min(odd)!r} is in one of this log and {self.source} only,"
-                " wanted the same slots"
+                " want the same slots"
             )
         twice = set(self.days) & set(other.days)
         if twice:
-            raise InputError(f"{other.source}: {min(twice)} is also in {self.source}, wanted different days")
+            raise InputError(f"{other.source}: {min(twice)} is also in {self.source}, want different days")
         days = sorted({*self.days, *other.days})
         slot = {slot_id: i for i, slot_id in enumerate(self.slot_ids)}
         slots = np.array([slot[slot_id] for slot_id in other.slot_ids], np.int64)
@@ -266,7 +266,7 @@ class OccupancyLog:
             (m,) float64; NaN for a slot that was not observed in these hours.
         """
         if kind not in ("weekday", "weekend"):
-            raise InputError(f"class of day: got {kind!r}, wanted weekday or weekend")
+            raise InputError(f"class of day is {kind!r}, want weekday or weekend")
         used = self.weekend == (kind == "weekend")
         if days is not None:
             used &= days
@@ -350,24 +350,24 @@ def csv_columns(
     """Return the positions of the required columns in the header."""
     _, header = next(rows, (0, []))
     if not header:
-        raise InputError(f"{path}: empty, wanted a header with the columns {', '.join(needed)}")
+        raise InputError(f"{path}: empty, want a header with the columns {', '.join(needed)}")
     for name in header:
         if name not in known:
-            raise InputError(f"{path}: column {name!r} is unknown, wanted some of {', '.join(known)}")
+            raise InputError(f"{path}: column {name!r} is unknown, want some of {', '.join(known)}")
         if header.count(name) > 1:
-            raise InputError(f"{path}: column {name!r} stands there twice, wanted it once")
+            raise InputError(f"{path}: column {name!r} stands there twice, want it once")
     for name in needed:
         if name not in header:
-            raise InputError(f"{path}: column {name!r} is missing, wanted {', '.join(needed)}")
+            raise InputError(f"{path}: column {name!r} is missing, want {', '.join(needed)}")
     return [header.index(name) for name in needed]
 
 
 def _moment(path: Path, line: int, text: str) -> datetime:
-    wanted = "wanted local date and time, for example 2015-11-12 07:09"
+    wanted = "want local date and time, for example 2015-11-12 07:09"
     try:
         moment = datetime.fromisoformat(text)
     except ValueError:
         moment = None
     if moment is None or ":" not in text or moment.tzinfo is not None:
-        raise InputError(f"{path}: line {line}: datetime: got {text!r}, {wanted}")
+        raise InputError(f"{path}: line {line}: datetime is {text!r}, {wanted}")
     return moment

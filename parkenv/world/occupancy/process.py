@@ -48,13 +48,13 @@ class ArrivalWindow:
         days = tuple(self.weekdays)
         if not days or len(set(days)) != len(days) or not set(days) <= set(range(7)):
             raise InputError(
-                f"ArrivalWindow.weekdays: got {days}, wanted different numbers from 0 (Mon) to 6 (Sun)"
+                f"ArrivalWindow.weekdays is {days}, want different numbers from 0 (Mon) to 6 (Sun)"
             )
         if not 0 <= self.start_s < DAY_S:
-            raise InputError(f"ArrivalWindow.start_s: got {self.start_s}, wanted seconds in [0, 86400)")
+            raise InputError(f"ArrivalWindow.start_s is {self.start_s}, want seconds in [0, 86400)")
         if not self.start_s <= self.end_s <= DAY_S:
             raise InputError(
-                f"ArrivalWindow.end_s: got {self.end_s}, wanted seconds in [start_s={self.start_s}, 86400]"
+                f"ArrivalWindow.end_s is {self.end_s}, want seconds in [start_s={self.start_s}, 86400]"
             )
         object.__setattr__(self, "weekdays", days)
 
@@ -71,7 +71,7 @@ class ArrivalWindow:
         """
         match = re.fullmatch(r"\s*(\d{1,2}):([0-5]\d)\s*-\s*(\d{1,2}):([0-5]\d)\s*", hours)
         if match is None:
-            raise InputError(f"arrival hours: got {hours!r}, wanted HH:MM-HH:MM, for example 08:00-13:00")
+            raise InputError(f"arrival hours are {hours!r}, want HH:MM-HH:MM, for example 08:00-13:00")
         start_h, start_min, end_h, end_min = map(int, match.groups())
         names = [name.strip() for name in days.lower().split(",")]
         if days.lower() in DAY_GROUPS:
@@ -80,7 +80,7 @@ class ArrivalWindow:
             weekdays = tuple(DAY_NAMES.index(name) for name in names)
         else:
             wanted = f"{', '.join(DAY_GROUPS)}, or some of {','.join(DAY_NAMES)}"
-            raise InputError(f"arrival days: got {days!r}, wanted {wanted}")
+            raise InputError(f"arrival days are {days!r}, want {wanted}")
         return cls(weekdays, start_h * HOUR_S + start_min * 60.0, end_h * HOUR_S + end_min * 60.0)
 
     def draw_second(self, key: np.uint64) -> float:
@@ -182,7 +182,7 @@ class ProcessWorld:
 
     def __init__(self, process: "OccupancyProcess", key: np.uint64, arrival: Arrival) -> None:
         if not math.isfinite(arrival.time):
-            raise InputError(f"Arrival.time: got {arrival.time}, wanted finite seconds")
+            raise InputError(f"Arrival.time is {arrival.time}, want finite seconds")
         # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
         self._cursors = np.zeros(process.n_slots, kernels.CURSOR)
         self.process = process
@@ -218,7 +218,7 @@ class ProcessWorld:
     def _seek(self, slots: IntArray, time: float, ends: FloatArray) -> BoolArray:
         arrival = float(self.arrival.time)
         if not arrival <= time < math.inf:
-            raise InputError(f"time: got {time}, wanted finite seconds at or after the arrival at {arrival}")
+            raise InputError(f"time is {time}, want finite seconds at or after the arrival at {arrival}")
         occupied = np.empty(slots.size, np.bool_)
         cursors = address_of(self._cursors, kernels.CURSOR)
         world = address_of(self._record, kernels.WORLD)
@@ -281,7 +281,7 @@ class OccupancyProcess:
             fastest = float((factors.max(axis=1) * profiles.max(axis=1)).max())
         if not fastest <= MAX_RATE:
             raise InputError(
-                f"OccupancyProcess: got a rate of {fastest:g}/s, wanted factor * profile <= {MAX_RATE:g}"
+                f"OccupancyProcess has a rate of {fastest:g}/s, want factor * profile <= {MAX_RATE:g}"
             )
         hazards = np.pad(np.cumsum(profiles * HOUR_S, axis=1), ((0, 0), (1, 0)))
         for name, array in (("factors", factors), ("profiles", profiles), ("hazards", hazards)):
@@ -304,11 +304,11 @@ class OccupancyProcess:
     def _checked_nearness(self, n: int) -> FloatArray | None:
         if self.nearness is None:
             if self.day_error.slope > 0.0:
-                raise InputError("OccupancyProcess.nearness: got None, wanted numbers: its days have a slope")
+                raise InputError("OccupancyProcess.nearness is None, want numbers: its days have a slope")
             return None
         near = _numbers("nearness", self.nearness, n)
         if not np.all(np.abs(near) <= 1.0):
-            raise InputError("OccupancyProcess.nearness: wanted numbers from -1 to 1")
+            raise InputError("OccupancyProcess.nearness: want numbers from -1 to 1")
         near.flags.writeable = False
         return near
 
@@ -328,12 +328,12 @@ class OccupancyProcess:
             mean_stay_s: s, mean parking duration, the same for all slots and hours.
         """
         if not 0 < mean_stay_s < math.inf:
-            raise InputError(f"mean_stay_s: got {mean_stay_s}, wanted seconds > 0")
+            raise InputError(f"mean_stay_s is {mean_stay_s}, want seconds > 0")
         attraction, demand = np.asarray(attraction, float), np.asarray(demand, float)
         for name, logits in (("attraction", attraction), ("demand", demand)):
             # Beyond this, the exponential exceeds the floating-point range.
             if not np.all(np.abs(logits) <= 300):
-                raise InputError(f"{name}: wanted finite logits between -300 and 300")
+                raise InputError(f"{name}: want finite logits between -300 and 300")
         return cls(
             np.exp(attraction),
             np.exp(demand) / mean_stay_s,
@@ -349,7 +349,7 @@ class OccupancyProcess:
         wanted = set(_FIELDS)
         if content.keys() != wanted:
             odd = ", ".join(sorted(content.keys() ^ wanted))
-            raise InputError(f"{path}: missing or unknown fields: {odd}; wanted {', '.join(sorted(wanted))}")
+            raise InputError(f"{path}: missing or unknown fields: {odd}; want {', '.join(sorted(wanted))}")
         sizes = content.pop("day_error")
         try:
             if not isinstance(sizes, dict) or not sizes.keys() <= {"level", "slope"}:
@@ -413,7 +413,7 @@ class OccupancyProcess:
         Scaling the arrival rates shifts every slot's attraction by the same logit.
         """
         if not 0 < target < 1:
-            raise InputError(f"target mean occupancy: got {target}, wanted a number between 0 and 1")
+            raise InputError(f"target mean occupancy is {target}, want a number between 0 and 1")
 
         def scaled(shift: float) -> OccupancyProcess:
             return replace(self, arrival_factor=self.arrival_factor * math.exp(shift))
@@ -463,7 +463,7 @@ _RATES = _FIELDS[:4]
 def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:
     array = _numbers(name, values, size)
     for i in np.flatnonzero(~((array >= 0) & np.isfinite(array))):
-        raise InputError(f"OccupancyProcess.{name}[{i}]: got {array[i]}, wanted a finite number >= 0")
+        raise InputError(f"OccupancyProcess.{name}[{i}] is {array[i]}, want a finite number >= 0")
     return array
 
 
@@ -471,9 +471,7 @@ def _numbers(name: str, values: Any, size: int | None = None) -> FloatArray:
     try:
         array = np.array(values, float)
     except (TypeError, ValueError) as error:
-        raise InputError(f"OccupancyProcess.{name}: {error}, wanted numbers") from error
+        raise InputError(f"OccupancyProcess.{name}: {error}, want numbers") from error
     if array.ndim != 1 or not array.size or array.size != (size or array.size):
-        raise InputError(
-            f"OccupancyProcess.{name}: got shape {array.shape}, wanted ({size or 'n'},), not empty"
-        )
+        raise InputError(f"OccupancyProcess.{name} has shape {array.shape}, want ({size or 'n'},), not empty")
     return array

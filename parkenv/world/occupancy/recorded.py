@@ -62,12 +62,12 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     for line, row in rows:
         slot_id, log_slot_id = row[at_slot], row[at_log_slot]
         if slot_id not in lot_index:
-            raise InputError(f"{path}: line {line}: slot_id: got {slot_id!r}, wanted a slot of the lot")
+            raise InputError(f"{path}: line {line}: slot_id is {slot_id!r}, want a slot of the lot")
         if mapping[lot_index[slot_id]] >= 0:
-            raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, wanted it once")
+            raise InputError(f"{path}: line {line}: slot_id: {slot_id!r} a second time, want it once")
         if log_slot_id not in log_index:
             raise InputError(
-                f"{path}: line {line}: log_slot_id: got {log_slot_id!r}, wanted a slot of {log.source}"
+                f"{path}: line {line}: log_slot_id is {log_slot_id!r}, want a slot of {log.source}"
             )
         mapping[lot_index[slot_id]] = log_index[log_slot_id]
     missing = [slot_id for slot_id, i in lot_index.items() if mapping[i] < 0]
@@ -161,7 +161,7 @@ class RecordedWorld:
         """Second of the recorded day."""
         if not self.arrival.time <= time < math.inf:
             raise InputError(
-                f"time: got {time}, wanted finite seconds from the arrival at {self.arrival.time} on"
+                f"time is {time}, want finite seconds from the arrival at {self.arrival.time} on"
             )
         return float(time) - self._midnight
 
@@ -218,17 +218,17 @@ class RecordedOccupancy:
     def __post_init__(self) -> None:
         walk = np.array(self.walk_m, float)
         if walk.ndim != 1 or not walk.size or not np.all((walk >= 0) & np.isfinite(walk)):
-            raise InputError(f"walk_m: got shape {walk.shape}, wanted (n,) finite metres >= 0")
+            raise InputError(f"walk_m has shape {walk.shape}, want (n,) finite metres >= 0")
         object.__setattr__(self, "walk_m", walk)
         if self.mapping is not None:
             mapping = np.array(self.mapping, np.int64)
             m = len(self.log.slot_ids)
             if mapping.shape != walk.shape or mapping.min() < 0 or mapping.max() >= m:
-                raise InputError(f"mapping: wanted ({walk.size},) indices of log slots from 0 to {m - 1}")
+                raise InputError(f"mapping: want ({walk.size},) indices of log slots from 0 to {m - 1}")
             object.__setattr__(self, "mapping", mapping)
         if self.forecast_from not in FORECAST_FROM:
             raise InputError(
-                f"forecast_from: got {self.forecast_from!r}, wanted one of {', '.join(FORECAST_FROM)}"
+                f"forecast_from is {self.forecast_from!r}, want one of {', '.join(FORECAST_FROM)}"
             )
         if self.replay_from is None and self.forecast_from != "others":
             raise InputError(f"forecast_from is {self.forecast_from!r}, want replay_from with it")
@@ -310,10 +310,10 @@ class RecordedOccupancy:
 
     def _second(self, arrival: Arrival) -> float:
         if arrival.day not in self.log.days[self._first :]:
-            raise InputError(f"Arrival.day: got {arrival.day!r}, wanted a recorded day of {self.log.source}")
+            raise InputError(f"Arrival.day is {arrival.day!r}, want a recorded day of {self.log.source}")
         second = arrival.time - weekday_of(arrival.day) * DAY_S
         if not 0 <= second < DAY_S:
-            raise InputError(f"Arrival.time: got {arrival.time}, wanted a second of {arrival.day}")
+            raise InputError(f"Arrival.time is {arrival.time}, want a second of {arrival.day}")
         return second
 
     def mapped_log(self, day: str) -> MappedLog:
@@ -364,7 +364,7 @@ class RecordedOccupancy:
         if not known.size:
             raise InputError(
                 f"{log.source}: a world of {self.n_slots} slots replays {len(held_out)} of {same_class.size} recorded"
-                f" {day_class(log.days[same_class[0]])} days, wanted at least {left} to forecast from"
+                f" {day_class(log.days[same_class[0]])} days, want at least {left} to forecast from"
             )
         return known
 
@@ -422,7 +422,7 @@ class RecordedOccupancy:
                 )
                 raise InputError(
                     f"{self.log.source}: slot {name} would serve {n_copies} slots of the lot but was recorded"
-                    f" on {n_days} days of the class{since}; wanted a smaller lot or a longer log"
+                    f" on {n_days} days of the class{since}; want a smaller lot or a longer log"
                 )
             days[slot] = chosen
         return days
