@@ -8,7 +8,7 @@ from PIL import Image
 
 from parkenv.engine.fleet import DriverKind, Fleet, total_s
 from parkenv.engine.fleet_rules import RULES
-from parkenv.show.fleet_rendering import FleetRenderer
+from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 

@@ -10,9 +10,10 @@ from gymnasium.utils.env_checker import check_env
 import parkenv  # noqa: F401  (registers the environments)
 from parkenv import make_scenario
 from parkenv.lots import city_lot
-from parkenv.show import rendering
-from parkenv.show.rendering import SearchRenderer, belief_colors, clock
-from parkenv.show.window import Window
+from parkenv.show.colors import PALETTE, belief_colors
+from parkenv.show.frames.lot import clock
+from parkenv.show.frames.search import SearchRenderer
+from parkenv.show.frames.window import Window
 from parkenv.world.lot import PARK, Lane, ParkingLot
 from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 
@@ -48,7 +49,7 @@ def middle_of_slot(renderer, state, slot, along=0.0):
     lot = renderer.scenario.lot
     yaw = lot.slot_yaw[slot]
     point = lot.slot_xy[slot] + along * np.array([np.cos(yaw), np.sin(yaw)])
-    column, row = np.floor(renderer.still_layer(state).view(point)).astype(int)
+    column, row = np.floor(renderer.frames.still(lot.vertex_xy[state.vertex]).view(point)).astype(int)
     return row, column
 
 
@@ -91,15 +92,13 @@ def test_slots_have_the_colour_of_the_belief_and_cars_stand_where_the_truth_is_t
         edge = frame[middle_of_slot(renderer, state, slot, along=2.3)]
         assert np.abs(edge.astype(int) - colors[slot]).max() <= 2
         center = frame[middle_of_slot(renderer, state, slot)]
-        assert (
-            np.abs(center.astype(int) - (rendering.PARKED_CAR if occupied[slot] else colors[slot])).max() <= 2
-        )
+        assert np.abs(center.astype(int) - (PALETTE["parked"] if occupied[slot] else colors[slot])).max() <= 2
 
 
 def test_what_was_not_seen_is_paler():
     p = np.array([0.0, 0.3, 0.8, 1.0])
     pale, full = (belief_colors(p, np.full(4, seen)).astype(float) for seen in (False, True))
-    ground = np.array(rendering.GROUND)
+    ground = np.array(PALETTE["ground"])
     assert (np.abs(pale - ground).sum(axis=1) < np.abs(full - ground).sum(axis=1)).all()
     assert full[0, 1] > full[0, 0]  # free is greenish,
     assert full[3, 0] > full[3, 1]  # taken is reddish
@@ -107,8 +106,8 @@ def test_what_was_not_seen_is_paler():
 
 def test_a_lot_higher_than_wide_is_turned_and_drawn_as_large():
     flat, high = (SearchRenderer(make_scenario(row_lot(vertical=v))) for v in (False, True))
-    assert high._whole.scale == pytest.approx(flat._whole.scale)
-    north = high._whole(np.array([0.0, 30.0])) - high._whole(np.array([0.0, 0.0]))
+    assert high.frames.whole.scale == pytest.approx(flat.frames.whole.scale)
+    north = high.frames.whole(np.array([0.0, 30.0])) - high.frames.whole(np.array([0.0, 0.0]))
     assert north[0] > 0
     assert north[1] == pytest.approx(0)
 
@@ -116,7 +115,7 @@ def test_a_lot_higher_than_wide_is_turned_and_drawn_as_large():
 def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     scenario = make_scenario(city_lot(4000, seed=2))
     renderer = SearchRenderer(scenario)
-    assert renderer._whole is None
+    assert renderer.frames.whole is None
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     env.reset(seed=0)
     state = env.unwrapped.state
@@ -125,12 +124,13 @@ def test_a_large_lot_is_shown_through_a_window_that_follows_the_car():
     for vertex in (0, 2000, 3999, 0):
         state = stand_in(env, vertex=vertex, path=[vertex])
         frame = renderer.frame(state, nothing)
-        column, row = renderer._still.view(scenario.lot.vertex_xy[vertex])
+        still = renderer.frames.still(scenario.lot.vertex_xy[vertex])
+        column, row = still.view(scenario.lot.vertex_xy[vertex])
         assert 0.2 * 640 < column < 0.8 * 640
         assert 0.2 * 446 < row < 0.8 * 446
-        assert (frame == rendering.CAR).all(axis=2).any()
+        assert (frame == PALETTE["car"]).all(axis=2).any()
         assert np.array_equal(frames.setdefault(vertex, frame), frame)
-        assert len(renderer._still.slots) < 1000
+        assert len(still.slots) < 1000
 
 
 def test_a_goal_out_of_the_window_is_pointed_at():
@@ -138,7 +138,7 @@ def test_a_goal_out_of_the_window_is_pointed_at():
     env = gym.make("parkenv/Search-v2", scenario=scenario, render_mode="rgb_array")
     env.reset(seed=0)
     away = scenario.lot.goals[0] - scenario.lot.vertex_xy[env.unwrapped.state.vertex]
-    rows, columns = np.nonzero((env.render()[:446] == rendering.WALK).all(axis=2))
+    rows, columns = np.nonzero((env.render()[:446] == PALETTE["goal"]).all(axis=2))
     assert len(rows) > 20
     if abs(away[0]) > abs(away[1]):
         assert np.sign(columns.mean() - 320) == np.sign(away[0])
@@ -159,7 +159,7 @@ def test_the_end_of_a_search_shows_the_walk():
     assert unwrapped.state.parked == free
 
     def walk_pixels(frame):
-        return int((frame == rendering.WALK).all(axis=2).sum())
+        return int((frame == PALETTE["goal"]).all(axis=2).sum())
 
     assert (walk_pixels(after) > walk_pixels(before) + 100) == free
 
@@ -174,7 +174,7 @@ def test_a_full_lot_ends_at_a_junction_too():
         onward = lot.vertex_xy[lot.neighbors[env.unwrapped.state.vertex, out], 0]
         _, _, over, _, _ = env.step(int(out[np.argmax(onward)]))
     state = stand_in(env, vertex=10)
-    assert (env.render()[446:] == rendering.GAVE_UP).all(axis=2).any()
+    assert (env.render()[446:] == PALETTE["warning"]).all(axis=2).any()
     assert "every slot is taken" in SearchRenderer(env.unwrapped.scenario).text(state)
 
 

@@ -36,7 +36,7 @@ from parkenv.world.traffic import Traffic
 from sim_sensors.laser.scanner import LaserScanner
 
 if TYPE_CHECKING:
-    from parkenv.show.drive_rendering import DriveRenderer
+    from parkenv.show.frames.drive import DriveRenderer
 
 
 SUBSTEPS = 2  # physics steps per action
@@ -349,7 +349,7 @@ length and width over the car's |
             )
             return None
         if self._renderer is None:
-            from parkenv.show.drive_rendering import DriveRenderer
+            from parkenv.show.frames.drive import DriveRenderer
 
             self._renderer = DriveRenderer(self.tasks.lot)
         frame = self._renderer.frame(self.state, [outline for _, outline in self._moving()])

@@ -17,7 +17,7 @@ from parkenv.world.demand import MAX_CARS, Demand, Headways
 from parkenv.world.lot import ACTIONS
 
 if TYPE_CHECKING:
-    from parkenv.show.fleet_rendering import FleetRenderer
+    from parkenv.show.frames.fleet import FleetRenderer
 
 Observation = Mapping[str, Any]
 MAX_CYCLES = MAX_STEPS
@@ -131,7 +131,7 @@ class FleetAgents:
             gym.logger.warn('render() does nothing without a render_mode, e.g. env(render_mode="rgb_array")')
             return None
         if self._renderer is None:
-            from parkenv.show.fleet_rendering import FleetRenderer
+            from parkenv.show.frames.fleet import FleetRenderer
 
             self._renderer = FleetRenderer(self.fleet)
         frame = self._renderer.frame()

@@ -25,7 +25,7 @@ from parkenv.world.lot import ACTIONS
 from parkenv.world.scenario import Scenario
 
 if TYPE_CHECKING:
-    from parkenv.show.rendering import SearchRenderer
+    from parkenv.show.frames.search import SearchRenderer
 
 _REBUILT = {
     "searches", "scenario", "_state", "_address", "_copies", "_place", "_step", "_copy_mask", "_copy_masks",
@@ -332,7 +332,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             )
             return None
         if self._renderer is None:
-            from parkenv.show.rendering import SearchRenderer
+            from parkenv.show.frames.search import SearchRenderer
 
             self._renderer = SearchRenderer(self.scenario)
         state = self.state

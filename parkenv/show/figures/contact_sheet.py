@@ -8,14 +8,14 @@ from pathlib import Path
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
 from parkenv.show.figures.picture_files import STYLE, save_picture
-from parkenv.world.lot import ParkingLot, corner_points
+from parkenv.show.figures.schematic import ONE_WAY, TWO_WAY, schematic
+from parkenv.show.painters.axes import paint
+from parkenv.world.lot import ParkingLot
 
 COLUMNS = 6
 WIDTH, HEIGHT, KEY = 2.8, 3.2, 0.4
@@ -25,7 +25,7 @@ SCALES = (5, 10, 20, 50, 100, 200, 500)
 LONGEST_NAME = 28
 LARGEST = 60
 """Number of lots in one sheet."""
-SLOT, ONE_WAY, TWO_WAY, TIE = "#9db8d2", "#aa3377", "#333a42", "#8fa58f"
+SLOT = "#9db8d2"
 
 
 def save_contact_sheets(lots: Sequence[tuple[str, ParkingLot]], folder: Path) -> list[Path]:
@@ -59,13 +59,16 @@ def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path)
         grid = figure.subplots(rows, columns, squeeze=False)
         for ax in grid.flat[len(shown) :]:
             ax.remove()
-        for ax, (caption, lot) in zip(grid.flat, shown, strict=False):
-            _draw_lot(ax, lot)
+        for ax, (caption, _) in zip(grid.flat, shown, strict=False):
+            ax.set(xticks=[], yticks=[])
             name, _, details = caption.partition("\n")
             ax.set_title(_shortened(name), fontsize=10, weight="bold", color=INK, pad=16)
             ax.text(0.0, 1.02, details, transform=ax.transAxes, fontsize=9, color=INK, va="bottom")
         bottom = KEY / (HEIGHT * rows + KEY)
         figure.tight_layout(pad=0.6, w_pad=1.0, h_pad=1.0, rect=(0.0, bottom, 1.0, 1.0))
+        # Widths depend on the final size of the axes.
+        for ax, (_, lot) in zip(grid.flat, shown, strict=False):
+            _draw_lot(ax, lot)
         handles = [
             Line2D([], [], linestyle="", marker="^", color=ENTRY, label="entry"),
             Line2D([], [], linestyle="", marker="*", color=GOAL, markeredgecolor=INK, label="goal"),
@@ -77,30 +80,28 @@ def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path)
 
 
 def _draw_lot(ax: Axes, lot: ParkingLot) -> None:
-    ax.set_aspect("equal", adjustable="datalim")
     ax.set(xticks=[], yticks=[], facecolor=GROUND)
     ax.spines[:].set_visible(False)
-    corners = corner_points(lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width)
-    ax.add_collection(PolyCollection(list(corners), facecolors=SLOT, edgecolors="white", linewidths=0.3))
-    mouth = lot.mouth_xy()
-    ties = np.stack([mouth, nearest_on_lanes(lot.lanes, mouth)[0]], axis=1)
-    ax.add_collection(LineCollection(list(ties), colors=TIE, linewidths=0.4))
-    colors = [ONE_WAY if lane.oneway else TWO_WAY for lane in lot.lanes]
-    ax.add_collection(LineCollection([lane.points for lane in lot.lanes], colors=colors, linewidths=1.1))
-    for lane in lot.lanes:
-        if lane.oneway:
-            arrow = {"arrowstyle": "->", "color": ONE_WAY}
-            ax.annotate("", lane.points[-1], lane.points[-2], arrowprops=arrow)
-    ax.plot(*lot.entries.T, "^", color=ENTRY, markersize=6)
-    ax.plot(*lot.goals.T, "*", color=GOAL, markeredgecolor=INK, markeredgewidth=0.4, markersize=9)
-    low_x, low_y, high_x, high_y = lot.bounds()
-    extent = max((high_x - low_x) / WIDTH, (high_y - low_y) / HEIGHT) * WIDTH
+    corners = lot.slot_corners()
+    lanes = [lane.points for lane in lot.lanes]
+    points = np.concatenate([corners.reshape(-1, 2), *lanes, lot.entries, lot.goals])
+    low, high = points.min(axis=0), points.max(axis=0)
+    box = ax.get_window_extent()
+    # As large as the axes allow, with room for the bar below the lot.
+    extent = 1.1 * max(high[0] - low[0], 1.1 * (high[1] - low[1]) * box.width / box.height)
+    (x, y), half = (low + high) / 2 - [0.0, 0.04 * extent], extent / 2
+    up = half * box.height / box.width
+    ax.set(xlim=(x - half, x + half), ylim=(y - up, y + up))
+    ax.set_aspect("equal")
+    paint(
+        ax,
+        schematic(corners, SLOT, lot.mouth_xy(), lot.lanes, lot.entries, lot.goals, small=True),
+        1.0,
+    )
     length = max((step for step in SCALES if step < 0.4 * extent), default=SCALES[0])
-    # Room for the bar below the lot.
-    bar_y = low_y - 0.08 * extent
-    ax.plot([low_x, low_x + length], [bar_y, bar_y], color=INK, linewidth=1.5, solid_capstyle="butt")
-    ax.text(low_x + length, bar_y, f" {length} m", fontsize=8, color=INK, va="center")
-    ax.autoscale_view()
+    bar_y = low[1] - 0.08 * extent
+    ax.plot([low[0], low[0] + length], [bar_y, bar_y], color=INK, linewidth=1.5, solid_capstyle="butt")
+    ax.text(low[0] + length, bar_y, f" {length} m", fontsize=8, color=INK, va="center")
 
 
 def _shortened(name: str) -> str:

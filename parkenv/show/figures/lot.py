@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
@@ -9,30 +10,27 @@ from textwrap import wrap
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.collections import EllipseCollection, LineCollection, PolyCollection
+from matplotlib.collections import EllipseCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
-from matplotlib.patches import FancyArrowPatch, PathPatch, Polygon, Rectangle
-from matplotlib.path import Path as Outline
 from matplotlib.typing import ColorType
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.lot_outline import LotOutline, Rings
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.show.rendering import BELIEF_ANCHORS
+from parkenv.show.colors import BELIEF_ANCHORS, hex_color
+from parkenv.show.painters.axes import draw_scale_bar, paint, points_per_m
+from parkenv.show.scene import ARROWHEAD, DISC, STAR, Layer, Lines, LotScene, Marks, posed
 from parkenv.world.lot import ParkingLot
 
-GROUND = "#e7eae0"
-ASPHALT = "#5f646a"
-PAINT = "#ffffff"
-BUILDING = "#cdc5b8"
-WALL = "#877d70"
-ENTRY = "#1d8a4e"
-GOAL = "#ffc53a"
-GRAPH = "#ffd98a"
 INK = "#333333"
+GROUND, ENTRY, GOAL = (hex_color(name) for name in ("ground", "entry", "star"))
+ARROWHEAD_LENGTH = 0.9  # m, of a move in the drive graph
+ENTRY_ARROW = np.array(
+    [[1.0, 0.0], [0.6, 0.28], [0.6, 0.1], [0.0, 0.1], [0.0, -0.1], [0.6, -0.1], [0.6, -0.28]]
+)
+"""An arrow from the entry into the lot."""
 BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
 """Colours of beliefs, from free to taken."""
 COST_MAP = "viridis"
@@ -61,24 +59,36 @@ def draw_lot(
     ax.set_aspect("equal")
     ax.set_facecolor(GROUND)
     ax.spines[:].set_visible(False)
-    # Road markings are drawn to scale, but not too thin to see.
-    scale = points_per_m(ax)
-    paint_width = float(np.clip(0.12 * scale, 0.2, 1.2))
-
-    outline = LotOutline.of(lot)
-    ax.add_patch(_patch(outline.paved(), facecolor=ASPHALT, edgecolor="none", zorder=0.5))
-    _draw_lane_marks(outline, ax, paint_width)
+    scene = LotScene.of(lot)
+    paint(ax, scene.ground(), 0.5)
     if slot_color is not None:
         ax.add_collection(
-            PolyCollection(list(outline.slots), facecolors=slot_color, edgecolors="none", zorder=1.0)
+            PolyCollection(list(scene.slots), facecolors=slot_color, edgecolors="none", zorder=1.0)
         )
-    lines = LineCollection(list(outline.slot_lines), colors=PAINT, linewidths=paint_width, zorder=1.1)
-    ax.add_collection(lines)
-    draw_walls(ax, outline.buildings, outline.walls)
+    paint(ax, [Lines(list(scene.slot_lines), "paint", 0.12, (0.2, 1.2))], 1.1)
     if show_graph:
-        _draw_graph(lot, ax, scale)
-    _draw_entries_and_goals(outline, ax, scale)
-    _draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0)
+        paint(ax, drive_graph(lot), 1.5)
+    marks = [
+        Marks(scene.entries, ENTRY_ARROW, "entry", px=32.0, edge="paint", edge_px=0.7),
+        Marks(posed(scene.lot.goals), STAR, "star", px=21.0, edge="ink", edge_px=0.9),
+    ]
+    paint(ax, marks, 5.0)
+    draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0, INK)
+
+
+def drive_graph(lot: ParkingLot) -> list[Layer]:
+    """Return the layers of the drive graph: an arrow for every move, a disc for every vertex."""
+    source, column = np.nonzero(lot.neighbors >= 0)
+    tail, head = lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]
+    step = head - tail
+    length = np.hypot(*step.T)
+    tip = ARROWHEAD_LENGTH / 2 / np.maximum(length, 1e-9)[:, None]
+    heads = posed(head - tip * step, np.arctan2(step[:, 1], step[:, 0]))
+    return [
+        Lines(list(np.stack([tail, head], axis=1)), "graph", 0.18, (0.2, math.inf)),
+        Marks(heads, ARROWHEAD, "graph", (ARROWHEAD_LENGTH, 0.8)),
+        Marks(posed(lot.vertex_xy), DISC, "graph", (0.55, 0.55), edge="ink", edge_px=0.3),
+    ]
 
 
 def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) -> None:
@@ -109,13 +119,6 @@ def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) 
             zorder=1.5,
         )
         ax.add_collection(discs)
-
-
-def points_per_m(ax: Axes) -> float:
-    """Return the size of a metre, points, in axes with an equal aspect ratio."""
-    box = ax.get_window_extent()
-    across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
-    return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
 
 
 def save_lot_picture(
@@ -173,118 +176,3 @@ def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:
     if guesses:
         lines = [line for guess in guesses for line in wrap(f"guessed: {guess}", 100)]
         ax.text(0.0, -0.01, "\n".join(lines), transform=ax.transAxes, va="top", fontsize=9, color=INK)
-
-
-def draw_walls(ax: Axes, buildings: Sequence[FloatArray], walls: Sequence[FloatArray]) -> None:
-    """Draw buildings and walls, (k, 2) m each."""
-    for building in buildings:
-        ax.add_patch(Polygon(building, facecolor=BUILDING, edgecolor=WALL, linewidth=0.8, zorder=0.8))
-    ax.add_collection(LineCollection(list(walls), colors=WALL, linewidths=1.6, capstyle="butt", zorder=0.8))
-
-
-def _patch(polygons: Sequence[Rings], **style: object) -> PathPatch:
-    rings = [ring for polygon in polygons for ring in polygon]
-    return PathPatch(Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings)), **style)
-
-
-def _draw_lane_marks(outline: LotOutline, ax: Axes, paint_width: float) -> None:
-    """Draw a dashed line in the middle of two-way lanes and arrows on one-way lanes."""
-    ax.add_collection(
-        LineCollection(
-            list(outline.centre_lines), colors=PAINT, alpha=0.45, linewidths=paint_width, linestyles=(0, (5, 6)),
-            zorder=0.9,
-        )
-    )  # fmt: skip
-    arrow = np.array(
-        [[1.6, 0.0], [-0.2, 0.75], [-0.2, 0.2], [-1.6, 0.2], [-1.6, -0.2], [-0.2, -0.2], [-0.2, -0.75]]
-    )
-    cos, sin = np.cos(outline.arrows[:, 2]), np.sin(outline.arrows[:, 2])
-    turn = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)
-    arrows = outline.arrows[:, None, :2] + arrow @ turn
-    ax.add_collection(
-        PolyCollection(list(arrows), facecolors=PAINT, edgecolors="none", alpha=0.85, zorder=0.9)
-    )
-
-
-def _draw_graph(lot: ParkingLot, ax: Axes, points_per_m: float) -> None:
-    source, column = np.nonzero(lot.neighbors >= 0)
-    tail, head = lot.vertex_xy[source], lot.vertex_xy[lot.neighbors[source, column]]
-    ax.quiver(
-        *tail.T,
-        *(head - tail).T,
-        angles="xy",
-        scale_units="xy",
-        scale=1.0,
-        units="xy",
-        width=0.18,
-        headwidth=4.5,
-        headlength=5.0,
-        headaxislength=4.5,
-        color=GRAPH,
-        zorder=1.5,
-    )
-    ax.scatter(
-        lot.vertex_xy[:, 0],
-        lot.vertex_xy[:, 1],
-        s=(0.55 * points_per_m) ** 2,
-        color=GRAPH,
-        edgecolors=INK,
-        linewidths=0.3,
-        zorder=1.6,
-    )
-
-
-def _draw_entries_and_goals(outline: LotOutline, ax: Axes, points_per_m: float) -> None:
-    """Draw an arrow into the lot at each entry and a star at each goal."""
-    for x, y, yaw in outline.entries:
-        reach = 32.0 / points_per_m
-        ax.add_patch(
-            FancyArrowPatch(
-                (x, y),
-                (x + reach * np.cos(yaw), y + reach * np.sin(yaw)),
-                arrowstyle="simple,head_length=0.9,head_width=1.1,tail_width=0.45",
-                mutation_scale=14.0,
-                shrinkA=0.0,
-                shrinkB=0.0,
-                facecolor=ENTRY,
-                edgecolor=PAINT,
-                linewidth=0.7,
-                zorder=5,
-            )
-        )
-    ax.scatter(
-        outline.goals[:, 0],
-        outline.goals[:, 1],
-        marker="*",
-        s=340.0,
-        color=GOAL,
-        edgecolors=INK,
-        linewidths=0.9,
-        zorder=5,
-    )
-
-
-def _draw_scale_bar(ax: Axes, x: float, y: float, width: float) -> None:
-    """Draw a scale bar of a round length, about a sixth of the lot's width, with its lower left corner at (x, y)."""
-    power = 10.0 ** np.floor(np.log10(width / 6))
-    length = power * max(step for step in (1, 2, 5) if step * power <= width / 6)
-    thickness = 0.005 * width
-    for i in (0, 1):
-        ax.add_patch(
-            Rectangle(
-                (x + i * length / 2, y),
-                length / 2,
-                thickness,
-                facecolor=(INK, "white")[i],
-                edgecolor=INK,
-                linewidth=0.7,
-            )
-        )
-    ax.annotate(
-        f"{length:g} m",
-        (x + length, y + thickness / 2),
-        (5, 0),
-        textcoords="offset points",
-        va="center",
-        color=INK,
-    )

@@ -7,24 +7,21 @@ from textwrap import wrap
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.draft import LotDraft
-from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK, draw_walls
+from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
 from parkenv.show.figures.picture_files import save_picture
-from parkenv.world.lot import Lane, corner_points, is_building, mouth_points
+from parkenv.show.figures.schematic import schematic
+from parkenv.show.painters.axes import paint
+from parkenv.show.scene import DISC, Areas, Marks, building_layers, posed
+from parkenv.world.lot import corner_points, is_building, mouth_points
 
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
-ROAD = "#333a42"
-TIE = "#9aa0a6"
-ARROW_EVERY = 15.0
-"""Distance between arrows on a one-way lane, m."""
 
 
 def save_import_picture(draft: LotDraft, path: str | Path) -> None:
@@ -45,9 +42,13 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     width, height = max(size[0] * scale, 5.0), max(size[1] * scale, 2.0)
     figure = Figure(figsize=(width, height + room))
     ax = figure.add_axes((0.07, (room + 0.1) / (height + room), 0.92, (height - 0.4) / (height + room)))
-    _draw(draft, ax)
     margin = 0.04 * size.max()
     ax.set(xlim=(low[0] - margin, high[0] + margin), ylim=(low[1] - margin, high[1] + margin))
+    ax.set_aspect("equal")
+    ax.set_facecolor(GROUND)
+    ax.tick_params(labelsize=7)
+    ax.set_xlabel("m", fontsize=7)
+    _draw(draft, ax)
     ax.set_title(f"{draft.name}: {len(draft.slots)} slots, {len(draft.lanes)} lanes", loc="left", fontsize=9)
     handles: list[Patch | Line2D] = [
         Patch(facecolor=SOURCE_COLORS[k % len(SOURCE_COLORS)], label=source)
@@ -82,46 +83,16 @@ def _extent(draft: LotDraft) -> FloatArray:
 
 
 def _draw(draft: LotDraft, ax: Axes) -> None:
-    ax.set_aspect("equal")
-    ax.set_facecolor(GROUND)
-    ax.tick_params(labelsize=7)
-    ax.set_xlabel("m", fontsize=7)
-    ax.add_collection(PolyCollection(list(draft.outlines), facecolors=AREA, edgecolors=AREA_EDGE, zorder=0.5))
-    draw_walls(ax, *([w for w in draft.walls if is_building(w) == closed] for closed in (True, False)))
-    ax.plot(*draft.loose.T, "o", color=SOURCE_COLORS[0], markersize=4, zorder=1.0)
-    slots = draft.slots
-    sources = _sources(draft)
+    slots, sources = draft.slots, _sources(draft)
     colors = [SOURCE_COLORS[sources.index(source) % len(SOURCE_COLORS)] for source in draft.slot_source]
-    corners = corner_points(slots.xy, slots.yaw, slots.length, slots.width)
-    ax.add_collection(
-        PolyCollection(list(corners), facecolors=colors, edgecolors="white", linewidths=0.4, zorder=1.0)
-    )
-    lines = [lane.points for lane in draft.lanes]
-    ax.add_collection(LineCollection(lines, colors=ROAD, linewidths=1.2, zorder=1.2))
-    if lines and len(slots):
-        mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
-        on_lane = nearest_on_lanes(draft.lanes, mouth)[0]
-        ax.add_collection(
-            LineCollection(list(np.stack([mouth, on_lane], axis=1)), colors=TIE, linewidths=0.5, zorder=1.1)
-        )
-    for lane in draft.lanes:
-        if lane.oneway:
-            _draw_arrows(lane, ax)
-    ax.plot(*draft.entries.reshape(-1, 2).T, "^", color=ENTRY, markeredgecolor=INK, markersize=9, zorder=2)
-    ax.plot(*draft.goals.reshape(-1, 2).T, "*", color=GOAL, markeredgecolor=INK, markersize=14, zorder=2)
-
-
-def _draw_arrows(lane: Lane, ax: Axes) -> None:
-    step = np.diff(lane.points, axis=0)
-    length = np.hypot(step[:, 0], step[:, 1])
-    for start, way, far in zip(lane.points, step, length, strict=False):
-        n = max(1, round(far / ARROW_EVERY))
-        for share in (np.arange(n) + 0.5) / n:
-            at = start + share * way
-            ax.annotate(
-                "",
-                tuple(at + 0.5 * way / far),
-                tuple(at - 0.5 * way / far),
-                arrowprops={"arrowstyle": "-|>", "color": ROAD, "mutation_scale": 9},
-                zorder=1.3,
-            )
+    mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    layers = [
+        Areas([[outline] for outline in draft.outlines], AREA, AREA_EDGE),
+        *building_layers([w for w in draft.walls if is_building(w)], draft.walls),
+        Marks(posed(draft.loose), DISC, SOURCE_COLORS[0], px=4.0),
+        *schematic(
+            corner_points(slots.xy, slots.yaw, slots.length, slots.width), colors, mouths, draft.lanes,
+            draft.entries.reshape(-1, 2), draft.goals.reshape(-1, 2),
+        ),
+    ]  # fmt: skip
+    paint(ax, layers, 0.5)

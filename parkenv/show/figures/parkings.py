@@ -11,7 +11,7 @@ from PIL import Image as PillowImage
 from parkenv.compiled.arrays import Image
 from parkenv.driving.drive_state import DriveState
 from parkenv.files.atomic_write import atomic_write
-from parkenv.show.drive_rendering import DriveRenderer
+from parkenv.show.frames.drive import DriveRenderer
 from parkenv.world.lot import ParkingLot
 
 COLUMNS = 2

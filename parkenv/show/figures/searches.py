@@ -9,7 +9,6 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.lines import Line2D
@@ -18,11 +17,12 @@ from matplotlib.patheffects import Normal, Stroke
 from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 
-from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.show.columns import OPTIONAL_TIMES, TIME_COLORS
-from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot, points_per_m
+from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
+from parkenv.show.painters.axes import paint, points_per_m
+from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, posed, poses_on
 from parkenv.show.search_trace import SearchTrace
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
@@ -76,46 +76,20 @@ def _title(trace: SearchTrace, width: float) -> str:
 def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
     lot, parked = trace.scenario.lot, bool(trace.metrics["parked"])
     xy = lot.vertex_xy[trace.path]
-    if parked:
-        end = lot.slot_xy[trace.path[-1]]
-        goal = lot.goals[trace.scenario.goal]
-        xy = np.vstack([xy, end])
-        ax.plot(
-            *np.stack([end, goal], axis=1),
-            color=WALK,
-            linewidth=1.8,
-            linestyle=(0, (3, 2)),
-            zorder=3,
-            path_effects=[Stroke(linewidth=3.4, foreground="white"), Normal()],
-        )
     width = float(np.clip(0.5 * scale, 1.2, 3.0))
-    ax.plot(
-        *xy.T,
-        color=PATH,
-        linewidth=width,
-        solid_joinstyle="round",
-        zorder=3.1,
-        path_effects=[Stroke(linewidth=width + 1.6, foreground=INK), Normal()],
-    )
-    step = np.diff(xy, axis=0)
-    length = np.hypot(step[:, 0], step[:, 1])
+    layers: list[Layer] = []
+    if parked:
+        end, goal = lot.slot_xy[trace.path[-1]], lot.goals[trace.scenario.goal]
+        xy = np.vstack([xy, end])
+        layers.append(Lines([np.stack([end, goal])], WALK, px=(1.8, 1.8), dash=(5.4, 3.6), halo="white"))
+    layers.append(Lines([xy], PATH, px=(width, width), halo=INK))
+    length = np.hypot(*np.diff(xy, axis=0).T)
     if length.any():
-        driven = np.r_[0.0, np.cumsum(length)]
         # About one mark per inch of path, but not hundreds on a long search.
-        n = int(np.clip(driven[-1] * scale / 60.0, 1, 18))
-        at = (np.arange(n) + 0.5) / n * driven[-1]
-        leg = np.clip(np.searchsorted(driven, at, side="right") - 1, 0, len(length) - 1)
-        ahead = step[leg] / length[leg, None]
-        middle = xy[leg] + (at - driven[leg])[:, None] * ahead
-        ax.add_collection(
-            PolyCollection(
-                _placed(_ARROWHEAD * (3.0 + 1.4 * width) / scale, middle, ahead),
-                facecolors=PATH,
-                edgecolors=INK,
-                linewidths=0.8,
-                zorder=3.2,
-            )
-        )
+        n = int(np.clip(length.sum() * scale / 60.0, 1, 18))
+        marks = poses_on(xy, (np.arange(n) + 0.5) / n * length.sum())
+        layers.append(Marks(marks, ARROWHEAD, PATH, px=1.7 * (3.0 + 1.4 * width), edge=INK, edge_px=0.8))
+    paint(ax, layers, 3.0)
     for number, point, color in (("1", xy[0], INK), ("2", xy[-1], WALK if parked else "#c03219")):
         ax.plot(*point, marker="o", markersize=11, color=color, markeredgecolor="white", zorder=6)
         ax.annotate(
@@ -130,12 +104,6 @@ def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
         )
 
 
-_ARROWHEAD = np.array([[1.0, 0.0], [-0.8, 0.9], [-0.35, 0.0], [-0.8, -0.9]])
-_ARROW = np.array(
-    [[1.0, 0.0], [0.25, 0.42], [0.25, 0.13], [-1.0, 0.13], [-1.0, -0.13], [0.25, -0.13], [0.25, -0.42]]
-)
-
-
 def _shows_policy(trace: SearchTrace, scale: float) -> bool:
     return trace.policy is not None and scale >= POLICY_SCALE
 
@@ -147,16 +115,10 @@ def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
     target = lot.neighbors[drives, policy[drives]]
     drives, target = drives[target >= 0], target[target >= 0]
     ahead = lot.vertex_xy[target] - lot.vertex_xy[drives]
-    ahead /= np.maximum(np.hypot(ahead[:, 0], ahead[:, 1]), 1e-9)[:, None]
-    colors = np.where(np.isin(np.arange(lot.n_vertices), trace.path), INK, "white")
-    ax.add_collection(
-        PolyCollection(
-            _placed(0.95 * _ARROW, lot.vertex_xy[drives], ahead),
-            facecolors=list(colors[drives]),
-            edgecolors="none",
-            zorder=3.5,
-        )
-    )
+    poses = posed(lot.vertex_xy[drives], np.arctan2(ahead[:, 1], ahead[:, 0]))
+    driven = np.isin(drives, trace.path)
+    for there, color in ((driven, INK), (~driven, "white")):
+        paint(ax, [Marks(poses[there], LANE_ARROW, color, (1.9, 0.8))], 3.5)
     size = min(2.1 * scale, 14.0)
     for color, extra in ((INK, 1.6), ("white", 0.0)):
         ax.plot(
@@ -174,12 +136,6 @@ def _text_marker(text: str) -> MplPath:
     """Return bold text as a marker; markers of mathematical text would need it in names, too."""
     path = TextPath((0, 0), text, prop=FontProperties(weight="bold"))
     return path.transformed(Affine2D().translate(*-path.get_extents().get_points().mean(axis=0)))
-
-
-def _placed(shape: FloatArray, at: FloatArray, ahead: FloatArray) -> list[FloatArray]:
-    """Place a shape, (k, 2) m with its nose towards +x, at each point, rotated to its heading."""
-    turn = np.stack([ahead, np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)], axis=1)
-    return list(at[:, None] + shape @ turn)
 
 
 def draw_searches(traces: Sequence[SearchTrace]) -> Figure:

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 
 from parkenv.compiled.arrays import Image
 from parkenv.perception.range_scan import disparity
-from parkenv.show.drawing import write_tag
 from parkenv.show.figures.lot import draw_lot
 from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.painters.opencv import write_tag
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import VehicleBoxes, View
 from sim_sensors.rig import Capture, SensorRig

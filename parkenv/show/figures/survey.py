@@ -23,9 +23,9 @@ from parkenv.mapping.inference import Prediction
 from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
-from parkenv.show.drawing import write_tag
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.painters.opencv import write_tag
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import View
 

@@ -15,7 +15,7 @@ from PIL import Image as PillowImage
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.survey import SessionResult, Survey, SurveyFrame
 from parkenv.perception.pipeline import CameraView, PerceptionResult
-from parkenv.show.report.lot_data import describe_lot
+from parkenv.show.scene import LotScene
 from sim_sensors.rig import poses_along
 
 PICTURE_WIDTH = 480
@@ -68,7 +68,7 @@ def record_drive(
     grid = result.grid
     rows, columns = grid.log_odds.shape
     return result, {
-        "lot": describe_lot(survey.scenario.lot),
+        "lot": LotScene.of(survey.scenario.lot).data(),
         "drive": {
             "key": result.session.key,
             "scenario": survey.scenario.name,

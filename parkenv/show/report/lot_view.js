@@ -31,11 +31,6 @@ class LotView {
       x: (ax + cx) / 2, y: (ay + cy) / 2, yaw: Math.atan2(by - ay, bx - ax),
       length: Math.hypot(bx - ax, by - ay), width: Math.hypot(dx - ax, dy - ay),
     }));
-    this.paved = new Path2D();
-    for (const ring of lot.paved.flat()) {
-      for (let i = 0; i < ring.length; i += 2) this.paved[i ? "lineTo" : "moveTo"](ring[i], ring[i + 1]);
-      this.paved.closePath();
-    }
     this.resize();
   }
 
@@ -100,38 +95,45 @@ class LotView {
     const { x, y, scale } = this.at;
     context.fillStyle = palette.ground;
     context.fillRect(x - this.width / scale, y - this.height / scale, (2 * this.width) / scale, (2 * this.height) / scale);
-    const trace = (points) => {
-      context.beginPath();
-      for (let i = 0; i < points.length; i += 2) context.lineTo(points[i], points[i + 1]);
-    };
     context.lineJoin = "round";
-    for (const building of lot.buildings) {
-      trace(building);
-      context.fillStyle = palette.building;
+    for (const layer of lot.ground) this.paintLayer(context, layer);
+    context.globalAlpha = 1;
+    context.setLineDash([]);
+  }
+
+  /** Paint a layer of the ground: areas with holes, lines, or one shape at several poses. */
+  paintLayer(context, layer) {
+    const trace = (points) => {
+      for (let i = 0; i < points.length; i += 2) context[i ? "lineTo" : "moveTo"](points[i], points[i + 1]);
+    };
+    context.globalAlpha = layer.opacity;
+    context.fillStyle = context.strokeStyle = palette[layer.color];
+    context.beginPath();
+    if (layer.areas) {
+      for (const ring of layer.areas.flat()) {
+        trace(ring);
+        context.closePath();
+      }
+      context.fill("evenodd");
+    } else if (layer.lines) {
+      context.lineWidth = Math.max(layer.width, this.px(layer.px));
+      context.setLineDash(layer.dash.map((part) => this.px(part)));
+      for (const line of layer.lines) trace(line);
+      context.stroke();
+      context.setLineDash([]);
+    } else {
+      const larger = layer.length ? Math.max(1, this.px(layer.px) / layer.length) : 1;
+      for (const [x, y, yaw] of layer.marks) {
+        context.save();
+        context.translate(x, y);
+        context.rotate(yaw);
+        context.scale(larger, larger);
+        trace(layer.shape);
+        context.closePath();
+        context.restore();
+      }
       context.fill();
     }
-    context.fillStyle = palette.asphalt;
-    context.fill(this.paved, "evenodd");
-    context.strokeStyle = palette.wall;
-    context.lineWidth = Math.max(0.25, this.px(1));
-    for (const wall of [...lot.buildings, ...lot.walls]) {
-      trace(wall);
-      context.stroke();
-    }
-    context.strokeStyle = palette.paint;
-    context.fillStyle = palette.paint;
-    context.globalAlpha = 0.7;
-    context.lineWidth = Math.max(0.12, this.px(0.6));
-    context.setLineDash([1.5, 2.5]);
-    for (const line of lot.centre_lines) {
-      trace(line);
-      context.stroke();
-    }
-    context.setLineDash([]);
-    for (const arrow of lot.arrows) this.arrowHead(context, ...arrow, 1.6);
-    context.globalAlpha = 1;
-    context.fillStyle = palette.entry;
-    for (const entry of lot.entries) this.arrowHead(context, ...entry, Math.max(2.4, this.px(13)));
   }
 
   arrowHead(context, x, y, yaw, size) {

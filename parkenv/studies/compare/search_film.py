@@ -12,25 +12,15 @@ import gymnasium as gym
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
-from parkenv.engine.state import SearchState
 from parkenv.envs.perception import SearchPerceptionEnv
+from parkenv.show.colors import PALETTE, belief_colors, rgb
 from parkenv.show.columns import OPTIONAL_TIMES, TIME_COLORS
-from parkenv.show.drawing import SUBPIXEL_BITS, draw_dashes, fill_disc, fixed_point, write_text
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.figures.survey import draw_detections
-from parkenv.show.rendering import (
-    CAR,
-    GLASS,
-    GROUND,
-    INK,
-    PARKED_CAR,
-    WALK,
-    WHITE,
-    MapView,
-    SearchRenderer,
-    clock,
-    draw_belief_key,
-)
+from parkenv.show.frames.lot import PIXELS, LotFrames, clock, draw_belief_key, paint_goal, strip
+from parkenv.show.frames.search import car_pose, searching_car, view_range, walk
+from parkenv.show.painters.opencv import paint, write_text
+from parkenv.show.scene import DISC, Lines, Marks, cars, posed
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.lot import PARK
@@ -57,51 +47,6 @@ _PARKING_FRAMES = 5
 _CAMERA = (213, 160)
 
 
-class FilmRenderer(SearchRenderer):
-    """Draws the map of a film, with the car at any pose.
-
-    Args:
-        scenario: the scenario.
-
-    Attributes:
-        pose: position, (2,) m, and yaw of the car.
-        trail: positions of the car so far.
-    """
-
-    def __init__(self, scenario: Scenario) -> None:
-        west, south, east, north = scenario.lot.bounds()
-        height = int(np.clip(WIDTH * (north - south + 6.0) / (east - west + 6.0), *MAP_HEIGHT))
-        super().__init__(scenario, (WIDTH, height), hud=0)
-        self.pose: tuple[FloatArray, float] = (np.zeros(2), 0.0)
-        self.trail: list[FloatArray] = []
-
-    def map_image(self, state: SearchState, slots: Image, plan: Sequence[FloatArray] = ()) -> Image:
-        """Draw trail, plan, goal and car on an image of the slots from `draw_slots`."""
-        image, view = slots.copy(), self.still_layer(state).view
-        if len(plan) > 1:
-            pixels = view(np.array(plan))
-            cv2.polylines(image, [fixed_point(pixels)], False, INK, 2, cv2.LINE_AA, SUBPIXEL_BITS)
-            fill_disc(image, pixels[-1], 5.0, INK)
-        self._draw_trail(image, view, state)
-        self._draw_goal(image, view, state)
-        self._draw_car(image, view, state)
-        return image
-
-    def place(self, state: SearchState) -> tuple[FloatArray, float]:
-        """Return position and yaw of the car at its vertex, or in its slot."""
-        return super()._pose(state)
-
-    def _pose(self, state: SearchState) -> tuple[FloatArray, float]:
-        del state
-        return self.pose
-
-    def _draw_trail(self, image: Image, view: MapView, state: SearchState) -> None:
-        del state
-        points = fixed_point(view(np.array([*self.trail, self.pose[0]])))
-        cv2.polylines(image, [points], False, INK, 5, cv2.LINE_AA, SUBPIXEL_BITS)
-        cv2.polylines(image, [points], False, CAR, 3, cv2.LINE_AA, SUBPIXEL_BITS)
-
-
 class SearchFilm(Observer):
     """Films a search in `parkenv/SearchPerception-v2`.
 
@@ -125,18 +70,20 @@ class SearchFilm(Observer):
         inner = env.unwrapped
         assert isinstance(inner, SearchPerceptionEnv)
         self._env = inner
-        self._renderer = FilmRenderer(inner.scenario)
+        lot = inner.scenario.lot
+        west, south, east, north = lot.bounds()
+        height = int(np.clip(WIDTH * (north - south + 6.0) / (east - west + 6.0), *MAP_HEIGHT))
+        self._map = LotFrames(lot, (WIDTH, height))
         self._slots = self._slots_image()
-        self._camera = np.full((_CAMERA[1], _CAMERA[0], 3), GROUND, np.uint8)
+        self._camera = np.full((_CAMERA[1], _CAMERA[0], 3), PALETTE["ground"], np.uint8)
         self._parts = dict.fromkeys(TIME_COLORS, 0.0)
-        self._renderer.pose = self._renderer.place(inner.state)
+        self._pose, self._trail = car_pose(inner.scenario, inner.state), list[FloatArray]()
         self._take("A car arrives. Its map says how likely each slot is taken.", hold=INTRO_S)
 
     def on_step(self, step: Step) -> None:
         """Show the way to the next vertex, or the parking attempt."""
-        state, lot, renderer = self._env.state, self._scenario.lot, self._renderer
-        start, yaw = renderer.pose
-        end, end_yaw = renderer.place(state)
+        state, lot = self._env.state, self._scenario.lot
+        start, end = self._pose, car_pose(self._scenario, state)
         info = step.info
         before = dict(self._parts)
         self._parts |= {key: float(info[key]) for key in self._parts if key != "walk_s"}
@@ -149,18 +96,18 @@ class SearchFilm(Observer):
         seconds = self._parts["drive_s"] - before["drive_s"]
         count = _PARKING_FRAMES if state.parked else max(1, round(seconds * FPS / DRIVE_SPEEDUP))
         text = f"Slot {lot.slot_ids[state.vertex]} is free: it parks" if state.parked else self._seen_so_far()
-        turn = math.remainder(end_yaw - yaw, 2 * math.pi)
-        renderer.trail.append(start)
+        turn = math.remainder(end[2] - start[2], 2 * math.pi)
+        self._trail.append(start[:2])
         for i in range(1, count + 1):
             share = i / count
             # On a lane the car has turned by the first half of an edge.
-            heading = yaw + turn * (share if state.parked else min(2 * share, 1.0))
-            renderer.pose = start + share * (end - start), heading
+            heading = start[2] + turn * (share if state.parked else min(2 * share, 1.0))
+            self._pose = np.array([*(start + share * (end - start))[:2], heading])
             elapsed = {k: before[k] + share * (self._parts[k] - before[k]) for k in before}
             if i == count:
                 self._look()
-            self._take(text, [renderer.pose[0], *plan], elapsed)
-        renderer.pose = end, end_yaw
+            self._take(text, [self._pose[:2], *plan], elapsed)
+        self._pose = end
 
     def on_end(self, result: EpisodeResult) -> None:
         """Show the driver's walk, and the total."""
@@ -195,7 +142,37 @@ class SearchFilm(Observer):
         occupied = state.world.occupied(np.arange(self._scenario.lot.n_slots), state.time)
         if state.parked:
             occupied[state.vertex] = False  # the searching car itself is there
-        return self._renderer.draw_slots(state, occupied)
+        belief = state.belief
+        return self._map.slots(self._here, belief_colors(belief.p_occupied, belief.observed), occupied)
+
+    @property
+    def _here(self) -> FloatArray:
+        """Position of the car's vertex, (2,) m, which a window on a large lot shows."""
+        here: FloatArray = self._scenario.lot.vertex_xy[self._env.state.vertex]
+        return here
+
+    def _map_image(self, plan: Sequence[FloatArray], walker: FloatArray | None) -> Image:
+        """Return the map with the plan, the trail, the goal, the car and the walking driver."""
+        state, scenario, here = self._env.state, self._scenario, self._here
+        image, view, goal = self._slots.copy(), self._map.still(here).view, scenario.lot.goals[scenario.goal]
+        if len(plan) > 1:
+            line = np.array(plan)
+            paint(
+                image,
+                view,
+                [Lines([line], "ink", px=(2.0, 2.0)), Marks(posed(line[-1]), DISC, "ink", px=10.0)],
+            )
+        trail = np.array([*self._trail, self._pose[:2]])
+        paint(image, view, [Lines([trail], "car", px=(3.0, 3.0), halo="ink")])
+        if state.parked:
+            paint(image, view, [walk(scenario.lot.slot_xy[state.vertex], goal)])
+        paint_goal(image, view, goal, here)
+        if not state.parked:
+            paint(image, view, [view_range(scenario, self._pose)])
+        paint(image, view, searching_car(self._pose))
+        if walker is not None:
+            paint(image, view, [Marks(posed(walker), DISC, "goal", px=12.0, edge="white", edge_px=2.0)])
+        return image
 
     def _seen_so_far(self) -> str:
         belief = self._env.state.belief
@@ -232,17 +209,12 @@ class SearchFilm(Observer):
         """Draw a frame, and show it for `hold` seconds."""
         state = self._env.state
         parts = elapsed or self._parts
-        middle = self._renderer.map_image(state, self._slots, plan)
-        if walker is not None:
-            at = self._renderer.still_layer(state).view(walker)
-            fill_disc(middle, at, 8.0, WHITE)
-            fill_disc(middle, at, 6.0, WALK)
-        top = np.full((CAPTION, WIDTH, 3), INK, np.uint8)
-        write_text(top, caption, (16, 32), WHITE, 22, 600)
+        top = strip(CAPTION, WIDTH)
+        write_text(top, caption, (16, 32), "white", 22, 600)
         seconds = sum(parts.values())
-        write_text(top, clock(state.arrival.time + seconds)[4:], (WIDTH - 186, 32), CAR, 20, 500)
-        write_text(top, f"{seconds:.0f} s", (WIDTH - 76, 32), CAR, 22, 700)
-        frame = np.vstack([top, middle, self._panel(parts)])
+        write_text(top, clock(state.arrival.time + seconds)[4:], (WIDTH - 186, 32), "car", 20, 500)
+        write_text(top, f"{seconds:.0f} s", (WIDTH - 76, 32), "car", 22, 700)
+        frame = np.vstack([top, self._map_image(plan, walker), self._panel(parts)])
         self.frames += [frame] * max(1, round(hold * FPS))
 
     def _panel(self, parts: dict[str, float]) -> Image:
@@ -250,16 +222,15 @@ class SearchFilm(Observer):
         panel = np.full((PANEL, WIDTH, 3), PAPER, np.uint8)
         width, height = _CAMERA
         panel[6 : 6 + height, 6 : 6 + width] = self._camera
-        cv2.rectangle(panel, (6, 6), (6 + 136, 6 + 20), INK, cv2.FILLED)
-        write_text(panel, "camera, detected cars", (11, 20), WHITE, 12, 500)
+        cv2.rectangle(panel, (6, 6), (6 + 136, 6 + 20), PALETTE["ink"], cv2.FILLED)
+        write_text(panel, "camera, detected cars", (11, 20), "white", 12, 500)
         left = width + 28
-        x = write_text(panel, f"agent {self._name}:", (left, 28), INK, 16, 700) + 12
+        x = write_text(panel, f"agent {self._name}:", (left, 28), "ink", 16, 700) + 12
         for key, (name, color) in TIME_COLORS.items():
             if key in OPTIONAL_TIMES and not parts[key]:
                 continue
-            rgb = tuple(int(color[i : i + 2], 16) for i in (1, 3, 5))
-            cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb, cv2.FILLED)
-            x = write_text(panel, f"{name} {parts[key]:.0f} s", (x + 20, 28), INK, 16, 500) + 20
+            cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb(color), cv2.FILLED)
+            x = write_text(panel, f"{name} {parts[key]:.0f} s", (x + 20, 28), "ink", 16, 500) + 20
         self._legend(panel, left)
         return panel
 
@@ -267,22 +238,22 @@ class SearchFilm(Observer):
         def words(text: str, x: int, y: int) -> None:
             write_text(panel, text, (x, y), SOFT, 15, 500)
 
-        def car(x: int, y: int, body: tuple[int, int, int], glass: tuple[int, int, int]) -> None:
-            cv2.rectangle(panel, (x, y - 11), (x + 26, y + 1), INK, cv2.FILLED)
-            cv2.rectangle(panel, (x + 1, y - 10), (x + 25, y), body, cv2.FILLED)
-            cv2.rectangle(panel, (x + 16, y - 8), (x + 19, y - 2), glass, cv2.FILLED)
-
-        right = left + 300
-        car(left, 63, CAR, INK)
+        right, size = left + 300, (26.0, 12.0)
+        dots = posed(np.array([left + 22.0, 88.0]))
+        circle = np.array([left + 412.0, 118.0]) + 18.0 * np.vstack([DISC, DISC[:1]])
+        layers = [
+            *cars(posed(np.array([left + 13.0, 58.0])), "car", size, edge="ink"),
+            *cars(posed(np.array([right + 13.0, 58.0])), "parked", size, glass="glass"),
+            Lines([np.array([[left, 88.0], [left + 22.0, 88.0]])], "ink", px=(2.0, 2.0)),
+            Marks(dots, DISC, "ink", px=10.0),
+            walk(np.array([right, 88.0]), np.array([right + 28.0, 88.0])),
+            Lines([circle], "glass", px=(2.0, 2.0)),
+        ]
+        paint(panel, PIXELS, layers)
         words("the searching car", left + 38, 63)
-        car(right, 63, PARKED_CAR, GLASS)
         words("a parked car, hidden until seen", right + 38, 63)
-        cv2.line(panel, (left, 88), (left + 22, 88), INK, 2, cv2.LINE_AA)
-        fill_disc(panel, np.array([left + 22.0, 88.0]), 5.0, INK)
         words("its plan", left + 38, 93)
-        draw_dashes(panel, np.array([right, 88.0]), np.array([right + 28.0, 88.0]), WALK)
         words("the walk to the goal G", right + 38, 93)
-        cv2.circle(panel, (left + 412, 118), 9, GLASS, 2, cv2.LINE_AA)
         words("sensor range", left + 430, 123)
         for half, (text, y) in enumerate((("what the map says", 123), ("what the car has seen", 151))):
             scale = np.zeros((24, 90, 3), np.uint8)

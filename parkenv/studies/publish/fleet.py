@@ -13,7 +13,7 @@ import numpy as np
 from parkenv.errors import InputError
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.picture_files import save_film
-from parkenv.show.fleet_rendering import FleetRenderer
+from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import summarize_days

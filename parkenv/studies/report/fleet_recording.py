@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet, total_s
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
-from parkenv.show.report.lot_data import describe_lot
+from parkenv.show.scene import LotScene
 from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.scenario import Scenario
@@ -59,7 +59,7 @@ class FleetDay:
         mean_s = float(total_s(cars).mean())
         before = counted.get(study.keys(self.setting, self.day)[0])
         return {
-            "lot": describe_lot(scenario.lot),
+            "lot": LotScene.of(scenario.lot).data(),
             "fleet": {
                 "scenario": scenario.name,
                 **self.setting.columns,

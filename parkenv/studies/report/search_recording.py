@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.engine.state import SearchState
 from parkenv.show.columns import TIME_COLORS
-from parkenv.show.report.lot_data import describe_lot
+from parkenv.show.scene import LotScene
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.occupancy.process import World
@@ -103,7 +103,7 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
         "forecast": _bytes(state.belief.forecast),
         **_truth(state.world, scenario.lot.n_slots, start, sorted(moments)),
     }
-    return {"lot": describe_lot(scenario.lot), "world": world, "searches": searches}
+    return {"lot": LotScene.of(scenario.lot).data(), "world": world, "searches": searches}
 
 
 def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -> Recording:

@@ -2,32 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.vehicle import SPEED
-from parkenv.engine.state import SearchState
-from parkenv.show.drawing import SUBPIXEL_BITS, fill_disc, fixed_point, mixed_color, write_text
-from parkenv.show.drive_rendering import draw_car, draw_movers
-from parkenv.show.rendering import (
-    ASPHALT,
-    CAR,
-    GAVE_UP,
-    HEIGHT,
-    HUD,
-    HUD_MARGIN,
-    INK,
-    WHITE,
-    WIDTH,
-    MapView,
-    SearchRenderer,
-    StillLayer,
-    clock,
-)
+from parkenv.show.colors import PALETTE, belief_colors, mixed_color
+from parkenv.show.frames.drive import movers, steered_car
+from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, LotFrames, clock, paint_goal, strip, write_line
+from parkenv.show.frames.search import walk
+from parkenv.show.painters.opencv import paint
+from parkenv.show.scene import DISC, Layer, Lines, Marks, posed
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip
-from parkenv.studies.trips.vehicle_controller import VehicleController
-from parkenv.world.scenario import Scenario
 
 SPEEDUP = 5
 """Playback speed relative to real time."""
@@ -42,101 +31,91 @@ _INSET = 0.34
 _STEP_S = 0.1
 
 
-class TripRenderer(SearchRenderer):
-    """Draws a search with the car at its driven pose.
+class TripFrames:
+    """Frames of a driven search: the car's surroundings, with the whole lot as an inset.
 
     Args:
-        scenario: the scenario.
-        driver: the driver of the car.
-        near: whether to show the car's surroundings instead of the whole lot.
+        search: the search.
     """
 
-    def __init__(self, scenario: Scenario, driver: VehicleController, *, near: bool) -> None:
-        super().__init__(scenario)
-        self._driver, self._near = driver, near
+    def __init__(self, search: DrivenSearch) -> None:
+        self._search = search
+        lot = search.scenario.lot
+        self._near = LotFrames(lot, smallest_slot=math.inf, window_slot=_SLOT_PX, parts=3)
+        self._far = LotFrames(lot, smallest_slot=0.0)
+        assert self._far.whole is not None
+        west, south, east, north = lot.bounds()
+        rows = self._far.whole(np.array([[west, south], [east, north], [west, north], [east, south]]))[:, 1]
+        self._rows = slice(max(0, int(rows.min() - 10.0)), min(HEIGHT - HUD, int(rows.max() + 10.0)))
         self.trail: list[FloatArray] = []
-        if near:
-            self._whole = None
 
-    def rows(self) -> tuple[int, int]:
-        """Return the first and last pixel row of the lot in a frame of the whole lot."""
-        assert self._whole is not None
-        west, south, east, north = self.scenario.lot.bounds()
-        corners = self._whole(np.array([[west, south], [east, north], [west, north], [east, south]]))
-        low, high = corners[:, 1].min() - 10.0, corners[:, 1].max() + 10.0
-        return max(0, int(low)), min(HEIGHT - HUD, int(high))
+    @property
+    def middle(self) -> FloatArray:
+        """Position of the car's centre, (2,) m."""
+        driver = self._search.driver
+        middle: FloatArray = driver.vehicle.at_middle(driver.state[:3])[:2]
+        return middle
 
-    def _middle(self) -> FloatArray:
-        return self._driver.vehicle.at_middle(self._driver.state[:3])
+    def frame(self, occupied: NDArray[np.bool_]) -> Image:
+        """Render the present moment, (480, 640, 3) uint8 RGB."""
+        driver, here = self._search.driver, self.middle
+        disc = Marks(posed(here), DISC, "car", px=17.0, edge="ink", edge_px=2.5)
+        near = self._picture(self._near, occupied, 2.0, steered_car(driver.vehicle, driver.state))
+        far = self._picture(self._far, occupied, 3.0, [disc])[self._rows]
+        width, height = round(_INSET * WIDTH), round(_INSET * len(far))
+        near[: height + 3, : width + 3] = PALETTE["ink"]
+        near[:height, :width] = cv2.resize(far, (width, height), interpolation=cv2.INTER_AREA)
+        return np.vstack([near, self._line()])
 
-    def still_layer(self, state: SearchState) -> StillLayer:
-        """Return the layer of the part of the lot near the car, or of the whole lot."""
-        if not self._near:
-            return super().still_layer(state)
-        return self._window(self._middle()[:2], _SLOT_PX, 3)
-
-    def _draw_trail(self, image: Image, view: MapView, state: SearchState) -> None:
-        del state  # the driven path is not part of it
+    def _picture(
+        self, frames: LotFrames, occupied: NDArray[np.bool_], trail_px: float, car: list[Layer]
+    ) -> Image:
+        search, here, state = self._search, self.middle, self._search.env.state
+        belief, scenario, others = state.belief, search.scenario, search.driver.others
+        image = frames.slots(here, belief_colors(belief.p_occupied, belief.observed), occupied)
+        view, goal = frames.still(here).view, scenario.lot.goals[scenario.goal]
         if len(self.trail) > 1:
-            points = fixed_point(view(np.array(self.trail)))
-            thickness = 2 if self._near else 3
-            cv2.polylines(
-                image, [points], False, mixed_color(ASPHALT, CAR, 0.7), thickness, cv2.LINE_AA, SUBPIXEL_BITS
-            )
+            color = mixed_color("asphalt", "car", 0.7)
+            paint(image, view, [Lines([np.array(self.trail)], color, px=(trail_px, trail_px))])
+        if state.parked:
+            paint(image, view, [walk(scenario.lot.slot_xy[state.vertex], goal)])
+        paint_goal(image, view, goal, here)
+        moving = [] if others is None else movers(others.poses, [outline for _, outline in others.outlines])
+        paint(image, view, [*moving, *car])
+        return image
 
-    def _draw_car(self, image: Image, view: MapView, state: SearchState) -> None:
-        del state
-        others = self._driver.others
-        if others is not None:
-            draw_movers(image, view, others.poses, [outline for _, outline in others.outlines])
-        if self._near:
-            draw_car(image, view, self._driver.vehicle, self._driver.state, CAR)
-            return
-        at = view(self._middle()[:2])
-        fill_disc(image, at, 11.0, INK)
-        fill_disc(image, at, 8.5, CAR)
-
-    def _draw_hud(self, image: Image, state: SearchState) -> None:
-        if not self._near:
-            return
-        driver = self._driver
-        x, baseline = HUD_MARGIN, HEIGHT - HUD // 2 + 5
-        for part in (
+    def _line(self) -> Image:
+        """Return the line of text below the map."""
+        driver, state, image = self._search.driver, self._search.env.state, strip()
+        parts = (
             clock(driver.time),
             f"{driver.time - state.arrival.time:.0f} s",
             f"{3.6 * abs(float(driver.state[SPEED])):.0f} km/h",
-        ):
-            write_text(image, part, (x, baseline), WHITE, 15, 500)
-            x += 124 if ":" in part else 76
+        )
         text = f"parked in {driver.log.attempts[-1].slot}" if state.parked else driver.doing
-        failed = ":" in text
-        write_text(image, text, (x, baseline), GAVE_UP if failed else CAR, 15, 600)
+        write_line(image, parts, (text,), "warning" if ":" in text else "car")
+        return image
 
 
 def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
     """Drive a trip and render it: frames of (480, 640, 3) uint8, at `FPS` frames per second."""
-    driver, env = search.driver, search.env
-    near = TripRenderer(search.scenario, driver, near=True)
-    far = TripRenderer(search.scenario, driver, near=False)
+    env, film = search.env, TripFrames(search)
     everything = np.arange(search.scenario.lot.n_slots)
     frames: list[Image] = []
     every = round(SPEEDUP / FPS / _STEP_S)
     steps = 0
-    low, high = far.rows()
 
     def take() -> None:
         state = env.state
-        occupied = state.world.occupied(everything, driver.time)
+        occupied = state.world.occupied(everything, search.driver.time)
         if state.parked:
             occupied[state.vertex] = False  # the searching car itself stands there
-        frames.append(_inset(near.frame(state, occupied), far.frame(state, occupied), low, high))
+        frames.append(film.frame(occupied))
 
     def on_control() -> None:
         nonlocal steps
-        place = driver.vehicle.at_middle(driver.state[:3])[:2]
-        for renderer in (near, far):
-            if not renderer.trail or np.hypot(*(place - renderer.trail[-1])) > 0.3:
-                renderer.trail.append(place)
+        if not film.trail or np.hypot(*(film.middle - film.trail[-1])) > 0.3:
+            film.trail.append(film.middle)
         if steps % every == 0:
             take()
         steps += 1
@@ -144,13 +123,3 @@ def film_trip(search: DrivenSearch, seed: int) -> tuple[Trip, list[Image]]:
     trip = search.run(seed, on_control=on_control)
     take()
     return trip, frames + frames[-1:] * round(LAST_S * FPS)
-
-
-def _inset(near: Image, far: Image, low: int, high: int) -> Image:
-    """Return the near frame with rows `low` to `high` of the whole lot's frame as a small inset."""
-    width, height = round(_INSET * WIDTH), round(_INSET * (high - low))
-    small = cv2.resize(far[low:high], (width, height), interpolation=cv2.INTER_AREA)
-    image = near.copy()
-    image[: height + 3, : width + 3] = INK
-    image[:height, :width] = small
-    return image

@@ -1,0 +1,109 @@
+"""Paint the layers of a scene on the axes of a figure (Matplotlib); its pixels are points of 1/72 inch."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PathCollection, PolyCollection
+from matplotlib.patches import Rectangle
+from matplotlib.path import Path as Outline
+from matplotlib.patheffects import Normal, Stroke
+
+from parkenv.show.colors import PALETTE
+from parkenv.show.scene import HALO_PX, Areas, Layer, Lines, Marks, Paint, Rings, placed_shape
+
+_STEP = 0.01
+
+
+def paint(ax: Axes, layers: Sequence[Layer], zorder: float) -> None:
+    """Add layers to axes with an equal aspect and their final limits and size, on which widths depend.
+
+    Args:
+        ax: the axes.
+        layers: from the lowest to the highest.
+        zorder: of the lowest; the others follow in steps of 0.01.
+    """
+    scale = points_per_m(ax)
+    for i, layer in enumerate(layers):
+        style: dict[str, Any] = {"zorder": zorder + _STEP * i, "alpha": layer.opacity}
+        if isinstance(layer, Areas):
+            rings = [_outline(polygon) for polygon in layer.polygons]
+            edge = "none" if layer.edge is None else _paint(layer.edge)
+            style |= {"facecolors": _paint(layer.color), "edgecolors": edge, "linewidths": layer.edge_px}
+            if rings:
+                ax.add_collection(PathCollection(rings, **style))
+        elif isinstance(layer, Lines):
+            width = float(np.clip(layer.width * scale, *layer.px))
+            style |= {"colors": _paint(layer.color), "linewidths": width, "capstyle": "round"}
+            if layer.dash is not None:
+                style |= {"linestyles": (0, tuple(part / width for part in layer.dash)), "capstyle": "butt"}
+            if layer.halo is not None:
+                halo = Stroke(linewidth=width + HALO_PX, foreground=_paint(layer.halo))
+                style["path_effects"] = [halo, Normal()]
+            ax.add_collection(LineCollection(list(layer.lines), joinstyle="round", **style))
+        else:
+            ax.add_collection(_marks(layer, scale, style))
+
+
+def _marks(layer: Marks, scale: float, style: dict[str, Any]) -> PolyCollection:
+    least = layer.px / scale
+    size = np.broadcast_to(np.asarray(layer.size, dtype=np.float64), (len(layer.poses), 2))
+    # Shapes without a size of their own are as wide as long.
+    size = np.where(size[:, :1] > 0.0, size * np.maximum(1.0, least / np.maximum(size[:, :1], 1e-9)), least)
+    corners = placed_shape(layer.shape, layer.poses, size)
+    edge = "none" if layer.edge is None else _paint(layer.edge)
+    width = layer.edge_px if layer.edge is not None else 0.0
+    return PolyCollection(
+        list(corners), facecolors=_paint(layer.color), edgecolors=edge, linewidths=width, **style
+    )
+
+
+def _outline(polygon: Rings) -> Outline:
+    """Return a polygon whose holes run against its outer ring, since Matplotlib fills by the winding number."""
+    ways = []
+    for i, ring in enumerate(polygon):
+        x, y = ring.T
+        clockwise = float(x @ np.roll(y, -1) - y @ np.roll(x, -1)) < 0.0
+        turned = ring[::-1] if clockwise == (i == 0) else ring
+        ways.append(Outline(np.vstack([turned, turned[:1]]), closed=True))
+    return Outline.make_compound_path(*ways)
+
+
+def _paint(color: Paint) -> Any:
+    """Return a colour, or one for each shape, as Matplotlib knows it."""
+    if isinstance(color, str):
+        return _paint(PALETTE[color]) if color in PALETTE else color
+    if isinstance(color, tuple) and all(isinstance(part, int) for part in color):
+        return tuple(float(part) / 255.0 for part in color)
+    return [_paint(one) if isinstance(one, str) else one for one in color]
+
+
+def points_per_m(ax: Axes) -> float:
+    """Return the size of a metre, points, in axes with an equal aspect ratio."""
+    box = ax.get_window_extent()
+    across, down = np.ptp(ax.get_xlim()), np.ptp(ax.get_ylim())
+    return float(min(box.width / across, box.height / down)) / ax.figure.dpi * 72
+
+
+def draw_scale_bar(ax: Axes, x: float, y: float, width: float, ink: str) -> None:
+    """Draw a scale bar of a round length, about a sixth of `width` m, with its lower left corner at (x, y)."""
+    power = 10.0 ** np.floor(np.log10(width / 6))
+    length = power * max(step for step in (1, 2, 5) if step * power <= width / 6)
+    thickness = 0.005 * width
+    for i in (0, 1):
+        left = x + i * length / 2
+        face = (ink, "white")[i]
+        ax.add_patch(
+            Rectangle((left, y), length / 2, thickness, facecolor=face, edgecolor=ink, linewidth=0.7)
+        )
+    ax.annotate(
+        f"{length:g} m",
+        (x + length, y + thickness / 2),
+        (5, 0),
+        textcoords="offset points",
+        va="center",
+        color=ink,
+    )

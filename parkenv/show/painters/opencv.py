@@ -1,0 +1,208 @@
+"""Paint the layers of a scene, and text, on images: anti-aliased, with subpixel precision (OpenCV)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Self
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.show.colors import PALETTE, Color, rgb
+from parkenv.show.scene import HALO_PX, Areas, Layer, Lines, Marks, Paint, placed_shape
+
+SUBPIXEL_BITS = 4
+SUPERSAMPLING = 4
+FONT = cv2.FontFace("sans")
+
+
+@dataclass(frozen=True, eq=False)
+class MapView:
+    """Maps the lot's coordinates to pixels: `pixels = xy @ turn * scale + shift`."""
+
+    turn: FloatArray  # (2, 2), north up, or north to the right
+    scale: float  # px/m
+    shift: FloatArray  # (2,) px
+    density: int = 1  # pixels of the image for a pixel of the picture, along both axes
+
+    @classmethod
+    def fit(
+        cls, xy: FloatArray, size: tuple[float, float], largest_scale: float = np.inf, margin: float = 0.0
+    ) -> Self:
+        """Fit all points, (k, 2) m, centred, into an image of this width and height, px.
+
+        North is up, or to the right if that makes the lot more than 20 % larger.
+        """
+        low, high = xy.min(axis=0), xy.max(axis=0)
+        extent = np.maximum(high - low, 1e-6)
+        room = np.array(size) - 2 * margin
+        upright, turned = (float(np.min(room / e)) for e in (extent, extent[::-1]))
+        scale = turned if turned > 1.2 * upright else upright
+        return cls.around((low + high) / 2, size, min(scale, largest_scale), turned=scale > upright)
+
+    @classmethod
+    def around(
+        cls, center: FloatArray, size: tuple[float, float], scale: float, *, turned: bool = False
+    ) -> Self:
+        """Centre the image on a point, (2,) m."""
+        turn = np.array([[0.0, 1.0], [1.0, 0.0]] if turned else [[1.0, 0.0], [0.0, -1.0]])
+        return cls(turn, scale, np.array(size) / 2 - center @ turn * scale)
+
+    def __call__(self, xy: FloatArray) -> FloatArray:
+        """Pixels, (..., 2), x right and y down, of points, (..., 2) m."""
+        pixels: FloatArray = xy @ self.turn * self.scale + self.shift
+        return pixels
+
+    def yaw(self, yaw: FloatArray) -> FloatArray:
+        """Return directions, rad, in the image, where y points down."""
+        ahead = np.stack([np.cos(yaw), np.sin(yaw)], axis=-1) @ self.turn
+        angle: FloatArray = np.arctan2(ahead[..., 1], ahead[..., 0])
+        return angle
+
+    def finer(self) -> MapView:
+        """Return the view of an image with `SUPERSAMPLING` times the resolution, to be averaged down."""
+        return MapView(self.turn, self.scale * SUPERSAMPLING, self.shift * SUPERSAMPLING, SUPERSAMPLING)
+
+
+def paint(image: Image, view: MapView, layers: Sequence[Layer]) -> None:
+    """Paint layers in order on an image, (h, w, 3) uint8 RGB."""
+    for layer in layers:
+        if layer.opacity < 1.0:
+            below = image.copy()
+            _paint(image, view, layer)
+            cv2.addWeighted(image, layer.opacity, below, 1.0 - layer.opacity, 0.0, image)
+        else:
+            _paint(image, view, layer)
+
+
+def _paint(image: Image, view: MapView, layer: Layer) -> None:
+    if isinstance(layer, Areas):
+        _paint_areas(image, view, layer)
+    elif isinstance(layer, Lines):
+        _paint_lines(image, view, layer)
+    else:
+        _paint_marks(image, view, layer)
+
+
+def _paint_areas(image: Image, view: MapView, layer: Areas) -> None:
+    for rings, color in zip(layer.polygons, _colors(layer.color, len(layer.polygons)), strict=True):
+        pixels = [fixed_point(view(ring)) for ring in rings]
+        cv2.fillPoly(image, pixels, color, _line_type(view), SUBPIXEL_BITS)
+        if layer.edge is not None:
+            thickness = max(1, round(layer.edge_px * view.density))
+            cv2.polylines(image, pixels, True, _only(layer.edge), thickness, _line_type(view), SUBPIXEL_BITS)
+
+
+def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
+    least, most = (end * view.density for end in layer.px)
+    width = min(max(layer.width * view.scale, least), most)
+    for points, color in zip(layer.lines, _colors(layer.color, len(layer.lines)), strict=True):
+        pixels = view(np.asarray(points))
+        if layer.halo is not None:
+            _stroke(image, view, pixels, rgb(layer.halo), width + HALO_PX * view.density)
+        if layer.dash is None:
+            _stroke(image, view, pixels, color, width)
+        else:
+            for dash in _dashes(pixels, *(part * view.density for part in layer.dash)):
+                _stroke(image, view, dash, color, width)
+
+
+def _stroke(image: Image, view: MapView, pixels: FloatArray, color: Color, width: float) -> None:
+    thickness = max(1, round(width))
+    cv2.polylines(image, [fixed_point(pixels)], False, color, thickness, _line_type(view), SUBPIXEL_BITS)
+
+
+def _dashes(pixels: FloatArray, on: float, off: float) -> Iterator[FloatArray]:
+    """Yield dashes, (2, 2) px, along a line; the last one ends with the line."""
+    along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(pixels, axis=0).T))]
+    n = max(1, round((along[-1] + off) / (on + off)))
+    for start in (on + off) * np.arange(n) * (along[-1] + off) / (n * (on + off)):
+        ends = np.array([start, min(start + on, along[-1])])
+        yield np.stack([np.interp(ends, along, axis) for axis in pixels.T], axis=1)
+
+
+def _paint_marks(image: Image, view: MapView, layer: Marks) -> None:
+    if not len(layer.poses):
+        return
+    at = np.column_stack([view(layer.poses[:, :2]), view.yaw(layer.poses[:, 2])])
+    size = view.scale * np.broadcast_to(np.asarray(layer.size, dtype=np.float64), (len(at), 2))
+    least = layer.px * view.density
+    # Shapes without a size of their own are as wide as long.
+    size = np.where(size[:, :1] > 0.0, size * np.maximum(1.0, least / np.maximum(size[:, :1], 1e-9)), least)
+    colors = _colors(layer.color, len(at))
+    if layer.edge is not None:
+        border = rgb(layer.edge)
+        for corners in placed_shape(layer.shape, at, size + 2.0 * layer.edge_px * view.density):
+            cv2.fillPoly(image, [fixed_point(corners)], border, _line_type(view), SUBPIXEL_BITS)
+    for corners, color in zip(placed_shape(layer.shape, at, size), colors, strict=True):
+        cv2.fillPoly(image, [fixed_point(corners)], color, _line_type(view), SUBPIXEL_BITS)
+
+
+def _colors(color: Paint, n: int) -> list[Color]:
+    """Return the colour of each of n shapes."""
+    if isinstance(color, str) or (isinstance(color, tuple) and not isinstance(color[0], str)):
+        return [_only(color)] * n
+    return [_only(one) for one in color]
+
+
+def _only(color: object) -> Color:
+    if isinstance(color, str):
+        return rgb(color)
+    red, green, blue = (int(part) for part in color)  # type: ignore[attr-defined]
+    return red, green, blue
+
+
+def _line_type(view: MapView) -> int:
+    """Anti-alias, unless the image is averaged down later."""
+    return cv2.LINE_AA if view.density == 1 else cv2.LINE_8
+
+
+def fixed_point(pixels: FloatArray) -> NDArray[np.int32]:
+    """Convert pixels to OpenCV's fixed-point numbers, whose pixel centres are integers."""
+    fixed: NDArray[np.int32] = np.round((pixels - 0.5) * 2**SUBPIXEL_BITS).astype(np.int32)
+    return fixed
+
+
+def write_text(
+    image: Image, text: str, at: tuple[int, int], color: str | Color, size: int, weight: int
+) -> int:
+    """Write text from a point on the baseline; returns its right end, px."""
+    (right, _), _ = cv2.putText(image, text, at, rgb(color), FONT, size, weight)
+    return int(right)
+
+
+def write_tag(image: Image, text: str, at: tuple[int, int], color: Color) -> None:
+    """Write dark text on a coloured ground with its upper left corner at a point."""
+    left, top = at
+    end = left + 8 + text_width(text, 13, 600)
+    cv2.rectangle(image, at, (end, top + 20), color, cv2.FILLED)
+    write_text(image, text, (left + 4, top + 15), (16, 16, 16), 13, 600)
+
+
+def text_width(text: str, size: int, weight: int) -> int:
+    """Return the width of a text, px."""
+    _, _, width, _ = cv2.getTextSize((1 << 14, 1 << 14), text, (0, 0), FONT, size, weight)
+    return int(width)
+
+
+def write_label(
+    image: Image,
+    text: str,
+    at: Sequence[float] | FloatArray,
+    color: str | Color,
+    size: int,
+    weight: int,
+    *,
+    halo: bool = False,
+) -> None:
+    """Write text centred at a point, kept inside the image."""
+    width = text_width(text, size, weight)
+    left = int(np.clip(round(at[0] - width / 2), 2, image.shape[1] - width - 2))
+    base = round(at[1] + 0.36 * size)
+    if halo:
+        for dx, dy in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
+            cv2.putText(image, text, (left + dx, base + dy), PALETTE["white"], FONT, size, weight)
+    cv2.putText(image, text, (left, base), rgb(color), FONT, size, weight)

@@ -1,0 +1,271 @@
+"""What is seen of a lot from above: layers of plain shapes, m, which every painter draws.
+
+A picture is the scene of a lot, with further layers on top. `painters.opencv` paints layers on images, `painters.axes`
+on the axes of a figure, and `report/lot_view.js` on the canvas of a page.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import shapely
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.driving.drivable_area import DrivableArea
+from parkenv.show.colors import Color
+from parkenv.world.drive_graph import linestrings
+from parkenv.world.lot import ParkingLot, is_building
+
+Rings = Sequence[FloatArray]  # A polygon, m: its outer ring, (k, 2), and its holes
+Paint = str | Color | Sequence[str] | FloatArray
+"""A name in `colors.PALETTE`, "#rrggbb" or RGB; or one for each shape, also as (n, 3) RGB in 0..1 (figures only)."""
+
+APRON = 0.25  # width of the asphalt beyond the kerbs, m
+ARROW_EVERY = 24.0  # approximate distance between two direction arrows on a one-way lane, m
+
+_CORNER = np.linspace(0, 2 * np.pi, 40, endpoint=False)
+CAR_BODY = 0.5 * np.stack(
+    [np.sign(f) * np.abs(f) ** 0.36 for f in (np.cos(_CORNER), np.sin(_CORNER))], axis=1
+)
+"""Outline of a car of unit length and width, nose to +x."""
+WINDSCREEN = np.array([[0.24, -0.40], [0.24, 0.40], [0.10, 0.32], [0.10, -0.32]])
+REAR_WINDOW = np.array([[-0.36, -0.36], [-0.36, 0.36], [-0.26, 0.30], [-0.26, -0.30]])
+DISC = 0.5 * np.stack([np.cos(_CORNER), np.sin(_CORNER)], axis=1)
+SQUARE = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]])
+ARROWHEAD = np.array([[0.6, 0.0], [-0.5, 0.5], [-0.22, 0.0], [-0.5, -0.5]])
+LANE_ARROW = np.array(
+    [[0.5, 0.0], [-0.06, 0.5], [-0.06, 0.13], [-0.5, 0.13], [-0.5, -0.13], [-0.06, -0.13], [-0.06, -0.5]]
+)
+_TIP = 0.5 * np.pi + 0.2 * np.pi * np.arange(10)
+STAR = np.stack([np.cos(_TIP), np.sin(_TIP)], axis=1) * np.where(np.arange(10) % 2, 0.2, 0.5)[:, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Areas:
+    """Filled polygons."""
+
+    polygons: Sequence[Rings]
+    color: Paint
+    edge: Paint | None = None  # of their outlines
+    edge_px: float = 0.8
+    opacity: float = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Lines:
+    """Lines, to scale within limits."""
+
+    lines: Sequence[FloatArray]  # (k, 2) m each
+    color: Paint
+    width: float = 0.0  # m
+    px: tuple[float, float] = (1.0, math.inf)  # least and greatest width in the picture
+    dash: tuple[float, float] | None = None  # lengths of a dash and of a gap, px
+    halo: str | Color | None = (
+        None  # colour of a line below that is wider by `HALO_PX`, visible on any ground
+    )
+    opacity: float = 1.0
+
+
+HALO_PX = 1.8
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """One shape at several poses, to scale, but not too small to see."""
+
+    poses: FloatArray  # (n, 3): x, y, m, and yaw
+    shape: FloatArray  # (k, 2), of unit length and width, nose to +x
+    color: Paint
+    size: tuple[float, float] | FloatArray = (0.0, 0.0)  # length and width, m; or those of each, (n, 2)
+    px: float = 0.0  # least length in the picture; the width grows in proportion
+    edge: str | Color | None = None  # colour of a border around it
+    edge_px: float = 1.5
+    opacity: float = 1.0
+
+
+Layer = Areas | Lines | Marks
+
+
+def cars(
+    poses: FloatArray,
+    color: Paint,
+    size: tuple[float, float] = (4.4, 1.94),
+    *,
+    px: float = 0.0,
+    edge: str | None = None,
+    glass: str = "ink",
+) -> list[Layer]:
+    """Return the layers of cars from above.
+
+    Args:
+        poses: (n, 3), m, of their centres.
+        color: colour of their bodies.
+        size: length and width, m.
+        px: least length in the picture.
+        edge: colour of a border.
+        glass: colour of their windows.
+    """
+    body = Marks(poses, CAR_BODY, color, size, px, edge)
+    return [body, *(Marks(poses, pane, glass, size, px) for pane in (WINDSCREEN, REAR_WINDOW))]
+
+
+def posed(xy: FloatArray, yaw: FloatArray | float = 0.0) -> FloatArray:
+    """Return poses, (n, 3), from positions, (n, 2), and yaws."""
+    xy = xy.reshape(-1, 2)
+    return np.column_stack([xy, np.broadcast_to(yaw, len(xy))])
+
+
+def placed_shape(shape: FloatArray, poses: FloatArray, size: FloatArray) -> FloatArray:
+    """Return a shape, (k, 2), at poses, (n, 3), with a length and width each, (n, 2): (n, k, 2)."""
+    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    turn = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)
+    corners: FloatArray = poses[:, None, :2] + (shape * size[:, None]) @ turn
+    return corners
+
+
+def arrows_along(lines: Sequence[FloatArray], every: float) -> FloatArray:
+    """Return poses, (n, 3), evenly spaced over each straight piece of lines, about `every` m apart, at least one."""
+    arrows = []
+    for points in lines:
+        for start, step in zip(points, np.diff(points, axis=0), strict=False):
+            n = max(1, round(math.hypot(*step) / every))
+            yaw = math.atan2(step[1], step[0])
+            arrows += [(*(start + (i + 0.5) / n * step), yaw) for i in range(n)]
+    return np.array(arrows, dtype=np.float64).reshape(-1, 3)
+
+
+def poses_on(line: FloatArray, at: FloatArray) -> FloatArray:
+    """Return poses, (n, 3), on a line, (k, 2), at distances from its start, (n,) m."""
+    step = np.diff(line, axis=0)
+    length = np.hypot(step[:, 0], step[:, 1])
+    along = np.r_[0.0, np.cumsum(length)]
+    leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(length) - 1)
+    xy = np.stack([np.interp(at, along, axis) for axis in line.T], axis=1)
+    return posed(xy, np.arctan2(step[leg, 1], step[leg, 0]))
+
+
+@dataclass(frozen=True, eq=False)
+class LotScene:
+    """The shapes of a lot, m, in the lot's frame."""
+
+    lot: ParkingLot
+    buildings: tuple[FloatArray, ...]  # outlines of buildings, (k, 2) each, closed
+    walls: tuple[FloatArray, ...]  # other walls, (k, 2) each
+    slots: FloatArray  # (n_slots, 4, 2), corners of the slots
+    slot_lines: FloatArray  # (n_slots, 4, 2), painted lines: three sides of each slot, without its mouth
+    centre_lines: tuple[FloatArray, ...]  # centre lines of the two-way lanes, (k, 2) each
+    arrows: FloatArray  # (a, 3), direction arrows on the one-way lanes
+    entries: FloatArray  # (e, 3), a car entering
+    area: DrivableArea  # the asphalt
+
+    @classmethod
+    def of(cls, lot: ParkingLot) -> LotScene:
+        """Describe a lot."""
+        corners = lot.slot_corners()
+        first = np.array([0, 3, 1])[lot.slot_mouth]
+        return cls(
+            lot=lot,
+            buildings=tuple(wall for wall in lot.walls if is_building(wall)),
+            walls=tuple(wall for wall in lot.walls if not is_building(wall)),
+            slots=corners,
+            slot_lines=corners[np.arange(lot.n_slots)[:, None], (first[:, None] + np.arange(4)) % 4],
+            centre_lines=tuple(lane.points for lane in lot.lanes if not lane.oneway),
+            arrows=arrows_along([lane.points for lane in lot.lanes if lane.oneway], ARROW_EVERY),
+            entries=_entries(lot),
+            area=DrivableArea(lot),
+        )
+
+    def paved(
+        self, center: FloatArray | None = None, reach: float = math.inf, *, apron: float = APRON
+    ) -> list[Rings]:
+        """Return the polygons of the asphalt, which ends at the kerbs of `DrivableArea`.
+
+        Args:
+            center: (2,); None: the whole lot.
+            reach: m, around the centre along both axes, within which the polygons are exact.
+            apron: m, width of the asphalt beyond the kerbs, on which the outer painted lines are visible.
+        """
+        if center is None:
+            low, high = np.array(self.lot.bounds()).reshape(2, 2)
+            center, reach = (low + high) / 2, float((high - low).max()) / 2
+        area = self.area.around(center, reach)
+        polygons = shapely.get_parts(shapely.buffer(area, apron, quad_segs=2) if apron else area)
+        return [
+            tuple(shapely.get_coordinates(ring) for ring in (polygon.exterior, *polygon.interiors))
+            for polygon in polygons
+        ]
+
+    def ground(
+        self, center: FloatArray | None = None, reach: float = math.inf, *, apron: float = APRON
+    ) -> list[Layer]:
+        """Return the layers below the slots: buildings, asphalt, walls and the marks of the lanes; see `paved`."""
+        return [
+            *building_layers(self.buildings, ()),
+            Areas(self.paved(center, reach, apron=apron), "asphalt"),
+            *building_layers((), (*self.buildings, *self.walls)),
+            Lines(self.centre_lines, "paint", 0.12, (0.5, 1.2), dash=(6.0, 8.0), opacity=0.45),
+            Marks(self.arrows, LANE_ARROW, "paint", (3.2, 1.5), opacity=0.8),
+        ]
+
+    def data(self) -> dict[str, Any]:
+        """Return the `lot` of `report.schema.json`: lengths in m, rounded to centimetres."""
+        lot = self.lot
+        entries = Marks(self.entries, ARROWHEAD, "entry", (2.4, 2.4), px=13.0)
+        return {
+            "name": lot.name,
+            "bounds": _rounded(np.array(lot.bounds())),
+            "slot_ids": list(lot.slot_ids),
+            "slots": [_rounded(corners) for corners in self.slots],
+            "vertices": [_rounded(xy) for xy in lot.vertex_xy],
+            "yaw": [round(float(a), 3) for a in lot.vertex_yaw],
+            "goals": [_rounded(xy) for xy in lot.goals],
+            "ground": [_layer_data(layer) for layer in (*self.ground(), entries)],
+        }
+
+
+def building_layers(buildings: Sequence[FloatArray], walls: Sequence[FloatArray]) -> list[Layer]:
+    """Return the layers of buildings, closed lines, and of walls."""
+    return [Areas([[ring] for ring in buildings], "building"), Lines(walls, "wall", 0.3, (1.0, 4.0))]
+
+
+def _layer_data(layer: Layer) -> dict[str, Any]:
+    """Return a layer for a page: its kind, its colour's name, and its numbers."""
+    data: dict[str, Any] = {"color": layer.color, "opacity": layer.opacity}
+    if isinstance(layer, Areas):
+        return data | {"areas": [[_rounded(ring) for ring in rings] for rings in layer.polygons]}
+    if isinstance(layer, Lines):
+        dash = list(layer.dash) if layer.dash else []
+        lines = [_rounded(points) for points in layer.lines]
+        return data | {"lines": lines, "width": layer.width, "px": layer.px[0], "dash": dash}
+    size = np.broadcast_to(np.asarray(layer.size), (1, 2))
+    shape = _rounded(layer.shape * size[0])
+    return data | {
+        "marks": [_rounded(pose) for pose in layer.poses],
+        "shape": shape,
+        "length": size[0, 0],
+        "px": layer.px,
+    }
+
+
+def _rounded(values: FloatArray) -> list[float]:
+    return [round(float(v), 2) for v in values.ravel()]
+
+
+def _entries(lot: ParkingLot) -> FloatArray:
+    """Return the entries with a yaw along their lane; on two-way lanes toward the slots."""
+    lines = linestrings([lane.points for lane in lot.lanes])
+    middle = lot.slot_xy.mean(axis=0)
+    entries = []
+    for xy in lot.entries:
+        k = int(np.argmin(np.asarray(shapely.distance(lines, shapely.Point(xy)))))
+        at = shapely.line_locate_point(lines[k], shapely.Point(xy))
+        ends = shapely.line_interpolate_point(lines[k], [max(at - 1.0, 0.0), at, at + 1.0])
+        before, here, after = shapely.get_coordinates(ends)
+        directions = [after - here] if lot.lanes[k].oneway else [after - here, before - here]
+        onward = max(directions, key=lambda direction: float(direction @ (middle - here)))
+        entries.append((*xy, math.atan2(onward[1], onward[0])))
+    return np.array(entries).reshape(-1, 3)
