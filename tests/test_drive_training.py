@@ -1,6 +1,5 @@
 """Training of parking agents: the training environment matches the environment, trainings resume, models drive."""
 
-import dataclasses
 import json
 import math
 import os
@@ -15,6 +14,7 @@ from command_line import PARKENV, parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from pictures import shows_color
+from small_trainings import drive_training, make_small
 from typer.testing import CliRunner
 
 from parkenv import make_scenario
@@ -44,8 +44,7 @@ from parkenv.studies.training.drive.env import (
     planned_path,
     slot_groups,
 )
-from parkenv.studies.training.drive.training import DriveTraining, evaluate_parking, parked_on
-from parkenv.studies.training.spec import DriveTrainingSpec
+from parkenv.studies.training.drive.training import evaluate_parking, parked_on
 from parkenv.studies.training.training import train_one
 from parkenv.studies.workers import SERIAL
 from planners.driving.parking_agents import make_parking_agent
@@ -76,32 +75,17 @@ class Always:
 
 
 def training_of(algorithm, steps, every=None, lots=(MINI,)):
-    spec = DriveTrainingSpec(
-        algorithm=algorithm,
-        steps=steps,
-        evaluate_every=every or steps // 2,
-        evaluation_episodes=len(EVALUATED),
-    )
-    training = DriveTraining(spec)
-    training.lots = lots
-    return training
+    return drive_training(algorithm, steps, every or steps // 2, lots, len(EVALUATED))
 
 
 FULL_SIZE = dict(DRIVE_CONFIGS)
-SMALL = {
-    "ppo": {"n_steps": 32, "batch_size": 256, "n_epochs": 2},
-    "sac": {"learning_starts": 800, "batch_size": 32, "gradient_steps": 1},
-    "tqc": {"learning_starts": 800, "batch_size": 32, "gradient_steps": 1},
-}
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small():
     """The training configs, with networks and batches that are fast to train."""
     with pytest.MonkeyPatch.context() as patch:
-        for name, config in DRIVE_CONFIGS.items():
-            changed = {**config.settings, **SMALL[name], "policy_kwargs": {"net_arch": [16]}}
-            patch.setitem(DRIVE_CONFIGS, name, dataclasses.replace(config, n_envs=16, settings=changed))
+        make_small(patch)
         yield
 
 
@@ -434,36 +418,6 @@ def test_a_model_is_trained_evaluated_and_driven(trained):
     rows = parked_on([MINI], EVALUATED, SERIAL, f"{algorithm}:{folder / 'model.safetensors'}")
     assert len(rows) == len(EVALUATED)
     assert np.mean([row["parked"] for row in rows]) == best["success"]
-
-
-# Two trainings each: one on-policy algorithm, and one with a replay buffer.
-@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
-def test_a_resumed_training_equals_an_unbroken_one(tmp_path, monkeypatch, algorithm):
-    """Stopped at its third evaluation: weights, drives under way, levels, replay buffer and random numbers go on."""
-    training = training_of(algorithm, STEPS[algorithm], STEPS[algorithm] // 3)
-    stopped_after(monkeypatch, 2, lambda: training.train(0, tmp_path / "resumed"))
-    assert (tmp_path / "resumed" / "checkpoint.pt").exists()
-    resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
-    assert repr([row | {"wall_s": 0} for row in resumed]) == repr([row | {"wall_s": 0} for row in whole])
-    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    assert not (tmp_path / "resumed" / "checkpoint.pt").exists()
-
-
-def stopped_after(monkeypatch, n, train):
-    """Interrupt a training after n evaluations."""
-    evaluate, evaluations = DriveTraining.evaluate, []
-
-    def stopping(self, policy, env):
-        if len(evaluations) == n:
-            raise KeyboardInterrupt
-        evaluations.append(policy)
-        return evaluate(self, policy, env)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(DriveTraining, "evaluate", stopping)
-        with pytest.raises(KeyboardInterrupt):
-            train()
 
 
 def test_models_of_another_task_are_refused(trained):

@@ -1,6 +1,5 @@
 """One network for all cars: the batch for stable-baselines3, the compiled network, trainings, models in fleets."""
 
-import itertools
 import json
 import pickle
 from pathlib import Path
@@ -22,10 +21,8 @@ from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_rule
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, driver_of
-from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.fleet import FleetTraining
-from parkenv.studies.training.spec import FleetTrainingSpec, TrainingSpec
-from parkenv.studies.training.training import train_one
+from parkenv.studies.training.spec import TrainingSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 from planners.model_file import save_model
@@ -198,43 +195,6 @@ def test_layers_that_do_not_fit_are_named():
         NetworkRule([(np.zeros((5, 7), np.float32), np.zeros(5, np.float32))])
     with pytest.raises(InputError, match="activation is 'elu'"):
         NetworkRule([(np.zeros((5, 91), np.float32), np.zeros(5, np.float32))], activation="elu")
-
-
-def fleet_training(steps=2048):
-    training = FleetTraining(FleetTrainingSpec(steps=steps, evaluate_every=1024, evaluation_episodes=2))
-    training.fleet = MixedFleet(MINI, DEMAND)
-    return training
-
-
-@pytest.fixture
-def small_config(monkeypatch):
-    from parkenv.studies.training import configs
-
-    settings = {**configs.SEARCH_CONFIGS["ppo"].settings, "n_steps": 32, "batch_size": 256}
-    config = configs.TrainingConfig(8, "MultiInputPolicy", settings)
-    for name in ("ppo", "maskable-ppo"):
-        monkeypatch.setitem(configs.FLEET_CONFIGS, name, config)
-
-
-def test_a_resumed_training_equals_an_unbroken_one(tmp_path, small_config, monkeypatch):
-    whole = train_one(fleet_training(), 0, tmp_path / "whole")
-    seen = itertools.count()
-    plain = FleetVecEnv.step_wait
-
-    def stops(self):
-        if next(seen) == 200:
-            raise KeyboardInterrupt
-        return plain(self)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(FleetVecEnv, "step_wait", stops)
-        with pytest.raises(KeyboardInterrupt):
-            train_one(fleet_training(), 0, tmp_path / "broken")
-    assert len(read_curve(tmp_path / "broken" / "curve.csv")) > 1
-    resumed = train_one(fleet_training(), 0, tmp_path / "broken")
-    times = [{**row, "wall_s": 0.0} for row in resumed.curve]
-    assert times == [{**row, "wall_s": 0.0} for row in whole.curve]
-    assert resumed.model == whole.model
 
 
 def test_members_of_a_mixed_fleet_are_those_asked_for():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from command_line import parkenv
 from gymnasium.utils.env_checker import check_env
+from small_trainings import make_small, search_training
 from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 
 from parkenv import InputError, SensorModel, make_scenario, make_scenarios
@@ -317,33 +318,10 @@ def test_a_curriculum_opens_places_by_size():
     assert open_places(1, 0.0) == open_places(3, 0.0) == 1
 
 
-def small(monkeypatch):
-    """Fewer environments, and searches of at most 60 decisions: an untrained agent drives in circles."""
-    import dataclasses
-
-    from parkenv.studies.training.configs import SEARCH_CONFIGS
-
-    config = SEARCH_CONFIGS["ppo"]
-    few = dataclasses.replace(
-        config, n_envs=16, settings={**config.settings, "batch_size": 256, "n_steps": 32}
-    )
-    monkeypatch.setitem(SEARCH_CONFIGS, "ppo", few)
-    monkeypatch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
-
-
-def training_in(places, held_out, steps, every, episodes):
-    spec = SearchTrainingSpec(
-        algorithm="ppo", steps=steps, evaluate_every=every, evaluation_episodes=episodes, curriculum="size"
-    )
-    training = SearchTraining(spec)
-    training.sides = places, held_out
-    return training
-
-
 def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
-    small(monkeypatch)
+    make_small(monkeypatch)
     met = []
-    training = training_in(PLACES[:4], PLACES[4:], steps=2_048, every=1_024, episodes=12)
+    training = search_training("ppo", 2_048, 1_024, PLACES[:4], PLACES[4:], episodes=12, curriculum="size")
     before = SearchTraining.before_rollout
 
     def watched(self, model):
@@ -372,29 +350,6 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     together, _ = episode_times(agent.model, PLACES, seeds)
     apart = [episode_times(agent.model, PLACES[place_of_episode(s, 0, 6)], [s])[0][0] for s in seeds]
     np.testing.assert_array_equal(together, apart)
-
-
-def test_a_resumed_curriculum_equals_an_unbroken_one(tmp_path, monkeypatch):
-    small(monkeypatch)
-    training = training_in(PLACES, (), steps=1_536, every=512, episodes=8)
-    calls = []
-
-    def stopped(*arguments):
-        calls.append(arguments)
-        if len(calls) == 3:
-            raise KeyboardInterrupt
-        save(*arguments)
-
-    from parkenv.studies.training.checkpoint import save_checkpoint as save
-
-    with monkeypatch.context() as patch:
-        patch.setattr("parkenv.studies.training.learning.save_checkpoint", stopped)
-        with pytest.raises(KeyboardInterrupt):
-            training.train(0, tmp_path / "resumed")
-    resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
-    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
-    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
-    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def test_a_task_names_both_sides_and_keeps_them_apart(folder):

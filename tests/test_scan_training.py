@@ -1,6 +1,5 @@
 """Learning from raw scans: what is observed, trainings, and models in comparisons."""
 
-import dataclasses
 import json
 import math
 from itertools import pairwise
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from command_line import parkenv
 from sb3_contrib import MaskablePPO
+from small_trainings import make_small, scan_training
 
 from parkenv import InputError, make_scenario
 from parkenv.envs.local_observation import LocalObservation
@@ -20,10 +20,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.fleet.drivers import driver_of
 from parkenv.studies.simulate import make_search, simulate
-from parkenv.studies.training.checkpoint import save_checkpoint
-from parkenv.studies.training.configs import SCAN_CONFIGS
-from parkenv.studies.training.search import SearchTraining, episode_times
-from parkenv.studies.training.spec import ScanTrainingSpec
+from parkenv.studies.training.search import episode_times
 from parkenv.studies.training.training import train_one
 from parkenv.studies.trips.driven_search import DrivenSearch
 from planners.agent import make_agent
@@ -109,45 +106,14 @@ def test_sizes_are_those_of_model_files():
     assert SearchVecEnv(2, "mini", observation="scan").observation_space == scans_space(SCANS)
 
 
-@pytest.fixture
-def small(monkeypatch):
-    """Small batches and rollouts, and short searches."""
-    config = SCAN_CONFIGS["maskable-ppo"]
-    sizes = {"batch_size": 128, "n_steps": 16, "policy_kwargs": {"net_arch": [32]}}
-    changed = dataclasses.replace(config, n_envs=8, settings={**config.settings, **sizes})
-    monkeypatch.setitem(SCAN_CONFIGS, "maskable-ppo", changed)
-    monkeypatch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
-
-
-def training_of(steps):
-    spec = ScanTrainingSpec(steps=steps, evaluate_every=128, evaluation_episodes=len(SEEDS))
-    return SearchTraining(spec.changed(scenarios=["mini"]))
-
-
-def test_a_resumed_training_equals_an_unbroken_one_and_its_model_searches_in_the_same_worlds(
-    small, tmp_path, monkeypatch
-):
-    saves = []
-
-    def killed(*arguments):
-        if len(saves) == 2:
-            raise KeyboardInterrupt
-        saves.append(arguments[0])
-        save_checkpoint(*arguments)
-
-    training = training_of(384)
-    with monkeypatch.context() as patch:
-        patch.setattr("parkenv.studies.training.learning.save_checkpoint", killed)
-        with pytest.raises(KeyboardInterrupt):
-            train_one(training, 0, tmp_path / "resumed")
-    resumed, whole = (train_one(training, 0, tmp_path / name).curve for name in ("resumed", "whole"))
-    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
-    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    card = ModelCard.of_file(files[0])
+def test_a_trained_model_searches_in_the_worlds_of_all_agents(tmp_path, monkeypatch):
+    make_small(monkeypatch)
+    train_one(scan_training(128, len(SEEDS)), 0, tmp_path)
+    file = tmp_path / "model.safetensors"
+    card = ModelCard.of_file(file)
     assert (card.observation, card.k, card.scenarios) == ("scan-1", SCANS, ("mini",))
 
-    agent = LearnedAgent(MINI, "maskable-ppo", files[0])
+    agent = LearnedAgent(MINI, "maskable-ppo", file)
     times, _ = episode_times(agent.model, MINI, SEEDS[:2])
     env = make_search(MINI, agent, max_episode_steps=60)
     planned = make_search(MINI, make_agent("mdp", MINI))
@@ -211,7 +177,8 @@ def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
     assert not (tmp_path / "out").exists()
 
 
-def test_the_size_of_the_day_error_is_that_of_all_scenarios(small, tmp_path):
+def test_the_size_of_the_day_error_is_that_of_all_scenarios(tmp_path, monkeypatch):
+    make_small(monkeypatch)
     done = parkenv(
         "train", "maskable-ppo", "--scenario", "mini", "--observation", "scan", "--day-error", "0",
         "--steps", 128, "--trainings", 1, "--evaluation-episodes", 2, "--agents", "none", "--test-on", "mini",

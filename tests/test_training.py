@@ -1,7 +1,6 @@
 """Learning agents: the batch for stable-baselines3, interruptible trainings, model metadata."""
 
 import base64
-import dataclasses
 import json
 import math
 import os
@@ -24,6 +23,7 @@ from command_line import PARKENV, parkenv
 from gymnasium.vector import AutoresetMode
 from pictures import shows_color
 from sb3_contrib import MaskablePPO
+from small_trainings import make_small, search_training, stop_training
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -65,22 +65,11 @@ SCENARIO = _MINI.replace(occupancy=_MINI.occupancy.with_day_error(DayError()))
 EVALUATED = range(2_000_000, 2_000_020)
 
 
-def search_training(algorithm, steps, every, places=(SCENARIO,), episodes=4, **fields):
-    """A training in places that are no files."""
-    training = SearchTraining(
-        SearchTrainingSpec(
-            algorithm=algorithm, steps=steps, evaluate_every=every, evaluation_episodes=episodes, **fields
-        )
-    )
-    training.sides = places, ()
-    return training
-
-
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
     """A short training in a folder."""
     folder = tmp_path_factory.mktemp("trained")
-    training = search_training("maskable-ppo", 80_000, 32_768, episodes=len(EVALUATED))
+    training = search_training("maskable-ppo", 80_000, 32_768, [SCENARIO], episodes=len(EVALUATED))
     train_one(training, 0, folder)
     return folder
 
@@ -165,10 +154,10 @@ def test_a_model_learns_to_park_and_evaluate_policy_agrees_with_compare(trained)
 
 
 def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
-    small_config("ppo", monkeypatch)
+    make_small(monkeypatch)
     seeds = []
     monkeypatch.setattr(SearchVecEnv, "seed", lambda self, seed: seeds.append(seed))
-    training = search_training("ppo", 400, 400)
+    training = search_training("ppo", 400, 400, [SCENARIO])
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
     (tmp_path / "temporary").mkdir()
     for seed in (0, 1):
@@ -177,51 +166,6 @@ def test_seeds_decide_networks_and_worlds(tmp_path, monkeypatch):
     assert seeds[1::2] == [TRAINING_SEEDS, 2 * TRAINING_SEEDS], "worlds apart from those of evaluations"
     models = [(tmp_path / seed / "model.safetensors").read_bytes() for seed in "01"]
     assert models[0] != models[1]
-
-
-@pytest.mark.parametrize("algorithm", sorted(SEARCH_CONFIGS))
-def test_a_resumed_training_equals_an_unbroken_one(algorithm, tmp_path, monkeypatch):
-    """Killed right before its third checkpoint: the evaluation before it is repeated."""
-    small_config(algorithm, monkeypatch)
-    training = search_training(algorithm, 1_500, 400, (SCENARIO, make_scenario("campus")))
-    stop_training(training, tmp_path / "resumed", monkeypatch)
-    resumed, whole = training.train(0, tmp_path / "resumed"), training.train(0, tmp_path / "whole")
-    assert [row["steps"] for row in whole][:3] == [0, 512, 1024] if algorithm != "dqn" else len(whole) == 5
-    assert [row | {"wall_s": 0.0} for row in resumed] == [row | {"wall_s": 0.0} for row in whole]
-    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
-    assert files[0].read_bytes() == files[1].read_bytes()
-    assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
-    row = search_times(LearnedAgent(SCENARIO, algorithm, files[0]), training.sides[0], EVALUATED[:4])
-    assert row["total_s"] == min(row["total_s"] for row in whole)
-    assert training.train(0, tmp_path / "resumed") == resumed, "a finished training is not repeated"
-
-
-def stop_training(training, folder, monkeypatch):
-    """Train until right before the third checkpoint."""
-    saves = []
-
-    def killed(*arguments):
-        if len(saves) == 2:
-            raise KeyboardInterrupt
-        saves.append(arguments[0])
-        save_checkpoint(*arguments)
-
-    with monkeypatch.context() as patch:
-        patch.setattr("parkenv.studies.training.learning.save_checkpoint", killed)
-        with pytest.raises(KeyboardInterrupt):
-            training.train(0, folder)
-
-
-def small_config(algorithm, monkeypatch):
-    """Make the batch and the rollouts of an algorithm's config small, and searches short: it drives in circles."""
-    config = SEARCH_CONFIGS[algorithm]
-    sizes = {
-        "batch_size": 256,
-        **({"learning_starts": 200, "buffer_size": 1_000} if algorithm == "dqn" else {"n_steps": 32}),
-    }
-    small = dataclasses.replace(config, n_envs=16, settings={**config.settings, **sizes})
-    monkeypatch.setitem(SEARCH_CONFIGS, algorithm, small)
-    monkeypatch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
 
 
 class Waits:
@@ -267,7 +211,7 @@ def test_cloning_takes_the_read_only_arrays_of_a_worker():
 
 def test_algorithms_without_cloning_are_refused():
     with pytest.raises(InputError, match="dqn has no behaviour cloning"):
-        search_training("dqn", 10, 10, clone="mdp").check()
+        search_training("dqn", 10, 10, [SCENARIO], clone="mdp").check()
 
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
@@ -412,19 +356,19 @@ def test_only_models_that_can_be_described_are_saved(tmp_path):
 
 
 def test_a_checkpoint_runs_nothing(tmp_path, monkeypatch):
-    small_config("ppo", monkeypatch)
+    make_small(monkeypatch)
     mark = tmp_path / "was_run"
     torch.save({"format": "parkenv-checkpoint-1", "curve": Payload(mark)}, tmp_path / "checkpoint.pt")
     with pytest.raises(InputError, match="no checkpoint of this version"):
-        search_training("ppo", 400, 400).train(0, tmp_path)
+        search_training("ppo", 400, 400, [SCENARIO]).train(0, tmp_path)
     assert not mark.exists()
 
 
 @pytest.fixture
 def checkpoint(tmp_path, monkeypatch):
     """A small training that was stopped, and its checkpoint."""
-    small_config("ppo", monkeypatch)
-    training = search_training("ppo", 1_100, 400)
+    make_small(monkeypatch)
+    training = search_training("ppo", 1_100, 400, [SCENARIO])
     stop_training(training, tmp_path, monkeypatch)
     return training, tmp_path / "checkpoint.pt"
 

@@ -1,0 +1,81 @@
+"""A training of any kind that is killed and resumed ends with the same evaluations and the same model, to the byte."""
+
+import pytest
+from small_trainings import (
+    drive_training,
+    fleet_training,
+    make_small,
+    scan_training,
+    search_training,
+    stop_training,
+)
+
+from parkenv import make_scenario
+from parkenv.envs.sb3 import FleetVecEnv
+from parkenv.lots import grid_lot, packaged_lot
+from parkenv.studies.fleet.drivers import MixedFleet
+from parkenv.studies.training.configs import SEARCH_CONFIGS
+from parkenv.studies.training.curve_file import read_curve
+from parkenv.studies.training.search import search_times
+from parkenv.studies.training.training import train_one
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
+from planners.learned import LearnedAgent
+
+PLACES = [make_scenario("mini"), make_scenario("campus")]
+DEMAND = Demand(PoissonArrivals(60.0, 8 * 3600, 8.5 * 3600), ExponentialTime(480.0), ConstantTime(300.0))
+LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]
+TRAININGS = {
+    **{name: lambda name=name: search_training(name, 1_500, 400, PLACES) for name in sorted(SEARCH_CONFIGS)},
+    "curriculum": lambda: search_training("ppo", 1_536, 512, LOTS, episodes=8, curriculum="size"),
+    "scans": lambda: scan_training(384, 6),
+    "fleet": lambda: fleet_training(MixedFleet(PLACES[0], DEMAND), 768, 256),
+    "drive, ppo": lambda: drive_training("ppo", 2_000, 600, (packaged_lot("mini"),)),
+    "drive, sac": lambda: drive_training("sac", 1_000, 300, (packaged_lot("mini"),)),
+}
+
+
+@pytest.fixture(autouse=True)
+def small(monkeypatch):
+    make_small(monkeypatch)
+
+
+@pytest.mark.parametrize("kind", TRAININGS)
+def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
+    """Killed right before its third checkpoint: the evaluation before it is repeated."""
+    training = TRAININGS[kind]()
+    stop_training(training, tmp_path / "resumed", monkeypatch)
+    assert (tmp_path / "resumed" / "checkpoint.pt").exists()
+    resumed, whole = (training.train(0, tmp_path / name) for name in ("resumed", "whole"))
+    assert len(whole) >= 4
+    assert repr([row | {"wall_s": 0.0} for row in resumed]) == repr([row | {"wall_s": 0.0} for row in whole])
+    files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
+    assert files[0].read_bytes() == files[1].read_bytes()
+    assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
+    again = training.train(0, tmp_path / "resumed")
+    assert repr(again) == repr(resumed), "a finished training is not repeated"
+    if kind in SEARCH_CONFIGS:
+        assert [row["steps"] for row in whole][:3] == [0, 512, 1024] if kind != "dqn" else len(whole) == 5
+        seeds = training.evaluation_seeds
+        row = search_times(LearnedAgent(PLACES[0], kind, files[0]), PLACES, seeds)
+        assert row["total_s"] == min(row["total_s"] for row in whole)
+
+
+def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):
+    training = fleet_training(MixedFleet(PLACES[0], DEMAND))
+    whole = train_one(training, 0, tmp_path / "whole")
+    steps, step_wait = iter(range(1_000)), FleetVecEnv.step_wait
+
+    def stops(self):
+        if next(steps) == 200:
+            raise KeyboardInterrupt
+        return step_wait(self)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(FleetVecEnv, "step_wait", stops)
+        with pytest.raises(KeyboardInterrupt):
+            train_one(training, 0, tmp_path / "broken")
+    assert len(read_curve(tmp_path / "broken" / "curve.csv")) > 1
+    resumed = train_one(training, 0, tmp_path / "broken")
+    curves = [[row | {"wall_s": 0.0} for row in each.curve] for each in (resumed, whole)]
+    assert curves[0] == curves[1]
+    assert resumed.model == whole.model
