@@ -152,7 +152,7 @@ def run(
         return result
     path = Path(folder)
     with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
-        results = Results(path, study.all_tables or (study.table,))
+        results = Results(path, _tables_of(study))
         settings, continues = results.claim(
             study.settings(), study.kind, resume=resume, overwrite=overwrite, goes_on=study.goes_on
         )
@@ -196,9 +196,13 @@ def open_run(folder: Path | str) -> Result:
         if not (path / name).exists():
             raise InputError(f"{path}: holds no finished run: no {name}")
     study = read_study(path / SPEC_FILE)
-    results = Results(path, study.all_tables or (study.table,))
+    results = Results(path, _tables_of(study))
     results.read()
     return Result(study, results, read_json(path / SUMMARY))
+
+
+def _tables_of(study: Study) -> Sequence[Table]:
+    return study.all_tables or (study.table,)
 
 
 def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
@@ -248,7 +252,8 @@ def _run_stage(stage: Stage, results: Results, workers: Workers, progress: Progr
     progress(doing, done, total)
     token = "" if workers.in_process else uuid4().hex
     tasks = [
-        partial(_run_block, token, study, study.enough(work, block, results), block) for work, block in blocks
+        partial(_run_block, token, study, study.input_of(work, block, results), block)
+        for work, block in blocks
     ]
     shown: set[tuple[str, str]] = set()
     synced = -math.inf

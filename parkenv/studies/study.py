@@ -180,7 +180,7 @@ class Study(ExecutionSpec):
         del results
         yield Stage(self.doing, self, self.cells())
 
-    def enough(self, work: Any, items: Sequence[Any], results: Results) -> Any:
+    def input_of(self, work: Any, items: Sequence[Any], results: Results) -> Any:
         """Return the work of a task, with what it needs from the tasks before."""
         del items, results
         return work

@@ -149,7 +149,7 @@ class Commute(Study):
                 doing, self, [Cell(run, days[first : first + self.block]) for run, days in self.cells()]
             )
 
-    def enough(self, work: CommuteRun, items: Sequence[Day], results: Results) -> _Days:
+    def input_of(self, work: CommuteRun, items: Sequence[Day], results: Results) -> _Days:
         """See `Study`: the trips of the days before."""
         from parkenv.mapping.store import MapStore
         from parkenv.studies.commute.runs import map_file
