@@ -13,7 +13,7 @@ from parkenv.files.known_names import (
     SCENARIO_NAMES,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.option import Option, words_in
+from parkenv.files.option import Option, numbers_in, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several
 from parkenv.scenarios.spec import (
     ScenarioSpec,
@@ -126,6 +126,17 @@ Detector = Annotated[
     Option(takes="NAME|FILE|MODULE:CLASS", panel="Sensors", default="the scenario's, hog"),
 ]
 Figures = Annotated[bool, Field(description="Draw figures."), Option(panel="Results")]
+
+
+def seconds_of_minutes(text: str) -> float:
+    """Convert minutes to s.
+
+    Raises:
+        InputError: the text is no number.
+    """
+    return 60.0 * numbers_in(text, 1)[0]
+
+
 ArrivalRate = Annotated[float, Field(gt=0.0, le=1e6)]
 Stay = Annotated[float, Field(ge=1.0, le=1e7)]  # s
 BUSY = TrafficSpec(cars=3, pedestrians=5)

@@ -14,19 +14,23 @@ from pydantic_core import PydanticCustomError
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
-from parkenv.files.spec_file import Axis, FilePath, Several
+from parkenv.files.option import Option
+from parkenv.files.spec_file import Axis, FilePath
 from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.scenarios.spec import Probability, scenario_spec
-from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
     MAX_EPISODES,
+    Agents,
     ArrivalRate,
-    ScenarioItem,
+    Figures,
+    OneScenario,
     Seed,
     Stay,
     Values,
     listed,
     require_distinct_names,
+    seconds_of_minutes,
 )
 from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS, Setting
 from parkenv.studies.results import CsvTable, Results, Row
@@ -67,39 +71,85 @@ class FleetStudy(Study):
     unit: ClassVar = "days"
 
     kind: Literal["fleet"] = "fleet"
-    agents: Several[AgentItem] = Field(
-        (AgentSpec(name="greedy-drive"),), min_length=1, max_length=1_000,
-        description="Each drives all cars in turn.",
-    )  # fmt: skip
-    scenario: ScenarioItem = scenario_spec("campus")
-    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = Field(
-        KNOWLEDGE, description="What members know: own, shared, reserve or full."
+    agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents)] = Field(
+        (AgentSpec(name="greedy-drive"),),
+        description="Agents, each of which drives all cars in turn, with any options in brackets. greedy-drive, "
+        "first-free and random are compiled; any other agent decides in Python.",
     )
-    shares: Values[Probability] = Field((1.0,), description="Shares of the cars that are members.")
-    arrivals_per_hour: Values[ArrivalRate] = Field((60.0, 120.0, 240.0), description="Cars.")
-    days: int = Field(10, ge=1, le=100_000, description="Days of each setting.")
-    stay_s: Stay = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
-    patience_s: Stay = Field(600.0, description="Search time after which a car goes elsewhere, s.")
-    delay_s: float = Field(0.0, ge=0.0, le=1e5, description="Age of the live map, s.")
-    manoeuvre_s: float | None = Field(
+    scenario: OneScenario = scenario_spec("campus")
+    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed), Option(panel="Knowledge")] = Field(
+        KNOWLEDGE,
+        description="What members know. own: what they observe; shared: also a live map of what members observe; "
+        "reserve: the slot that a guidance system has reserved; full: the state of every slot.",
+    )
+    shares: Annotated[Values[Probability], Option("--share", panel="Knowledge")] = Field(
+        (1.0,),
+        description="Shares of the cars that are members, from 0 to 1; the others know what they observe.",
+    )
+    arrivals_per_hour: Annotated[Values[ArrivalRate], Option(panel="Demand")] = Field(
+        (60.0, 120.0, 240.0), description="Cars an hour that arrive."
+    )
+    days: Annotated[int, Option("--episodes", short="-n", takes="N >= 1")] = Field(
+        10, ge=1, le=100_000, description="Days of each setting."
+    )
+    stay_s: Annotated[
+        Stay,
+        Option(
+            "--stay-min",
+            takes="X",
+            default="60",
+            panel="Demand",
+            parse=seconds_of_minutes,
+            description="Mean of the exponentially distributed stays, minutes.",
+        ),
+    ] = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
+    patience_s: Annotated[
+        Stay,
+        Option(
+            "--patience-min",
+            takes="X",
+            default="10",
+            panel="Demand",
+            parse=seconds_of_minutes,
+            description="Minutes after which a searching car goes elsewhere, at the give-up penalty.",
+        ),
+    ] = Field(600.0, description="Search time after which a car goes elsewhere, s.")
+    delay_s: Annotated[float, Option("--delay", panel="Knowledge")] = Field(
+        0.0, ge=0.0, le=1e5, description="Age of the live map, s."
+    )
+    manoeuvre_s: Annotated[
+        float | None,
+        Option(
+            "--manoeuvre", panel="Interactions",
+            default="as in --calibrated; else 0, cars pass through each other",
+        ),
+    ] = Field(
         None, ge=0.0, le=3600.0,
-        description="Time for which a car that parks or leaves blocks its lane, s; if absent, as calibrated, or 0.",
+        description="Seconds for which a car that parks or leaves blocks its lane; queues form behind it, and behind a "
+        "car that stands.",
     )  # fmt: skip
-    leaving_soon_s: float = Field(
+    leaving_soon_s: Annotated[float, Option("--leaving-soon", panel="Interactions")] = Field(
         0.0,
         ge=0.0,
         le=3600.0,
-        description="Time for which a car shows that it leaves, s; who waits has the slot.",
+        description="Seconds for which cars show that they leave; a car that stands before such a slot holds it.",
     )
-    sees_cars: bool = Field(False, description="Whether agents observe the other cars in view.")
-    calibrated: FilePath | None = Field(
-        None, description="Speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`."
+    sees_cars: Annotated[bool, Option(panel="Interactions")] = Field(
+        False, description="Let agents observe other cars in view, in a further key of the observation."
     )
-    decision_limit_s: float | None = Field(
-        None, ge=0.01, le=1e5, description="Wall time after which a decision in Python stops the run, s."
+    calibrated: Annotated[FilePath | None, Option(panel="Interactions")] = Field(
+        None,
+        description="Take driving speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`.",
     )
-    seed: Seed = Field(0, description="Seed of the days.")
-    figures: bool = Field(True, description="Draw the picture.")
+    decision_limit_s: Annotated[
+        float | None, Option("--decision-limit", panel="Agents", default="none")
+    ] = Field(
+        None, ge=0.01, le=1e5,
+        description="Stop the run if an agent in Python takes longer for a decision, in seconds of wall time, "
+        "compiling included.",
+    )  # fmt: skip
+    seed: Seed = 0
+    figures: Figures = True
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
