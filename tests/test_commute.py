@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import parkenv
+from pictures import shows_color
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.files.spec_file import read_tables
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore
+from parkenv.show.figures.times import AGENT_COLORS
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.commute.runs import TRIP, CommuteRun, calendar
 from parkenv.studies.commute.study import Commute
@@ -78,7 +80,7 @@ def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
     times = {(e["course"], round(float(e["arrival_s"]) % 86400, 2)) for e in episodes}
     assert len(times) == 2
     assert len(list((out / "maps").glob("*.sqlite"))) == 4
-    assert (out / "commute.png").stat().st_size > 10_000
+    assert shows_color(out / "commute.png", AGENT_COLORS["belief"])
     assert "Maps that learn from every trip on mini" in (out / "report.html").read_text()
     assert read_tables(out / "experiment.json")["kind"] == "commute"
 

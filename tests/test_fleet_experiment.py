@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 from command_line import parkenv
+from pictures import shows_color
 
 from parkenv.engine.fleet import total_s
 from parkenv.errors import InputError
@@ -14,6 +15,7 @@ from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_specs
+from parkenv.show.figures.fleet import KNOWLEDGE_COLORS
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.measures import Roads, gini, looks_s
 from parkenv.studies.fleet.setting import MEASURES, Setting
@@ -155,7 +157,7 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
         "agents knows share arrivals_per_hour total_s total_s_ci95 search_s failed_attempts balked_fraction"
     )
     assert {*wanted.split(), "price_of_anarchy", "price_of_anarchy_ci95"} <= rows[0].keys()
-    assert (tmp_path / "a" / "fleet.png").stat().st_size > 10_000
+    assert shows_color(tmp_path / "a" / "fleet.png", KNOWLEDGE_COLORS["reserve"])
     with (tmp_path / "a" / "days.csv").open() as file:
         days = list(csv.DictReader(file))
     assert len(days) == 2 * len(rows)

@@ -13,6 +13,7 @@ import shapely
 from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from pictures import shows_color
 from typer.testing import CliRunner
 
 from parkenv import make_scenario
@@ -24,7 +25,8 @@ from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.show.figures.lot_import import save_import_picture
+from parkenv.show.figures.lot_import import SOURCE_COLORS, save_import_picture
+from parkenv.show.figures.schematic import TWO_WAY
 from parkenv.studies.compare.cases import Case
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
@@ -1017,7 +1019,7 @@ def test_the_command_line_imports_draws_and_checks(tmp_path):
     assert "22 slots from amenity=parking_space" in done.output
     assert "left out: spaces for disabled drivers: 2 (way/5, way/7)" in done.output
     assert read_lot(lot).n_slots == 22
-    assert picture.stat().st_size > 10_000
+    assert all(shows_color(picture, color) for color in (SOURCE_COLORS[0], TWO_WAY))
     assert run("import", place, "--out", lot, "--disabled").exit_code == 0
     assert read_lot(lot).n_slots == 24
     refused = run("import", place, "--out", lot, "--goal", "48")
@@ -1060,4 +1062,4 @@ def test_pictures_are_drawn_of_whatever_was_found(tmp_path):
         ("nothing", outline_alone(access="private").draft(tmp_path)),
     ):
         save_import_picture(draft, tmp_path / f"{name}.png")
-        assert (tmp_path / f"{name}.png").stat().st_size > 5_000
+        assert shows_color(tmp_path / f"{name}.png", SOURCE_COLORS[0]) == (name == "all")

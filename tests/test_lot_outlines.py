@@ -13,6 +13,7 @@ from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_outlines import document, double_row, kerb, row, town, write
+from pictures import shows_color
 
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
@@ -21,6 +22,7 @@ from parkenv.lots.draft import ImportOptions
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
 from parkenv.lots.quality import Provenance, read_provenance
+from parkenv.show.colors import PALETTE
 from parkenv.studies.drivability import ManoeuvreKind, can_park, check_drivability
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
@@ -425,7 +427,9 @@ class TestTown:
         )
         shown = parkenv("lot", "show", out / f"{rows[0]['lot']}.geojson", "--out", tmp_path / "lot.png")
         assert "guessed: entry at" in shown.stdout
-        assert (tmp_path / "lot.png").stat().st_size > 10_000
+        assert all(
+            shows_color(tmp_path / "lot.png", PALETTE[name]) for name in ("ground", "asphalt", "entry")
+        )
 
     def test_the_example_is_what_its_generator_makes(self):
         path = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"

@@ -6,8 +6,10 @@ import math
 import numpy as np
 import pytest
 from command_line import parkenv
+from pictures import shows_color
 
 from parkenv.errors import InputError
+from parkenv.show.figures.verification import AGREES
 from parkenv.studies.runner import run
 from parkenv.studies.verify import line, looks
 from parkenv.studies.verify.line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
@@ -119,7 +121,7 @@ def test_the_command_writes_rows_and_a_picture(tmp_path, monkeypatch):
     for row in summary["rows"]:
         assert {"case", "expected", "found", "found_ci95", "source"} <= row.keys()
         assert row["agrees"]
-    assert (tmp_path / "verify.png").stat().st_size > 10_000
+    assert shows_color(tmp_path / "verify.png", AGREES, within=40)
     again = parkenv("verify", "--cases", "looks", "--jobs", 1, "--out", tmp_path / "again")
     assert again.returncode == 0
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["rows"] == summary["rows"]

@@ -89,7 +89,7 @@ def _draw(draft: LotDraft, ax: Axes) -> None:
     layers = [
         Areas([[outline] for outline in draft.outlines], AREA, AREA_EDGE),
         *building_layers([w for w in draft.walls if is_building(w)], draft.walls),
-        Marks(posed(draft.loose), DISC, SOURCE_COLORS[0], px=4.0),
+        Marks(posed(draft.loose), DISC, SOURCE_COLORS[0], px=5.0),
         *schematic(
             corner_points(slots.xy, slots.yaw, slots.length, slots.width), colors, mouths, draft.lanes,
             draft.entries.reshape(-1, 2), draft.goals.reshape(-1, 2),

@@ -149,26 +149,11 @@ class FleetView {
   }
 
   paint(context, number) {
-    const { view } = this;
-    const slot = view.slots[number];
-    const line = Math.max(0.1, view.px(0.75));
-    context.save();
-    context.translate(slot.x, slot.y);
-    context.rotate(slot.yaw);
-    const [l, w] = [slot.length / 2 - line / 2, slot.width / 2 - line / 2];
-    context.fillStyle = palette.asphalt;
-    context.fillRect(-l, -w, 2 * l, 2 * w);
-    context.strokeStyle = palette.paint;
-    context.lineWidth = line;
-    context.strokeRect(-l, -w, 2 * l, 2 * w);
-    if (this.day.slots[number] !== EMPTY) {
-      const [length, width] = [Math.min(0.78 * slot.length, 4.4), Math.min(0.6 * slot.width, 1.75)];
-      context.fillStyle = this.colorOf(number);
-      context.beginPath();
-      context.roundRect(-length / 2, -width / 2, length, width, 0.3 * width);
-      context.fill();
-    }
-    context.restore();
+    const slot = this.view.slots[number];
+    this.view.paintSlot(context, slot, palette.asphalt, 1, () => {
+      if (this.day.slots[number] === EMPTY) return;
+      this.view.carBody(context, this.colorOf(number), Math.min(0.78 * slot.length, 4.4), Math.min(0.6 * slot.width, 1.75));
+    });
   }
 
   draw(seconds) {
@@ -230,12 +215,9 @@ class FleetView {
     canvas.height = Math.ceil(width + line + 1);
     const context = canvas.getContext("2d");
     context.translate(canvas.width / 2, canvas.height / 2);
-    context.fillStyle = body;
     context.strokeStyle = "#1c2126";
     context.lineWidth = line;
-    context.beginPath();
-    context.roundRect(-length / 2, -width / 2, length, width, 0.32 * width);
-    context.fill();
+    view.carBody(context, body, length, width);
     context.stroke();
     context.fillStyle = roof;
     context.fillRect(-0.26 * length, -0.27 * width, 0.36 * length, 0.54 * width);

@@ -155,33 +155,44 @@ class LotView {
    * belief(i) is 0 to 255, or -1 where unknown; seen(i), taken(i) are booleans.
    */
   drawSlots(belief, seen, taken) {
-    const context = this.context;
-    const line = Math.max(0.1, this.px(0.75));
     this.slots.forEach((slot, i) => {
-      context.save();
-      context.translate(slot.x, slot.y);
-      context.rotate(slot.yaw);
-      const [l, w] = [slot.length / 2 - line / 2, slot.width / 2 - line / 2];
       const value = belief(i);
-      if (value >= 0) {
-        context.globalAlpha = seen(i) ? 1 : 0.42;
-        context.fillStyle = palette.belief[value];
-        context.fillRect(-l, -w, 2 * l, 2 * w);
-        context.globalAlpha = 1;
-      }
-      context.strokeStyle = palette.paint;
-      context.lineWidth = line;
-      context.strokeRect(-l, -w, 2 * l, 2 * w);
-      if (taken(i)) this.parkedCar(context, Math.min(0.72 * slot.length, 4.2), Math.min(0.52 * slot.width, 1.6));
-      context.restore();
+      this.paintSlot(this.context, slot, value < 0 ? null : palette.belief[value], seen(i) ? 1 : 0.42, () => {
+        if (taken(i)) this.parkedCar(this.context, Math.min(0.72 * slot.length, 4.2), Math.min(0.52 * slot.width, 1.6));
+      });
     });
   }
 
-  parkedCar(context, length, width) {
-    context.fillStyle = palette.parked;
+  /** Paint a slot: filled, unless the colour is null, with its lines; draw() adds what stands in it, along x. */
+  paintSlot(context, slot, fill, opacity, draw) {
+    const line = Math.max(0.1, this.px(0.75));
+    const [l, w] = [slot.length / 2 - line / 2, slot.width / 2 - line / 2];
+    context.save();
+    context.translate(slot.x, slot.y);
+    context.rotate(slot.yaw);
+    if (fill) {
+      context.globalAlpha = opacity;
+      context.fillStyle = fill;
+      context.fillRect(-l, -w, 2 * l, 2 * w);
+      context.globalAlpha = 1;
+    }
+    context.strokeStyle = palette.paint;
+    context.lineWidth = line;
+    context.strokeRect(-l, -w, 2 * l, 2 * w);
+    draw();
+    context.restore();
+  }
+
+  /** Fill the body of a car that heads along x. */
+  carBody(context, color, length, width) {
+    context.fillStyle = color;
     context.beginPath();
-    context.roundRect(-length / 2, -width / 2, length, width, 0.3 * width);
+    context.roundRect(-length / 2, -width / 2, length, width, 0.31 * width);
     context.fill();
+  }
+
+  parkedCar(context, length, width) {
+    this.carBody(context, palette.parked, length, width);
     if (this.at.scale * width < 5) return;
     context.fillStyle = palette.glass;
     context.fillRect(0.1 * length, -0.36 * width, 0.13 * length, 0.72 * width);
@@ -196,12 +207,9 @@ class LotView {
     context.save();
     context.translate(x, y);
     context.rotate(yaw);
-    context.fillStyle = palette.car;
     context.strokeStyle = "#1c2126";
     context.lineWidth = this.px(1.5);
-    context.beginPath();
-    context.roundRect(-length / 2, -width / 2, length, width, 0.32 * width);
-    context.fill();
+    this.carBody(context, palette.car, length, width);
     context.stroke();
     context.fillStyle = "#1c2126";
     context.fillRect(0.08 * length, -0.34 * width, 0.15 * length, 0.68 * width);

@@ -6,20 +6,17 @@ import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import gymnasium as gym
-import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from parkenv import __version__
 from parkenv.files.atomic_write import atomic_write
 from parkenv.show.figures.picture_files import save_film
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import rows_of
+from parkenv.studies.frame_recorder import FrameRecorder
 from parkenv.studies.results import Row
-from parkenv.studies.simulate import Observer, Step, make_search, simulate
+from parkenv.studies.simulate import make_search, simulate
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
@@ -92,13 +89,13 @@ class Publication:
     def film(self, path: Path) -> None:
         """Film the model's first episodes in the first scenario, a GIF."""
         scenario = next(iter(self.scenarios.values()))
-        seeds, frames = range(self.seed, self.seed + _FILMED), _Frames()
+        seeds, frames = range(self.seed, self.seed + _FILMED), FrameRecorder()
         if self.card.task == "search":
             agent = make_agent(self._source, scenario)
             env = make_search(scenario, agent, render_mode="rgb_array", max_episode_steps=_LONGEST)
             for seed in seeds:
                 simulate(env, agent, seed, (frames,))
-            save_film(frames.shown, path, fps=4.0, colors=128)
+            save_film(frames.frames, path, fps=4.0, colors=128)
         else:
             parker, drive = (
                 make_parking_agent(self._source),
@@ -200,28 +197,6 @@ gives the same numbers with parkenv {__version__}.
 {extra}"""
         with atomic_write(path) as beside:
             beside.write_text(text, encoding="utf-8")
-
-
-class _Frames(Observer):
-    """Renders the start and every step."""
-
-    def __init__(self) -> None:
-        self.shown: list[NDArray[np.uint8]] = []
-
-    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Render the start."""
-        del observation
-        self._env = env
-        self._render()
-
-    def on_step(self, step: Step) -> None:
-        """Render the step."""
-        del step
-        self._render()
-
-    def _render(self) -> None:
-        frame: Any = self._env.render()
-        self.shown.append(frame)
 
 
 def _metrics(row: Row) -> list[Row]:

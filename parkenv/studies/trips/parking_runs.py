@@ -16,6 +16,7 @@ from parkenv.driving.drive_state import DriveState
 from parkenv.driving.vehicle import STEERING, YAW
 from parkenv.envs.drive import DriveEnv
 from parkenv.files.csv_writing import write_csv
+from parkenv.studies.frame_recorder import FrameRecorder
 from parkenv.studies.simulate import Observer, Step, simulate
 from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.lot import ParkingLot
@@ -61,36 +62,28 @@ class Parking:
     frames: list[Any] = field(default_factory=list)  # rendered frames, if requested
 
 
-class _ParkingRecorder(Observer):
-    """Record steering angle and heading after every step, and frames.
+class _MotionRecorder(Observer):
+    """Record steering angle and heading at the start and after every step."""
 
-    Args:
-        every: steps between frames; 0 for none.
-    """
-
-    def __init__(self, every: int) -> None:
-        self._every = every
+    def __init__(self) -> None:
         self.steering: list[float] = []
         self.yaws: list[float] = []
-        self.frames: list[Any] = []
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Record the start."""
         del observation
-        self._env, self.drive = env, cast(DriveEnv, env.unwrapped)
-        self._record(frame=True)
+        self.drive = cast(DriveEnv, env.unwrapped)
+        self._record()
 
     def on_step(self, step: Step) -> None:
-        """Record the step; the last one always has a frame."""
-        over = step.terminated or step.truncated
-        self._record(frame=over or (self._every > 0 and len(self.yaws) % self._every == 0))
+        """Record the step."""
+        del step
+        self._record()
 
-    def _record(self, *, frame: bool) -> None:
+    def _record(self) -> None:
         vehicle = self.drive.state.vehicle
         self.steering.append(float(vehicle[STEERING]))
         self.yaws.append(float(vehicle[YAW]))
-        if self._every and frame:
-            self.frames.append(self._env.render())
 
 
 def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0) -> Parking:
@@ -107,8 +100,9 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         wheel_rad and turned_rad (total change of steering angle and heading), position_error_m,
         angle_error_deg; for a planner also plans, planning_s (all plans), path_m, expansions, margin_m.
     """
-    recorder = _ParkingRecorder(every)
-    result = simulate(env, agent, seed, (recorder,))
+    recorder = _MotionRecorder()
+    film = [FrameRecorder(every)] if every else []
+    result = simulate(env, agent, seed, (recorder, *film))
     info, memory, drive = result.info, result.memory, recorder.drive
     state: DriveState = drive.get_state()[1]
     task = state.task
@@ -139,7 +133,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         }
         if not row["parked"] and not info["contact"] and not memory.paths:
             row["reason"] = "no path was found"
-    return Parking(row, state, recorder.frames)
+    return Parking(row, state, film[0].frames if film else [])
 
 
 def park_all(
