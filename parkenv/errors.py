@@ -1,9 +1,12 @@
-"""The one exception that bad input raises, and hints for misspelt names."""
+"""The one exception that bad input raises, the checks that raise it, and hints for misspelt names."""
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+import math
+from collections.abc import Collection, Iterable
+from numbers import Integral, Real
+from typing import Any
 
 
 class InputError(ValueError):
@@ -11,6 +14,69 @@ class InputError(ValueError):
 
     The command line turns it into one line on standard error and exit code 2.
     """
+
+
+def require_number(
+    name: str,
+    value: Any,
+    *,
+    above: float | None = None,
+    least: float | None = None,
+    below: float | None = None,
+    most: float | None = None,
+    finite: bool = True,
+) -> None:
+    """Check that a value is a number within bounds, each of which may be absent.
+
+    Raises:
+        InputError: it is no number, not finite or out of bounds.
+
+    Examples:
+        >>> require_number("every", -1.0, above=0.0)
+        Traceback (most recent call last):
+        parkenv.errors.InputError: every is -1.0, want a finite number above 0
+    """
+    good = isinstance(value, Real) and not _is_flag(value) and not math.isnan(value)
+    if (
+        not good
+        or (finite and math.isinf(value))
+        or (above is not None and not value > above)
+        or (least is not None and not value >= least)
+        or (below is not None and not value < below)
+        or (most is not None and not value <= most)
+    ):
+        bounds = {"above": above, "at least": least, "below": below, "at most": most}
+        wanted = " and ".join(f"{word} {bound:g}" for word, bound in bounds.items() if bound is not None)
+        if least is not None and most is not None:
+            wanted = f"from {least:g} to {most:g}"
+        kind = "a finite number" if finite else "a number"
+        raise InputError(f"{name} is {value!r:.60}, want {kind} {wanted}".rstrip())
+
+
+def require_whole(name: str, value: Any, *, least: int = 0, most: int | None = None) -> None:
+    """Check that a value is a whole number of at least `least` and, unless that is None, at most `most`.
+
+    Raises:
+        InputError: it is not.
+    """
+    good = isinstance(value, Integral) and not _is_flag(value)
+    if not good or value < least or (most is not None and value > most):
+        wanted = f"of at least {least}" if most is None else f"from {least:,} to {most:,}"
+        raise InputError(f"{name} is {value!r:.60}, want a whole number {wanted}")
+
+
+def require_one_of(name: str, value: object, known: Collection[object]) -> None:
+    """Check that a value is one of those known.
+
+    Raises:
+        InputError: it is not.
+    """
+    if value not in known:
+        raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known))}")
+
+
+def _is_flag(value: object) -> bool:
+    return isinstance(value, bool)
 
 
 def nearest(name: str, known: Iterable[str]) -> str:

@@ -345,11 +345,11 @@ def test_too_little_to_train_on_is_said(crops):
     ("settings", "message"),
     [
         ({"models": ()}, "models is empty"),
-        ({"least_height": 2.0}, "least_height is 2.0 px"),
+        ({"least_height": 2.0}, "least_height is 2.0"),
         ({"scale_step": 1.0}, "scale_step is 1.0"),
         ({"threshold": 1.0}, "threshold is 1.0"),
         ({"margin": -0.1}, "margin is -0.1"),
-        ({"inside": 1.2}, "inside is 1.2, want 0 to 1"),
+        ({"inside": 1.2}, "inside is 1.2, want a finite number from 0 to 1"),
     ],
 )
 def test_bad_detectors_are_named(model, settings, message):

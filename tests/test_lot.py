@@ -130,8 +130,8 @@ def test_grid_is_laid_out_as_documented():
     [
         ({"rows": 0, "columns": 3}, "rows is 0"),
         ({"rows": 2, "columns": 2.5}, "columns is 2.5"),
-        ({"rows": 2, "columns": 2, "aisle": 1.0}, "aisle is 1.0 m, want 3 to 16 m"),
-        ({"rows": 2, "columns": 2, "pitch": float("nan")}, "pitch is nan m"),
+        ({"rows": 2, "columns": 2, "aisle": 1.0}, "aisle is 1.0, want a finite number from 3 to 16"),
+        ({"rows": 2, "columns": 2, "pitch": float("nan")}, "pitch is nan"),
     ],
 )
 def test_grid_that_cannot_be_is_refused(arguments, message):

@@ -218,7 +218,7 @@ def test_a_rig_that_cannot_see_or_range_is_refused():
         ({"weather": "hail"}, "weather is 'hail'"),
         ({"windows": ()}, "windows is empty"),
         ({"every": 0.0}, "every is 0"),
-        ({"picture_width": 12}, "picture_width is 12 px"),
+        ({"picture_width": 12}, "picture_width is 12"),
     ],
 )
 def test_bad_settings_are_named(wrong, message):

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require_number
 
 HOURS = 24
 N_HOUR_KNOTS = 2 * HOURS
@@ -67,9 +67,8 @@ class MapErrorPrior:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            least = "above 0" if name in ("memory_days", "weight") else "at least 0"
-            if not (value > 0.0 or (value == 0.0 and least == "at least 0")):
-                raise InputError(f"MapErrorPrior.{name} is {value}, want a number {least}")
+            bound = "above" if name in ("memory_days", "weight") else "least"
+            require_number(f"MapErrorPrior.{name}", value, finite=False, **{bound: 0.0})
 
     def covariance(self, nearness: FloatArray) -> FloatArray:
         """Covariance of f and g, (n + 48, n + 48), for slots of the given nearness, (n,), -1 to 1."""

@@ -12,7 +12,7 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require_number, require_whole
 from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
@@ -151,15 +151,14 @@ def grid_lot(
     Raises:
         InputError: a count below one, or sizes without room to drive or without a lane within reach.
     """
-    _require_count("grid lot: rows", rows)
-    _require_count("grid lot: columns", columns)
+    require_whole("grid lot: rows", rows, least=1)
+    require_whole("grid lot: columns", columns, least=1)
     for what, value, low, high in (
         ("pitch", pitch, 1.0, 100.0),
         ("depth", depth, 1.0, 100.0),
         ("aisle", aisle, 2 * LANE_OFFSET, 2 * SLOT_REACH),
     ):
-        if not low <= value <= high:
-            raise InputError(f"grid lot: {what} is {value} m, want {low:g} to {high:g} m")
+        require_number(f"grid lot: {what}", value, least=low, most=high)
 
     n_aisles = (rows + 1) // 2
     aisle_y = np.arange(n_aisles) * (2 * depth + aisle)
@@ -201,7 +200,7 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
     Raises:
         InputError: `n_slots` is below one.
     """
-    _require_count("city: n_slots", n_slots)
+    require_whole("city: n_slots", n_slots, least=1)
     # A block has about 45 slots: add rows of blocks until all slots fit.
     for n_blocks in count(max(1, int(np.sqrt(n_slots / 48)))):
         streets = _random_streets(n_blocks, np.random.default_rng([seed, n_blocks]))
@@ -312,8 +311,3 @@ def outlines(corners: FloatArray, setback: float) -> list[FloatArray]:
     """Return closed outlines, (k, 2) m each, of the polygons `corners`, (n, k, 2) m, shrunk by `setback` m."""
     shrunk = shapely.buffer(shapely.polygons(corners), -setback, join_style="mitre")
     return [shapely.get_coordinates(polygon) for polygon in np.asarray(shrunk) if not polygon.is_empty]
-
-
-def _require_count(what: str, value: int) -> None:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < 1:
-        raise InputError(f"{what} is {value!r}, want a whole number, at least 1")

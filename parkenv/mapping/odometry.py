@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 
 DRIFT_M = 100.0
 """Distance straight ahead, m, after which the error of drifting odometry is stated."""
@@ -37,10 +37,8 @@ class PoseNoise:
 
     def __post_init__(self) -> None:
         for name in ("position", "heading", "drift"):
-            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
-                raise InputError(f"{name} is {getattr(self, name)}, want a finite number of at least 0")
-        if not self.length > 0.0:
-            raise InputError(f"length is {self.length} m, want above 0")
+            require_number(name, getattr(self, name), least=0.0)
+        require_number("length", self.length, above=0.0, finite=False)
         if self.drift > MOST_DRIFT:
             raise InputError(f"drift is {self.drift}, want at most {MOST_DRIFT}; 0.02 is 2 % of the distance")
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.compiled.keyed_random import world_key
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_one_of, require_whole
 from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.localisation import make_locate
@@ -58,18 +58,15 @@ class SurveySettings:
     picture_width: int | None = None  # px, of the cameras' pictures; None: the rig's own
 
     def __post_init__(self) -> None:
-        if self.rig not in RIG_NAMES:
-            raise InputError(f"rig is {self.rig!r}, want one of {', '.join(RIG_NAMES)}")
-        if self.weather is not None and self.weather not in PRESETS:
-            raise InputError(f"weather is {self.weather!r}, want one of {', '.join(PRESETS)}")
-        if self.localise not in LOCALISERS:
-            raise InputError(f"localise is {self.localise!r}, want one of {', '.join(LOCALISERS)}")
+        require_one_of("rig", self.rig, RIG_NAMES)
+        if self.weather is not None:
+            require_one_of("weather", self.weather, PRESETS)
+        require_one_of("localise", self.localise, LOCALISERS)
         if not self.windows:
             raise InputError("windows is empty, want at least one")
-        if self.picture_width is not None and self.picture_width < 64:
-            raise InputError(f"picture_width is {self.picture_width} px, want at least 64")
-        if not (np.isfinite(self.every) and self.every > 0.0):
-            raise InputError(f"every is {self.every} m, want a finite distance above 0")
+        if self.picture_width is not None:
+            require_whole("picture_width", self.picture_width, least=64)
+        require_number("every", self.every, above=0.0)
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.files.archives import parse_arrays, read_arrays
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import parse_json
@@ -55,8 +55,7 @@ class CarModel:
         left, top, right, bottom = self.car
         if not (0.0 <= left < right <= 1.0 and 0.0 <= top < bottom <= 1.0):
             raise InputError(f"car is {self.car}, want fractions left < right, top < bottom of the window")
-        if not (self.region_aspect > 0.0 and math.isfinite(self.region_aspect)):
-            raise InputError(f"region_aspect is {self.region_aspect}, want a finite number above 0")
+        require_number("region_aspect", self.region_aspect, above=0.0)
         slope, offset = self.calibration
         if not (math.isfinite(self.bias) and math.isfinite(offset) and 0.0 < slope < math.inf):
             raise InputError(

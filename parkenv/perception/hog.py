@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Image
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 
 Float32Array = NDArray[np.float32]
 
@@ -60,10 +60,7 @@ class Descriptor:
             value = getattr(self, name)
             if not isinstance(value, int) or value < 2 * CELL or value % CELL:
                 raise InputError(f"{name} is {value!r} px, want a multiple of {CELL} of at least {2 * CELL}")
-        if self.normalization not in NORMALIZATIONS:
-            raise InputError(
-                f"normalization is {self.normalization!r}, want one of {', '.join(NORMALIZATIONS)}"
-            )
+        require_one_of("normalization", self.normalization, NORMALIZATIONS)
 
     @property
     def shape(self) -> tuple[int, int, int]:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Image
 from parkenv.compiled.threads import in_threads
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
 from parkenv.perception.detector import Detections, GroundBand
 from parkenv.perception.hog import CELL, Descriptor, correlate
@@ -60,20 +60,15 @@ class HogDetector:
     def __post_init__(self) -> None:
         if not self.models:
             raise InputError("models is empty, want at least one")
-        if self.least_height is not None and not self.least_height >= 8.0:
-            raise InputError(f"least_height is {self.least_height} px, want at least 8")
-        if self.most_height is not None and not self.most_height >= (self.least_height or 8.0):
-            raise InputError(
-                f"most_height is {self.most_height} px, want at least {self.least_height or 8.0}"
-            )
-        if not self.scale_step > 1.0:
-            raise InputError(f"scale_step is {self.scale_step}, want above 1")
+        if self.least_height is not None:
+            require_number("least_height", self.least_height, least=8.0, finite=False)
+        if self.most_height is not None:
+            require_number("most_height", self.most_height, least=self.least_height or 8.0, finite=False)
+        require_number("scale_step", self.scale_step, above=1.0, finite=False)
         for name in ("threshold", "overlap"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise InputError(f"{name} is {getattr(self, name)}, want between 0 and 1")
+            require_number(name, getattr(self, name), above=0.0, below=1.0)
         for name in ("inside", "margin"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputError(f"{name} is {getattr(self, name)}, want 0 to 1")
+            require_number(name, getattr(self, name), least=0.0, most=1.0)
 
     @classmethod
     def load(

@@ -28,7 +28,7 @@ from parkenv.compiled.keyed_random import (
     STAY_STREAM,
     car_uniforms,
 )
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_whole
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
@@ -60,7 +60,7 @@ class ConstantTime:
     seconds: float
 
     def __post_init__(self) -> None:
-        _require("ConstantTime.seconds", self.seconds, finite=False)
+        require_number("ConstantTime.seconds", self.seconds, above=0.0, finite=False)
 
     @property
     def mean_s(self) -> float:
@@ -83,7 +83,7 @@ class ExponentialTime:
     mean_s: float
 
     def __post_init__(self) -> None:
-        _require("ExponentialTime.mean_s", self.mean_s)
+        require_number("ExponentialTime.mean_s", self.mean_s, above=0.0)
 
     def quantile(self, u: FloatArray) -> FloatArray:
         """Return the durations; see `Duration`."""
@@ -103,8 +103,8 @@ class LogNormalTime:
     cv: float = 1.0
 
     def __post_init__(self) -> None:
-        _require("LogNormalTime.mean_s", self.mean_s)
-        _require("LogNormalTime.cv", self.cv)
+        require_number("LogNormalTime.mean_s", self.mean_s, above=0.0)
+        require_number("LogNormalTime.cv", self.cv, above=0.0)
 
     def quantile(self, u: FloatArray) -> FloatArray:
         """Return the durations; see `Duration`."""
@@ -125,7 +125,7 @@ class EmpiricalTime:
     def __post_init__(self) -> None:
         object.__setattr__(self, "values_s", _numbers("EmpiricalTime.values_s", self.values_s))
         for i, value in enumerate(self.values_s):
-            _require(f"EmpiricalTime.values_s[{i}]", value)
+            require_number(f"EmpiricalTime.values_s[{i}]", value, above=0.0)
 
     @property
     def mean_s(self) -> float:
@@ -165,8 +165,8 @@ class Headways:
     mean_s: float = 10.0
 
     def __post_init__(self) -> None:
-        _require_cars("Headways.cars", self.cars)
-        _require("Headways.mean_s", self.mean_s)
+        require_whole("Headways.cars", self.cars, least=1, most=MAX_CARS)
+        require_number("Headways.mean_s", self.mean_s, above=0.0)
 
     @property
     def most(self) -> int:
@@ -207,9 +207,9 @@ class PoissonArrivals:
                 )
             object.__setattr__(self, "per_hour", rates)
         for rate in np.atleast_1d(self.per_hour):
-            _require("PoissonArrivals.per_hour", float(rate), least=0.0)
+            require_number("PoissonArrivals.per_hour", float(rate), least=0.0)
         _require_second("PoissonArrivals.start_s", self.start_s)
-        _require("PoissonArrivals.end_s", self.end_s, above=self.start_s)
+        require_number("PoissonArrivals.end_s", self.end_s, above=self.start_s)
         if not self.expected > 0.0:
             raise InputError(
                 f"PoissonArrivals.per_hour is {self.per_hour!r}, want a rate above 0 in the window: no car would arrive"
@@ -482,25 +482,10 @@ def _choices(u: FloatArray, weights: Sequence[float]) -> IntArray:
     return np.minimum(np.searchsorted(shares, u, side="right"), len(weights) - 1).astype(np.int64)
 
 
-def _require(
-    name: str, value: Any, *, above: float = 0.0, least: float | None = None, finite: bool = True
-) -> None:
-    number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-    good = number and not math.isnan(value) and (not finite or math.isfinite(value))
-    if not good or (value < least if least is not None else value <= above):
-        want = f"at least {least:g}" if least is not None else f"above {above:g}"
-        raise InputError(f"{name} is {value!r}, want a {'finite ' if finite else ''}number {want}")
-
-
 def _require_second(name: str, value: Any) -> None:
-    _require(name, value, least=0.0)
+    require_number(name, value, least=0.0)
     if value >= DAY_S:
         raise InputError(f"{name} is {value!r}, want seconds of the day in [0, 86400)")
-
-
-def _require_cars(name: str, value: Any) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= MAX_CARS:
-        raise InputError(f"{name} is {value!r}, want a whole number from 1 to {MAX_CARS:,}")
 
 
 def _numbers(name: str, values: ArrayLike) -> tuple[float, ...]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.process import Arrival, ArrivalWindow, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
@@ -56,9 +56,9 @@ class SearchProblem:
             raise InputError(f"sensor_model is a {type(self.sensor_model).__name__}, want a SensorModel")
         _require_index("goal", self.goal, len(self.lot.goals))
         for name in ("v_drive", "v_walk", "wait_s"):
-            _require_number(name, getattr(self, name), above=0.0)
+            require_number(name, getattr(self, name), above=0.0)
         for name in ("failure_s", "give_up_s"):
-            _require_number(name, getattr(self, name), least=0.0)
+            require_number(name, getattr(self, name), least=0.0)
 
     @cached_property
     def walk_s(self) -> FloatArray:
@@ -196,13 +196,6 @@ class Scenario(SearchProblem):
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:
     array.flags.writeable = False
     return array
-
-
-def _require_number(name: str, value: Any, *, above: float | None = None, least: float | None = None) -> None:
-    want = f"above {above:g}" if above is not None else f"at least {least:g}"
-    good = isinstance(value, (int, float, np.number)) and not isinstance(value, bool) and math.isfinite(value)
-    if not good or (above is not None and not value > above) or (least is not None and not value >= least):
-        raise InputError(f"{name} is {value!r}, want a finite number {want}")
 
 
 def _require_index(name: str, value: Any, count: int) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import os
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_one_of
 from parkenv.files.versioned_json import JsonFormat
 
 SENSOR_MODEL_NAMES = ("laser", "stereo")  # rigs with a packaged fitted sensor model
@@ -55,13 +54,11 @@ class SensorBand:
     false_alarm_rate: float
 
     def __post_init__(self) -> None:
-        if not (self.up_to >= 0.0 and math.isfinite(self.up_to)):
-            raise InputError(f"up_to is {self.up_to} m, want a finite distance of at least 0")
+        require_number("up_to", self.up_to, least=0.0)
         if not isinstance(self.beside, bool):
             raise InputError(f"beside is {self.beside!r}, want true or false")
         _require_rates(self.hit_rate, self.false_alarm_rate)
-        if not 0.0 <= self.seen_rate <= 1.0:
-            raise InputError(f"seen_rate is {self.seen_rate}, want a probability")
+        require_number("seen_rate", self.seen_rate, least=0.0, most=1.0)
 
 
 @dataclass(frozen=True)
@@ -85,8 +82,7 @@ class SensorModel:
     bands: tuple[SensorBand, ...] = ()
 
     def __post_init__(self) -> None:
-        if not (self.view_range >= 0.0 and math.isfinite(self.view_range)):
-            raise InputError(f"view_range is {self.view_range} m, want a finite distance of at least 0")
+        require_number("view_range", self.view_range, least=0.0)
         _require_rates(self.hit_rate, self.false_alarm_rate)
 
     @classmethod
@@ -103,8 +99,7 @@ class SensorModel:
             >>> SensorModel.named("laser").view_range
             16.0
         """
-        if name not in SENSOR_MODEL_NAMES:
-            raise InputError(f"sensor_model is {name!r}, want one of {', '.join(SENSOR_MODEL_NAMES)}")
+        require_one_of("sensor_model", name, SENSOR_MODEL_NAMES)
         return cls.from_file(_FOLDER / f"{name}.json")
 
     @classmethod

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require_whole
 from parkenv.world.lot import ParkingLot
 
 if TYPE_CHECKING:
@@ -51,9 +51,7 @@ class Traffic:
 
     def __post_init__(self) -> None:
         for name in ("cars", "pedestrians"):
-            value = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or value < 0:
-                raise InputError(f"Traffic.{name} is {value!r}, want a whole number of at least 0")
+            require_whole(f"Traffic.{name}", getattr(self, name))
 
 
 class LotTraffic:

@@ -15,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_whole
 from parkenv.perception.boxes import overlaps
 from parkenv.perception.lab.center_network import GREY_MEAN, GREY_STD, STRIDE, CenterNetwork, sides, to_onnx
 from parkenv.perception.lab.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
@@ -59,10 +59,8 @@ class CenterTrainingSettings:
 
     def __post_init__(self) -> None:
         for name in ("steps", "batch", "held_out", "textures"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} is {getattr(self, name)}, want at least 1")
-        if self.seed < 0:
-            raise InputError(f"seed is {self.seed}, want at least 0")
+            require_whole(name, getattr(self, name), least=1)
+        require_whole("seed", self.seed)
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Image
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_whole
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, best_boxes
@@ -44,16 +44,13 @@ class TrainingSettings:
 
     def __post_init__(self) -> None:
         for name in ("penalty", "positives_weight"):
-            if not getattr(self, name) > 0.0:
-                raise InputError(f"{name} is {getattr(self, name)}, want a number above 0")
+            require_number(name, getattr(self, name), above=0.0)
         for name in ("rounds", "jitter", "misaligned", "per_image", "seed"):
-            if not (isinstance(getattr(self, name), int) and getattr(self, name) >= 0):
-                raise InputError(f"{name} is {getattr(self, name)!r}, want a whole number of at least 0")
+            require_whole(name, getattr(self, name))
         if not (self.enlarged == 0.0 or 1.0 <= self.enlarged <= 8.0):
             raise InputError(f"enlarged is {self.enlarged}, want 0 or 1 to 8")
         for name in ("shift", "resize"):
-            if not 0.0 <= getattr(self, name) < 0.5:
-                raise InputError(f"{name} is {getattr(self, name)}, want a share below 0.5")
+            require_number(name, getattr(self, name), least=0.0, below=0.5)
 
 
 def train(

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from parkenv.errors import InputError
+from parkenv.errors import require_number
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 
@@ -29,8 +29,7 @@ class FlatMap:
     true: PriorModel  # provides the decay rates and the day error, which remain correct
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.p_occupied <= 1.0:
-            raise InputError(f"p_occupied is {self.p_occupied}, want a probability")
+        require_number("p_occupied", self.p_occupied, least=0.0, most=1.0)
 
     @property
     def n_slots(self) -> int:

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import require_number
 
 MAX_LOGITS = 5.0
 """Largest standard deviation of a level or slope; days then are almost empty or almost full."""
@@ -50,11 +50,7 @@ class DayError:
     def __post_init__(self) -> None:
         for name in ("level", "slope"):
             value = getattr(self, name)
-            number = isinstance(value, (int, float, np.number)) and not isinstance(value, bool)
-            if not (number and 0.0 <= value <= MAX_LOGITS):
-                raise InputError(
-                    f"day_error.{name} is {value!r:.60}, want a number of logits from 0 to {MAX_LOGITS:g}"
-                )
+            require_number(f"day_error.{name}", value, least=0.0, most=MAX_LOGITS)
             object.__setattr__(self, name, float(value))
 
     def __bool__(self) -> bool:
