@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.command import options_of
 from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import make_console, make_table, print_recorded
 from parkenv.errors import InputError
@@ -17,21 +18,14 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
 
 
+@options_of("parkenv.studies.trips.calibration_study:CalibrationStudy")
 def calibrate(
-    scenario: str | None = None,
-    episodes: int = 100,
-    agents: str = "mdp",
-    seed: int = 0,
+    given: dict[str, Any],
+    /,
     out: Path = Path("results/calibrate"),
     *,
-    notice: float = 2.0,
-    v_drive_kmh: float | None = None,
-    world: args.ObservedSearches,
-    traffic: args.Traffic,
-    rig: RigName | None = None,
-    detector: str | None = None,
-    resume: bool = False,
-    machines: args.Machines,
+    trust: bool = False,
+    folder: args.RunFolder,
 ) -> None:
     """Drive whole trips, and measure the driving speed and the cost of a failed attempt of the drive graph.
 
@@ -44,26 +38,13 @@ def calibrate(
         parkenv compare --calibrated results/calibrate/calibrated.json
 
     Options:
-        episodes, -n (1 <= N <= 1000000): Trips with observations, and as many without.
-        agents (NAME): The agent that searches, with any options in brackets: mdp(failure_s=90).
         out, -o (DIR): Folder for calibrated.json, trips.jsonl, summary.json and the figure.
-
-    Costs and speeds:
-        notice (M): Metres along its path at which the car notices at the latest that it would drive into a taken slot.
-        v_drive_kmh (V): Speed limit on the lanes, km/h.  [default: the scenario's, 10]
-
-    Results:
-        resume: Go on with the trips in --out.
     """
-    from parkenv.studies.agent_spec import AgentSpec
+    from parkenv.cli.spec_options import given_spec
     from parkenv.studies.trips.calibration_study import CalibrationStudy
 
-    args.require_rig(rig, detector)
-    study = CalibrationStudy().changed(
-        scenario=traffic.on(world.spec(scenario)), agent=AgentSpec.of(args.one_agent(agents)), episodes=episodes,
-        seed=seed, notice_m=notice, v_drive_kmh=v_drive_kmh, rig=rig, detector=detector, **machines.given,
-    )  # fmt: skip
-    run_study(study, out, args.ReportedRun(resume=resume), show_calibration)
+    _, study = given_spec(CalibrationStudy(), given, out, folder.resume, trust)
+    run_study(study, out, args.ReportedRun(folder.resume, folder.overwrite), show_calibration)
 
 
 def show_calibration(console: Console, result: Result) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from parkenv.cli import arguments as args
+from parkenv.cli.command import options_of
 from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import make_table
-from parkenv.cli.trust import readable_models, require_trust
 from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
@@ -18,22 +18,15 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
 
 
+@options_of("parkenv.studies.commute.study:Commute", "--cars", "--pedestrians")
 def commute(
-    agents: str | None = None,
-    scenario: str | None = None,
-    map: str | None = None,
-    days: int | None = None,
-    drivers: int | None = None,
-    fleet: int | None = None,
-    seed: int | None = None,
+    given: dict[str, Any],
+    /,
     out: Path = Path("results/commute"),
     *,
-    world: args.Commutes,
-    figures: bool | None = None,
     trust: bool = False,
     trust_model: bool = False,
     folder: args.ReportedRun,
-    machines: args.Machines,
 ) -> None:
     """Let drivers come day after day, with a map that learns from every trip.
 
@@ -53,49 +46,12 @@ def commute(
         parkenv commute --resume --days 60
 
     Options:
-        agents (NAME[,...]): Agents, with any options in brackets; differences in `weeks` of summary.json are to the
-            first that uses no map.  [default: belief,mdp,first-free,greedy-drive]
-        scenario (NAME|FILE|DIR[,...]): {scenarios}; scenario files (.toml), lots (.geojson), or folders.  [default:
-            campus]
-        map (empty|right|wrong[,...]): The map on the first day. empty: 50 % for every slot. right: the forecast of the
-            scenario's occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right
-            one with near and far slots exchanged.  [default: empty]
-        days (N >= 1): Days on which each driver comes, at most those of a recorded log.  [default: 30]
-        drivers (N >= 1): Drivers (or fleets), each with a map of their own: the more, the narrower the intervals.
-            [default: 40]
-        fleet (N >= 1): Drivers who share a map, and come every day.  [default: 1]
-        seed (N >= 0): Seed of days and drivers.  [default: 0]
         out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json, commute.png and the maps.
-
-    World:
-        forecast_from (past|rolling|others): Days that the right map's forecast is made from. past: those before
-            --replay-from; rolling: those before the earliest that a world replays; others: all that it does not replay.
-            [default: the scenario's; others, with counts rolling]
-        mapping (FILE): CSV slot_id,log_slot_id that assigns the log's slots to the lot's.  [default: the log's fullest
-            slots are nearest to the goal; the same slots on every day]
-        hours (HH:MM-HH:MM): Drivers come between these hours.  [default: the scenario's, 08:00-13:00]
-
-    Sensors:
-        sensor_model (NAME|FILE): How slots are observed. perfect: without error; blind: by attempts alone; laser,
-            stereo: as measured with that rig; a file of `parkenv fit-sensor-model`.  [default: the scenario's]
-
-    Results:
-        figures: Draw the picture.  [default: figures]
     """
-    from parkenv.studies.agent_spec import split_agents
+    from parkenv.cli.spec_options import given_spec
     from parkenv.studies.commute.study import Commute
 
-    base = Commute()
-    if folder.resume:
-        base = args.saved(out, Commute)
-        if agents is None:
-            require_trust(base, out, trust)
-    given = args.not_none(days=days, drivers=drivers, fleet=fleet, seed=seed, figures=figures)
-    if agents is not None:
-        given["agents"] = readable_models(split_agents(agents), trust_model)
-    if map is not None:
-        given["maps"] = tuple(args.words("--map", map))
-    study = base.changed(scenarios=tuple(world.specs(scenario, base.scenarios)), **given, **machines.given)
+    _, study = given_spec(Commute(), given, out, folder.resume, trust, trust_model)
     run_study(study, out, folder, show)
 
 

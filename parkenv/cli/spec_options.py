@@ -106,14 +106,19 @@ def spec_class(source: str) -> type[Spec]:
 
 
 def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[FieldOption]:
-    """Yield the options of a specification and of its tables."""
+    """Yield the options of a specification and of its tables; its own go before those of the same name in a table."""
+    own = [
+        FieldOption((*path, name), field, mark, model)
+        for name, field in model.model_fields.items()
+        for mark in {mark.name: mark for mark in field.metadata if isinstance(mark, Option)}.values()
+    ]
+    names = {option.name for option in own}
     for name, field in model.model_fields.items():
-        marks = {mark.name: mark for mark in field.metadata if isinstance(mark, Option)}
-        for mark in marks.values():
-            yield FieldOption((*path, name), field, mark, model)
+        yield from (option for option in own if option.path[-1] == name)
         for inner in models_in(field.annotation):
             if issubclass(inner, Spec):
-                yield from field_options(inner, (*path, name))
+                inside = field_options(inner, (*path, name))
+                yield from (option for option in inside if option.name not in names)
 
 
 def changed_by(spec: SpecT, given: Mapping[str, Any]) -> SpecT:

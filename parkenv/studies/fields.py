@@ -11,6 +11,7 @@ from pydantic_core import PydanticCustomError
 from parkenv.errors import InputError
 from parkenv.files.known_names import (
     SCENARIO_NAMES,
+    RigName,
 )
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Option, numbers_in, words_in
@@ -117,6 +118,16 @@ def listed(value: object) -> object:
 
 Level = Annotated[float, Field(gt=0.0, lt=1.0)]
 Values = Annotated[Axis[T], BeforeValidator(listed)]  # an axis of the grid; a single value needs no list
+Rig = Annotated[
+    RigName | None,
+    Field(
+        description="Observe slots through simulated sensors, detector and all, instead of the sensor model: about a "
+        "second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and a camera to "
+        "each side."
+    ),
+    Option(panel="Sensors"),
+]
+"""Simulated sensors that observe the slots."""
 Detector = Annotated[
     DetectorName | None,
     Field(

@@ -12,10 +12,19 @@ from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
 from parkenv.files.known_names import MapName
-from parkenv.files.spec_file import Axis, Several
+from parkenv.files.option import Option
+from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.agent_spec import AgentItem, AgentSpec
-from parkenv.studies.fields import MAX_EPISODES, Scenarios, Seed, listed, require_distinct_names
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import (
+    MAX_EPISODES,
+    Agents,
+    Figures,
+    Scenarios,
+    Seed,
+    listed,
+    require_distinct_names,
+)
 from parkenv.studies.results import OUTCOME_COLUMNS, CsvTable, Key, Results, Row
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.workers import Task
@@ -49,21 +58,32 @@ class Commute(Study):
     unit: ClassVar = "searches"
 
     kind: Literal["commute"] = "commute"
-    agents: Several[AgentItem] = Field(
+    agents: Agents = Field(
         tuple(AgentSpec(name=name) for name in ("belief", "mdp", "first-free", "greedy-drive")),
-        min_length=1,
-        max_length=1_000,
-        description="Differences by week are to the first that uses no map.",
+        description="Agents, with any options in brackets; differences in `weeks` of summary.json are to the first "
+        "that uses no map.",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
-    maps: Annotated[Axis[MapName], BeforeValidator(listed)] = Field(
-        ("empty",), description="Maps to start from: empty, right or wrong."
+    maps: Annotated[Axis[MapName], BeforeValidator(listed), Option("--map")] = Field(
+        ("empty",),
+        description="The map on the first day. empty: 50 % for every slot. right: the forecast of the scenario's "
+        "occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right one with near "
+        "and far slots exchanged.",
     )
-    days: int = Field(30, ge=1, le=MAX_DAYS, description="Days on which each driver comes.")
-    drivers: int = Field(40, ge=1, le=100_000, description="Repetitions, each with a map of its own.")
-    fleet: int = Field(1, ge=1, le=1_000, description="Drivers who share a map.")
+    days: Annotated[int, Option(takes="N >= 1")] = Field(
+        30, ge=1, le=MAX_DAYS, description="Days on which each driver comes, at most those of a recorded log."
+    )
+    drivers: Annotated[int, Option(takes="N >= 1")] = Field(
+        40,
+        ge=1,
+        le=100_000,
+        description="Drivers (or fleets), each with a map of their own: the more, the narrower the intervals.",
+    )
+    fleet: Annotated[int, Option(takes="N >= 1")] = Field(
+        1, ge=1, le=1_000, description="Drivers who share a map, and come every day."
+    )
     seed: Seed = Field(0, description="Seed of days and drivers.")
-    figures: bool = Field(True, description="Draw the picture.")
+    figures: Figures = True
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:

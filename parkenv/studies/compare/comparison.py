@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
-from parkenv.files.known_names import RigName
 from parkenv.files.option import Option, numbers_in
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
@@ -24,6 +23,7 @@ from parkenv.studies.fields import (
     Detector,
     Figures,
     Level,
+    Rig,
     Scenarios,
     Seed,
     Values,
@@ -154,12 +154,7 @@ class Comparison(CaseStudy):
         200, ge=1, le=MAX_EPISODES, description="Episodes of each agent in each setting."
     )
     seed: Seed = 0
-    rig: Annotated[RigName | None, Option(panel="Sensors")] = Field(
-        None,
-        description="Observe slots through simulated sensors, detector and all, instead of the sensor model: about a "
-        "second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and a camera to "
-        "each side.",
-    )
+    rig: Rig = None
     detector: Detector = None
     figures: Figures = True
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.files.known_names import RigName
+from parkenv.files.option import Option
 from parkenv.scenarios.spec import Speed, scenario_spec
-from parkenv.studies.agent_spec import AgentItem, AgentSpec
-from parkenv.studies.fields import Detector, OneScenario, Seed
+from parkenv.studies.agent_spec import AgentItem, AgentSpec, split_agents
+from parkenv.studies.fields import Detector, OneScenario, Rig, Seed
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
@@ -29,6 +29,13 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 CALIBRATED = "calibrated.json"
+
+
+def _one_agent(text: str) -> str:
+    names = split_agents(text)
+    if len(names) != 1:
+        raise InputError(f"names {len(names)} agents, want one")
+    return names[0]
 
 
 class _Trips(NamedTuple):
@@ -62,22 +69,25 @@ class CalibrationStudy(Study):
 
     kind: Literal["calibrate"] = "calibrate"
     scenario: OneScenario = scenario_spec("campus")
-    agent: AgentItem = Field(AgentSpec(name="mdp"), description="The agent that searches, with any options.")
-    episodes: int = Field(
+    agent: Annotated[AgentItem, Option("--agents", takes="NAME", parse=_one_agent)] = Field(
+        AgentSpec(name="mdp"),
+        description="The agent that searches, with any options in brackets: mdp(failure_s=90).",
+    )
+    episodes: Annotated[int, Option(short="-n", takes="1 <= N <= 1000000")] = Field(
         100, ge=1, le=1_000_000, description="Trips with observations, and as many without."
     )
     seed: Seed = 0
-    notice_m: float = Field(
+    notice_m: Annotated[float, Option("--notice", takes="M", panel="Costs and speeds")] = Field(
         2.0,
         ge=0.0,
         le=1_000.0,
         description="Metres along its path at which the car notices at the latest that it would drive into a taken "
         "slot.",
     )
-    v_drive_kmh: Speed | None = Field(
-        None, description="Speed limit on the lanes, km/h; the scenario's if absent."
-    )
-    rig: RigName | None = Field(None, description="Observe slots through this rig's simulated sensors.")
+    v_drive_kmh: Annotated[
+        Speed | None, Option(takes="V", panel="Costs and speeds", default="the scenario's, 10")
+    ] = Field(None, description="Speed limit on the lanes, km/h.")
+    rig: Rig = None
     detector: Detector = None
 
     @model_validator(mode="after")
