@@ -136,6 +136,46 @@ def test_the_batch_drives_as_the_environment_does(lot):
     assert (batch.status >= CONTACT).sum() >= 3
 
 
+def first_contact(touches, clear, blocked):
+    """Halve the way between a clear and a blocked pose until it begins to touch."""
+    for _ in range(40):
+        middle = 0.5 * (clear + blocked)
+        clear, blocked = (clear, middle) if touches(middle) else (middle, blocked)
+    return blocked
+
+
+@pytest.mark.parametrize("lot", [MINI, STREET, packaged_lot("campus")], ids=lambda lot: lot.name)
+def test_contacts_begin_where_they_do_in_pymunk(lot):
+    rng = np.random.default_rng(0)
+    for key in range(4):
+        task = DriveEnv(lot=lot).tasks.draw(key)
+        space, batch = CollisionWorld(task.vehicle, task.obstacles), DriveBatch(1)
+        c, s = math.cos(task.slot[2]), math.sin(task.slot[2])
+
+        def touches(pose, batch=batch, task=task):
+            """Stand at a pose in the slot's frame for one decision."""
+            batch.start(0, PreparedTask(task), pose)
+            batch.state[0, SPEED] = 0.0
+            batch.drive(np.zeros((1, 2), np.float32))
+            return batch.status[0] == CONTACT
+
+        def touches_in_pymunk(pose, space=space, task=task, c=c, s=s):
+            x, y, yaw = pose.tolist()
+            east, north = task.slot[0] + c * x - s * y, task.slot[1] + s * x + c * y
+            return bool(space.touched(east, north, yaw + task.slot[2]))
+
+        found = 0
+        while found < 10:
+            clear, blocked = rng.uniform(-7.0, 7.0, (2, 3))
+            blocked[2] = clear[2]
+            assert touches(clear) == touches_in_pymunk(clear)
+            if touches(clear) or not touches(blocked):
+                continue
+            poses = [first_contact(test, clear, blocked) for test in (touches, touches_in_pymunk)]
+            assert np.hypot(*(poses[0] - poses[1])[:2]) < 1e-5
+            found += 1
+
+
 def test_a_drive_that_stands_in_its_slot_has_parked():
     env = DriveEnv(lot=MINI, obstacle_map=True)
     env.reset(seed=0)
