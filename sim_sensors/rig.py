@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -87,6 +87,13 @@ class Capture:
     images: dict[str, Frame]
     pairs: dict[str, StereoFrame]
     scans: dict[str, NDArray[np.float32]]
+
+
+class TimedCapture(NamedTuple):
+    """Measurements of a rig at one moment."""
+
+    time: float  # s since Monday 00:00
+    capture: Capture  # images, stereo pairs and laser scans, with the true pose of the vehicle
 
 
 @dataclass(frozen=True)

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
+from test_csv_tables import SESSION
 from test_import_osm import car_park
-from test_typed_csv import SESSION
 from tiny_networks import Tiny
 
 from parkenv.errors import InputError

@@ -13,10 +13,9 @@ from parkenv.files.videos import Video
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.recorded_drive import Head, RecordedDrive, map_drive, recording
 from parkenv.mapping.store import MapStore
-from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detections
 from sim_sensors.camera.models import Frame
-from sim_sensors.rig import Capture, SensorRig
+from sim_sensors.rig import Capture, SensorRig, TimedCapture
 
 pytest.importorskip("rosbags.rosbag2", reason="the extra bags is not installed")
 

@@ -9,7 +9,7 @@ import jsonschema
 import numpy as np
 import pytest
 from command_line import parkenv
-from test_typed_csv import SESSION, write
+from test_csv_tables import SESSION, write
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief

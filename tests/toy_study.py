@@ -6,8 +6,8 @@ from typing import ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
+from parkenv.files.csv_tables import WHOLE
 from parkenv.files.spec_file import Several
-from parkenv.files.typed_csv import WHOLE
 from parkenv.studies.results import CsvTable
 from parkenv.studies.study import Cell, Study
 

@@ -56,7 +56,7 @@ def detect(
         out, -o (DIR): Folder for NAME_cars.png, NAME_cars.mp4, boxes.csv and summary.json.  [default: none]
     """
     from parkenv.files.atomic_write import make_folder
-    from parkenv.files.csv_writing import write_csv
+    from parkenv.files.csv_tables import write_csv
     from parkenv.studies.sensing.detection_run import (
         BOX_COLUMNS,
         detect_in_image,

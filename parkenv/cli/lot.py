@@ -284,7 +284,7 @@ def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("r
         out, -o (DIR): Folder for census.csv, summary.json, census.png and contact sheets.
     """
     from parkenv.files.atomic_write import make_folder
-    from parkenv.files.csv_writing import write_csv
+    from parkenv.files.csv_tables import write_csv
     from parkenv.show.figures.census import save_census
     from parkenv.show.figures.contact_sheet import save_contact_sheets
     from parkenv.studies.lot_census import COLUMNS, count_lot, lot_files

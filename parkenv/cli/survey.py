@@ -253,7 +253,7 @@ def show_map(
         out, -o (DIR): Folder for map.png, slots.csv, summary.json.  [default: none]
     """
     from parkenv.files.atomic_write import make_folder
-    from parkenv.files.csv_writing import write_csv
+    from parkenv.files.csv_tables import write_csv
     from parkenv.mapping.inference import predict
     from parkenv.mapping.store import MapStore
     from parkenv.scenarios.build import build

@@ -13,11 +13,10 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError
-from parkenv.perception.capture import TimedCapture
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.rig import RIG_NAMES, SensorRig
+from sim_sensors.rig import RIG_NAMES, SensorRig, TimedCapture
 
 if TYPE_CHECKING:
     from sim_sensors.movers import Movers

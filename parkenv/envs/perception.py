@@ -10,14 +10,13 @@ import numpy as np
 from parkenv.engine.kernel import act_at, apply_observations_at, finish_step_at
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.envs.sensors import SensingSearchEnv
-from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotObservation
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
-from sim_sensors.rig import SensorRig
+from sim_sensors.rig import SensorRig, TimedCapture
 
 
 class OnboardPerception:

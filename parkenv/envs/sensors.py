@@ -15,9 +15,8 @@ from parkenv.engine.spaces import LATEST
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import SearchEnv
 from parkenv.errors import InputError
-from parkenv.perception.capture import TimedCapture
 from parkenv.scenarios.build import ScenarioSource, make_scenario
-from sim_sensors.rig import SensorRig
+from sim_sensors.rig import SensorRig, TimedCapture
 
 FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
 

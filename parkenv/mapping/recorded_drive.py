@@ -39,7 +39,6 @@ from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey import Survey, update_grid
-from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
@@ -48,7 +47,7 @@ from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.scanner import LaserScanner
-from sim_sensors.rig import RIG_NAMES, Capture, SensorRig
+from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, TimedCapture
 
 PAIR_S = 0.1
 """Longest time between a picture and what other sensors measured with it, s."""

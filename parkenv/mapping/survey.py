@@ -20,7 +20,6 @@ from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey_score import SurveyScore, TrueBoxes, true_boxes
-from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
@@ -28,7 +27,7 @@ from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.occupancy.process import Arrival, ArrivalWindow, World
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, poses_along
+from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, TimedCapture, poses_along
 from sim_sensors.scene import Scene
 
 _SEEDS = 1 << 31

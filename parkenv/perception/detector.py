@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from parkenv.errors import InputError
 from sim_sensors.ground_truth import View
 
 Float32Array = NDArray[np.float32]
+Float = TypeVar("Float", np.float32, np.float64)
 
 LEAST_PROBABILITY = 0.08
 """Least probability of the boxes that a detector should return. The pipeline keeps a box below 0.25 only if the range
@@ -158,3 +159,11 @@ def _checked(name: str, values: NDArray[np.floating], shape: tuple[int, ...]) ->
     if array.shape != shape or not np.isfinite(array).all():
         raise InputError(f"detections: {name} has shape {array.shape}, want {shape} finite numbers")
     return array
+
+
+def overlaps(box: NDArray[Float], others: NDArray[np.floating] | NDArray[np.integer]) -> NDArray[Float]:
+    """Return the intersection over union of a box, (4,) left, top, right, bottom, with others, (n, 4)."""
+    inner = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    common = np.clip(inner, 0.0, None).prod(axis=1)
+    area = (box[2:] - box[:2]).prod() + (others[:, 2:] - others[:, :2]).prod(axis=1)
+    return np.asarray(common / np.maximum(area - common, 1e-9), dtype=box.dtype)

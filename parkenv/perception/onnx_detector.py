@@ -364,8 +364,8 @@ def _input_size(file: OnnxFile, value: OnnxValue, settings: OnnxSettings) -> tup
     """Return width and height of the input."""
     beside = _beside(file.name)
     _, _, height, width = value.shape
-    told = _IMGSZ.fullmatch(file.metadata.get("imgsz", "").strip()) if settings.size is None else None
-    wanted = settings.size or ((int(told[2]), int(told[1])) if told else (width, height))
+    noted = _IMGSZ.fullmatch(file.metadata.get("imgsz", "").strip()) if settings.size is None else None
+    wanted = settings.size or ((int(noted[2]), int(noted[1])) if noted else (width, height))
     if wanted[0] is None or wanted[1] is None:
         raise InputError(
             f"{file.name}: its input {value.name} {_shown(value.shape)} is of any size; write "
@@ -395,8 +395,8 @@ def _cars(
     if not named and classes in _COCO:
         cars = _COCO[classes]
     if not cars or (classes is not None and max(cars) >= classes):
-        told = ", ".join(f"{i} {name}" for i, name in list(named.items())[:8])
-        fault = f"of its classes ({told}) none is known as a car" if named else "does not name its classes"
+        listed = ", ".join(f"{i} {name}" for i, name in list(named.items())[:8])
+        fault = f"of its classes ({listed}) none is known as a car" if named else "does not name its classes"
         raise InputError(f"{file.name}: {fault}; write cars = [indices from 0] in {beside}")
     return cars
 

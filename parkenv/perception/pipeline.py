@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError
-from parkenv.perception.capture import TimedCapture
 from parkenv.perception.detector import BandDetector, Detections, Detector, GroundBand
 from parkenv.perception.detector_registry import make_detector
 from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
@@ -30,7 +29,7 @@ from parkenv.perception.ranging import (
 from parkenv.perception.slot_filter import SlotFilter, SlotObservation
 from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
-from sim_sensors.rig import Capture, Mount, SensorRig
+from sim_sensors.rig import Capture, Mount, SensorRig, TimedCapture
 
 PROBABILITY = 0.25  # least probability of a detection; a located one needs only `LEAST_PROBABILITY`
 

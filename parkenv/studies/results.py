@@ -15,18 +15,19 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import append_text, atomic_write, make_folder
-from parkenv.files.csv_writing import csv_text, write_csv
-from parkenv.files.limited_reading import parse_json, read_json, read_text
-from parkenv.files.typed_csv import (
+from parkenv.files.csv_tables import (
     NUMBER,
     NUMBER_OR_NOTHING,
     TEXT,
     WHOLE,
     YES_OR_NO,
     Kind,
+    csv_text,
     typed_records,
     wholes,
+    write_csv,
 )
+from parkenv.files.limited_reading import parse_json, read_json, read_text
 from parkenv.show.columns import SETTING_AXES
 
 if TYPE_CHECKING:

@@ -25,7 +25,7 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
     settings = TrainingSettings(penalty=0.1, shift=0.03, resize=0.05, seed=seed)
     empty = [p.labelled.image for p in photos if not len(p.labelled.boxes)]
     peopled = [p.labelled for p in photos if len(p.labelled.boxes)]
-    told = f"{len(photos)} simulated pictures, seed {seed}"
+    trained_on = f"{len(photos)} simulated pictures, seed {seed}"
     side = train(
         [crop for p in photos for crop in p.sides],
         empty,
@@ -34,7 +34,7 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
         region_aspect=SIDE_ASPECT,
         car=SIDE_CAR,
         settings=settings,
-        trained_on=told,
+        trained_on=trained_on,
         progress=progress,
     )
     front = train(
@@ -46,7 +46,7 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
         car=END_CAR,
         end_on=True,
         settings=settings,
-        trained_on=told,
+        trained_on=trained_on,
         progress=progress,
     )
     return {"side": side, "front": front}

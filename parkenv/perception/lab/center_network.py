@@ -123,13 +123,13 @@ def sides(logarithms: Tensor) -> Tensor:
     return _REACH * torch.exp(torch.clamp(logarithms, -4.0, 4.0))
 
 
-def to_onnx(network: CenterNetwork, calibration: tuple[float, float], told: Mapping[str, object]) -> bytes:
+def to_onnx(network: CenterNetwork, calibration: tuple[float, float], card: Mapping[str, object]) -> bytes:
     """Return the trained network as an ONNX file of the layout `centers`, with weights of 16 bits.
 
     Args:
         network: the network.
         calibration: slope and offset of the score's logit, so that it becomes a probability.
-        told: the model card, for the file's metadata.
+        card: the model card, for the file's metadata.
     """
     from onnx import TensorProto, checker, helper, numpy_helper
 
@@ -201,7 +201,7 @@ def to_onnx(network: CenterNetwork, calibration: tuple[float, float], told: Mapp
     model = helper.make_model(
         graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8, producer_name="parkenv"
     )
-    helper.set_model_props(model, {key: json.dumps(value) for key, value in told.items()})
+    helper.set_model_props(model, {key: json.dumps(value) for key, value in card.items()})
     checker.check_model(model, full_check=True)
     data: bytes = model.SerializeToString()
     return data

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from parkenv.errors import InputError, require_whole
-from parkenv.perception.boxes import overlaps
+from parkenv.perception.detector import overlaps
 from parkenv.perception.lab.center_network import GREY_MEAN, GREY_STD, STRIDE, CenterNetwork, sides, to_onnx
 from parkenv.perception.lab.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
 from parkenv.perception.lab.training_crops import Example, ExampleMaker, draw_size
@@ -65,7 +65,7 @@ class CenterTrainingSettings:
 
 @dataclass(frozen=True, eq=False)
 class _Batch:
-    """Examples and what the network should make of them; cells are 8×8 px."""
+    """A batch of inputs and targets; cells are 8×8 px."""
 
     images: Tensor  # (b, 1, h, w)
     peak: Tensor  # (b, h/8, w/8), 1 in the centres of cars, less around them
@@ -156,7 +156,7 @@ def train_centers(
     for step in range(settings.steps):
         for optimizer, rate in zip(optimizers, (settings.rate, settings.other_rate), strict=True):
             for group in optimizer.param_groups:
-                group["lr"] = rate * _warmth(step / settings.steps)
+                group["lr"] = rate * _lr_factor(step / settings.steps)
         size = draw_size(rng, small=step < 0.5 * settings.steps)
         batch = _batched([maker.draw(size) for _ in range(settings.batch)])
         with torch.autocast("cpu", torch.bfloat16):
@@ -170,8 +170,10 @@ def train_centers(
         _average(averaged, network, min(settings.averaging, (step + 1) / (step + 10)))
         losses += 0.01 * (np.array([float(part.detach()) for part in parts]) - losses)
         if (step + 1) % 100 == 0:
-            told = ", ".join(f"{loss:.3f}" for loss in losses)
-            progress(f"step {step + 1} of {settings.steps}, {time.monotonic() - begun:.0f} s: losses {told}")
+            loss_text = ", ".join(f"{loss:.3f}" for loss in losses)
+            progress(
+                f"step {step + 1} of {settings.steps}, {time.monotonic() - begun:.0f} s: losses {loss_text}"
+            )
         if (step + 1) % 500 == 0:
             averaged.eval()
             on_network(averaged, step + 1)
@@ -218,7 +220,7 @@ def _orthogonal(matrix: Tensor) -> Tensor:
     return x if wide else x.T
 
 
-def _warmth(done: float) -> float:
+def _lr_factor(done: float) -> float:
     """Return the learning rate as a fraction of the greatest: a short rise, then down along a cosine."""
     return min(done / 0.05 + 0.01, 1.0) * (0.5 + 0.5 * math.cos(math.pi * done)) + 1e-3
 

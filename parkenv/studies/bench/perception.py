@@ -16,7 +16,6 @@ from parkenv.errors import InputError
 from parkenv.files.limited_reading import parse_json
 from parkenv.mapping.grid import OccupancyGrid
 from parkenv.mapping.survey import Survey, SurveySettings
-from parkenv.perception.capture import TimedCapture
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey
@@ -26,7 +25,7 @@ from parkenv.perception.slot_filter import SlotFilter
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot_scene import slot_lot
-from sim_sensors.rig import SensorRig
+from sim_sensors.rig import SensorRig, TimedCapture
 
 PEERS_PYTHON = "PARKENV_BENCH_PYTHON"
 """Environment variable with the path of a Python that has `opencv-python-headless<5` and `scikit-image`: parkenv needs

@@ -13,10 +13,10 @@ from pydantic_core import PydanticCustomError
 
 from parkenv import __version__
 from parkenv.errors import InputError
+from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
 from parkenv.files.option import Option
 from parkenv.files.spec_file import Axis, FilePath
-from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.mapping.route import survey_route
-from parkenv.perception.boxes import overlaps
-from parkenv.perception.detector import Detections, Detector
+from parkenv.perception.detector import Detections, Detector, overlaps
 from parkenv.studies.results import Row
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario

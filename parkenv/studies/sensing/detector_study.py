@@ -171,7 +171,7 @@ class DetectorStudy(Study):
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: the table, the reach of each detector, and the cars that it missed."""
-        from parkenv.files.csv_writing import write_csv
+        from parkenv.files.csv_tables import write_csv
         from parkenv.files.file_names import file_name
         from parkenv.show.figures.detectors import save_reach
         from parkenv.show.plurals import plural

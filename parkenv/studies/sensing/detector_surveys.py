@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray
 from parkenv.errors import InputError
-from parkenv.files.csv_writing import write_csv
-from parkenv.files.typed_csv import NUMBER_OR_NAN, typed_records
+from parkenv.files.csv_tables import NUMBER_OR_NAN, typed_records, write_csv
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.mapping.survey_score import CLEAR, DISTANCE_ENDS, SIDES, SIGHTING

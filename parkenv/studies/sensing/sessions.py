@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from parkenv.errors import InputError
-from parkenv.files.typed_csv import NUMBER_OR_NAN, TEXT, WHOLE, typed_records, wholes
+from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE, typed_records, wholes
 from parkenv.mapping.survey_score import DISTANCE_ENDS
 from parkenv.studies.results import CsvTable, Row
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.errors import InputError
-from parkenv.files.typed_csv import NUMBER_OR_NAN, WHOLE, Kind, typed_records
+from parkenv.files.csv_tables import NUMBER_OR_NAN, WHOLE, Kind, typed_records
 from parkenv.show.columns import columns_of
 from parkenv.studies.statistics import mean_interval
 

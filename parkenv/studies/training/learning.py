@@ -13,7 +13,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv.files.csv_writing import write_csv
+from parkenv.files.csv_tables import write_csv
 from parkenv.studies.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.studies.training.configs import TrainingConfig
 from parkenv.studies.training.curve_file import CURVE, Row, read_curve, require_columns

@@ -12,7 +12,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.csv_writing import write_csv
+from parkenv.files.csv_tables import write_csv
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import COLORS

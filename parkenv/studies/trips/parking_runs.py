@@ -15,7 +15,7 @@ from scipy.stats import binomtest
 from parkenv.driving.drive_state import DriveState
 from parkenv.driving.vehicle import STEERING, YAW
 from parkenv.envs.drive import DriveEnv
-from parkenv.files.csv_writing import write_csv
+from parkenv.files.csv_tables import write_csv
 from parkenv.studies.frame_recorder import FrameRecorder
 from parkenv.studies.simulate import Observer, Step, simulate
 from parkenv.studies.workers import SERIAL, Workers

@@ -20,7 +20,7 @@ from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from parkenv.envs.search import SearchEnv
-from parkenv.files.csv_writing import write_csv
+from parkenv.files.csv_tables import write_csv
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.places import seeds_by_place

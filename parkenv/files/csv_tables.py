@@ -1,12 +1,15 @@
-"""Read CSV tables that parkenv wrote: a column holds one kind of value, and a wrong value is named with its place."""
+"""CSV tables: written whole, read with one kind of value in a column; a wrong value is named with its place."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import csv_records
 
 MAX_NUMBER = 1e12
@@ -104,3 +107,23 @@ def typed_records(
                     f"{path}: line {line}: {name:.80} is {text!r:.80}, want {kind.wanted}"
                 ) from error
         yield line, row
+
+
+def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = False) -> str:
+    """Return rows as CSV text, below a header if wanted; values that a row lacks are empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    if header:
+        writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
+    """Write a CSV file with a header, atomically.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    with atomic_write(path) as beside:
+        beside.write_text(csv_text(columns, rows, header=True), encoding="utf-8")
