@@ -10,7 +10,6 @@ import cv2
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import Colormap, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -25,7 +24,9 @@ from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.painters.axes import paint
 from parkenv.show.painters.opencv import write_tag
+from parkenv.show.scene import DISC, Lines, Marks, posed
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import View
 
@@ -67,6 +68,12 @@ def draw_detections(
         cv2.rectangle(drawn, (left, top), (right, bottom), color, 2, cv2.LINE_AA)
         write_tag(drawn, f"{p:.2f}{hidden}", (left, max(top, 0)), color)
     return drawn
+
+
+def headings(poses: FloatArray, color: str, length: float = 2.5) -> Lines:
+    """Return a line through each of some cars, (n, 3), along its heading, `length` m."""
+    ahead = 0.5 * length * np.stack([np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=1)
+    return Lines(list(np.stack([poses[:, :2] - ahead, poses[:, :2] + ahead], axis=1)), color, px=(1.3, 1.3))
 
 
 def save_detections(result: SessionResult, path: Path) -> None:
@@ -119,10 +126,7 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
             scale, cax=inset, orientation="horizontal", label="P(a car is here)", ticks=[0, 0.5, 1]
         )
         cars = result.session.cars
-        axes[1].quiver(
-            cars[:, 0], cars[:, 1], np.cos(cars[:, 2]), np.sin(cars[:, 2]), pivot="mid", headwidth=1, headlength=0,
-            headaxislength=0, scale=60, width=0.0016, color=WRONG, zorder=3,
-        )  # fmt: skip
+        paint(axes[1], [headings(cars, WRONG)], 3.0)
         axes[1].set_title(f"{len(cars)} detections of cars, frame by frame")
         heading = Line2D(
             [], [], color=WRONG, linewidth=2.0, label="a car's middle and heading, from the laser"
@@ -149,12 +153,12 @@ def save_localisation(lot: ParkingLot, result: SessionResult, path: Path) -> Non
         for ax, (name, poses, placed) in zip(figure.subplots(2, 1), panels, strict=True):
             draw_lot(lot, ax)
             error = np.hypot(*(poses - result.true_poses)[:, :2].T)
-            ax.quiver(
-                placed[:, 0], placed[:, 1], np.cos(placed[:, 2]), np.sin(placed[:, 2]), pivot="mid", headwidth=1,
-                headlength=0, headaxislength=0, scale=60, width=0.0012, color=CAR_COLOR, zorder=4,
-            )  # fmt: skip
-            ax.plot(*result.true_poses[:, :2].T, color=INK, linewidth=1.0, linestyle="--", zorder=3)
-            ax.plot(*poses[:, :2].T, color=PATH_COLOR, linewidth=1.2, zorder=3)
+            layers = [
+                Lines([result.true_poses[:, :2]], INK, px=(1.0, 1.0), dash=(3.7, 1.6)),
+                Lines([poses[:, :2]], PATH_COLOR, px=(1.2, 1.2)),
+                headings(placed, CAR_COLOR),
+            ]
+            paint(ax, layers, 3.0)
             rms = float(np.sqrt((error**2).mean()))
             ax.set_title(f"{name}: {rms:.2f} m off the true path, at most {error.max():.2f} m")
         keys = [
@@ -190,10 +194,8 @@ def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, 
         figure = Figure(figsize=(11.0, _height(lot, 11.0, 1)), layout="constrained")
         ax = figure.subplots()
         draw_lot(lot, ax)
-        ahead = np.stack([np.cos(found.yaw), np.sin(found.yaw)], axis=1)
-        ends = found.xy[:, None] + 2.0 * np.array([-1.0, 1.0])[None, :, None] * ahead[:, None]
-        ax.add_collection(LineCollection(list(ends), colors=WRONG, linewidths=1.6, zorder=3))
-        ax.plot(*found.xy.T, linestyle="none", marker="o", markersize=3.0, color=WRONG, zorder=3.1)
+        slots = posed(found.xy, found.yaw)
+        paint(ax, [headings(slots, WRONG, 4.0), Marks(slots, DISC, WRONG, px=3.0)], 3.0)
         off = f", mean error {score.error:.2f} m" if score.recall else ""
         ax.set_title(
             f"{lot.name}: {len(found.xy)} slots discovered without a map; precision {score.precision:.0%}, "
@@ -259,8 +261,8 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     color = np.array([to_rgb(TAKEN if o else FREE) for o in states.occupied])
     color[~states.in_view] = to_rgb(UNKNOWN)
     draw_lot(lot, ax, slot_color=color)
-    for corners in lot.slot_corners()[wrong]:
-        ax.fill(*corners.T, fill=False, edgecolor=WRONG, linewidth=2.0, zorder=4)
+    outlines = lot.slot_corners()[wrong][:, [0, 1, 2, 3, 0]]
+    paint(ax, [Lines(list(outlines), WRONG, px=(2.0, 2.0))], 4.0)
     names: dict[str, Any] = {"taken": TAKEN, "free": FREE, "never in view": UNKNOWN}
     handles = [Patch(color=c, label=name) for name, c in names.items()]
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))

@@ -34,13 +34,10 @@ class DriveReplay {
       driveLegend(),
     );
     this.open(0);
-    let width = root.clientWidth;
-    new ResizeObserver(() => {
-      if (root.clientWidth === width) return;
-      width = root.clientWidth;
+    onNewWidth(root, () => {
       this.layOut();
       this.draw();
-    }).observe(root);
+    });
   }
 
   open(number) {
@@ -196,13 +193,13 @@ class DriveReplay {
 }
 
 function driveLegend() {
-  const key = (color, text, hollow) => make("span", { class: "key" }, make("span", { class: "swatch", style: hollow ? `border: 2px solid ${color}` : `background: ${color}` }), text);
+  const key = (color, text, hollow) => keyed(make("span", { class: "swatch", style: hollow ? `border: 2px solid ${color}` : `background: ${color}` }), text);
   const scale = make("span", { class: "scale", style: "background: linear-gradient(90deg, var(--belief))" });
   const grid = make("span", { class: "scale", style: "background: linear-gradient(90deg, #96bed755, #7030aa)" });
   return make(
     "div", { class: "legend lot" },
     key(SIDE, "a car's side", true), key(END, "front or rear", true), key(NOWHERE, "not ranged", true),
-    make("span", { class: "key" }, "free ", scale, "taken, slots"), make("span", { class: "key" }, "free ", grid, "car, grid"),
+    keyed(make("span", {}, "free ", scale), "taken, slots"), keyed(make("span", {}, "free ", grid), "car, grid"),
     key(SCAN, "scan"), key("var(--ink)", "car fitted to its beams", true), key("var(--car)", "slot classified wrong", true),
   );
 }

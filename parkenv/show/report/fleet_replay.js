@@ -265,12 +265,7 @@ class FleetReplay {
       this.panels, transport, fleetLegend(fleets),
     );
     this.open(this.groups[0]);
-    let width = root.clientWidth;
-    new ResizeObserver(() => {
-      if (root.clientWidth === width) return;
-      width = root.clientWidth;
-      this.redraw();
-    }).observe(root);
+    onNewWidth(root, () => this.redraw());
   }
 
   groupOf(its) {
@@ -410,20 +405,18 @@ class FleetReplay {
 
 /** The legend of cars. */
 function fleetLegend(fleets) {
-  const key = (mark, text) => make("span", { class: "key" }, mark, text);
-  const svg = (width, ...children) => makeSvg("svg", { width, height: 16, viewBox: `0 0 ${width} 16`, "aria-hidden": "true" }, ...children);
-  const body = (color, roof) => svg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: `fill: var(${color}); stroke: #1c2126; stroke-width: 1.2` }), makeSvg("rect", { x: 7, y: 5, width: 8, height: 6, style: `fill: var(${roof})` }));
-  const parked = (color) => svg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: `fill: var(${color})` }));
-  const cross = svg(16, makeSvg("path", { d: "M3 3l10 10M3 13l10-10", style: "stroke: var(--failed); stroke-width: 2.4" }));
+  const body = (color, roof) => markSvg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: `fill: var(${color}); stroke: #1c2126; stroke-width: 1.2` }), makeSvg("rect", { x: 7, y: 5, width: 8, height: 6, style: `fill: var(${roof})` }));
+  const parked = (color) => markSvg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: `fill: var(${color})` }));
+  const cross = markSvg(16, makeSvg("path", { d: "M3 3l10 10M3 13l10-10", style: "stroke: var(--failed); stroke-width: 2.4" }));
   const mixed = fleets.some((its) => its.share > 0);
   const queues = fleets.some((its) => its.tracks.some((track) => track.some((code, i) => i > 0 && i % 2 === 0 && (code & 3) === QUEUES)));
-  const area = svg(24, makeSvg("rect", { x: 1, y: 5, width: 22, height: 9, style: "fill: var(--car)" }));
-  const line = svg(24, makeSvg("path", { d: "M1 8H23", style: "stroke: var(--ink); stroke-width: 1.6" }));
+  const area = markSvg(24, makeSvg("rect", { x: 1, y: 5, width: 22, height: 9, style: "fill: var(--car)" }));
+  const line = markSvg(24, makeSvg("path", { d: "M1 8H23", style: "stroke: var(--ink); stroke-width: 1.6" }));
   return make(
     "div", { class: "legend lot" },
-    key(body("--car", "--other"), "searching"), mixed ? key(body("--car", "--member"), "searching member") : null,
-    key(body("--failed", "--other"), "failed attempt"), queues ? key(body("--queue", "--other"), "in a queue") : null,
-    key(parked("--other"), "parked"), mixed ? key(parked("--member"), "parked member") : null, key(parked("--resident"), "resident"),
-    key(cross, "gave up"), key(area, "searching cars"), key(line, "slots taken, dashes 100 %"),
+    keyed(body("--car", "--other"), "searching"), mixed ? keyed(body("--car", "--member"), "searching member") : null,
+    keyed(body("--failed", "--other"), "failed attempt"), queues ? keyed(body("--queue", "--other"), "in a queue") : null,
+    keyed(parked("--other"), "parked"), mixed ? keyed(parked("--member"), "parked member") : null, keyed(parked("--resident"), "resident"),
+    keyed(cross, "gave up"), keyed(area, "searching cars"), keyed(line, "slots taken, dashes 100 %"),
   );
 }

@@ -57,3 +57,23 @@ function shortName(agent) {
   const parts = agent.slice(colon + 1).split("/").filter((part) => part !== "model.zip");
   return `${agent.slice(0, colon)} ${parts.slice(-1)[0].replace("_", " ")}`;
 }
+
+/** An entry of a legend: a mark and what it means. */
+function keyed(mark, text) {
+  return make("span", { class: "key" }, mark, text);
+}
+
+/** A drawing for a legend, 16 px high. */
+function markSvg(width, ...children) {
+  return makeSvg("svg", { width, height: 16, viewBox: `0 0 ${width} 16`, "aria-hidden": "true" }, ...children);
+}
+
+/** Call redraw() when the width of an element changes. */
+function onNewWidth(root, redraw) {
+  let width = root.clientWidth;
+  new ResizeObserver(() => {
+    if (root.clientWidth === width) return;
+    width = root.clientWidth;
+    redraw();
+  }).observe(root);
+}

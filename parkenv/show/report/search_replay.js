@@ -157,12 +157,7 @@ class SearchReplay {
     const lot = data.lots[worlds[0].lot];
     this.follow = Math.min(root.clientWidth, 1280) / (lot.bounds[2] - lot.bounds[0]) < 2.6;
     this.open(0);
-    let width = root.clientWidth;
-    new ResizeObserver(() => {
-      if (root.clientWidth === width) return;
-      width = root.clientWidth;
-      this.redraw();
-    }).observe(root);
+    onNewWidth(root, () => this.redraw());
   }
 
   worldName(world) {
@@ -347,18 +342,16 @@ class SearchReplay {
 
 /** The legend of the lot's marks. */
 function lotLegend() {
-  const key = (mark, text) => make("span", { class: "key" }, mark, text);
-  const svg = (width, ...children) => makeSvg("svg", { width, height: 16, viewBox: `0 0 ${width} 16`, "aria-hidden": "true" }, ...children);
   const scale = make("span", { class: "scale", style: "background: linear-gradient(90deg, var(--belief))" });
   const pale = make("span", { class: "scale", style: "background: linear-gradient(90deg, var(--belief)); opacity: 0.42" });
-  const car = svg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: "fill: var(--parked); stroke: var(--faint); stroke-width: 0.8" }), makeSvg("rect", { x: 15, y: 5, width: 3, height: 6, style: "fill: var(--glass)" }));
-  const mine = svg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: "fill: var(--car); stroke: #1c2126; stroke-width: 1.4" }));
-  const plan = svg(34, makeSvg("path", { d: "M1 8H33", style: "stroke: var(--ink); stroke-width: 1.6" }), makeSvg("path", { d: "M21 8l-8-4.5 2.5 4.5-2.5 4.5z", style: "fill: var(--ink)" }));
-  const walk = svg(34, makeSvg("path", { d: "M1 8H33", style: "stroke: var(--goal); stroke-width: 2; stroke-dasharray: 5 4" }));
-  const goal = svg(18, makeSvg("circle", { cx: 9, cy: 8, r: 7, style: "fill: var(--goal)" }), makeSvg("circle", { cx: 9, cy: 8, r: 2.6, style: "fill: var(--halo)" }));
+  const car = markSvg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: "fill: var(--parked); stroke: var(--faint); stroke-width: 0.8" }), makeSvg("rect", { x: 15, y: 5, width: 3, height: 6, style: "fill: var(--glass)" }));
+  const mine = markSvg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: "fill: var(--car); stroke: #1c2126; stroke-width: 1.4" }));
+  const plan = markSvg(34, makeSvg("path", { d: "M1 8H33", style: "stroke: var(--ink); stroke-width: 1.6" }), makeSvg("path", { d: "M21 8l-8-4.5 2.5 4.5-2.5 4.5z", style: "fill: var(--ink)" }));
+  const walk = markSvg(34, makeSvg("path", { d: "M1 8H33", style: "stroke: var(--goal); stroke-width: 2; stroke-dasharray: 5 4" }));
+  const goal = markSvg(18, makeSvg("circle", { cx: 9, cy: 8, r: 7, style: "fill: var(--goal)" }), makeSvg("circle", { cx: 9, cy: 8, r: 2.6, style: "fill: var(--halo)" }));
   return make(
     "div", { class: "legend lot" },
-    key(make("span", {}, "free ", scale), "taken: belief, slots observed"), key(pale, "forecast, slots not observed yet"),
-    key(car, "parked car"), key(mine, "searching car"), key(plan, "its plan"), key(walk, "walk"), key(goal, "goal"),
+    keyed(make("span", {}, "free ", scale), "taken: belief, slots observed"), keyed(pale, "forecast, slots not observed yet"),
+    keyed(car, "parked car"), keyed(mine, "searching car"), keyed(plan, "its plan"), keyed(walk, "walk"), keyed(goal, "goal"),
   );
 }
