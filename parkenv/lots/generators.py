@@ -102,6 +102,9 @@ def bay_row(
     )
 
 
+NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
+
+
 def kerb_rows(
     start: FloatArray, end: FloatArray, left: BoolArray, size: tuple[float, float] = KERB_SIZE
 ) -> tuple[Slots, NDArray[np.intp]]:

@@ -9,7 +9,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import Slots, bay_row
+from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.lot import Lane, mouth_points
 
@@ -42,7 +42,7 @@ class LotContents:
 
     name: str
     slot_ids: list[str] = field(default_factory=list)
-    slots: Slots = field(default_factory=lambda: bay_row((0.0, 0.0), 0.0, 0))
+    slots: Slots = NO_SLOTS
     lanes: list[Lane] = field(default_factory=list)
     entries: list[FloatArray] = field(default_factory=list)
     goals: list[FloatArray] = field(default_factory=list)

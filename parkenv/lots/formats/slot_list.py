@@ -11,12 +11,11 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import csv_rows
 from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
-from parkenv.lots.generators import KERB_SIZE, Slots
+from parkenv.lots.generators import KERB_SIZE, NO_SLOTS, Slots
 from parkenv.lots.infer.centers import CenterRow, describe_rows, spaces_from_centers
 from parkenv.lots.infer.draft import draft_inferred_lot
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.rows import NO_SLOTS
 from parkenv.world.lot import Mouth
 
 COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")

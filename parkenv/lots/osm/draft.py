@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
-from parkenv.lots.generators import Slots
+from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.infer.spaces import to_rectangle
 from parkenv.lots.local_frame import LocalFrame
@@ -45,7 +45,7 @@ from parkenv.lots.osm.kerbs import Junctions, kerb_of, kerb_slots
 from parkenv.lots.osm.outline_draft import outline_draft
 from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
 from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
-from parkenv.lots.osm.rows import ARRANGEMENTS, NO_SLOTS, boxes_of, without_overlaps
+from parkenv.lots.osm.rows import ARRANGEMENTS, boxes_of, without_overlaps
 from parkenv.lots.osm.spaces import split_space, why_no_slot
 from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
 from parkenv.world.drive_graph import SLOT_REACH

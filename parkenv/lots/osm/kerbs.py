@@ -14,12 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import KERB_SIZE, Slots
+from parkenv.lots.generators import KERB_SIZE, NO_SLOTS, Slots
 from parkenv.lots.osm.roads import Rank, Road, metres, whole_number
 from parkenv.lots.osm.rows import (
     ARRANGEMENTS,
     DRAWN,
-    NO_SLOTS,
     Side,
     bend_factor,
     row_anchors,

@@ -8,12 +8,11 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 
-from parkenv.lots.generators import Slots
+from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.osm.roads import Road
 from parkenv.lots.osm.rows import (
     ARRANGEMENTS,
     DRAWN,
-    NO_SLOTS,
     Arrangement,
     Side,
     boxes_of,

@@ -10,7 +10,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots, bay_row
+from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots
 from parkenv.world.lot import Mouth, corner_points
 
 Side = Literal["left", "right"]
@@ -37,7 +37,6 @@ ARRANGEMENTS = {
 }
 """Arrangement for each value of OpenStreetMap's `orientation`; diagonal cars park at 60°."""
 DRAWN = 0.05  # tolerance, m, of the length of a row: OpenStreetMap's seven digits round to a centimetre
-NO_SLOTS = bay_row((0.0, 0.0), 0.0, 0)
 
 
 @dataclass(frozen=True, eq=False)

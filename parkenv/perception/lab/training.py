@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError, require_number, require_whole
 from parkenv.perception.car_model import CarModel
+from parkenv.perception.detector import overlaps
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, best_boxes
 from parkenv.perception.lab.car_datasets import LabelledImage
@@ -167,23 +168,12 @@ def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> F
         )
         seen = scan.scan(model, image)
         seen = seen.select(np.argsort(-seen.score, kind="stable")[: 40 * per_image])
-        seen = seen.select(~_overlap_any(seen.boxes, labelled.boxes))
+        for car in labelled.boxes:
+            seen = seen.select(overlaps(car, seen.boxes) <= CAR_OVERLAP)
         seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:per_image])
         cuts = [_cut(image, (r[0], r[1]), (r[2], r[3]), size) for r in seen.regions.tolist()]
         found += [window.describe(cut)[None] for cut in cuts]
     return np.concatenate(found)
-
-
-def _overlap_any(boxes: Float32Array, cars: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Return which boxes overlap any of the cars by more than `CAR_OVERLAP`, intersection over union."""
-    hit = np.zeros(len(boxes), dtype=np.bool_)
-    area = (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
-    for car in cars:
-        inner = np.minimum(boxes[:, 2:], car[2:]) - np.maximum(boxes[:, :2], car[:2])
-        common = np.clip(inner, 0.0, None).prod(axis=1)
-        own = (car[2] - car[0]) * (car[3] - car[1])
-        hit |= common > CAR_OVERLAP * (area + own - common)
-    return hit
 
 
 def _fitted(model: CarModel, yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> CarModel:
