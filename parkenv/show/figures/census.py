@@ -23,7 +23,7 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
     """Draw how many lots there are of each size and kind, their drive times, and how sure they are.
 
     Args:
-        rows: of a census: slots, kind, result, drive_s, doubt and the number of slots of each kind.
+        rows: of a census: slots, kind, result, drive_s, error_probability and the number of slots of each kind.
         path: the PNG file to write.
 
     Raises:
