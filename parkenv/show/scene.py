@@ -21,7 +21,7 @@ from parkenv.world.drive_graph import linestrings
 from parkenv.world.lot import ParkingLot, is_building
 
 Rings = Sequence[FloatArray]  # A polygon, m: its outer ring, (k, 2), and its holes
-Paint = str | Color | Sequence[str] | FloatArray
+Paint = str | Color | Sequence[str] | Sequence[Color] | FloatArray
 """A name in `colors.PALETTE`, "#rrggbb" or RGB; or one for each shape, also as (n, 3) RGB in 0..1 (figures only)."""
 
 APRON = 0.25  # width of the asphalt beyond the kerbs, m

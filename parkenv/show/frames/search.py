@@ -49,6 +49,7 @@ class SearchRenderer:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.frames = LotFrames(scenario.lot)
+        self._key = _key()
         self.window = Window(f"parkenv: {scenario.name}")
 
     def frame(self, state: SearchState, occupied: NDArray[np.bool_]) -> Image:
@@ -69,22 +70,15 @@ class SearchRenderer:
         path = lot.vertex_xy[state.path]
         if state.parked:
             path = np.vstack([path, pose[:2]])
-        paint(image, view, fading_trail(path))
-        if state.parked:
-            paint(image, view, [walk(pose[:2], goal)])
+        paint(image, view, [fading_trail(path), *([walk(pose[:2], goal)] if state.parked else [])])
         paint_goal(image, view, goal, here)
-        if not state.parked:
-            paint(image, view, [view_range(self.scenario, pose)])
-        paint(image, view, searching_car(pose))
+        around = [] if state.parked else [view_range(self.scenario, pose)]
+        paint(image, view, [*around, *searching_car(pose)])
         return np.vstack([image, self._line(state)])
 
     def _line(self, state: SearchState) -> Image:
         """Return the line of text below the map."""
-        image = strip()
-        top, right = HUD // 2 - 6, image.shape[1] - HUD_MARGIN
-        write_label(image, "taken", (right - 18.0, top + 6.0), "white", 13, 400)
-        draw_belief_key(image, (right - 116, top), (72, 12))
-        write_label(image, "free", (right - 132.0, top + 6.0), "white", 13, 400)
+        image = self._key.copy()
         parts = (
             clock(state.time),
             f"{state.time - state.arrival.time + state.walk_s + state.gave_up_s:.0f} s",
@@ -153,6 +147,16 @@ class SearchRenderer:
         return ["".join(row).rstrip() for row in rows]
 
 
+def _key() -> Image:
+    """Return the background of the line of text, with the key of colours."""
+    image = strip()
+    top, right = HUD // 2 - 6, image.shape[1] - HUD_MARGIN
+    write_label(image, "taken", (right - 18.0, top + 6.0), "white", 13, 400)
+    draw_belief_key(image, (right - 116, top), (72, 12))
+    write_label(image, "free", (right - 132.0, top + 6.0), "white", 13, 400)
+    return image
+
+
 def car_pose(scenario: Scenario, state: SearchState) -> FloatArray:
     """Return the car's pose, (3,): x, y, m, and yaw, at its vertex or in its slot."""
     lot, vertex = scenario.lot, state.vertex
@@ -180,12 +184,12 @@ def walk(slot: FloatArray, goal: FloatArray) -> Layer:
     return Lines([np.stack([slot, goal])], "goal", px=(2.0, 2.0), dash=(4.5, 4.5))
 
 
-def fading_trail(path: FloatArray) -> list[Layer]:
+def fading_trail(path: FloatArray) -> Layer:
     """Return the driven path, (k, 2) m, brighter where it is newer."""
     ages = np.linspace(0, len(path) - 1, min(len(path), 25)).astype(int)
     pieces = [path[first : last + 1] for first, last in pairwise(ages)]
     colors = [mixed_color("asphalt", "car", 0.35 + 0.65 * (i + 1) / len(pieces)) for i in range(len(pieces))]
-    return [Lines([piece], color, 0.5, (2.0, 5.0)) for piece, color in zip(pieces, colors, strict=True)]
+    return Lines(pieces, colors, 0.5, (2.0, 5.0))
 
 
 def _fitting(words: list[str], width: int) -> str:

@@ -78,7 +78,7 @@ def _paint(color: Paint) -> Any:
         return _paint(PALETTE[color]) if color in PALETTE else color
     if isinstance(color, tuple) and all(isinstance(part, int) for part in color):
         return tuple(float(part) / 255.0 for part in color)
-    return [_paint(one) if isinstance(one, str) else one for one in color]
+    return [_paint(one) if isinstance(one, str | tuple) else one for one in color]
 
 
 def points_per_m(ax: Axes) -> float:

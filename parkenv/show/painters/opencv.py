@@ -97,22 +97,27 @@ def _paint_areas(image: Image, view: MapView, layer: Areas) -> None:
 
 
 def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
+    if not len(layer.lines):
+        return
     least, most = (end * view.density for end in layer.px)
     width = min(max(layer.width * view.scale, least), most)
-    for points, color in zip(layer.lines, _colors(layer.color, len(layer.lines)), strict=True):
-        pixels = view(np.asarray(points))
-        if layer.halo is not None:
-            _stroke(image, view, pixels, rgb(layer.halo), width + HALO_PX * view.density)
-        if layer.dash is None:
-            _stroke(image, view, pixels, color, width)
-        else:
-            for dash in _dashes(pixels, *(part * view.density for part in layer.dash)):
-                _stroke(image, view, dash, color, width)
+    ends = np.cumsum([len(points) for points in layer.lines])[:-1]
+    pixels = np.split(view(np.concatenate(layer.lines)), ends)
 
+    def stroke(lines: Sequence[FloatArray], color: Color, thickness: float) -> None:
+        fixed = [fixed_point(line) for line in lines]
+        cv2.polylines(image, fixed, False, color, max(1, round(thickness)), _line_type(view), SUBPIXEL_BITS)
 
-def _stroke(image: Image, view: MapView, pixels: FloatArray, color: Color, width: float) -> None:
-    thickness = max(1, round(width))
-    cv2.polylines(image, [fixed_point(pixels)], False, color, thickness, _line_type(view), SUBPIXEL_BITS)
+    if layer.halo is not None:
+        stroke(pixels, rgb(layer.halo), width + HALO_PX * view.density)
+    parts = [[line] for line in pixels]
+    if layer.dash is not None:
+        parts = [[*_dashes(line, *(part * view.density for part in layer.dash))] for line in pixels]
+    if _is_one(layer.color):
+        stroke([piece for pieces in parts for piece in pieces], _only(layer.color), width)
+        return
+    for pieces, color in zip(parts, _colors(layer.color, len(parts)), strict=True):
+        stroke(pieces, color, width)
 
 
 def _dashes(pixels: FloatArray, on: float, off: float) -> Iterator[FloatArray]:
@@ -143,9 +148,12 @@ def _paint_marks(image: Image, view: MapView, layer: Marks) -> None:
 
 def _colors(color: Paint, n: int) -> list[Color]:
     """Return the colour of each of n shapes."""
-    if isinstance(color, str) or (isinstance(color, tuple) and not isinstance(color[0], str)):
-        return [_only(color)] * n
-    return [_only(one) for one in color]
+    return [_only(color)] * n if _is_one(color) else [_only(one) for one in color]
+
+
+def _is_one(color: Paint) -> bool:
+    """Whether all shapes have one colour."""
+    return isinstance(color, str) or (isinstance(color, tuple) and isinstance(color[0], int))
 
 
 def _only(color: object) -> Color:
