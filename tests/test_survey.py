@@ -167,9 +167,9 @@ def test_survey_and_map_on_the_command_line(tmp_path):
         (["map", tmp_path / "none", "--scenario", "mini"], "no such map file"),
         (
             ["survey", "--rig", "sonar", "--out", tmp_path / "x"],
-            "--rig: 'sonar' is not one of 'laser', 'stereo', 'both_sides'",
+            "--rig is 'sonar', want 'laser', 'stereo' or 'both_sides'",
         ),
-        (["survey", "--weather", "snow", "--out", tmp_path / "x"], "--weather: 'snow' is not one of"),
+        (["survey", "--weather", "snow", "--out", tmp_path / "x"], "--weather is 'snow', want 'sunny'"),
     ):
         bad = parkenv(*words)
         assert bad.returncode == 2

@@ -226,11 +226,6 @@ class ObservedSearches(Observed, Searches):
 
 
 @dataclass(frozen=True)
-class Commutes(Observed, Hours):
-    """Where and at what time drivers come day after day, and how slots are observed."""
-
-
-@dataclass(frozen=True)
 class Traffic:
     """Other road users.
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from parkenv.cli import arguments as args
+from parkenv.cli.command import options_of
 from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import make_console, make_table, print_recorded, progress_bar, save_summary
 from parkenv.errors import InputError, nearest
-from parkenv.files.known_names import LocaliserName, RigName, WeatherName
+from parkenv.files.known_names import LocaliserName
 from parkenv.show.plurals import plural
 
 if TYPE_CHECKING:
@@ -22,27 +23,16 @@ MOST_ROWS = 12
 """Slots in the table of a map; files have all."""
 
 
+@options_of("parkenv.studies.sensing.survey_study:SurveyStudy", "--sensor-model", "--view-range")
 def survey(
-    scenario: str | None = None,
-    sessions: int = 6,
-    every: float = 1.25,
-    seed: int = 0,
+    given: dict[str, Any],
+    /,
     out: Path = Path("results/survey"),
     *,
-    world: args.Weekdays,
-    hours: str | None = None,
-    traffic: args.Traffic,
-    rig: RigName | None = None,
-    detector: str | None = None,
-    weather: WeatherName | None = None,
-    pose_noise: float = 0.0,
-    odometry_drift: float = 0.0,
-    localise: LocaliserName = "none",
-    picture_width: int | None = None,
     rerun: Path | None = None,
     record: Path | None = None,
+    trust: bool = False,
     folder: args.ReportedRun,
-    machines: args.Machines,
 ) -> None:
     """Drive past every slot with simulated sensors, and write which slots are taken to a map file.
 
@@ -58,35 +48,17 @@ def survey(
         parkenv survey --scenario mini --sessions 1 --rerun drive.rrd
 
     Options:
-        sessions (N >= 1): Survey drives; the thesis made 21.
-        every (M >= 0.1): Metres between captures.
         out, -o (DIR): Folder for map.sqlite, pictures and summary.json.
-
-    World:
-        hours (HH:MM-HH:MM[,...]): When sessions begin; the windows are used in turn.  [default: 08:00-10:00,
-            11:00-14:00,16:00-18:00]
-
-    Sensors:
-        rig (laser|stereo|both_sides): laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a
-            laser and a camera to each side.  [default: the scenario's, laser]
-        pose_noise (M >= 0): Localisation error of the car, m.
-        odometry_drift (0 <= P <= 0.5): Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.
-        localise (none|scan-matching): scan-matching: correct the odometry by parked cars, walls and slots.
-        picture_width (64 <= PX <= 4096): Width of the cameras' pictures; searches have 400.  [default: 640]
 
     Results:
         record (FILE.mcap): Also record images, scans and poses of the first session (extra bags), for `parkenv
             map-drive`.  [default: none]
     """
-    from parkenv.studies.fields import BUSY
+    from parkenv.cli.spec_options import given_spec
+    from parkenv.studies.results import SPEC_FILE
     from parkenv.studies.sensing.survey_study import SurveyStudy
 
-    windows = {} if hours is None else {"hours": [window.strip() for window in hours.split(",")]}
-    study = SurveyStudy().changed(
-        scenario=traffic.on(world.spec(scenario), BUSY), sessions=sessions, rig=rig, detector=detector,
-        weather=weather, every=every, pose_noise=pose_noise, odometry_drift=odometry_drift, localise=localise,
-        picture_width=picture_width, seed=seed, **windows, **machines.given,
-    )  # fmt: skip
+    _, study = given_spec(SurveyStudy(), given, out, folder.resume and (out / SPEC_FILE).exists(), trust)
     run_survey(study, out, folder, rerun, record)
 
 

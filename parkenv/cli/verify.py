@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from parkenv.cli import arguments as args
+from parkenv.cli.command import options_of
 from parkenv.cli.study_run import run_study
 from parkenv.cli.tables import make_table
-from parkenv.files.known_names import VERIFY_CASES
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,13 +19,8 @@ if TYPE_CHECKING:
     from parkenv.studies.verify.rows import Row
 
 
-def verify(
-    cases: str | None = None,
-    seed: int = 0,
-    out: Path | None = None,
-    *,
-    machines: args.Machines,
-) -> None:
+@options_of("parkenv.studies.verify.study:Verification")
+def verify(given: dict[str, Any], /, out: Path | None = None) -> None:
     """Compare closed forms of the literature with what planners and worlds of this package do.
 
     A case without chance has to be found exactly. A simulated one agrees if theory is in the 99.99 % interval of the
@@ -36,15 +31,13 @@ def verify(
         parkenv verify --cases line,looks --seed 7
 
     Options:
-        cases (NAME[,...]): Some of {cases}.  [default: all]
-        seed (N >= 0): First seed of the simulated cases.
         out, -o (DIR): Folder for summary.json and verify.png.  [default: none]
     """
+    from parkenv.cli.spec_options import changed_by
     from parkenv.studies.verify.rows import disagreeing
     from parkenv.studies.verify.study import Verification
 
-    names = VERIFY_CASES if cases is None else args.words("--cases", cases)
-    study = Verification().changed("--cases", cases=names, seed=seed, **machines.given)
+    study = changed_by(Verification(), given)
     result = run_study(study, out, args.ReportedRun(), show)
     if disagreeing(study.statements(result.results)):
         raise typer.Exit(1)

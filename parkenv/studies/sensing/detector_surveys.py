@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import BoolArray
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, typed_records, write_csv
+from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
-from parkenv.mapping.survey_score import CLEAR, DISTANCE_ENDS, SIDES, SIGHTING
+from parkenv.mapping.survey_score import CLEAR, SIDES, SIGHTING
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.detector_drives import DISTANCES, LEAST_HEIGHT, VISIBLE
 from parkenv.studies.sensing.sessions import MAP_FILE

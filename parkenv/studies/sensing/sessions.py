@@ -7,7 +7,7 @@ from pathlib import Path
 
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE, typed_records, wholes
-from parkenv.mapping.survey_score import DISTANCE_ENDS
+from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.studies.results import CsvTable, Row
 
 MAP_FILE = "map.sqlite"

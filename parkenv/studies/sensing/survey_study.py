@@ -5,15 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
 from parkenv import __version__
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
+from parkenv.files.option import Option
 from parkenv.files.spec_file import Several
-from parkenv.scenarios.spec import Hours, scenario_spec
-from parkenv.studies.fields import BUSY, CaptureDistance, Detector, ScenarioItem, Seed
+from parkenv.scenarios.spec import Hours, ScenarioSpec, scenario_spec
+from parkenv.studies.fields import BUSY, CaptureDistance, Detector, OneScenario, Seed
 from parkenv.studies.results import Key, Results, Row
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.study import Cell, Study
@@ -33,6 +34,10 @@ SHOWN = "shown"
 """Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording."""
 
 
+def _with_traffic(scenario: ScenarioSpec) -> ScenarioSpec:
+    return scenario if scenario.traffic else scenario.changed(traffic=BUSY)
+
+
 class SurveyStudy(Study):
     """A survey: drives past every slot with simulated sensors, recorded in a map file."""
 
@@ -44,26 +49,45 @@ class SurveyStudy(Study):
     keeps_order: ClassVar = True
 
     kind: Literal["survey"] = "survey"
-    scenario: ScenarioItem = scenario_spec("campus")
-    sessions: int = Field(6, ge=1, le=100_000, description="Survey drives; the thesis made 21.")
-    rig: RigName | None = Field(None, description="The scenario's if absent.")
+    scenario: Annotated[OneScenario, AfterValidator(_with_traffic)] = Field(
+        scenario_spec("campus"), validate_default=True
+    )
+    sessions: Annotated[int, Option(takes="N >= 1")] = Field(
+        6, ge=1, le=100_000, description="Survey drives; the thesis made 21."
+    )
+    rig: Annotated[RigName | None, Option(panel="Sensors", default="the scenario's, laser")] = Field(
+        None,
+        description="laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a laser and a camera "
+        "to each side.",
+    )
     detector: Detector = None
-    hours: Several[Hours] = Field(
+    hours: Annotated[
+        Several[Hours],
+        Option(takes="HH:MM-HH:MM[,...]", panel="World", default="08:00-10:00,11:00-14:00,16:00-18:00"),
+    ] = Field(
         ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
-        description="When drives begin, one window after the other, on the scenario's days.",
+        description="When sessions begin, on the scenario's days; the windows are used in turn.",
     )  # fmt: skip
-    weather: WeatherName | None = Field(None, description="Drawn for each session if absent.")
-    every: CaptureDistance = Field(1.25, description="Distance between captures, m.")
-    pose_noise: float = Field(0.0, ge=0.0, le=100.0, description="Localisation error of the car, m.")
-    odometry_drift: float = Field(
+    weather: Annotated[WeatherName | None, Option(panel="Sensors", default="drawn each time")] = Field(
+        None, description="Of all sessions."
+    )
+    every: Annotated[CaptureDistance, Option(takes="M >= 0.1")] = Field(
+        1.25, description="Metres between captures."
+    )
+    pose_noise: Annotated[float, Option(takes="M >= 0", panel="Sensors")] = Field(
+        0.0, ge=0.0, le=100.0, description="Localisation error of the car, m."
+    )
+    odometry_drift: Annotated[float, Option(takes="0 <= P <= 0.5", panel="Sensors")] = Field(
         0.0,
         ge=0.0,
         le=0.5,
-        description="Error of the car's odometry after 100 m, as a share of the distance.",
+        description="Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.",
     )
-    localise: LocaliserName = Field("none", description="What corrects the odometry.")
-    picture_width: int | None = Field(
-        None, ge=64, le=4_096, description="Width of the cameras' pictures, px; 640 if absent."
+    localise: Annotated[LocaliserName, Option(panel="Sensors")] = Field(
+        "none", description="scan-matching: correct the odometry by parked cars, walls and slots."
+    )
+    picture_width: Annotated[int | None, Option(takes="64 <= PX <= 4096", panel="Sensors", default="640")] = (
+        Field(None, ge=64, le=4_096, description="Width of the cameras' pictures; searches have 400.")
     )
     seed: Seed = Field(0, description="Seed of the drives.")
 
@@ -72,7 +96,7 @@ class SurveyStudy(Study):
         """The scenario."""
         from parkenv.scenarios.build import build
 
-        return build(self.scenario if self.scenario.traffic else self.scenario.changed(traffic=BUSY))
+        return build(self.scenario)
 
     @cached_property
     def drive_settings(self) -> SurveySettings:

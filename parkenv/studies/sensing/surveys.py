@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.mapping.discovery import FoundSlots, discover, score_discovery
+from parkenv.mapping.distance_bins import DISTANCE_ENDS
 from parkenv.mapping.inference import SessionLog, predict
 from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import SessionResult, SurveySettings
-from parkenv.mapping.survey_score import DISTANCE_ENDS, METHODS
+from parkenv.mapping.survey_score import METHODS
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, SESSION_COLUMNS
 from parkenv.world.occupancy.counted import CountedOccupancy

@@ -6,13 +6,14 @@ import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
 from importlib import import_module
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
 from parkenv import __version__
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import VERIFY_CASES
+from parkenv.files.option import Option
 from parkenv.files.spec_file import Axis
 from parkenv.studies.fields import Seed
 from parkenv.studies.results import JsonTable, Results, Row
@@ -56,7 +57,9 @@ class Verification(Study):
     goes_on: ClassVar = "unfinished"
 
     kind: Literal["verify"] = "verify"
-    cases: Axis[str] = Field(VERIFY_CASES, description=f"Some of {', '.join(VERIFY_CASES)}.")
+    cases: Annotated[Axis[str], Option(takes="NAME[,...]", default="all")] = Field(
+        VERIFY_CASES, description=f"Some of {', '.join(VERIFY_CASES)}."
+    )
     seed: Seed = Field(0, description="First seed of the simulated cases.")
 
     @cached_property
