@@ -6,7 +6,6 @@ import math
 import numpy as np
 import pytest
 
-from parkenv.engine.fleet import total_s
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.measures import Roads
@@ -104,4 +103,4 @@ def test_no_fleet_is_below_it(knows):
             fleet.reset(2, day)
             bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
             fleet.run(agents)
-            assert roads.alone_s(fleet.cars).sum() - 1e-4 <= bound_s <= total_s(fleet.cars).sum()
+            assert roads.alone_s(fleet.cars).sum() - 1e-4 <= bound_s <= fleet.cars["total_s"].sum()

@@ -17,7 +17,7 @@ from small_lots import small_lot
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
-from parkenv.engine.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
 from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
 from parkenv.world.demand import (
@@ -120,7 +120,7 @@ def test_one_car_is_the_single_search_to_the_last_bit(source, changes):
                 assert_same(observation, fleet.observation(0))
                 fleet.release()
                 assert fleet.next_car() is None
-                assert total_s(fleet.cars)[0] == info["total_s"]
+                assert fleet.cars["total_s"][0] == info["total_s"]
                 break
 
 

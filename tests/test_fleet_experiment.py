@@ -9,7 +9,6 @@ import pytest
 from command_line import parkenv
 from pictures import shows_color
 
-from parkenv.engine.fleet import total_s
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
 from parkenv.scenarios.build import make_scenario
@@ -79,7 +78,7 @@ def test_measures_of_a_day_are_those_of_its_cars():
     cars = fleet.cars
     members = (cars["kind"] == 0).mean()
     assert day["cars"] == len(cars)
-    assert day["total_s"] == pytest.approx(total_s(cars).mean())
+    assert day["total_s"] == pytest.approx(cars["total_s"].mean())
     assert day["total_s"] == pytest.approx(members * day["members_s"] + (1 - members) * day["others_s"])
     assert day["balked_fraction"] == (cars["slot"] < 0).mean() > 0.0, "60 cars for ten slots"
     assert 0.5 < day["occupancy"] <= 1.0
@@ -96,7 +95,7 @@ def test_nobody_is_faster_than_alone():
     fleet, agents = its.fleet(its.fleet_settings[0])
     fleet.reset(1)
     fleet.run(agents)
-    assert (total_s(fleet.cars) >= roads.alone_s(fleet.cars) - 1e-9).all()
+    assert (fleet.cars["total_s"] >= roads.alone_s(fleet.cars) - 1e-9).all()
     parked = fleet.cars[fleet.cars["slot"] >= 0]
     assert (parked["driven_m"] >= roads.metres(parked) - 1e-9).all()
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import parkenv
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times, total_s
+from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.engine.fleet_rules import RULES
 from parkenv.world.demand import (
     ConstantTime,
@@ -125,7 +125,7 @@ def means(knows, demand, **options):
     for seed in range(12):
         fleet.reset(seed)
         fleet.run()
-        found.append(total_s(fleet.cars).mean())
+        found.append(fleet.cars["total_s"].mean())
     return np.mean(found)
 
 

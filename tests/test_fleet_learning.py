@@ -13,7 +13,7 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.engine.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
 from parkenv.engine.network import NetworkRule
 from parkenv.engine.records import SEARCHING
@@ -92,7 +92,7 @@ def test_the_other_cars_choose_as_the_learning_one_does():
     )
     fleet.reset(1, 0)
     fleet.run()
-    wanted = total_s(fleet.cars)
+    wanted = fleet.cars["total_s"]
     assert len(ended) > 5
     assert set(np.round(ended, 6)) <= set(np.round(wanted, 6))
 
@@ -114,7 +114,7 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
         fleet = Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False)
         fleet.reset(3)
         fleet.run(agents)
-        found.append(np.array([total_s(fleet.cars), fleet.cars["n_steps"], fleet.cars["slot"]]))
+        found.append(np.array([fleet.cars["total_s"], fleet.cars["n_steps"], fleet.cars["slot"]]))
     np.testing.assert_array_equal(*found)
 
 
@@ -210,8 +210,8 @@ def test_members_of_a_mixed_fleet_are_those_asked_for():
     fleet.run()
     members = fleet.cars["kind"] == 0
     assert day["cars"] == members.sum()
-    assert day["total_s"] == pytest.approx(total_s(fleet.cars)[members].mean())
-    assert day["others_s"] == pytest.approx(total_s(fleet.cars)[~members].mean())
+    assert day["total_s"] == pytest.approx(fleet.cars["total_s"][members].mean())
+    assert day["others_s"] == pytest.approx(fleet.cars["total_s"][~members].mean())
     assert (few.name, MixedFleet(MINI, DEMAND).name) == ("0.25 among greedy-drive", "every car")
 
 

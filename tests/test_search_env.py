@@ -17,10 +17,11 @@ from hypothesis import strategies as st
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
-from parkenv.engine.kernel import COUNT_METRICS, REWARD_TERMS, STEP_RESULT, TIME_METRICS
+from parkenv.engine.kernel import STEP_RESULT
 from parkenv.envs.wrappers import ThesisReward
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
+from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.decay import decay_factor
 
@@ -140,7 +141,7 @@ def test_a_step_returns_the_numbers_in_the_order_of_their_names():
     record = env.searches.records[0]
     for action in (3, PARK, 3):
         result = dict(zip(STEP_RESULT, env._advance(action), strict=True))
-        for name in (*TIME_METRICS, *COUNT_METRICS, "parked", "over", "vertex"):
+        for name in (*METRICS, "over", "vertex"):
             if name != "total_s":
                 assert result[name] == record[name], name
         terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")

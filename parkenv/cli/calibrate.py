@@ -145,12 +145,14 @@ def trip(
 
 
 def _show(console: Console, driven: Any) -> None:
+    from parkenv.world.cost_terms import COST_TERMS
+
     end = f"parked in {driven.slot}" if driven.parked else "not parked"
     parts = (
-        (driven.lanes_s, "on the lanes"), (driven.manoeuvre_s, "manoeuvre"), (driven.failed_s, "failed"),
-        (driven.walk_s, "walk"), (driven.parking_cost_s, "parking cost"), (driven.gave_up_s, "give-up penalty"),
+        (driven.lanes_s, "on the lanes", False), (driven.manoeuvre_s, "manoeuvre", False),
+        *((driven.costs[t.field], t.label, t.optional) for t in COST_TERMS if t.field in driven.costs),
     )  # fmt: skip
-    terms = " + ".join(f"{s:.1f} s {what}" for i, (s, what) in enumerate(parts) if s or i < 4)
+    terms = " + ".join(f"{s:.1f} s {what}" for s, what, optional in parts if s or not optional)
     console.print(f"{end}: {driven.total_s:.1f} s = {terms}")
     if driven.waited_s or driven.contacts:
         console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +18,7 @@ from parkenv.cli.tables import (
 from parkenv.errors import InputError
 from parkenv.show.plurals import plural
 from parkenv.studies.results import Row
+from parkenv.world.cost_terms import COST_TERMS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -136,11 +137,6 @@ def _record(case: Case, seeds: Sequence[int], path: Path) -> None:
 Column = tuple[str, Callable[[Row], str]]
 
 _DETAILS: tuple[Column, ...] = (
-    ("drive", lambda r: _seconds(r["drive_s"])),
-    ("failed", lambda r: _seconds(r["failed_s"])),
-    ("walk", lambda r: _seconds(r["walk_s"])),
-    ("parking", lambda r: _seconds(r["parking_cost_s"])),
-    ("gave up", lambda r: _seconds(r["gave_up_s"])),
     ("parked", lambda r: f"{r['parked_fraction']:.0%}"),
     ("replans", lambda r: f"{r['replans']:.1f}"),
     ("ms/decision", lambda r: f"{r['decision_ms']:.2f}" if "decision_ms" in r else ""),
@@ -168,13 +164,19 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
             f"{plural(max(r['episodes'] for r in its_rows), 'episode')}"
         )
-        costs = any(row["parking_cost_s"] for row in its_rows)
-        details = tuple(column for column in _DETAILS if costs or column[0] != "parking")
+        details = (*_cost_columns(its_rows), *_DETAILS)
         for columns in [results + details] if width >= WIDE else [results, details]:
             headings = ("agent", *(heading for heading, _ in columns))
             cells = ((row["agent"], *(text(row) for _, text in columns)) for row in its_rows)
             tables.append(make_table(title if columns is not details else None, headings, cells))
     return tables
+
+
+def _cost_columns(rows: Sequence[Row]) -> Iterator[Column]:
+    """Yield a column for each term of the costs, but for optional ones that are 0."""
+    for term in COST_TERMS:
+        if not term.optional or any(row[term.field] for row in rows):
+            yield term.name.replace("_", " "), lambda row, field=term.field: _seconds(row[field])  # type: ignore[misc]
 
 
 def _difference(row: Row, first_agent: str) -> str:

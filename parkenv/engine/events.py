@@ -22,6 +22,7 @@ from parkenv.compiled.keyed_random import car_key
 from parkenv.compiled.memory import call_at, float64s, int64s
 from parkenv.engine.kernel import (
     SCENARIO_BYTES,
+    clear_step,
     drive_or_park,
     empty_shared_slots,
     enter,
@@ -31,6 +32,7 @@ from parkenv.engine.kernel import (
     leaves_soon,
     observe,
     refresh_belief,
+    sum_of_costs,
     write_clock,
 )
 from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report_view
@@ -42,6 +44,7 @@ from parkenv.engine.records import (
     GAVE_UP,
     LEFT,
     N_ACTIONS,
+    N_TERMS,
     NO_CAR,
     OWN_KNOWLEDGE,
     PARKED,
@@ -338,8 +341,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
     fleet.n_decisions += 1
     fleet.reservations_stale = True
     if action == LEAVE:
-        search.step_drive_s = search.step_failed_s = search.step_walk_s = search.step_parking_cost_s = 0.0
-        search.step_gave_up_s = 0.0
+        clear_step(search)
         give_up(search)
         _end_search(fleet, number, BALKED)
         return True
@@ -401,8 +403,8 @@ def _end_search(fleet: Any, number: int, state: int) -> None:
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
     car.state, car.ended_at = state, fleet.time
-    car.drive_s, car.failed_s, car.walk_s = search.drive_s, search.failed_s, search.walk_s
-    car.parking_cost_s, car.gave_up_s = search.parking_cost_s, search.gave_up_s
+    for term in range(N_TERMS):
+        car.costs[term] = search.costs[term]
     car.driven_m, car.walked_m = search.driven_m, search.walked_m
     car.failed_parks, car.slots_passed, car.n_steps = search.failed_parks, search.slots_passed, search.n_steps
     release_slot(fleet, car)
@@ -413,6 +415,7 @@ def _end_search(fleet: Any, number: int, state: int) -> None:
         fleet.n_gone += 1
     if state == TRUNCATED:
         car.gave_up_s += scenario_at(search.scenario, 0).give_up_s
+    car.total_s = sum_of_costs(car)
     if car.rule == 0:
         _make_ready(fleet, number)
     else:

@@ -34,11 +34,8 @@ from parkenv.engine.events import (
 )
 from parkenv.engine.fleet_rules import Rule
 from parkenv.engine.kernel import (
-    COUNT_METRICS,
-    REWARD_TERMS,
-    STEP_RESULT,
-    TIME_METRICS,
     shared_slots_taken_at,
+    step_info,
     step_result_at,
 )
 from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings_at
@@ -609,14 +606,10 @@ class Fleet:
     def outcome(self, car: int) -> StepOutcome:
         """Return the result of a car's last step."""
         searches, row = self._search_of(car)
-        numbers = dict(
-            zip(STEP_RESULT, step_result_at(searches.address + row * SEARCH.itemsize), strict=True)
-        )
-        info = {"reward_terms": {term: numbers[term] for term in REWARD_TERMS}}
-        info |= {name: numbers[name] for name in (*TIME_METRICS, *COUNT_METRICS, "parked")}
-        info["place"] = self.scenarios[self._cars["place"][car]].name
+        result = step_result_at(searches.address + row * SEARCH.itemsize)
+        info = step_info(self.scenarios[self._cars["place"][car]].name, *result)
         begun = bool(searches.records["n_steps"][row])
-        return StepOutcome(begun, numbers["reward"], numbers["parked"], numbers["over"], info)
+        return StepOutcome(begun, result[0], info["parked"], result[-2], info)
 
     def _search_of(self, car: int) -> tuple[Searches, int]:
         """Return the searches that hold a car's record, and its row there."""
@@ -699,12 +692,6 @@ class Fleet:
         options |= {"background": background, "drivers": self.drivers, "max_steps": int(record["max_steps"])}
         options["leave_full_lot"] = bool(self._tables.records["leave_full_lot"][0])
         return _fleet, (self.scenario, self.demand, options | {"sees_cars": self.sees_cars})
-
-
-def total_s(cars: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return the total time of cars whose search is over, (n_cars,) s: drive, failed attempts, walk, costs, penalty."""
-    terms = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
-    return np.asarray(np.sum([cars[name] for name in terms], axis=0))
 
 
 def drive_times(problem: SearchProblem, vertex: int) -> NDArray[np.float64]:

@@ -8,9 +8,12 @@ Functions named `..._at` take an address: that of a record of `Searches`, where 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numba.cpython.unsafe.tuple import tuple_setitem
+from numba.np.unsafe.ndarray import to_fixed_tuple
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
@@ -33,6 +36,7 @@ from parkenv.engine.records import (
     FORECAST,
     LOG_KIND,
     N_ACTIONS,
+    N_TERMS,
     NEVER_OBSERVED,
     NO_CAR,
     OBSERVED_AT,
@@ -51,25 +55,32 @@ from parkenv.engine.records import (
     shared_world_at,
     slot_at,
 )
+from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy import kernel as worlds
 from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
-REWARD_TERMS = ("drive", "failed", "walk", "parking", "gave_up")
-TIME_METRICS = (
-    "drive_s",
-    "failed_s",
-    "walk_s",
-    "parking_cost_s",
-    "gave_up_s",
-    "total_s",
-    "driven_m",
-    "walked_m",
-)
-COUNT_METRICS = ("failed_parks", "slots_passed")
-STEP_RESULT = ("reward", *REWARD_TERMS, *TIME_METRICS, *COUNT_METRICS, "parked", "over", "vertex")
+STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
 """Names of the numbers that a step returns; metrics are those of the episode so far."""
+
+
+def _info_function() -> Callable[..., dict[str, Any]]:
+    """Return the function of a place and the numbers of `STEP_RESULT` that makes `info`.
+
+    Its source is written from the table of terms: a dict display is several times as fast as `dict(zip(...))`, which
+    would take as long as the step.
+    """
+    terms = ", ".join(f"{name!r}: {name}" for name in REWARD_TERMS)
+    metrics = ", ".join(f"{name!r}: {name}" for name in METRICS)
+    made: Callable[..., dict[str, Any]] = eval(
+        f"lambda place, {', '.join(STEP_RESULT)}: {{'reward_terms': {{{terms}}}, {metrics}, 'place': place}}"
+    )
+    return made
+
+
+step_info = _info_function()
+"""Function (name of the scenario, *result of a step) -> `info` of the step."""
 SCENARIO_BYTES = SCENARIO.itemsize
 
 # ---- one search, from Python
@@ -139,7 +150,7 @@ def fail_attempt_at(address: int) -> None:
     search = search_at(address, 0)
     search.failed_parks += 1
     search.n_steps += 1
-    search.step_walk_s = search.step_parking_cost_s = 0.0
+    clear_step(search)
 
 
 @kernel
@@ -214,15 +225,25 @@ def step_result(search: Any) -> tuple[Any, ...]:
 
     Compiled code makes a plain tuple six times as fast as a named one.
     """
-    drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
-    parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s
-    total_s = search.drive_s + search.failed_s + search.walk_s + search.parking_cost_s + search.gave_up_s
-    return (
-        -(drive + failed + walk + parking + gave_up), -drive, -failed, -walk, -parking, -gave_up,
-        search.drive_s, search.failed_s, search.walk_s, search.parking_cost_s, search.gave_up_s, total_s,
-        search.driven_m, search.walked_m,
-        search.failed_parks, search.slots_passed, search.parked, search.over, search.vertex,
+    terms = to_fixed_tuple(search.step_costs, N_TERMS)
+    for term in range(N_TERMS):
+        terms = tuple_setitem(terms, term, -search.step_costs[term])
+    result: tuple[Any, ...] = (
+        (-step_cost_s(search),) + terms + to_fixed_tuple(search.costs, N_TERMS) + (  # noqa: RUF005 - for numba
+            search.total_s, search.driven_m, search.walked_m, search.failed_parks, search.slots_passed,
+            search.parked, search.over, search.vertex,
+        )
     )  # fmt: skip
+    return result
+
+
+@inlined
+def step_cost_s(search: Any) -> float:
+    """Return what the last step cost, s."""
+    seconds = 0.0
+    for term in range(N_TERMS):
+        seconds += search.step_costs[term]
+    return seconds
 
 
 @kernel
@@ -264,10 +285,10 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
         worlds.draw_day(worlds.process_at(scenario.world, 0), search)
     search.vertex = search.previous_vertex = vertex
     search.parked = search.over = False
-    search.drive_s = search.failed_s = search.walk_s = search.parking_cost_s = search.gave_up_s = 0.0
-    search.step_drive_s = search.step_failed_s = search.step_walk_s = 0.0
-    search.step_parking_cost_s = search.step_gave_up_s = 0.0
-    search.driven_m = search.walked_m = search.n_observed_free = search.n_expected_free = 0.0
+    for term in range(N_TERMS):
+        search.costs[term] = search.step_costs[term] = 0.0
+    search.total_s = search.driven_m = search.walked_m = 0.0
+    search.n_observed_free = search.n_expected_free = 0.0
     search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = (
         search.n_last_observed_taken
     ) = 0
@@ -318,7 +339,8 @@ def drive_or_park(search: Any, action: int) -> None:
     """Move the car, or attempt to park."""
     scenario, vertex = scenario_at(search.scenario, 0), search.vertex
     edge = edge_at(scenario.edges, vertex * N_ACTIONS + action)
-    drive_s, failed_s, walk_s, parking_cost_s = edge.seconds, 0.0, 0.0, 0.0
+    clear_step(search)
+    search.step_drive_s = edge.seconds
     search.driven_m += edge.metres
     target = edge.target
     if target != vertex:
@@ -329,16 +351,21 @@ def drive_or_park(search: Any, action: int) -> None:
         if taken:
             search.failed_parks += 1
             set_belief(search, column, taken, 1.0)
-            failed_s = scenario.failure_s
+            search.step_failed_s = scenario.failure_s
         else:
             search.parked = True
-            walk_s = float64s(scenario.walk_s)[vertex]
-            parking_cost_s = float64s(scenario.parking_cost_s)[vertex]
+            search.step_walk_s = float64s(scenario.walk_s)[vertex]
+            search.step_parking_cost_s = float64s(scenario.parking_cost_s)[vertex]
             search.walked_m = float64s(scenario.walk_m)[vertex]
-    search.time += drive_s + failed_s
-    search.step_drive_s, search.step_failed_s = drive_s, failed_s
-    search.step_walk_s, search.step_parking_cost_s = walk_s, parking_cost_s
+    search.time += search.step_drive_s + search.step_failed_s
     search.n_steps += 1
+
+
+@inlined
+def clear_step(search: Any) -> None:
+    """Begin a step: it costs nothing yet."""
+    for term in range(N_TERMS):
+        search.step_costs[term] = 0.0
 
 
 @inlined
@@ -348,11 +375,9 @@ def finish_step(search: Any) -> None:
     full = search.n_last_observed_taken == scenario.n_slots and scenario.leave_full_lot
     search.step_gave_up_s = scenario.give_up_s if full else 0.0
     search.over = full or search.parked
-    search.drive_s += search.step_drive_s
-    search.failed_s += search.step_failed_s
-    search.walk_s += search.step_walk_s
-    search.parking_cost_s += search.step_parking_cost_s
-    search.gave_up_s += search.step_gave_up_s
+    for term in range(N_TERMS):
+        search.costs[term] += search.step_costs[term]
+    search.total_s = sum_of_costs(search)
 
 
 @inlined
@@ -361,7 +386,17 @@ def give_up(search: Any) -> None:
     penalty = scenario_at(search.scenario, 0).give_up_s
     search.step_gave_up_s += penalty
     search.gave_up_s += penalty
+    search.total_s = sum_of_costs(search)
     search.over = True
+
+
+@inlined
+def sum_of_costs(record: Any) -> float:
+    """Return the sum of `costs` of a SEARCH or CAR record, s."""
+    seconds = 0.0
+    for term in range(N_TERMS):
+        seconds += record.costs[term]
+    return seconds
 
 
 # ---- what is observed

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at
 from parkenv.errors import InputError
+from parkenv.files.known_names import KNOWLEDGE
+from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.occupancy.counted import CountedOccupancy
 from parkenv.world.occupancy.kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
@@ -84,24 +86,23 @@ _TABLES = tuple(
 _PROCESS_TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
 N_REGIONS = 4
 
-_PROGRESS = [
-    # Sums over the episode, s and m.
-    ("drive_s", np.float64),
-    ("failed_s", np.float64),
-    ("walk_s", np.float64),
-    ("parking_cost_s", np.float64),
-    ("gave_up_s", np.float64),
+N_TERMS = len(COST_TERMS)
+_SUMS = [
+    # Costs over the episode, s; their sum; m.
+    *((name, np.float64) for name in COST_FIELDS),
+    ("total_s", np.float64),
     ("driven_m", np.float64),
     ("walked_m", np.float64),
     ("failed_parks", np.int64),
     ("slots_passed", np.int64),
     ("n_steps", np.int64),
+]
+STEP_FIELDS = tuple(f"step_{name}" for name in COST_FIELDS)
+"""Fields of the costs of the last step."""
+_PROGRESS = [
+    *_SUMS,
     # Costs of the last step, s.
-    ("step_drive_s", np.float64),
-    ("step_failed_s", np.float64),
-    ("step_walk_s", np.float64),
-    ("step_parking_cost_s", np.float64),
-    ("step_gave_up_s", np.float64),
+    *((name, np.float64) for name in STEP_FIELDS),
     # Current status; times in s since Monday 00:00.
     ("vertex", np.int64),
     ("previous_vertex", np.int64),
@@ -131,7 +132,21 @@ _EPISODES = [("episode", np.int64), ("seed_state", np.uint64), ("clock", np.floa
 PROGRESS_FIELDS = tuple(str(entry[0]) for entry in _PROGRESS + _EPISODES)
 """Fields of a SEARCH record that a search changes."""
 
-SEARCH = np.dtype(
+
+def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:
+    """Return the record type of some fields, in which arrays of `N_TERMS` costs overlie the fields that begin there."""
+    plain = np.dtype(list(fields), align=True)
+    assert plain.names is not None
+    assert plain.fields is not None
+    members = {name: plain.fields[name][:2] for name in plain.names}
+    for name, first in arrays.items():
+        members[name] = np.dtype((np.float64, (N_TERMS,))), plain.fields[first][1]
+    formats, offsets = zip(*members.values(), strict=True)
+    layout = {"names": list(members), "formats": formats, "offsets": offsets, "itemsize": plain.itemsize}
+    return np.dtype(layout, align=True)  # type: ignore[call-overload, no-any-return]
+
+
+SEARCH = _with_costs(
     [
         *_PROGRESS,
         # Number of the episode, and the mixed seed: together they give `key`.
@@ -159,9 +174,10 @@ SEARCH = np.dtype(
         ("p_occupied", ADDRESS),
         ("belief", ADDRESS),
     ],
-    align=True,
+    costs=COST_FIELDS[0],
+    step_costs=STEP_FIELDS[0],
 )
-"""A running search."""
+"""A running search; `costs` and `step_costs` are its costs by term, (N_TERMS,)."""
 
 SENTINEL = 0  # column shared by all slots without their own: they were not observed
 
@@ -260,11 +276,13 @@ DUE, SEARCHING, PARKED, LEFT, GAVE_UP, BALKED, TRUNCATED = range(7)
 """States of a car: not yet arrived; searching; parked; has left its slot; went elsewhere because the lot was proven
 full; went elsewhere because its patience was at an end; ended by the limit of steps."""
 
-OWN_KNOWLEDGE, SHARED_KNOWLEDGE, RESERVE_KNOWLEDGE, FULL_KNOWLEDGE = range(4)
+OWN_KNOWLEDGE, SHARED_KNOWLEDGE, RESERVE_KNOWLEDGE, FULL_KNOWLEDGE = (
+    KNOWLEDGE.index(name) for name in ("own", "shared", "reserve", "full")
+)
 """What a car knows of the slots: its own observations; also those on the live map; the slot that the guidance system
 has reserved for it; the true state of every slot."""
 
-CAR = np.dtype(
+CAR = _with_costs(
     [
         # The demand: index of the scenario (goal) and of the kind of driver; vertex of the entry; arrival, s since
         # Monday 00:00; s.
@@ -295,16 +313,7 @@ CAR = np.dtype(
         ("queues_since", np.float64),
         ("holds", np.int64),
         # Sums of the search, complete when it has ended.
-        ("drive_s", np.float64),
-        ("failed_s", np.float64),
-        ("walk_s", np.float64),
-        ("parking_cost_s", np.float64),
-        ("gave_up_s", np.float64),
-        ("driven_m", np.float64),
-        ("walked_m", np.float64),
-        ("failed_parks", np.int64),
-        ("slots_passed", np.int64),
-        ("n_steps", np.int64),
+        *_SUMS,
         # Its SEARCH record, 0 unless searching. For compiled drivers: the target slot, or -1; the moves to it,
         # (n_vertices,) uint8 from the last to the first, and how many are left.
         ("search", ADDRESS),
@@ -312,9 +321,9 @@ CAR = np.dtype(
         ("moves", ADDRESS),
         ("n_moves", np.int64),
     ],
-    align=True,
+    costs=COST_FIELDS[0],
 )
-"""A car of the fleet."""
+"""A car of the fleet; `costs` are its costs by term, (N_TERMS,)."""
 
 LIVE_SLOT = np.dtype([("time", np.float64), ("taken", np.bool_), ("p", np.float64)], align=True)
 """A slot on the live map: time of the last report, s, before all others without one; what it says; P(taken) then."""

@@ -16,7 +16,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import uint8s
 from parkenv.engine.events import act_at, advance_at, release_at
-from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet, total_s
+from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
+from parkenv.engine.kernel import step_cost_s
 from parkenv.engine.local_observation import local_space
 from parkenv.engine.network import Layer, NetworkRule, observe_locally
 from parkenv.engine.records import (
@@ -35,6 +36,7 @@ from parkenv.envs.scan_vector import StackedScanVectorEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenario, make_scenarios
+from parkenv.world.cost_terms import METRICS
 from parkenv.world.demand import Demand
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import kernel
@@ -129,10 +131,6 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
 
 # ---- searches
 
-METRICS = (
-    "drive_s", "failed_s", "walk_s", "gave_up_s", "total_s", "driven_m", "walked_m", "failed_parks",
-    "slots_passed", "parked", "place",
-)  # fmt: skip
 
 _DEFAULT_K = {"scan": SCANS}
 
@@ -230,7 +228,7 @@ class SearchVecEnv(SharedVecEnv):
 
         def final(i: int) -> tuple[dict[str, Any], dict[str, Any]]:
             metrics = info["final_info"]
-            return info["final_obs"][i], {name: metrics[name][i].item() for name in METRICS}
+            return info["final_obs"][i], {name: metrics[name][i].item() for name in (*METRICS, "place")}
 
         infos = self._end_episodes(done, truncated & ~terminated, final)
         return observations, (rewards * self.reward_scale).astype(np.float32), done, infos
@@ -279,9 +277,6 @@ class SearchVecEnv(SharedVecEnv):
 
 LEARNERS = 0
 """The kind of drivers that learn."""
-_METRICS = (
-    "drive_s", "failed_s", "walk_s", "gave_up_s", "driven_m", "walked_m", "failed_parks", "slots_passed",
-)  # fmt: skip
 _DECIDED, _UNDER_WAY, _OVER, _OBSERVED = range(4)
 """Stages of a world during a step: its car has decided, is under way, has ended its search, or has observed."""
 _CAR_BYTES = CAR.itemsize
@@ -321,7 +316,8 @@ class FleetVecEnv(SharedVecEnv):
         InputError: an argument out of its range; the message names it.
 
     Examples:
-        >>> from parkenv.world.demand import Demand, PoissonArrivals
+        >>> from parkenv.world.cost_terms import METRICS
+    from parkenv.world.demand import Demand, PoissonArrivals
         >>> venv = FleetVecEnv(4, "mini", Demand(PoissonArrivals(30, 8 * 3600, 9 * 3600)))
         >>> venv.seed(0)
         [0, 1, 2, 3]
@@ -456,8 +452,8 @@ class FleetVecEnv(SharedVecEnv):
     def _end_of(self, i: int) -> tuple[dict[str, Any], dict[str, Any]]:
         """Return the last observation, and the metrics, of the car whose search has ended."""
         car = self._ended[i : i + 1]
-        metrics = {name: car[name].item() for name in _METRICS}
-        metrics |= {"total_s": total_s(car).item(), "parked": bool(car["slot"][0] != NO_CAR)}
+        metrics = {name: car[name].item() for name in METRICS if name != "parked"}
+        metrics["parked"] = bool(car["slot"][0] != NO_CAR)
         return {"action_mask": self._masks[1, i].copy(), "local": self._local[1, i].copy()}, metrics
 
     def get_state(self) -> dict[str, Any]:
@@ -590,13 +586,7 @@ def advance_worlds(
             observe_locally(fleets[e], cars[e], local[int(over), e])
             _write_mask(search, masks[int(over), e])
             if search.n_steps > 0:
-                rewards[e] = -(
-                    search.step_drive_s
-                    + search.step_failed_s
-                    + search.step_walk_s
-                    + search.step_parking_cost_s
-                    + search.step_gave_up_s
-                )
+                rewards[e] = -step_cost_s(search)
             if not over:
                 stages[e] = _OBSERVED
                 break

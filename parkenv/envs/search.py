@@ -14,6 +14,7 @@ from parkenv.engine.kernel import (
     begin_search_at,
     init_external_forecast_at,
     step_exact_at,
+    step_info,
     step_noisy_at,
 )
 from parkenv.engine.records import ScenarioRecords, Searches
@@ -279,37 +280,14 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
         number = action_number(action)
-        (
-            reward, drive, failed, walk, parking, gave_up,
-            drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m, walked_m,
-            failed_parks, slots_passed, parked, over, vertex,
-        ) = self._advance(number)  # fmt: skip
+        result = self._advance(number)
+        reward, over, vertex = result[0], result[-2], result[-1]
         state = self._state
         if vertex != state.path[-1]:
             state.path.append(vertex)
         self._over = over
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
-        info = {
-            "reward_terms": {
-                "drive": drive,
-                "failed": failed,
-                "walk": walk,
-                "parking": parking,
-                "gave_up": gave_up,
-            },
-            "drive_s": drive_s,
-            "failed_s": failed_s,
-            "walk_s": walk_s,
-            "parking_cost_s": parking_cost_s,
-            "gave_up_s": gave_up_s,
-            "total_s": total_s,
-            "driven_m": driven_m,
-            "walked_m": walked_m,
-            "failed_parks": failed_parks,
-            "slots_passed": slots_passed,
-            "parked": parked,
-            "place": self.scenario.name,
-        }
+        info = step_info(self.scenario.name, *result)
         if self.render_mode == "human":
             self.render()
         return self._observation(vertex), reward, over, False, info

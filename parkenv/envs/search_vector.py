@@ -16,21 +16,20 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import seed_state
 from parkenv.compiled.memory import uint8s
 from parkenv.engine.kernel import (
-    COUNT_METRICS,
-    REWARD_TERMS,
-    TIME_METRICS,
     arrive,
     init_prior,
     refresh_belief,
+    step_cost_s,
     take_step,
     write_clock,
 )
 from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.engine.records import N_ACTIONS, ScenarioRecords, Searches, scenario_at, search_at
+from parkenv.engine.records import N_ACTIONS, STEP_FIELDS, ScenarioRecords, Searches, scenario_at, search_at
 from parkenv.engine.spaces import space_of
 from parkenv.envs.search_prefetch import prefetch_searches
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
+from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.kernel import kernel
 
@@ -38,7 +37,7 @@ OBSERVATIONS = ("full", "occupancy", "local")
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
-_WHICH = tuple(f"_{name}" for name in ("reward_terms", "parked", "place", *TIME_METRICS, *COUNT_METRICS))
+_WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "place"))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 
 
@@ -48,29 +47,16 @@ class Steps(NamedTuple):
     Attributes:
         rewards: (n,) float64.
         terminated, truncated: (n,) bool.
-        terms: (5, n) float64, reward terms of the searches that have ended; like all below, stale for the others.
-        times: (8, n) float64, `TIME_METRICS`.
-        tallies: (2, n) int64, `COUNT_METRICS`.
-        parked: (n,) bool.
     """
 
     rewards: FloatArray
     terminated: BoolArray
     truncated: BoolArray
-    terms: FloatArray
-    times: FloatArray
-    tallies: IntArray
-    parked: BoolArray
 
     @classmethod
     def of(cls, n: int) -> Self:
         """Return the initial results for n searches."""
-        flags = [np.zeros(n, dtype=np.bool_) for _ in range(3)]
-        tallies = np.zeros((len(COUNT_METRICS), n), dtype=np.int64)
-        times = np.zeros((len(TIME_METRICS), n))
-        return cls(
-            np.zeros(n), flags[0], flags[1], np.zeros((len(REWARD_TERMS), n)), times, tallies, flags[2]
-        )
+        return cls(np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_))
 
 
 @kernel
@@ -145,7 +131,7 @@ def first_wrong(actions: IntArray) -> int:
 
 @kernel
 def report_step(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
-    """Write a search's reward, end of episode, final metrics and action mask."""
+    """Write a search's reward, end of episode and action mask."""
     masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     for action in range(N_ACTIONS):
         mask[e, action] = masks[search.vertex * N_ACTIONS + action]
@@ -153,21 +139,9 @@ def report_step(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask
         steps.rewards[e] = 0.0
         steps.terminated[e] = steps.truncated[e] = False
         return
-    drive, failed, walk = search.step_drive_s, search.step_failed_s, search.step_walk_s
-    parking, gave_up = search.step_parking_cost_s, search.step_gave_up_s
-    steps.rewards[e] = -(drive + failed + walk + parking + gave_up)
+    steps.rewards[e] = -step_cost_s(search)
     steps.terminated[e] = search.over
     steps.truncated[e] = search.n_steps >= limit
-    if not (steps.terminated[e] or steps.truncated[e]):
-        return
-    terms, times = steps.terms[:, e], steps.times[:, e]
-    terms[0], terms[1], terms[2], terms[3], terms[4] = -drive, -failed, -walk, -parking, -gave_up
-    times[0], times[1], times[2] = search.drive_s, search.failed_s, search.walk_s
-    times[3], times[4] = search.parking_cost_s, search.gave_up_s
-    times[5] = search.drive_s + search.failed_s + search.walk_s + search.parking_cost_s + search.gave_up_s
-    times[6], times[7] = search.driven_m, search.walked_m
-    steps.tallies[0, e], steps.tallies[1, e] = search.failed_parks, search.slots_passed
-    steps.parked[e] = search.parked
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
@@ -305,10 +279,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     @property
     def reward_terms(self) -> dict[str, FloatArray]:
         """The terms of the last step's rewards, (n_envs,) each."""
-        fields = ("step_drive_s", "step_failed_s", "step_walk_s", "step_parking_cost_s", "step_gave_up_s")
-        return {
-            term: -self._searches.records[field] for term, field in zip(REWARD_TERMS, fields, strict=True)
-        }
+        records = self._searches.records
+        return {name: -records[field] for name, field in zip(REWARD_TERMS, STEP_FIELDS, strict=True)}
 
     @property
     def place_of(self) -> IntArray:
@@ -472,18 +444,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
         """Return the `info` of `SearchEnv`, with masks of the searches that have ended."""
-        steps = self._steps
-        terms, times, tallies, parked = steps.terms, steps.times, steps.tallies, steps.parked
-        if self._copy:
-            terms, times, tallies, parked = terms.copy(), times.copy(), tallies.copy(), parked.copy()
-        of_terms = dict(zip(REWARD_TERMS, terms, strict=True)) | dict.fromkeys(_WHICH_TERMS, done)
-        metrics: dict[str, Any] = {
-            "reward_terms": of_terms,
-            "parked": parked,
+        records = self._searches.records
+        metrics: dict[str, Any] = {name: records[name].copy() for name in METRICS}
+        metrics |= {
+            "reward_terms": self.reward_terms | dict.fromkeys(_WHICH_TERMS, done),
             "place": self._names[self.place_of],
         }
-        metrics |= zip(TIME_METRICS, times, strict=True)
-        metrics |= zip(COUNT_METRICS, tallies, strict=True)
         return metrics | dict.fromkeys(_WHICH, done)
 
     def _chosen(self, options: dict[str, Any] | None) -> BoolArray:

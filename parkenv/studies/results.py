@@ -29,6 +29,7 @@ from parkenv.files.csv_tables import (
 )
 from parkenv.files.limited_reading import parse_json, read_json, read_text
 from parkenv.show.columns import SETTING_AXES
+from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
     from parkenv.studies.study import Cell, Study
@@ -47,11 +48,7 @@ OUTCOME_COLUMNS = (
     "parked",
     "truncated",
     "total_s",
-    "drive_s",
-    "failed_s",
-    "walk_s",
-    "parking_cost_s",
-    "gave_up_s",
+    *COST_FIELDS,
     "bound_s",
     "driven_m",
     "walked_m",

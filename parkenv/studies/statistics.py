@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import stats
 
+from parkenv.world.cost_terms import COST_FIELDS
+
 RESAMPLES = 9999
 _ROUNDING = 1e-12
 """Relative difference of values that count as the same."""
@@ -127,11 +129,7 @@ def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, flo
 
 
 MEANS = (
-    "drive_s",
-    "failed_s",
-    "walk_s",
-    "parking_cost_s",
-    "gave_up_s",
+    *COST_FIELDS,
     "failed_parks",
     "replans",
     "driven_m",

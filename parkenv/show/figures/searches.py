@@ -18,12 +18,12 @@ from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 
 from parkenv.errors import InputError
-from parkenv.show.columns import OPTIONAL_TIMES, TIME_COLORS
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
 from parkenv.show.painters.axes import paint, points_per_m
 from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, posed, poses_on
 from parkenv.show.search_trace import SearchTrace
+from parkenv.world.cost_terms import COST_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
 
@@ -58,9 +58,9 @@ def _title(trace: SearchTrace, width: float) -> str:
     """Describe the search, with lines broken to a width in inches at the current font size."""
     scenario, metrics = trace.scenario, trace.metrics
     terms = [
-        f"{metrics[key]:.0f} {name}"
-        for key, (name, _) in TIME_COLORS.items()
-        if key not in OPTIONAL_TIMES or metrics[key]
+        f"{metrics[term.field]:.0f} {term.label}"
+        for term in COST_TERMS
+        if not term.optional or metrics[term.field]
     ]
     replans = metrics.get("replans", 0)
     planned = f"; {replans} replan{'s' if replans > 1 else ''}" if replans else ""

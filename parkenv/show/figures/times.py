@@ -14,9 +14,10 @@ from matplotlib.patches import Patch
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.show.columns import OPTIONAL_TIMES, SETTING_AXES, TIME_COLORS
+from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.picture_files import INK, STYLE
 from parkenv.show.plurals import plural
+from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
 
@@ -75,9 +76,9 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
             axes[lowest, column].tick_params(labelbottom=True)
             axes[lowest, column].set_xlabel("mean total time, s; 95 % interval", color="#444444")
         handles: list[Any] = [
-            Patch(color=color, label=name)
-            for key, (name, color) in TIME_COLORS.items()
-            if key not in OPTIONAL_TIMES or any(row[key] for row in rows)
+            Patch(color=term.color, label=term.label)
+            for term in COST_TERMS
+            if not term.optional or any(row[term.field] for row in rows)
         ]
         handles.append(
             Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
@@ -91,14 +92,14 @@ def _draw_split(ax: Axes, rows: Sequence[Row], limit: float) -> None:
     y = np.arange(len(rows))
     total = np.array([row["total_s"] for row in rows])
     left = np.zeros(len(rows))
-    for key, (_, color) in TIME_COLORS.items():
-        part = np.array([row[key] for row in rows])
+    for term in COST_TERMS:
+        part = np.array([row[term.field] for row in rows])
         ax.barh(
             y,
             np.minimum(left + part, limit) - np.minimum(left, limit),
             0.66,
             np.minimum(left, limit),
-            color=color,
+            color=term.color,
         )
         left += part
     for i, row in enumerate(rows):

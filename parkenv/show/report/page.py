@@ -6,7 +6,7 @@ import html
 import io
 import json
 import shlex
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any
@@ -21,6 +21,7 @@ from parkenv.show.figures.picture_files import CAPTION
 from parkenv.show.plurals import plural
 from parkenv.show.report.drive_recording import data_uri
 from parkenv.show.report.tables import tables_of
+from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
 
@@ -89,6 +90,9 @@ def page_data(
             "seed": summary.get("seed"),
             "notes": list(notes),
         },
+        "terms": [
+            {"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS
+        ],
         "learning": list(learning),
         "tables": tables_of(kind, summary, sessions),
         "lots": lots,
@@ -113,13 +117,26 @@ def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()
     embedded = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
     text = Template((_HERE / "page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(data["run"]["title"]),
-        style=(_HERE / "style.css").read_text(encoding="utf-8"),
+        style=(_HERE / "style.css").read_text(encoding="utf-8") + _term_colors(),
         figures="\n".join(_figure(f) for f in sorted(figures, key=_rank)),
         data=embedded,
         program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
     )
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")
+
+
+def _term_colors() -> str:
+    """Return the style sheet of the colours of the costs: a variable for each term, `--gave-up` for `gave_up`."""
+
+    def variables(colors: Iterable[str]) -> str:
+        return " ".join(
+            f"--{term.name.replace('_', '-')}: {color};"
+            for term, color in zip(COST_TERMS, colors, strict=True)
+        )
+
+    light, dark = (term.color for term in COST_TERMS), (term.dark_color for term in COST_TERMS)
+    return f':root {{ {variables(light)} }}\n:root[data-theme="dark"] {{ {variables(dark)} }}\n'
 
 
 def _rank(path: Path) -> int:

@@ -14,6 +14,9 @@ function lastUpTo(values, limit) {
   return low - 1;
 }
 
+/** Return the terms of the costs that are charged once the car stands. */
+const termsAfterDrive = () => data.terms.filter(({ field }) => !["drive_s", "failed_s"].includes(field));
+
 /** The true occupancy of a world over time. */
 class Truth {
   constructor(world, slots) {
@@ -99,10 +102,10 @@ class Track {
     let failed = search.failed[k] / 100;
     const now = Math.min(seconds, this.end);
     if (k + 1 < search.t.length && search.failed[k + 1] > search.failed[k]) failed += now - search.t[k] / 100;
-    const after = Math.max(0, seconds - this.end);
-    const walk = Math.min(after, search.walk_s);
-    const rest = after - walk;
-    return { drive: now - failed, failed, walk, parking_cost: Math.min(rest, search.parking_cost_s), gave_up: Math.min(rest, search.gave_up_s) };
+    const parts = { drive_s: now - failed, failed_s: failed };
+    let rest = Math.max(0, seconds - this.end);
+    for (const { field } of termsAfterDrive()) rest -= parts[field] = Math.min(rest, search.costs[field]);
+    return parts;
   }
 
   status(seconds, k) {
@@ -238,21 +241,21 @@ class SearchReplay {
   layStrips(duration) {
     const rows = this.shown.flatMap(({ track }) => {
       const { search } = track;
-      const strip = make("div", { class: "strip", title: "drive, failed attempts, walk, parking cost or give-up penalty" });
+      const strip = make("div", { class: "strip", title: data.terms.map(({ label }) => label).join(", ") });
       const part = (from, to, color) => {
-        if (to > from) strip.append(make("span", { style: `left: ${(100 * from) / duration}%; width: ${(100 * (to - from)) / duration}%; background: var(${color})` }));
+        if (to > from) strip.append(make("span", { style: `left: ${(100 * from) / duration}%; width: ${(100 * (to - from)) / duration}%; background: ${color}` }));
       };
       let from = 0;
       let failing = false;
       search.t.forEach((t, k) => {
         const fails = k + 1 < search.t.length && search.failed[k + 1] > search.failed[k];
         if (k === search.t.length - 1 || fails !== failing) {
-          part(from, t / 100, failing ? "--failed" : "--drive");
+          part(from, t / 100, failing ? "var(--failed)" : "var(--drive)");
           [from, failing] = [t / 100, fails];
         }
       });
-      part(track.end, track.end + search.walk_s, "--walk");
-      part(track.end + search.walk_s, search.total_s, search.parked ? "--price" : "--gave-up");
+      let end = track.end;
+      for (const term of termsAfterDrive()) part(end, (end += search.costs[term.field]), termColor(term));
       if (search.replans && search.t.length < 500) {
         search.plan.forEach((plan, k) => {
           if (plan !== null && k > 0 && plan.length) strip.append(make("span", { class: "replan", style: `left: ${search.t[k] / duration}%` }));
@@ -296,7 +299,7 @@ class SearchReplay {
       const over = seconds >= search.total_s - 0.005;
       const goal = this.lot.goals[this.world.goal];
       const slot = search.parked ? view.slots[search.slot] : null;
-      const walked = parked ? Math.min((seconds - track.end) / Math.max(search.walk_s, 0.01), 1) : 0;
+      const walked = parked ? Math.min((seconds - track.end) / Math.max(search.costs.walk_s, 0.01), 1) : 0;
       const walker = parked ? [slot.x + walked * (goal[0] - slot.x), slot.y + walked * (goal[1] - slot.y)] : null;
       view.begin(walker ?? [x, y]);
       if (!parked) view.drawView(x, y, this.world.view_range_m);
@@ -329,9 +332,9 @@ class SearchReplay {
       panel.dataset.vertex = search.vertex[k];
       panel.dataset.total = search.total_s;
       canvas.setAttribute("aria-label", `${search.agent} after ${seconds2(seconds)} s: ${statusText}`);
-      const words = [["drive", "--drive"], ["failed", "--failed"], ["walk", "--walk"], ["parking_cost", "--price"], ["gave_up", "--gave-up"]]
-        .filter(([name]) => !["parking_cost", "gave_up"].includes(name) || search[`${name}_s`] > 0)
-        .map(([name, color]) => make("span", {}, make("i", { style: `background: var(${color})` }), `${name.replace("_", " ")} `, make("b", {}, seconds2(parts[name]))));
+      const words = data.terms
+        .filter(({ field, optional }) => !optional || search.costs[field] > 0)
+        .map((term) => make("span", {}, make("i", { style: `background: ${termColor(term)}` }), `${term.name.replace("_", " ")} `, make("b", {}, seconds2(parts[term.field]))));
       if (over && search.agrees !== null) {
         words.push(make("span", { class: search.agrees ? "check" : "check bad", title: "Whether the simulation reproduced the total time in episodes.csv" }, search.agrees ? "✓ as in episodes.csv" : `episodes.csv: ${seconds2(search.counted_s)} s`));
       }

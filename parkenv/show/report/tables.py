@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from parkenv.show.columns import OPTIONAL_TIMES
+from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 
 Row = Mapping[str, Any]
 Cell = float | int | str | bool | None | list[float | None]
@@ -34,6 +34,7 @@ class Column(NamedTuple):
     help: str = ""
 
 
+_OPTIONAL = tuple(term.field for term in COST_TERMS if term.optional)
 _MINUS_OWN = "total time, minus that of all cars if nobody knows more than it observes, on the same days"
 _KNOWN = {
     column.key: column
@@ -52,14 +53,10 @@ _KNOWN = {
         Column("v_drive_kmh", "drive", "km/h", 0),
         Column("episodes", "searches", digits=0),
         Column("seed", "seed", digits=0),
-        Column("total_s", "total time", "s", help="Drive + failed attempts + walk + give-up penalty"),
+        Column("total_s", "total time", "s", help=" + ".join(term.label for term in COST_TERMS).capitalize()),
         Column("difference_s", "minus first agent", "s", signed=True, help="Paired by world; 95 % interval"),
         Column("regret_s", "regret", "s", help="Difference to the clairvoyant lower bound"),
-        Column("drive_s", "drive", "s", help="Time driving, waits included"),
-        Column("failed_s", "failed attempts", "s", help="Time of failed parking attempts"),
-        Column("walk_s", "walk", "s"),
-        Column("parking_cost_s", "parking cost", "s", help="Cost of the slot, as time"),
-        Column("gave_up_s", "give-up penalty", "s", help="Charged where the lot is full or the search was truncated"),
+        *(Column(term.field, term.label, "s", help=term.help) for term in COST_TERMS),
         Column("bound_s", "bound", "s", help="Clairvoyant lower bound: least time with full knowledge of the future"),
         Column("parked_fraction", "parked", share=True, digits=0),
         Column("failed_parks", "failed attempts", digits=2),
@@ -136,8 +133,7 @@ _KNOWN = {
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
     "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "difference_s", "gap_to_exact",
-    "price_of_anarchy", "price_over_bound", "search_s", "regret_s", "drive_s", "failed_s", "walk_s", "parking_cost_s",
-    "gave_up_s", "parked_fraction",
+    "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 _OF_FLEETS = {
@@ -205,7 +201,7 @@ def table_of(
         same = [
             k
             for k in same
-            if values[k][0] is None or k in _ORDER[:8] or k in ("episodes", "rig", "slots", *OPTIONAL_TIMES)
+            if values[k][0] is None or k in _ORDER[:8] or k in ("episodes", "rig", "slots", *_OPTIONAL)
         ]
     shown = [k for k in keys if k not in same]
     return {

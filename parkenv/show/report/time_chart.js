@@ -1,6 +1,7 @@
 // Mean total time: a stacked bar per agent with the confidence interval of its mean, a panel per setting.
 
-const PARTS = [["drive_s", "drive", "--drive"], ["failed_s", "failed attempts", "--failed"], ["walk_s", "walk", "--walk"], ["parking_cost_s", "parking cost", "--price"], ["gave_up_s", "give-up penalty", "--gave-up"]];
+/** Return the colour of a term of the costs; the style sheet has a variable for each. */
+const termColor = ({ name }) => `var(--${name.replace("_", "-")})`;
 /** Bars longer than this many times the shortest agent's of the panel may be cut off. */
 const CUT = 2.6;
 
@@ -30,9 +31,9 @@ function timePanel(rows, end, width) {
     name.textContent = shortName(row.agent);
     svg.append(name);
     let from = 0;
-    for (const [key, , color] of PARTS) {
-      const to = from + (row[key] ?? 0);
-      if (x(to) > x(from)) svg.append(makeSvg("rect", { x: x(from), y, width: x(to) - x(from), height: 15, style: `fill: var(${color})` }));
+    for (const term of data.terms) {
+      const to = from + (row[term.field] ?? 0);
+      if (x(to) > x(from)) svg.append(makeSvg("rect", { x: x(from), y, width: x(to) - x(from), height: 15, style: `fill: ${termColor(term)}` }));
       from = to;
     }
     const [mean, low, high] = row.total_s;
@@ -82,8 +83,8 @@ function showTimeChart(root, table) {
     const words = settingInWords(varying, varying.map((column) => its[0][column.key]));
     grid.append(make("div", {}, groups.size > 1 ? make("h3", {}, words) : null, timePanel(its, end, width)));
   }
-  const used = PARTS.filter(([key]) => rows.some((row) => row[key] > 0));
-  const keys = used.map(([, label, color]) => make("span", { class: "key" }, make("span", { class: "swatch", style: `background: var(${color})` }), label));
+  const used = data.terms.filter(({ field }) => rows.some((row) => row[field] > 0));
+  const keys = used.map((term) => make("span", { class: "key" }, make("span", { class: "swatch", style: `background: ${termColor(term)}` }), term.label));
   const line = makeSvg("svg", { width: 22, height: 14 }, makeSvg("path", { class: "whisker", d: "M2 7H20M2 3V11M20 3V11", fill: "none" }));
   const dashes = makeSvg("svg", { width: 10, height: 16 }, makeSvg("line", { class: "bound", x1: 5, x2: 5, y1: 0, y2: 16 }));
   keys.push(make("span", { class: "key" }, line, "95 % interval of the mean"));

@@ -14,7 +14,6 @@ import numpy as np
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.show.colors import PALETTE, belief_colors, rgb
-from parkenv.show.columns import OPTIONAL_TIMES, TIME_COLORS
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.figures.survey import draw_detections
 from parkenv.show.frames.lot import PIXELS, LotFrames, clock, draw_belief_key, paint_goal, strip
@@ -23,6 +22,7 @@ from parkenv.show.painters.opencv import paint, write_text
 from parkenv.show.scene import DISC, Lines, Marks, cars, posed
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
+from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
@@ -76,7 +76,7 @@ class SearchFilm(Observer):
         self._map = LotFrames(lot, (WIDTH, height))
         self._slots = self._slots_image()
         self._camera = np.full((_CAMERA[1], _CAMERA[0], 3), PALETTE["ground"], np.uint8)
-        self._parts = dict.fromkeys(TIME_COLORS, 0.0)
+        self._parts = dict.fromkeys(COST_FIELDS, 0.0)
         self._pose, self._trail = car_pose(inner.scenario, inner.state), list[FloatArray]()
         self._take("A car arrives. Its map says how likely each slot is taken.", hold=INTRO_S)
 
@@ -226,11 +226,14 @@ class SearchFilm(Observer):
         write_text(panel, "camera, detected cars", (11, 20), "white", 12, 500)
         left = width + 28
         x = write_text(panel, f"agent {self._name}:", (left, 28), "ink", 16, 700) + 12
-        for key, (name, color) in TIME_COLORS.items():
-            if key in OPTIONAL_TIMES and not parts[key]:
+        for term in COST_TERMS:
+            if term.optional and not parts[term.field]:
                 continue
-            cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb(color), cv2.FILLED)
-            x = write_text(panel, f"{name} {parts[key]:.0f} s", (x + 20, 28), "ink", 16, 500) + 20
+            cv2.rectangle(panel, (x, 15), (x + 13, 28), rgb(term.color), cv2.FILLED)
+            x = (
+                write_text(panel, f"{term.label} {parts[term.field]:.0f} s", (x + 20, 28), "ink", 16, 500)
+                + 20
+            )
         self._legend(panel, left)
         return panel
 

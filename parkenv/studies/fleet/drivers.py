@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.engine.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES, Rule
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
@@ -129,10 +129,10 @@ class MixedFleet:
         cars, members = fleet.cars, fleet.cars["kind"] == 0
         return {
             "cars": int(members.sum()),
-            "total_s": _mean(total_s(cars)[members]),
+            "total_s": _mean(cars["total_s"][members]),
             "search_s": _mean((cars["ended_at"] - cars["arrival"])[members]),
             "parked_fraction": _mean((cars["slot"] >= 0)[members]),
-            "others_s": _mean(total_s(cars)[~members]),
+            "others_s": _mean(cars["total_s"][~members]),
         }
 
     def row(self, member: AgentSpec | Rule, seed: int, days: int, workers: Workers | None = None) -> Row:

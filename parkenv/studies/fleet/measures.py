@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.engine.fleet import Fleet, total_s
+from parkenv.engine.fleet import Fleet
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
 from parkenv.world.scenario import SearchProblem
 
@@ -90,7 +90,7 @@ def day_measures(
         clairvoyant_s: lower bound on the total time of all cars together, s.
     """
     cars = fleet.cars
-    times, parked = total_s(cars), cars["slot"] >= 0
+    times, parked = cars["total_s"], cars["slot"] >= 0
     direct_m = np.zeros(len(cars))
     direct_m[parked] = roads.metres(cars[parked])
     cruised_m = np.maximum(cars["driven_m"] - direct_m, 0.0)

@@ -134,7 +134,7 @@ class FleetPublication(Publication):
     def usage(self) -> str:
         """See `Publication`."""
         return f"""import parkenv
-from parkenv.engine.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import demand_in, driver_of
 
@@ -144,4 +144,4 @@ rule, _ = driver_of(AgentSpec(name="{self.card.algorithm}:{MODEL}"), scenario)
 fleet = Fleet(scenario, demand, drivers=[DriverKind(rule=rule, knows="{self.fleets.knows[0]}")], leave_full_lot=False)
 fleet.reset(seed=0)
 fleet.run()
-print(total_s(fleet.cars).mean(), "s")"""
+print(fleet.cars["total_s"].mean(), "s")"""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.engine.fleet import Fleet, total_s
+from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
 from parkenv.studies.fleet.setting import Setting
@@ -56,7 +56,7 @@ class FleetDay:
         residents = fleet.slots["leaves_at"].copy()
         fleet.run(agents)
         cars, begin = fleet.cars, fleet.begin
-        mean_s = float(total_s(cars).mean())
+        mean_s = float(cars["total_s"].mean())
         before = counted.get(study.keys(self.setting, self.day)[0])
         return {
             "lot": LotScene.of(scenario.lot).data(),

@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.engine.state import SearchState
-from parkenv.show.columns import TIME_COLORS
 from parkenv.show.scene import LotScene
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
+from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.occupancy.process import World
 from planners.agent import Agent
 
@@ -173,7 +173,8 @@ class SearchRecorder(Observer):
             "parked": parked,
             "slot": self.state.vertex if parked else None,
             "truncated": result.truncated,
-            **{name: info[name] for name in ("total_s", *TIME_COLORS)},
+            "total_s": info["total_s"],
+            "costs": {name: info[name] for name in COST_FIELDS},
             "failed_parks": int(info["failed_parks"]),
             "replans": int(getattr(result.memory, "replans", 0)),
         }

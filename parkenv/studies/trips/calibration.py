@@ -73,7 +73,9 @@ def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
     legs = [Leg(*leg) for row in observed for leg in row["legs"]]
     lists: dict[str, list[float]] = {
         "speed_kmh": [
-            r["graph_m"] / r["lanes_s"] / KMH for r in observed if r["lanes_s"] > 0.0 and not r["failed_s"]
+            r["graph_m"] / r["lanes_s"] / KMH
+            for r in observed
+            if r["lanes_s"] > 0.0 and not r["costs"]["failed_s"]
         ],
         "manoeuvre_s": [t.seconds for t in done],
         **{f"manoeuvre_s.{kind}": [t.seconds for t in done if t.kind == kind] for kind in KINDS},

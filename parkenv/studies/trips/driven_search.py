@@ -19,6 +19,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.studies.trips.executor import Leg, MotionExecutor, ParkingAttempt
 from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
+from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent, make_agent
@@ -118,13 +119,10 @@ class Trip:
 
     seed: int  # seed of the world
     agent: str
-    total_s: float  # sum of the next six
+    total_s: float  # sum of the next two and of `costs`
     lanes_s: float  # driving on the lanes, waiting included
     manoeuvre_s: float  # from the decision to park until the car stood in the slot
-    failed_s: float  # failed attempts
-    walk_s: float  # walk to the goal
-    parking_cost_s: float  # parking cost of the slot, as time
-    gave_up_s: float  # give-up penalty
+    costs: dict[str, float]  # the terms but `drive_s`: `failed_s`, `walk_s`, ...; see `COST_TERMS`
     parked: bool  # whether the car was parked
     slot: str  # name of the slot; empty if not parked
     slot_kind: str  # orientation of the slot to the lane
@@ -160,7 +158,7 @@ class DrivenSearch:
         >>> import math
         >>> from parkenv import make_scenario
         >>> trip = DrivenSearch(make_scenario("mini")).run(seed=1)
-        >>> parts = trip.lanes_s + trip.manoeuvre_s + trip.failed_s + trip.walk_s + trip.parking_cost_s + trip.gave_up_s
+        >>> parts = trip.lanes_s + trip.manoeuvre_s + sum(trip.costs.values())
         >>> trip.parked, math.isclose(trip.total_s, parts)
         (True, True)
     """
@@ -209,15 +207,15 @@ class DrivenSearch:
         parked = env.manoeuvre
         manoeuvre_s = parked.seconds if parked else 0.0
         lanes_s = float(info["drive_s"]) - manoeuvre_s
-        terms = {name: float(info[name]) for name in ("failed_s", "walk_s", "parking_cost_s", "gave_up_s")}
+        costs = {name: float(info[name]) for name in COST_FIELDS if name != "drive_s"}
         log = driver.log
         return Trip(
             seed=int(seed),
             agent=self.agent,
-            total_s=sum((lanes_s, manoeuvre_s, *terms.values())),
+            total_s=sum((lanes_s, manoeuvre_s, *costs.values())),
             lanes_s=lanes_s,
             manoeuvre_s=manoeuvre_s,
-            **terms,
+            costs=costs,
             parked=bool(info["parked"]),
             slot=parked.slot if parked else "",
             slot_kind=parked.kind if parked else "",

@@ -1,0 +1,55 @@
+"""What a step of a search can cost: one table, from which records, sums, `info`, columns, tables and legends are made.
+
+A new term is a row here, a line of `parkenv.engine.kernel` that charges it, and, where planners can foresee it, a part
+of what `parkenv.world.scenario.SearchProblem` says that an arrival or a move costs.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class CostTerm(NamedTuple):
+    """A part of the total time.
+
+    Attributes:
+        name: key in `info["reward_terms"]`, where it is negative.
+        field: key of its sum over an episode, s, in `info`, and name of its column in tables and records.
+        label: name for people.
+        help: explanation.
+        color: in pictures and in reports on a light ground.
+        dark_color: in reports on a dark ground.
+        optional: whether pictures and tables leave it out where it is 0 everywhere.
+    """
+
+    name: str
+    field: str
+    label: str
+    help: str
+    color: str
+    dark_color: str
+    optional: bool = False
+
+
+COST_TERMS = (
+    CostTerm("drive", "drive_s", "drive", "Time driving, waits included", "#0072b2", "#3b9bdc"),
+    CostTerm(
+        "failed", "failed_s", "failed attempts", "Time of failed parking attempts", "#d55e00", "#ee7f34"
+    ),
+    CostTerm("walk", "walk_s", "walk", "", "#a6cfe8", "#a9d3ef"),
+    CostTerm(
+        "parking", "parking_cost_s", "parking cost", "Cost of the slot, as time", "#cc79a7", "#e09bc4", optional=True
+    ),
+    CostTerm(
+        "gave_up", "gave_up_s", "give-up penalty", "Charged where the lot is full or the search was truncated",
+        "#8c8c8c", "#8f959b", optional=True,
+    ),
+)  # fmt: skip
+"""All terms, in the order in which they are added up."""
+
+REWARD_TERMS = tuple(term.name for term in COST_TERMS)
+"""Keys of `info["reward_terms"]`."""
+COST_FIELDS = tuple(term.field for term in COST_TERMS)
+"""Keys of the sums over an episode; they add up to `total_s`."""
+METRICS = (*COST_FIELDS, "total_s", "driven_m", "walked_m", "failed_parks", "slots_passed", "parked")
+"""Keys of the metrics of an episode so far in `info`."""

@@ -1,0 +1,178 @@
+"""The costs of a step add up to its reward, and those of an episode to its total time, in every adapter."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode
+from small_lots import features
+
+from parkenv import ParkingLot, lot_v0, make_scenario
+from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.engine.fleet_rules import RULES
+from parkenv.engine.records import CAR, N_TERMS, SEARCH
+from parkenv.envs.sb3 import FleetVecEnv, SearchVecEnv
+from parkenv.envs.search_vector import ParkSearchVectorEnv
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.results import OUTCOME_COLUMNS
+from parkenv.studies.statistics import summarize
+from parkenv.studies.trips.driven_search import DrivenSearch
+from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS, METRICS, REWARD_TERMS
+from parkenv.world.demand import Demand, Headways, PoissonArrivals
+from planners import make_agent
+
+PRICE_S = 45.0
+LIMIT = 60
+
+
+@pytest.fixture(scope="module")
+def scenario():
+    """A lot where every slot has a price, and where a failed attempt is likely."""
+    plain = make_scenario("mini")
+    lot = ParkingLot(**features(plain.lot) | {"slot_parking_cost_s": np.full(plain.lot.n_slots, PRICE_S)})
+    return replace(plain, lot=lot, failure_s=7.0)
+
+
+def check_sums(info, parked=True):
+    """The terms of an episode, as `info` names them, are its total."""
+    assert set(METRICS) <= set(info)
+    assert sum(info[name] for name in COST_FIELDS) == pytest.approx(info["total_s"])
+    if parked:
+        assert info["parked"]
+        assert info["parking_cost_s"] == PRICE_S
+
+
+def check_step(reward, info):
+    """The terms of a step are its reward."""
+    assert tuple(info["reward_terms"]) == REWARD_TERMS
+    assert sum(info["reward_terms"].values()) == pytest.approx(reward)
+
+
+def tries(mask, rng):
+    """A random action that the graph has, mostly parking where there is a slot."""
+    return 4 if mask[4] and rng.random() < 0.7 else int(rng.choice(np.nonzero(mask)[0]))
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("Search-v2", {}),
+        ("SearchSensors-v2", {"observation": "scan"}),
+        ("SearchPerception-v2", {"captures": 1}),
+    ],
+)
+def test_single_searches(scenario, name, options):
+    env = gym.make(f"parkenv/{name}", scenario=scenario, **options)
+    rng, seen = np.random.default_rng(0), set()
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        returned, over, sums = 0.0, False, dict.fromkeys(REWARD_TERMS, 0.0)
+        while not over:
+            observation, reward, terminated, truncated, info = env.step(
+                tries(observation["action_mask"], rng)
+            )
+            check_step(reward, info)
+            check_sums(info, parked=bool(terminated and info["parked"]))
+            returned, over = returned + reward, terminated or truncated
+            sums = {term: sums[term] - info["reward_terms"][term] for term in REWARD_TERMS}
+        assert info["total_s"] == pytest.approx(-returned)
+        for term in COST_TERMS:
+            assert info[term.field] == pytest.approx(sums[term.name])
+        seen |= {term.name for term in COST_TERMS if info[term.field]}
+    assert {"drive", "walk", "parking"} <= seen
+
+
+def test_the_batch(scenario):
+    envs = ParkSearchVectorEnv(8, scenario, max_episode_steps=LIMIT, autoreset_mode=AutoresetMode.SAME_STEP)
+    observations, _ = envs.reset(seed=0)
+    rng, returns, ended = np.random.default_rng(0), np.zeros(8), 0
+    for _ in range(200):
+        actions = np.array([tries(mask, rng) for mask in observations["action_mask"]])
+        observations, rewards, terminated, truncated, infos = envs.step(actions)
+        returns += rewards
+        done = terminated | truncated
+        for i in np.flatnonzero(done):
+            final = {name: infos["final_info"][name][i] for name in METRICS}
+            check_sums(final, parked=bool(final["parked"]))
+            terms = infos["final_info"]["reward_terms"]
+            assert sum(terms[name][i] for name in REWARD_TERMS) == pytest.approx(rewards[i])
+            assert final["total_s"] == pytest.approx(-returns[i])
+            ended += int(final["parked"])
+        returns[done] = 0.0
+    assert ended > 10
+
+
+@pytest.mark.parametrize("of_many", [False, True])
+def test_stable_baselines3(scenario, of_many):
+    if of_many:
+        venv = FleetVecEnv(4, scenario, Demand(PoissonArrivals(30, 8 * 3600, 9 * 3600)), max_steps=LIMIT)
+    else:
+        venv = SearchVecEnv(4, scenario, max_episode_steps=LIMIT)
+    venv.seed(0)
+    venv.reset()
+    rng, ended = np.random.default_rng(0), 0
+    for _ in range(200):
+        actions = np.array([tries(mask, rng) for mask in venv.action_masks()])
+        _, _, done, infos = venv.step(actions)
+        for i in np.flatnonzero(done):
+            check_sums(infos[i], parked=infos[i]["parked"])
+            charged_later = (
+                0.0 if not of_many or not infos[i]["TimeLimit.truncated"] else infos[i]["gave_up_s"]
+            )
+            assert infos[i]["episode"]["r"] == pytest.approx(charged_later - infos[i]["total_s"])
+            ended += int(infos[i]["parked"])
+    assert ended > 10
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_many_cars_as_agents(scenario):
+    env = lot_v0.env(scenario=scenario, cars=6)
+    env.reset(seed=0)
+    rng, returns, parked = np.random.default_rng(0), {}, 0
+    for car in env.agent_iter():
+        observation, _, terminated, truncated, info = env.last()
+        if "reward_terms" in info:
+            returns[car] = returns.get(car, 0.0) + sum(info["reward_terms"].values())
+            check_sums(info, parked=info["parked"])
+        if terminated or truncated:
+            assert info["total_s"] == pytest.approx(-returns[car])
+            parked += int(info["parked"])
+            env.step(None)
+        else:
+            env.step(tries(observation["action_mask"], rng))
+    assert parked > 0
+
+
+def test_cars_of_compiled_drivers(scenario):
+    fleet = Fleet(scenario, Demand(Headways(6)), drivers=[DriverKind(rule=RULES["greedy-drive"])])
+    fleet.reset(seed=0)
+    fleet.run()
+    cars = fleet.cars
+    np.testing.assert_allclose(sum(cars[name] for name in COST_FIELDS), cars["total_s"])
+    assert set(cars["parking_cost_s"][cars["slot"] >= 0]) == {PRICE_S}
+
+
+def test_driven_trips(scenario):
+    trip = DrivenSearch(scenario).run(seed=1)
+    assert trip.parked
+    assert trip.costs["parking_cost_s"] == PRICE_S
+    assert set(trip.costs) == set(COST_FIELDS) - {"drive_s"}
+    assert trip.total_s == pytest.approx(trip.lanes_s + trip.manoeuvre_s + sum(trip.costs.values()))
+
+
+def test_results_of_a_comparison(scenario):
+    runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
+    rows = [runner.run(seed).row for seed in range(3)]
+    for row in rows:
+        assert set(COST_FIELDS) <= set(OUTCOME_COLUMNS)
+        check_sums(row)
+    summary = summarize({}, rows)
+    assert sum(summary[name] for name in COST_FIELDS) == pytest.approx(summary["total_s"])
+
+
+@pytest.mark.parametrize("record", [SEARCH, CAR])
+def test_records_hold_every_term_in_order(record):
+    one = np.zeros(1, record)
+    one["costs"] = np.arange(N_TERMS) + 1.0
+    assert [one[name][0] for name in COST_FIELDS] == [i + 1.0 for i in range(N_TERMS)]
