@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from parkenv.engine.fleet import DriverKind, Fleet, total_s
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.fleet_rules import RULES
 from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
@@ -36,7 +36,7 @@ for seed in range(3):
     fleet.reset(seed)
     fleet.run(agents)
     for kind, name in enumerate(drivers):
-        found[name].append(total_s(fleet.cars[fleet.cars["kind"] == kind]).mean())
+        found[name].append(fleet.cars["total_s"][fleet.cars["kind"] == kind].mean())
 for name, values in found.items():
     print(f"{name:32} {np.mean(values):6.0f} s")
 

@@ -212,6 +212,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if place == self._place:
             return
         self._place, self.scenario = place, self.scenarios[place]
+        self._name = self.scenario.name
         self._step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
         self._copy_mask = self._copy_masks[place]
         self.close()
@@ -287,7 +288,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             state.path.append(vertex)
         self._over = over
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
-        info = step_info(self.scenario.name, *result)
+        info = step_info(self._name, *result)
         if self.render_mode == "human":
             self.render()
         return self._observation(vertex), reward, over, False, info
