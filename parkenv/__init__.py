@@ -5,24 +5,18 @@ Importing this package registers the environments; heavy modules are loaded on f
 
 from __future__ import annotations
 
-import signal
-import sys
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-# Ctrl-C ends the command without a traceback, also while it imports its modules.
-if (
-    ("parkenv" in [Path(name).stem for name in sys.argv[:1]] or sys.orig_argv[1:3] == ["-m", "parkenv"])
-    and signal.getsignal(signal.SIGINT) is signal.default_int_handler
-):  # fmt: skip
-    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
     from parkenv.errors import InputError
+    from parkenv.lots import import_lot, load_lot
     from parkenv.scenarios.build import make_scenario, make_scenarios
+    from parkenv.studies.runner import Result, open_run
+    from parkenv.studies.simulate import simulate
+    from parkenv.studies.verbs import compare, fleet, survey
     from parkenv.world.lot import Lane, Mouth, ParkingLot
     from parkenv.world.occupancy.log import OccupancyLog
     from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
@@ -30,6 +24,7 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario, SearchProblem
     from parkenv.world.sensor_model import SensorBand, SensorModel
     from parkenv.world.traffic import Traffic
+    from planners.agent import make_agent
 
 __version__ = "0.1.0"
 
@@ -42,13 +37,22 @@ _EXPORTS = {
     "OccupancyProcess": "parkenv.world.occupancy.process",
     "ParkingLot": "parkenv.world.lot",
     "RecordedOccupancy": "parkenv.world.occupancy.recorded",
+    "Result": "parkenv.studies.runner",
     "Scenario": "parkenv.world.scenario",
     "SearchProblem": "parkenv.world.scenario",
     "SensorBand": "parkenv.world.sensor_model",
     "SensorModel": "parkenv.world.sensor_model",
     "Traffic": "parkenv.world.traffic",
+    "compare": "parkenv.studies.verbs",
+    "fleet": "parkenv.studies.verbs",
+    "import_lot": "parkenv.lots",
+    "load_lot": "parkenv.lots",
+    "make_agent": "planners.agent",
     "make_scenario": "parkenv.scenarios.build",
     "make_scenarios": "parkenv.scenarios.build",
+    "open_run": "parkenv.studies.runner",
+    "simulate": "parkenv.studies.simulate",
+    "survey": "parkenv.studies.verbs",
 }
 
 __all__ = [
@@ -60,13 +64,22 @@ __all__ = [
     "OccupancyProcess",
     "ParkingLot",
     "RecordedOccupancy",
+    "Result",
     "Scenario",
     "SearchProblem",
     "SensorBand",
     "SensorModel",
     "Traffic",
+    "compare",
+    "fleet",
+    "import_lot",
+    "load_lot",
+    "make_agent",
     "make_scenario",
     "make_scenarios",
+    "open_run",
+    "simulate",
+    "survey",
 ]
 
 

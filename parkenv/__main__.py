@@ -1,6 +1,16 @@
-"""`python -m parkenv`."""
+"""The command `parkenv`, and `python -m parkenv`."""
 
-from parkenv.cli import main
+import signal
+
+
+def main() -> None:
+    """Entry point: Ctrl-C ends the command without a traceback, also while it imports its modules."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from parkenv.cli import main as run
+
+    run()
+
 
 if __name__ == "__main__":
     main()

@@ -9,7 +9,7 @@ from unittest import mock
 
 from parkenv.cli import main
 
-PARKENV = [sys.executable, "-c", "from parkenv.cli import main; main()"]
+PARKENV = [sys.executable, "-c", "from parkenv.__main__ import main; main()"]
 """The command in a separate process."""
 
 

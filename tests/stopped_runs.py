@@ -42,7 +42,9 @@ class Run:
     def __init__(self, name, out, *options):
         script = out.with_name("parkenv")
         script.write_text(
-            "from parkenv.cli import main\nfrom few_searches import few_searches\n"
+            # What `parkenv.__main__.main` begins with.
+            "import signal\nsignal.signal(signal.SIGINT, signal.SIG_DFL)\n"
+            "from few_searches import few_searches\nfrom parkenv.__main__ import main\n"
             "if __name__ == '__main__':\n    with few_searches():\n        main()\n"
         )
         path = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))

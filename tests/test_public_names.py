@@ -1,0 +1,57 @@
+"""What `import parkenv` gives, and what it leaves alone."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import parkenv
+
+PAGE = (Path(__file__).parents[1] / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+
+
+def test_public_names_are_those_of_the_page_and_exist():
+    listed = PAGE.partition("Classes of these names:")[2]
+    assert set(re.findall(r"`(\w+)`", listed)) == set(parkenv.__all__) == set(parkenv._EXPORTS)
+    for name in parkenv.__all__:
+        assert getattr(parkenv, name).__name__ == name
+
+
+def test_import_changes_no_signal_handler_and_loads_no_study():
+    program = (
+        "import signal, sys; before = [signal.getsignal(n) for n in signal.valid_signals()]; import parkenv\n"
+        "assert before == [signal.getsignal(n) for n in signal.valid_signals()]\n"
+        "assert not {'pydantic', 'numba', 'planners', 'parkenv.studies'} & set(sys.modules)"
+    )
+    # The name of the program makes no difference.
+    subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.argv = ['parkenv']; {program}"], check=True, timeout=60
+    )
+
+
+def test_a_comparison_needs_no_folder():
+    agents = ["first-free", "greedy-goal"]
+    result = parkenv.compare(scenarios=["mini"], agents=agents, episodes=2, jobs=1, figures=False)
+    assert {row["agent"] for row in result.rows} == set(agents)
+    assert result.complete
+
+
+def test_an_unknown_field_is_answered_by_the_nearest():
+    with pytest.raises(parkenv.InputError, match=r"unknown key 'episods'; did you mean 'episodes'"):
+        parkenv.compare(episods=3)
+
+
+def test_the_command_lets_ctrl_c_end_it_before_it_imports_its_modules():
+    program = (
+        "import signal, sys, types; from parkenv.__main__ import main\n"
+        "assert 'parkenv.cli' not in sys.modules\n"
+        "command = types.ModuleType('parkenv.cli')\n"
+        "command.main = lambda: print(signal.getsignal(signal.SIGINT) == signal.SIG_DFL)\n"
+        "sys.modules['parkenv.cli'] = command; signal.signal(signal.SIGINT, signal.default_int_handler); main()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == "True\n"
