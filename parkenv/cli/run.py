@@ -13,10 +13,9 @@ from parkenv.cli.compare import show as show_comparison
 from parkenv.cli.demo import run_demo
 from parkenv.cli.detector_drives import show as show_detectors
 from parkenv.cli.fleet import show as show_fleet
-from parkenv.cli.single_writer import writing_into
 from parkenv.cli.study_run import run_study
 from parkenv.cli.survey import show as show_survey
-from parkenv.cli.train import run_training
+from parkenv.cli.train import show as show_training
 from parkenv.cli.trust import require_trust
 from parkenv.cli.verify import show as show_verification
 from parkenv.errors import InputError
@@ -30,6 +29,7 @@ SHOWN: Mapping[str, Callable[..., None]] = {
     "detectors": show_detectors,
     "calibrate": show_calibration,
     "verify": show_verification,
+    "train": show_training,
 }
 """What prints the result of each kind of study."""
 
@@ -70,8 +70,5 @@ def run(
     study, out = study.changed(**machines.given), out or Path("results") / file.stem
     if study.kind == "demo":
         run_demo(study, out, folder)
-    elif study.kind == "train":
-        with writing_into(out, f"parkenv run {out} --resume"):
-            run_training(study, out, folder)
     else:
         run_study(study, out, folder, SHOWN[study.kind])

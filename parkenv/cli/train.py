@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-from parkenv import __version__
 from parkenv.cli import arguments as args
-from parkenv.cli.report import make_report
-from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import command_line, make_console, make_table, save_summary
+from parkenv.cli.study_run import run_study
+from parkenv.cli.tables import make_table
 from parkenv.errors import InputError
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from parkenv.studies.training.curve_file import Row
-    from parkenv.studies.training.spec import TrainingSpec
-    from parkenv.studies.training.training import Training
-    from parkenv.studies.workers import Workers
+    from parkenv.studies.runner import Result
 
 
 def train(
@@ -137,7 +129,6 @@ def train(
         tensorboard: Keep logs for TensorBoard in --out.
     """
     from parkenv.studies.training.spec import TrainingSpec
-    from parkenv.studies.training.training import training_of
 
     if day_error and not (scenario or lot):
         raise InputError("--day-error goes with --scenario or --lot")
@@ -153,12 +144,11 @@ def train(
         "stay_s": _seconds(stay_min), "patience_s": _seconds(patience_min), "knows": knows,
         "learners": learners, "without": args.words("--without", without) if without else None,
         "agents": _agents(agents), "test_among": _agents(test_among), "among": among,
+        "beside": args.words("--beside", beside) if beside else None,
         "tensorboard": tensorboard or None, **machines.given,
     }  # fmt: skip
     spec = TrainingSpec.parse({name: value for name, value in given.items() if value is not None}, "")
-    out = out or Path("results") / training_of(spec).folder
-    with writing_into(out, "the same command with --resume"):
-        run_training(spec, out, folder, args.words("--beside", beside) if beside else ())
+    run_study(spec, out or Path("results") / spec.training.folder, folder, show)
 
 
 def _seconds(minutes: float | None) -> float | None:
@@ -171,109 +161,12 @@ def _agents(text: str | None) -> list[str] | None:
     return None if text is None else [] if text == "none" else split_agents(text)
 
 
-def run_training(spec: TrainingSpec, out: Path, folder: args.ReportedRun, beside: Sequence[str] = ()) -> None:
-    """Train, test and draw; see `train`.
-
-    Raises:
-        InputError: the training is impossible, or the folder cannot be used.
-    """
-    from parkenv.studies.results import SPEC_FILE
-    from parkenv.studies.training.training import FIGURE, MODEL, Trained, curves_beside, training_of
-
-    training = training_of(spec, tuple(command_line()))
-    training.check()
-    settings = {"version": __version__, **training.settings()}
-    others = curves_beside(beside, out, training)
-    _require_free(out, settings, folder)
-    console = make_console()
-    if training.announcement:
-        console.print(training.announcement)
-    with args.workers_of(spec) as workers:
-        training.begin(console.status)
-        _claim(out, settings, folder.overwrite)
-        spec.write(out / SPEC_FILE)
-        numbers = range(spec.seed, spec.seed + spec.trainings)
-        curves = _train_all(console, training, numbers, out, workers)
-        models = {n: out / f"seed_{n}" / MODEL for n in numbers}
-        outcome, table = training.report(
-            console.status, workers, Trained(curves, models, others), out / FIGURE
+def show(console: Console, result: Result) -> None:
+    """Print the tests of the models and of the planners."""
+    study: Any = result.study
+    if study.training.announcement:
+        console.print(study.training.announcement)
+    if result.complete:
+        console.print(
+            make_table(*study.training.table_of(result.summary["transfer"], result.summary["planners"]))
         )
-    console.print(make_table(*table))
-    save_summary(out, spec.seed, outcome.pop("rows"), settings=settings, **outcome)
-    console.print(f"Models, curves, summary and figure are in {out}")
-    if folder.report:
-        make_report(out, spec)
-
-
-def _require_free(out: Path, settings: Row, folder: args.ReportedRun) -> None:
-    """Check that the folder holds no training, or one to resume or replace."""
-    from parkenv.studies.results import read_settings, require_same_settings
-
-    if folder.resume and folder.overwrite:
-        raise InputError("--resume and --overwrite exclude each other")
-    if folder.resume:
-        require_same_settings(out, settings, "training")
-    elif not folder.overwrite and read_settings(out) is not None:
-        raise InputError(
-            f"--out {out}: holds a training; add --resume to go on with it, --overwrite to replace it, or name "
-            "another folder"
-        )
-
-
-def _claim(out: Path, settings: Row, overwrite: bool) -> None:
-    """Write the settings of the new training, and remove the results of the previous one."""
-    import shutil
-
-    from parkenv.studies.results import PAGE, SUMMARY, write_settings
-    from parkenv.studies.training.training import FIGURE
-
-    # Delete the summary: a folder without one holds an unfinished training.
-    for outcome in (SUMMARY, PAGE, FIGURE):
-        (out / outcome).unlink(missing_ok=True)
-    if overwrite:
-        for folder in out.glob("seed_*"):
-            shutil.rmtree(folder)
-    write_settings(out, settings)
-
-
-def _train_all(
-    console: Console, training: Training, seeds: range, out: Path, workers: Workers
-) -> list[list[Row]]:
-    """Train all seeds, with one progress bar each, updated from the curves that the trainings write."""
-    from functools import partial
-
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
-    from parkenv.studies.training.curve_file import CURVE, read_curve
-    from parkenv.studies.training.training import train_one
-
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[score]}"), TimeElapsedColumn(),
-        TimeRemainingColumn(), console=console, disable=not console.is_terminal,
-    )  # fmt: skip
-    bars = {k: progress.add_task(f"seed {k}", total=training.steps, score="") for k in seeds}
-    over = threading.Event()
-
-    def update_bars() -> None:
-        while not over.is_set():
-            for k, bar in bars.items():
-                # The training itself reports a damaged curve.
-                with suppress(InputError):
-                    if curve := read_curve(out / f"seed_{k}" / CURVE, training.columns):
-                        last = curve[-1]
-                        progress.update(bar, completed=last["steps"], score=training.score_text(last))
-            over.wait(2.0)
-
-    watcher = threading.Thread(target=update_bars, daemon=True)
-    with progress:
-        watcher.start()
-        try:
-            tasks = [partial(train_one, training, k, out / f"seed_{k}") for k in seeds]
-            curves: dict[int, list[Row]] = {}
-            for i, trained in workers.results(tasks):
-                trained.save(out / f"seed_{seeds[i]}")
-                curves[i] = trained.curve
-        finally:
-            over.set()
-            watcher.join()
-    return [curves[i] for i in range(len(seeds))]

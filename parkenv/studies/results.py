@@ -29,6 +29,7 @@ from parkenv.files.csv_tables import (
 )
 from parkenv.files.limited_reading import parse_json, read_json, read_text
 from parkenv.show.columns import SETTING_AXES
+from parkenv.studies.workers import SERIAL
 from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
@@ -314,11 +315,15 @@ class Results:
 
     Attributes:
         kept: what this run has found besides, for figures.
+        workers, progress, command: those of the run, for a study that needs more than its cells.
     """
 
     def __init__(self, path: Path, tables: Sequence[Table] = (EPISODES,)) -> None:
         self.path, self._tables = path, tables
         self.kept: dict[str, Any] = {}
+        self.workers = SERIAL
+        self.progress: Callable[[str, int, int], None] = lambda *_: None
+        self.command: tuple[str, ...] = ()
         self._rows: dict[str, dict[Key, Row]] = {table.file: {} for table in tables}
 
     def read(self) -> None:

@@ -153,6 +153,8 @@ def run(
     path = Path(folder)
     with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
         results = Results(path, _tables_of(study))
+        results.workers, results.progress = used, progress
+        results.command = tuple(command or ("parkenv", study.kind))
         settings, continues = results.claim(
             study.settings(), study.kind, resume=resume, overwrite=overwrite, goes_on=study.goes_on
         )
@@ -170,7 +172,7 @@ def run(
             interrupted = True
         _put_in_order(done, results)
         head = {
-            "command": list(command or ("parkenv", study.kind)),
+            "command": list(results.command),
             "version": __version__,
             "seed": getattr(study, "seed", None),
         }

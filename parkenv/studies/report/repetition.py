@@ -16,13 +16,10 @@ from parkenv.studies.report.fleet_recording import MOST_CARS
 from parkenv.studies.report.run_folder import RunFolder
 from parkenv.studies.report.search_recording import MOST_SLOTS
 from parkenv.studies.study import Study
-from parkenv.studies.training.spec import NetworkTrainingSpec, ScanTrainingSpec, SearchTrainingSpec
 from parkenv.world.scenario import Scenario
 
 Cases = list[tuple[Case, Sequence[int]]]
 """Searches: cases with their seeds."""
-BESIDE_MODELS = 3
-"""Number of planners shown beside a trained model."""
 
 
 def replays_of(run: RunFolder, spec: Spec | None) -> Replays:
@@ -33,8 +30,6 @@ def replays_of(run: RunFolder, spec: Spec | None) -> Replays:
     """
     if isinstance(spec, Study):
         return spec.replays(run.path)
-    if isinstance(spec, SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec):
-        return Replays(_trained(run, spec))
     return Replays()
 
 
@@ -77,29 +72,3 @@ def differences(watched: Sequence[dict[str, Any]]) -> list[str]:
         for search in e["searches"]
         if search["agrees"] is False
     ]
-
-
-def _trained(run: RunFolder, spec: SearchTrainingSpec | ScanTrainingSpec | NetworkTrainingSpec) -> Cases:
-    """Return the best model and the best planners in the test scenarios; none without a test."""
-    if not run.summary.get("transfer"):
-        return []
-    # These load torch.
-    from parkenv.studies.training.search import SearchTraining
-    from parkenv.studies.training.training import MODEL, TEST_SEED, training_of
-
-    best = min(run.summary["rows"], key=lambda row: float(row["total_s"]))
-    model = run.path / f"seed_{int(best['seed'])}" / MODEL
-    training = training_of(spec)
-    assert isinstance(training, SearchTraining)
-    seeds = range(TEST_SEED, TEST_SEED + int(run.summary["transfer"][0]["episodes"]))
-    cases: Cases = []
-    for name, (scenario, *_) in training.tests.items():
-        planners = [row for row in run.summary.get("planners", []) if row["scenario"] == name]
-        beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
-        cases.append((Case(scenario, f"{training.algorithm}:{model}"), seeds))
-        made = {
-            case.label: case
-            for case in (Case(scenario, a.name, options=a.options) for a in training.compared)
-        }
-        cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
-    return cases

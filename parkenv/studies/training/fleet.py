@@ -20,11 +20,12 @@ from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, demand_in, driver_of
+from parkenv.studies.study import Progress
 from parkenv.studies.training.configs import FLEET_CONFIGS, REWARD_SCALE, TrainingConfig
 from parkenv.studies.training.curve_file import Row
 from parkenv.studies.training.learning import RLTraining
 from parkenv.studies.training.spec import FleetTrainingSpec
-from parkenv.studies.training.training import EVALUATION_SEED, TEST_SEED, Status, Tested, Trained
+from parkenv.studies.training.training import EVALUATION_SEED, TEST_SEED, Tested, Trained
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 
@@ -154,21 +155,18 @@ class FleetTraining(RLTraining):
         settings |= {"fleet": fleet.name, "knows": fleet.knows, "demand": str(fleet.demand)}
         return {"scenarios": [fleet.scenario.name], "settings": settings}
 
-    def score_text(self, row: Row) -> str:
-        """See `Training`."""
-        return f"{row['total_s']:.1f} s"
-
-    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
         """See `Training`."""
         lines, rows, days = dict[str, float](), list[Row](), self.evaluation_episodes
         for agent in self.spec.agents:
-            with status(f"{agent.label} drives on the same days"):
-                lines[agent.label] = self.fleet.row(agent, EVALUATION_SEED, days, workers)["total_s"]
-                named = {"agent": agent.label}
-                rows += [
-                    named | {"scenario": test.name, **test.row(agent, TEST_SEED, 2 * days, workers)}
-                    for test in self.tests
-                ]
+            progress(f"{agent.label} drives on the same days", 0, 1)
+            lines[agent.label] = self.fleet.row(agent, EVALUATION_SEED, days, workers)["total_s"]
+            named = {"agent": agent.label}
+            rows += [
+                named | {"scenario": test.name, **test.row(agent, TEST_SEED, 2 * days, workers)}
+                for test in self.tests
+            ]
+            progress(f"{agent.label} drives on the same days", 1, 1)
         return lines, rows
 
     def test(self, model: Path, workers: Workers) -> Tested:

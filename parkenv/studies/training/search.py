@@ -28,9 +28,11 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.suite import suite_lots
-from parkenv.studies.compare.cases import rows_of
+from parkenv.studies.compare.cases import Case, rows_of
+from parkenv.studies.replays import Replays
 from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval
+from parkenv.studies.study import Progress
 from parkenv.studies.training.cloning import Demonstrations, clone, require_cloneable
 from parkenv.studies.training.configs import (
     MAX_STEPS,
@@ -42,7 +44,7 @@ from parkenv.studies.training.configs import (
 from parkenv.studies.training.curve_file import Row
 from parkenv.studies.training.learning import RLTraining
 from parkenv.studies.training.spec import ScanTrainingSpec, SearchTrainingSpec
-from parkenv.studies.training.training import Status, Tested, Trained, name_of
+from parkenv.studies.training.training import MODEL, TEST_SEED, Tested, Trained, name_of
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
@@ -51,6 +53,8 @@ from planners.model_file import SEARCH_OBSERVATIONS, observation_of
 
 METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
 HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
+BESIDE_MODELS = 3
+"""Number of planners replayed beside a trained model."""
 DEMONSTRATION_SEED = 5_000_000
 """First world seed of the demonstrations."""
 PLANNERS = tuple(
@@ -183,14 +187,15 @@ class SearchTraining(RLTraining):
             "evaluation_episodes": settings.get("evaluation_episodes"),
         }
 
-    def begin(self, status: Status) -> None:
+    def begin(self, progress: Progress) -> None:
         """Record the searches of the planner to clone."""
         planner = self.spec.clone
         if planner is not None:
             count = self.spec.demonstrations or 2000
             seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
-            with status(f"Recording {count} searches of {planner}"):
-                self.demonstrations = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
+            progress(f"Recording searches of {planner}", 0, count)
+            self.demonstrations = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
+            progress(f"Recording searches of {planner}", count, count)
 
     def make_env(self) -> SearchVecEnv:
         """Make a batch of search environments over all scenarios."""
@@ -227,11 +232,6 @@ class SearchTraining(RLTraining):
         """Return minus the mean total time."""
         return (-row["total_s"],)
 
-    def score_text(self, row: Row) -> str:
-        """See `Training`."""
-        held_out = f", held out {row['held_out_s']:.1f} s" if self.holds_out else ""
-        return f"{row['total_s']:.1f} s{held_out}"
-
     def description(self) -> dict[str, Any]:
         """Return scenarios and settings for the model file."""
         config, (learned, held_out) = self.config, self.sides
@@ -243,16 +243,19 @@ class SearchTraining(RLTraining):
             "settings": settings,
         }
 
-    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
         """See `Training`."""
         if not self.compared:
             return {}, []
         learned, held_out = self.sides
         rows = list[Row]()
-        with status("Planners search in the same worlds"):
-            evaluated = rows_of(self.compared, held_out or learned, self.evaluation_seeds, workers)
-            for name, places in self.tests.items():
-                rows += rows_of(self.compared, places, self.test_seeds, workers, name)
+        doing, count = "Planners search in the same worlds", 1 + len(self.tests)
+        progress(doing, 0, count)
+        evaluated = rows_of(self.compared, held_out or learned, self.evaluation_seeds, workers)
+        for number, (name, places) in enumerate(self.tests.items(), start=1):
+            progress(doing, number, count)
+            rows += rows_of(self.compared, places, self.test_seeds, workers, name)
+        progress(doing, count, count)
         lines = {row["agent"]: row["total_s"] for row in evaluated}
         return lines | {"clairvoyant bound": evaluated[0]["bound_s"]}, rows
 
@@ -282,6 +285,23 @@ class SearchTraining(RLTraining):
         """See `Training`."""
         low, high = row["total_s_ci95"]
         return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]"
+
+    def replays(self, summary: Row, folder: Path) -> Replays:
+        """Return the tests of the best model and of the best planners; nothing without a test."""
+        if not summary.get("transfer"):
+            return Replays()
+        best = min(summary["rows"], key=lambda row: float(row["total_s"]))
+        model = folder / f"seed_{int(best['seed'])}" / MODEL
+        seeds = range(TEST_SEED, TEST_SEED + int(summary["transfer"][0]["episodes"]))
+        cases: list[tuple[Case, Sequence[int]]] = []
+        for name, (scenario, *_) in self.tests.items():
+            planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
+            beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
+            cases.append((Case(scenario, f"{self.algorithm}:{model}"), seeds))
+            compared = (Case(scenario, agent.name, options=agent.options) for agent in self.compared)
+            made = {case.label: case for case in compared}
+            cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
+        return Replays(cases)
 
     def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
         """See `Training`."""

@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, get_args
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
+from parkenv import __version__
+from parkenv.files.csv_tables import WHOLE
 from parkenv.files.known_names import KnowledgeName
+from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentItem, AgentSpec
 from parkenv.studies.fields import MAX_EPISODES, ArrivalRate, Level, Scenarios, Stay
-from parkenv.studies.study import ExecutionSpec
+from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row
+from parkenv.studies.study import Cell, Stage, Study
+from parkenv.studies.training.curve_file import CURVE, read_curve
 from planners.names import PARKING_PLANNER
+
+if TYPE_CHECKING:
+    from parkenv.studies.replays import Replays
+    from parkenv.studies.results import Results
+    from parkenv.studies.training.training import Training
 
 Steps = Annotated[int, Field(ge=1, le=10**12, description="Decisions of a training.")]
 EvaluateEvery = Annotated[int, Field(ge=1, le=10**12, description="Decisions between evaluations.")]
@@ -24,7 +36,22 @@ ObservedSlots = Annotated[int, Field(ge=1, le=1_000, description="Slots in an ob
 TensorBoard = Annotated[bool, Field(description="Keep logs for TensorBoard.")]
 
 
-class TrainingSpec(ExecutionSpec):
+class _Seeds(NamedTuple):
+    """The trainings of a study, by seed.
+
+    Attributes:
+        folder: that of the run; a training keeps its checkpoint there.
+        demonstrations: to clone, if any.
+        command: command line of the run.
+    """
+
+    folder: Path = Path()
+    demonstrations: Any = None
+    command: tuple[str, ...] = ()
+    columns: Row = {}  # noqa: RUF012 - never changed
+
+
+class TrainingSpec(Study):
     """Training by reinforcement learning, one model per seed: what all kinds of training have.
 
     `TrainingSpec.parse` and `read` return the specification of the kind that `env`, `algorithm` and `observation`
@@ -35,6 +62,12 @@ class TrainingSpec(ExecutionSpec):
     """What chooses this kind of training, for messages."""
     trained_by: ClassVar[str] = ""
     """`MODULE:CLASS` of the training, in this package; importing it loads torch."""
+    table: ClassVar = CsvTable(
+        "trainings.csv", ("seed",), ("steps", "wall_s"), {"seed": WHOLE, "steps": WHOLE}, timings=None
+    )
+    block: ClassVar = 1
+    doing: ClassVar = "Training"
+    unit: ClassVar = ""
 
     kind: Literal["train"] = "train"
     env: Literal["search", "fleet", "drive"] = "search"
@@ -44,6 +77,11 @@ class TrainingSpec(ExecutionSpec):
     seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
     evaluation_episodes: Episodes
     agents: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
+    beside: Several[str] = Field(
+        (),
+        max_length=100,
+        description="Folders of other trainings with the same evaluations, drawn in the same figure.",
+    )
 
     @classmethod
     def parse(
@@ -88,6 +126,87 @@ class TrainingSpec(ExecutionSpec):
                 "own": f" with {cls.chosen_by}" if name == "algorithm" else "",
             },
         )
+
+    @cached_property
+    def training(self) -> Training:
+        """What trains, evaluates and tests; it loads torch."""
+        from parkenv.studies.training.training import training_of
+
+        return training_of(self)
+
+    def check(self) -> None:
+        """See `Study`."""
+        self.training.check()
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        return {"version": __version__, **self.training.settings()}
+
+    def prepare(self, results: Results, *, continues: bool) -> None:
+        """See `Study`."""
+        from parkenv.studies.training.training import FIGURE, curves_beside
+
+        results.kept["beside"] = curves_beside(self.beside, results.path, self.training)
+        for outcome in (PAGE, FIGURE):
+            (results.path / outcome).unlink(missing_ok=True)
+        if not continues:
+            for folder in results.path.glob("seed_*"):
+                shutil.rmtree(folder)
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [Cell(_Seeds(), range(self.seed, self.seed + self.trainings))]
+
+    def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`; the bars of the trainings follow the curves that they write."""
+        self.training.begin(results.progress)
+        with self.training.watched(results.path, self.cells()[0].items, results.progress):
+            yield Stage(self.doing, self, self.cells())
+
+    def input_of(self, work: _Seeds, items: Sequence[int], results: Results) -> _Seeds:
+        """See `Study`."""
+        del items
+        shared = getattr(self.training, "demonstrations", None)
+        return work._replace(folder=results.path, demonstrations=shared, command=tuple(results.command))
+
+    def run(self, work: _Seeds, items: Sequence[int]) -> list[Row]:
+        """See `Study`; a training goes on from its checkpoint."""
+        from parkenv.studies.training.training import train_one
+
+        self.training.command = work.command
+        if work.demonstrations is not None:
+            self.training.demonstrations = work.demonstrations  # type: ignore[attr-defined]
+        rows: list[Row] = []
+        for seed in items:
+            trained = train_one(self.training, seed, work.folder / f"seed_{seed}")
+            last = trained.curve[-1]
+            row = {"seed": seed, "steps": int(last["steps"]), "wall_s": last["wall_s"], "trained": trained}
+            rows.append(row)
+        return rows
+
+    def keep(self, work: _Seeds, rows: Sequence[Row], results: Results) -> None:
+        """See `Study`: the model and the curve."""
+        del work
+        for row in rows:
+            row.pop("trained").save(results.path / f"seed_{row['seed']}")
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`; the models are tested once all are trained."""
+        from parkenv.studies.training.training import FIGURE, MODEL, Trained
+
+        (seeds,) = self.cells()
+        if len(results.of(self, seeds)) < self.trainings:
+            return {"rows": []}
+        folders = {seed: results.path / f"seed_{seed}" for seed in seeds.items}
+        curves = [read_curve(folder / CURVE, self.training.columns) for folder in folders.values()]
+        models = {seed: folder / MODEL for seed, folder in folders.items()}
+        trained = Trained(curves, models, results.kept["beside"])
+        summary = self.training.report(results.progress, results.workers, trained, results.path / FIGURE)
+        return {"settings": self.settings(), **summary}
+
+    def replays(self, folder: Path) -> Replays:
+        """See `Study`."""
+        return self.training.replays(read_json(folder / SUMMARY), folder)
 
     @property
     def tested(self) -> Scenarios | None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import os
+import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from importlib import import_module
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
@@ -17,10 +18,14 @@ from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import COLORS
 from parkenv.studies.fingerprints import fingerprints, flat_tables
+from parkenv.studies.replays import Replays
 from parkenv.studies.results import SETTINGS, read_settings
+from parkenv.studies.study import Progress
 from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve
-from parkenv.studies.training.spec import TrainingSpec
 from parkenv.studies.workers import Workers
+
+if TYPE_CHECKING:
+    from parkenv.studies.training.spec import TrainingSpec
 
 EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
 """First world seeds of the evaluations during training, and of the final test."""
@@ -29,12 +34,10 @@ TRAINING_SEEDS = 10_000_000
 MODEL, FIGURE = "model.safetensors", "learning_curve.png"
 _OUTSIDE = {
     "kind", "jobs", "backend", "address", "trainings", "seed", "agents", "tensorboard", "scenarios", "held_out",
-    "evaluate_on", "test_on", "test_among",
+    "evaluate_on", "test_on", "test_among", "beside",
 }  # fmt: skip
 """Fields of a specification that do not change its trainings, or that `settings` gives in other words."""
 
-Status = Callable[[str], AbstractContextManager[Any]]
-"""Shows what is going on during a block."""
 Table = tuple[str, list[str], list[list[str]]]
 """Title, headings and rows."""
 
@@ -149,9 +152,36 @@ class Training(ABC):
     def evaluation_settings(self, settings: Row) -> Row:
         """Return the settings that evaluations depend on: curves are comparable if these are equal."""
 
-    def begin(self, status: Status) -> None:
+    def begin(self, progress: Progress) -> None:
         """Make what the trainings with all seeds share."""
-        del status
+        del progress
+
+    @contextmanager
+    def watched(self, out: Path, seeds: Sequence[int], progress: Progress) -> Iterator[None]:
+        """Follow the curves that trainings write into a folder, with a bar for each, during a block."""
+        over = threading.Event()
+
+        def follow() -> None:
+            while not over.wait(2.0):
+                for seed in seeds:
+                    # The training itself reports a damaged curve.
+                    with suppress(InputError):
+                        if curve := read_curve(out / f"seed_{seed}" / CURVE, self.columns):
+                            last = curve[-1]
+                            progress(f"seed {seed}", last["steps"], self.steps)
+
+        watcher = threading.Thread(target=follow, daemon=True)
+        watcher.start()
+        try:
+            yield
+        finally:
+            over.set()
+            watcher.join()
+
+    def replays(self, summary: Row, folder: Path) -> Replays:
+        """Return what a report may run again; nothing by default."""
+        del summary, folder
+        return Replays()
 
     @abstractmethod
     def train(self, seed: int, folder: Path) -> list[Row]:
@@ -165,35 +195,31 @@ class Training(ABC):
             The rows of `curve.csv`.
         """
 
-    @abstractmethod
-    def score_text(self, row: Row) -> str:
-        """Return the score of an evaluation as text for the progress bar."""
-
-    def report(self, status: Status, workers: Workers, trained: Trained, figure: Path) -> tuple[Row, Table]:
-        """Test the models and draw the figure; return the entries of the summary, and a table to print."""
-        lines, planners = self.planners(status, workers)
+    def report(self, progress: Progress, workers: Workers, trained: Trained, figure: Path) -> Row:
+        """Test the models and draw the figure; return the entries of the summary."""
+        lines, planners = self.planners(progress, workers)
         rows, transfer, places = list[Row](), list[Row](), list[Row]()
-        with status("Testing"):
-            for (seed, model), curve in zip(trained.models.items(), trained.curves, strict=True):
-                of_model, last = {"agent": self.algorithm, "seed": seed}, curve[-1]
-                tested = self.test(model, workers)
-                transfer += [of_model | row for row in tested.transfer]
-                places += [of_model | row for row in tested.places]
-                rows.append({
-                    "agent": self.algorithm, "scenario": tested.scenario, "seed": seed, "steps": last["steps"],
-                    **tested.own, "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
-                })  # fmt: skip
+        for number, (seed, model) in enumerate(trained.models.items()):
+            progress("Testing", number, len(trained.models))
+            of_model, last = {"agent": self.algorithm, "seed": seed}, trained.curves[number][-1]
+            tested = self.test(model, workers)
+            transfer += [of_model | row for row in tested.transfer]
+            places += [of_model | row for row in tested.places]
+            rows.append({
+                "agent": self.algorithm, "scenario": tested.scenario, "seed": seed, "steps": last["steps"],
+                **tested.own, "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
+            })  # fmt: skip
         self.draw(trained, lines, figure)
-        summary = {
+        progress("Testing", len(rows), len(rows))
+        return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
             **({"places": places} if places else {}),
             "curve": self.across_seeds(trained.curves),
             "beside": {name: self.across_seeds(its) for name, its in trained.beside.items()},
         }  # fmt: skip
-        return summary, self._table(transfer, planners)
 
     @abstractmethod
-    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
         """Run the agents to compare with; return their scores in the evaluations by name, and their rows of tests."""
 
     @abstractmethod
@@ -212,7 +238,7 @@ class Training(ABC):
     def test_text(self, row: Row) -> str:
         """Return a test as text for the table."""
 
-    def _table(self, transfer: Sequence[Row], planners: Sequence[Row]) -> Table:
+    def table_of(self, transfer: Sequence[Row], planners: Sequence[Row]) -> Table:
         """Return a table with a column for each test, and a row for each model and planner."""
         by = self.table_by
         columns = list(dict.fromkeys((row["test_scenario"], *(row[name] for name in by)) for row in transfer))

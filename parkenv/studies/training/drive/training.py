@@ -17,6 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from parkenv.compiled.keyed_random import world_key
 from parkenv.scenarios.build import build
 from parkenv.show.figures.learning_curves import save_success_curves
+from parkenv.studies.study import Progress
 from parkenv.studies.training.configs import DRIVE_CONFIGS, DriveTrainingConfig
 from parkenv.studies.training.curve_file import Row, across_seeds
 from parkenv.studies.training.drive.batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
@@ -29,7 +30,7 @@ from parkenv.studies.training.drive.env import (
 )
 from parkenv.studies.training.learning import RLTraining
 from parkenv.studies.training.spec import DriveTrainingSpec
-from parkenv.studies.training.training import Status, Tested, Trained
+from parkenv.studies.training.training import Tested, Trained
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, parking_table
 from parkenv.studies.workers import Workers
 from parkenv.world.lot import ParkingLot
@@ -169,20 +170,19 @@ class DriveTraining(RLTraining):
             ]
         return tasks
 
-    def score_text(self, row: Row) -> str:
-        """See `Training`."""
-        return f"{row['success']:.0%} parked"
-
-    def planners(self, status: Status, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
         """See `Training`."""
         if not self.spec.agents:
             return {}, []
         rows = list[Row]()
-        with status("The planner parks in the same tasks"):
-            parkings = parked_on(self.lots, self.evaluation_seeds, workers, PARKING_PLANNER)
-            for lot in self.tested:
-                table = parking_table(parked_on([lot], self.test_seeds, workers, PARKING_PLANNER))
-                rows += [{"agent": PARKING_PLANNER, "scenario": lot.name, **row} for row in table]
+        doing, count = "The planner parks in the same tasks", 1 + len(self.tested)
+        progress(doing, 0, count)
+        parkings = parked_on(self.lots, self.evaluation_seeds, workers, PARKING_PLANNER)
+        for number, lot in enumerate(self.tested, start=1):
+            progress(doing, number, count)
+            table = parking_table(parked_on([lot], self.test_seeds, workers, PARKING_PLANNER))
+            rows += [{"agent": PARKING_PLANNER, "scenario": lot.name, **row} for row in table]
+        progress(doing, count, count)
         return {row["kind"]: row["success"] for row in parking_table(parkings)}, rows
 
     def test(self, model: Path, workers: Workers) -> Tested:
