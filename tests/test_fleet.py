@@ -29,6 +29,7 @@ from parkenv.world.demand import (
     ListedArrivals,
     PoissonArrivals,
 )
+from parkenv.world.occupancy.process import Forecast, PriorModel
 
 NOISY = SensorModel(
     15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
@@ -352,12 +353,10 @@ def test_ordered_entry_loses_as_erlang_says():
 def test_a_forecast_computed_in_python_reaches_every_car():
     scenario = parkenv.make_scenario("mini")
 
-    class Prior:
+    class Prior(PriorModel):
         n_slots = scenario.lot.n_slots
 
         def forecast(self, arrival):
-            from parkenv.world.occupancy.process import Forecast
-
             return Forecast(np.full(self.n_slots, 0.25), np.full(self.n_slots, 1e-3))
 
     fleet = Fleet(scenario.replace(prior=Prior()), Demand(Headways(3, 1.0)))

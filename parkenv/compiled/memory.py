@@ -130,6 +130,18 @@ def call_at(_: Any, address: Any, one: Any, other: Any) -> Any:  # noqa: ARG001 
     return types.int64(types.int64, types.int64, types.int64), code
 
 
+@intrinsic
+def call_world_at(_: Any, address: Any, data: Any, slot: Any, time: Any) -> Any:  # noqa: ARG001 - numba passes them
+    """Call the function at an address with int64 data and slot and a float64 time; returns a float64."""
+
+    def code(_: Any, builder: Any, __: Any, values: Any) -> Any:
+        number, real = ir.IntType(64), ir.DoubleType()
+        function = ir.FunctionType(real, [number, number, real]).as_pointer()
+        return builder.call(builder.inttoptr(values[0], function), values[1:])
+
+    return types.float64(types.int64, types.int64, types.int64, types.float64), code
+
+
 def call_address(function: Any) -> int:
     """Return the address of a compiled function of two int64 that returns an int64, for `call_at`.
 

@@ -40,7 +40,6 @@ from parkenv.engine.records import (
     ARRIVAL,
     BALKED,
     DEPARTURE,
-    EXTERNAL_KIND,
     GAVE_UP,
     LEFT,
     N_ACTIONS,
@@ -61,7 +60,7 @@ from parkenv.engine.records import (
     step_at,
 )
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy.kernel import inlined, kernel
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
 
 (
     FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform, world_key
+from parkenv.compiled.keyed_random import world_key
 from parkenv.compiled.memory import address_of
 from parkenv.engine.events import (
     FINISHED,
@@ -47,12 +47,10 @@ from parkenv.engine.records import (
     EVENT,
     FLEET,
     LIVE_SLOT,
-    LOG_KIND,
     NO_CAR,
     REPORT,
     SEARCH,
     SEARCHING,
-    SHARED_KIND,
     SHARED_SLOT,
     STATES,
     STEP,
@@ -64,8 +62,9 @@ from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import Demand
-from parkenv.world.occupancy.counted import CountedOccupancy
-from parkenv.world.occupancy.kernel import RECORDED_DAY
+from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, draw_arrival
+from parkenv.world.occupancy.process import Arrival
+from parkenv.world.occupancy.python_functions import raise_error
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import DAY_S, hour_of_week
 
@@ -230,7 +229,7 @@ class Fleet:
         self._address = address_of(self.records, FLEET)
         self._tables = ScenarioRecords(self.scenarios)
         first = self._tables.records[0]
-        self._world_kind, self._world = int(first["world_kind"]), int(first["world"])
+        self._record["world_kind"], self._world = first["world_kind"], int(first["world"])
         self._tables.records["world_kind"], self._tables.records["world"] = SHARED_KIND, self._address
         self._tables.records["leave_full_lot"] = leave_full_lot
         self._pool: list[Searches] = []
@@ -309,25 +308,23 @@ class Fleet:
     def reset(self, seed: int = 0, episode: int = 0) -> None:
         """Begin the world of a seed and an episode: equal numbers give equal arrivals, stays, kinds and residents."""
         record, key = self._record, world_key(seed, episode)
-        window = self.scenario.arrival
-        weekdays = self._tables.records["n_weekdays"][0]
-        day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * weekdays)
-        arrival = self.scenario.occupancy.draw_arrival(window, key)
-        arrival_s = window.draw_second(key)
-        midnight = round((arrival.time - arrival_s) / DAY_S) * DAY_S
+        window, occupancy = self.scenario.arrival, self.scenario.occupancy
+        days = occupancy.arrival_days(window)
+        day, arrival_s = draw_arrival(key, len(days), float(window.start_s), float(window.end_s))
+        midnight = days[day].weekday * DAY_S
         begin_s = self.demand.arrivals.begin_s(arrival_s)
         begin = midnight + begin_s
         _, hour, second = hour_of_week(begin)
         record["key"], record["day"], record["midnight"], record["arrival"] = key, day, midnight, begin
         record["hour"], record["second_of_hour"] = hour, second
-        record["is_log"] = self._world_kind == LOG_KIND
-        record["world"] = self._world + (day * RECORDED_DAY.itemsize if record["is_log"] else 0)
-        if isinstance(self.scenario.occupancy, CountedOccupancy):
-            self._counted = self.scenario.occupancy.process_of(arrival.day).record
-            record["world"] = self._counted.ctypes.data
+        record["world"] = self._world + (day * RECORDED_DAY.itemsize if occupancy.kind == LOG_KIND else 0)
+        if not self._world:
+            self._made = occupancy.world(key, Arrival(begin, days[day].date))
+            record["world"] = self._made.address
         self._write_cars(key, midnight, arrival_s)
         self._memory.clear()
         begin_world_at(self._address)
+        raise_error()
 
     def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
         plans = self.demand.draw(key, arrival_s, len(self._entries))
@@ -448,6 +445,7 @@ class Fleet:
             raise ResetNeeded("the fleet has no world yet: call reset() first")
         while True:
             status = int(advance_at(self._address, until))
+            raise_error()
             if status >= 0:
                 return status
             if status in (FINISHED, PAUSED):
@@ -492,7 +490,6 @@ class Fleet:
         """Compute the external forecast of the car that has just arrived."""
         searches, row = self._row[int(self._cars["search"][self._record["pending"]])]
         searches.complete_arrival(row)
-        searches.records["process"][row] = self._address
         init_forecast_at(self._address)
 
     def _grow_reports(self) -> None:

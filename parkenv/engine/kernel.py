@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
-    ARRIVAL_STREAM,
     ENTRY_STREAM,
     OBSERVATION_STREAM,
     PLACE_STREAM,
@@ -32,9 +31,7 @@ from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
     DECAY_RATE,
-    EXTERNAL_KIND,
     FORECAST,
-    LOG_KIND,
     N_ACTIONS,
     N_TERMS,
     NEVER_OBSERVED,
@@ -42,11 +39,9 @@ from parkenv.engine.records import (
     OBSERVED_AT,
     P_OBSERVED,
     PROCESS_BACKGROUND,
-    PROCESS_KIND,
     RESIDENTS_BACKGROUND,
     SCENARIO,
     SENTINEL,
-    SHARED_KIND,
     block_at,
     edge_at,
     scenario_at,
@@ -58,7 +53,7 @@ from parkenv.engine.records import (
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy import kernel as worlds
-from parkenv.world.occupancy.kernel import inlined, kernel
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, SHARED_KIND, inlined, kernel
 from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
 
 STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
@@ -82,6 +77,7 @@ def _info_function() -> Callable[..., dict[str, Any]]:
 step_info = _info_function()
 """Function (name of the scenario, *result of a step) -> `info` of the step."""
 SCENARIO_BYTES = SCENARIO.itemsize
+_DAY_BYTES = worlds.RECORDED_DAY.itemsize
 
 # ---- one search, from Python
 
@@ -253,12 +249,9 @@ def arrive(search: Any) -> None:
     search.place = int(keyed_uniform(key, PLACE_STREAM, 0, 0) * search.n_places)
     search.scenario = search.scenarios + search.place * SCENARIO_BYTES
     scenario = scenario_at(search.scenario, 0)
-    day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * scenario.n_weekdays)
+    day, second = worlds.draw_arrival(key, scenario.n_weekdays, scenario.window_start, scenario.window_end)
     midnight = int64s(scenario.weekdays)[day] * DAY_S
-    second_of_window = keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (
-        scenario.window_end - scenario.window_start
-    )
-    arrival = midnight + (scenario.window_start + second_of_window)
+    arrival = midnight + second
     entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * scenario.n_entries)
     enter(search, key, day, arrival, midnight, int64s(scenario.entries)[entry])
 
@@ -277,12 +270,13 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
     """
     scenario = scenario_at(search.scenario, 0)
     clear_slots(search)
-    search.process = scenario.world
+    search.world = scenario.world
+    if scenario.world_kind == LOG_KIND:
+        search.world += day * _DAY_BYTES
     _, hour, second = hour_of_week(arrival)
     search.key, search.day, search.hour, search.second_of_hour = key, day, hour, second
     search.arrival, search.time, search.second_of_day = arrival, arrival, arrival - midnight
-    if scenario.world_kind == PROCESS_KIND:
-        worlds.draw_day(worlds.process_at(scenario.world, 0), search)
+    worlds.begin_day(scenario.world_kind, scenario.world, search)
     search.vertex = search.previous_vertex = vertex
     search.parked = search.over = False
     for term in range(N_TERMS):
@@ -585,13 +579,11 @@ def is_taken(search: Any, column: int, time: float) -> bool:
 def find_state(search: Any, record: Any, time: float) -> None:
     """Compute whether a slot is taken at a time beyond the known part of its sojourn."""
     scenario, slot = scenario_at(search.scenario, 0), np.int64(record.slot)
-    if scenario.world_kind == LOG_KIND:
-        worlds.recorded_state(worlds.recorded_day_at(scenario.world, search.day), slot, record, time)
-    elif scenario.world_kind == SHARED_KIND:
+    if scenario.world_kind == SHARED_KIND:
         # Another car may change it at any time, so `valid_until` stays 0.
-        record.occupied = not is_slot_open(search.process, slot, search.car, time)
+        record.occupied = not is_slot_open(search.world, slot, search.car, time)
     else:
-        worlds.process_state(worlds.process_at(search.process, 0), search, slot, record, time)
+        worlds.find_state(scenario.world_kind, search.world, search, slot, record, time)
 
 
 @kernel
@@ -687,12 +679,9 @@ def leaves_soon(world: Any, slot: int, time: float, soon_s: float) -> bool:
 
 @inlined
 def _background_state(world: Any, slot: int, shared: Any, time: float) -> bool:
-    """Return whether the scenario's own process or log takes a slot at a time."""
+    """Return whether the scenario's own world takes a slot at a time."""
     if time >= shared.valid_until:
-        if world.is_log:
-            worlds.recorded_state(worlds.recorded_day_at(world.world, 0), slot, shared, time)
-        else:
-            worlds.process_state(worlds.process_at(world.world, 0), world, slot, shared, time)
+        worlds.find_state(world.world_kind, world.world, world, slot, shared, time)
     return bool(shared.occupied)
 
 
@@ -704,25 +693,15 @@ def empty_shared_slots(address: int) -> None:
         address: address of the SHARED_WORLD record.
     """
     world = shared_world_at(address, 0)
-    if not world.is_log:
-        worlds.draw_day(worlds.process_at(world.world, 0), world)
+    worlds.begin_day(world.world_kind, world.world, world)
     for slot in range(world.n_slots):
         shared = shared_slot_at(world.slots, slot)
         shared.sojourn, shared.valid_until = 0, -np.inf
         shared.car, shared.held_by, shared.leaves_at = NO_CAR, NO_CAR, -np.inf
         if world.background == RESIDENTS_BACKGROUND and _background_state(world, slot, shared, world.arrival):
-            shared.leaves_at = _end_of_stay(world, slot, shared)
-
-
-@inlined
-def _end_of_stay(world: Any, slot: int, shared: Any) -> float:
-    """Return when the background's car that stands in a slot leaves, s; infinite if never."""
-    if not world.is_log:
-        worlds.find_sojourn_end(worlds.process_at(world.world, 0), world, slot, shared)
-        return float(shared.valid_until)
-    while shared.occupied and shared.valid_until < np.inf:
-        _background_state(world, slot, shared, shared.valid_until + 1e-3)
-    return float(np.inf if shared.occupied else shared.valid_until)
+            shared.leaves_at = worlds.find_end_of_stay(
+                world.world_kind, world.world, world, slot, shared, world.arrival
+            )
 
 
 @kernel

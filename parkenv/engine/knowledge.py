@@ -100,7 +100,7 @@ def inform(fleet: Any, number: int) -> None:
         _inform_by_map(fleet, car, search)
     elif car.knows == FULL_KNOWLEDGE:
         for slot in range(fleet.n_slots):
-            taken = not is_slot_open(search.process, slot, number, fleet.time)
+            taken = not is_slot_open(search.world, slot, number, fleet.time)
             set_belief_of(search, column_of(search, slot), taken, 1.0 if taken else 0.0, search.time)
     elif car.knows == RESERVE_KNOWLEDGE:
         for slot in range(fleet.n_slots):

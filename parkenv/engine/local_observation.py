@@ -52,7 +52,6 @@ from parkenv.engine.records import (
     BLOCK_SIZE,
     N_ACTIONS,
     N_REGIONS,
-    PROCESS_KIND,
     SENTINEL,
     block_at,
     scenario_at,
@@ -61,7 +60,7 @@ from parkenv.engine.records import (
 )
 from parkenv.errors import InputError
 from parkenv.world.lot import MOVES
-from parkenv.world.occupancy.kernel import inlined, kernel, prefetch_forecast
+from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import SearchProblem
 
 MINUTE = 60.0

@@ -13,22 +13,18 @@ from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.occupancy.counted import CountedOccupancy
-from parkenv.world.occupancy.kernel import CURSOR_FIELDS, PROCESS, RECORDED_DAY, WORLD_FIELDS
-from parkenv.world.occupancy.log import weekday_of
-from parkenv.world.occupancy.process import (
-    Arrival,
-    OccupancyModel,
-    OccupancyProcess,
-    PriorModel,
+from parkenv.world.occupancy.kernel import (
+    CURSOR_FIELDS,
+    EXTERNAL_KIND,
+    LOG_KIND,
+    PROCESS_KIND,
+    RECORDED_DAY,
+    WORLD_FIELDS,
 )
-from parkenv.world.occupancy.recorded import RecordedOccupancy
+from parkenv.world.occupancy.process import Arrival, CompiledModel, PriorModel, World
 from parkenv.world.scenario import Scenario
 
 N_ACTIONS = PARK + 1
-PROCESS_KIND, LOG_KIND, EXTERNAL_KIND, SHARED_KIND = range(4)
-"""Kinds of world and prior: a generating process; a replayed log; a forecast computed in Python at every arrival; slots
-that a fleet of cars shares."""
 
 EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
 """Result of an action at a vertex: the vertex that it leads to, s, m.
@@ -66,8 +62,8 @@ SCENARIO = np.dtype(
         ("seen_rate", ADDRESS),
         ("hit_rate", ADDRESS),
         ("false_alarm_rate", ADDRESS),
-        # For PROCESS_KIND, a PROCESS record (that of the world may change from search to search, see SEARCH); for
-        # LOG_KIND, RECORDED_DAY records, one for each of `weekdays`; for SHARED_KIND, the SHARED_WORLD record.
+        # For PROCESS_KIND, a PROCESS record; for LOG_KIND, RECORDED_DAY records, one for each of `weekdays`; for
+        # SHARED_KIND, the SHARED_WORLD record; 0 if Python makes the world of every search.
         ("world_kind", np.int64),
         ("world", ADDRESS),
         ("prior_kind", np.int64),
@@ -83,7 +79,6 @@ _TABLES = tuple(
     if SCENARIO[name] == ADDRESS
     and name not in ("n_slots", "n_weekdays", "n_entries", "world_kind", "prior_kind")
 )
-_PROCESS_TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
 N_REGIONS = 4
 
 N_TERMS = len(COST_TERMS)
@@ -159,15 +154,15 @@ SEARCH = _with_costs(
         # Number of the car in its fleet, where slots are shared.
         ("car", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
-        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; PROCESS
-        # record of the world, if it is a process, or SHARED_WORLD record.
+        # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; the
+        # record of the world: PROCESS, RECORDED_DAY, FUNCTIONS or SHARED_WORLD.
         ("scenario", ADDRESS),
         ("blocks", ADDRESS),
         ("slots", ADDRESS),
         ("columns", ADDRESS),
         ("external_forecast", ADDRESS),
         ("day_error", ADDRESS),
-        ("process", ADDRESS),
+        ("world", ADDRESS),
         # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
         # observation, or 0 if these are not kept.
         ("width", np.int64),
@@ -226,8 +221,8 @@ SHARED_WORLD_FIELDS = [
     ("slots", ADDRESS),
     *WORLD_FIELDS,
     ("background", np.int64),
-    # The scenario's own world, as in SCENARIO: whether it is a log; a PROCESS record, or the RECORDED_DAY of the day.
-    ("is_log", np.bool_),
+    # The scenario's own world: its kind; the PROCESS or FUNCTIONS record, or the RECORDED_DAY of the day.
+    ("world_kind", np.int64),
     ("world", ADDRESS),
 ]
 SHARED_WORLD = np.dtype(SHARED_WORLD_FIELDS, align=True)
@@ -235,7 +230,7 @@ SHARED_WORLD = np.dtype(SHARED_WORLD_FIELDS, align=True)
 its address.
 
 A slot is taken if a car of the fleet stands in it, or else by the *background*: nobody; residents, who were parked when
-the world began, leave once and are followed by cars of the fleet only; or the scenario's own process or log, in which
+the world began, leave once and are followed by cars of the fleet only; or the scenario's own world, in which
 other cars come and go all day.
 """
 
@@ -430,12 +425,11 @@ class ScenarioRecords:
         scenarios: the scenarios.
         n_bytes: memory of records and arrays, bytes.
 
-    Raises:
-        InputError: an occupancy that is neither a process nor a log.
     """
 
     def __init__(self, scenarios: Sequence[Scenario]) -> None:
         self._kept: list[Any] = []
+        self._models: list[CompiledModel] = []
         self.scenarios = tuple(scenarios)
         self.records = np.zeros(len(scenarios), SCENARIO)
         for record, scenario in zip(self.records, scenarios, strict=True):
@@ -444,28 +438,30 @@ class ScenarioRecords:
         if len(scenarios) > 1:
             self._join()
         arrays = {id(array): array for array in _arrays_in(self._kept)}
+        for model in self._models:
+            of_model = _arrays_in([model.record, *model.tables.values(), *model.kept])
+            arrays |= {id(array): array for array in of_model}
         self.n_bytes = self.records.nbytes + sum(array.nbytes for array in arrays.values())
 
     def _join(self) -> None:
         """Move the tables of all scenarios into one block of memory."""
-        processes = [one for one in self._kept if isinstance(one, OccupancyProcess)]
-        tables = [one for one in self._kept if isinstance(one, np.ndarray)]
-        others = [one for one in self._kept if not isinstance(one, np.ndarray | OccupancyProcess)]
-        tables += [getattr(one, name) for one in processes for name in _PROCESS_TABLES]
+        of_models = [array for model in self._models for array in model.tables.values()]
+        tables = [*self._kept, *of_models]
         copies = in_one_block(tables)
         moved = {
             address_of(old, old.dtype): address_of(new, new.dtype)
             for old, new in zip(tables, copies, strict=True)
         }
-        for one in processes:
-            record = one.record.copy()
-            for name in _PROCESS_TABLES:
+        models = []
+        for model in self._models:
+            record = model.record.copy()
+            for name in model.tables:
                 record[name] = moved[int(record[name][0])]
-            moved[address_of(one.record, PROCESS)] = address_of(record, PROCESS)
-            others += [record, *(value for value in (one.nearness, one._centring) if value is not None)]
+            moved[address_of(model.record, record.dtype)] = address_of(record, record.dtype)
+            models.append(model._replace(record=record, tables={}))
         for name in _TABLES:
             self.records[name] = [moved.get(int(address), int(address)) for address in self.records[name]]
-        self._kept = [*copies, *others]
+        self._kept, self._models = copies, models
 
     def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
         array = np.ascontiguousarray(values, dtype)
@@ -511,39 +507,24 @@ class ScenarioRecords:
             record[name] = value
 
     def _write_occupancy(self, record: np.void, scenario: Scenario) -> None:
-        occupancy, prior = scenario.occupancy, scenario.prior
-        if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
-            weekdays = [weekday_of(day) for day in occupancy.days_in(scenario.arrival)]
-        else:
-            weekdays = list(scenario.arrival.weekdays)
+        occupancy, prior = scenario.occupancy, scenario.prior or scenario.occupancy
+        weekdays = [day.weekday for day in occupancy.arrival_days(scenario.arrival)]
         record["weekdays"], record["n_weekdays"] = self._keep(weekdays, np.int64), len(weekdays)
-        record["world_kind"], record["world"] = self._kind_and_address(occupancy, scenario)
-        if record["world_kind"] == EXTERNAL_KIND:
-            raise InputError(
-                f"occupancy is a {type(occupancy).__name__}, want an OccupancyProcess, a RecordedOccupancy or a "
-                "CountedOccupancy"
-            )
-        if isinstance(prior or occupancy, CountedOccupancy):
-            record["prior_kind"] = EXTERNAL_KIND
-        elif prior is None or prior is occupancy:
+        record["world_kind"], record["world"] = occupancy.kind, self._address_of(occupancy, scenario)
+        if prior is occupancy and record["world"]:
             record["prior_kind"], record["prior"] = record["world_kind"], record["world"]
-        elif isinstance(prior, OccupancyProcess):
-            record["prior_kind"], record["prior"] = self._kind_and_address(prior, scenario)
+        elif prior.kind == PROCESS_KIND and (address := self._address_of(prior, scenario)):
+            record["prior_kind"], record["prior"] = PROCESS_KIND, address
         else:
             record["prior_kind"] = EXTERNAL_KIND
 
-    def _kind_and_address(self, model: OccupancyModel | PriorModel, scenario: Scenario) -> tuple[int, int]:
-        if isinstance(model, OccupancyProcess):
-            self._kept.append(model)
-            return PROCESS_KIND, address_of(model.record, PROCESS)
-        if isinstance(model, RecordedOccupancy):
-            self._kept += [model, days := model.day_records(model.days_in(scenario.arrival))]
-            return LOG_KIND, address_of(days, RECORDED_DAY)
-        if isinstance(model, CountedOccupancy):
-            # A process for every day, made when a search begins on it: `Searches.complete_arrival`.
-            self._kept.append(first := model.process_of(model.days_in(scenario.arrival)[0]))
-            return PROCESS_KIND, address_of(first.record, PROCESS)
-        return EXTERNAL_KIND, 0
+    def _address_of(self, model: PriorModel, scenario: Scenario) -> int:
+        """Keep the records of a model and return their address; 0 without records."""
+        compiled = model.compiled(scenario.arrival)
+        if compiled is None:
+            return 0
+        self._models.append(compiled)
+        return address_of(compiled.record, compiled.record.dtype)
 
 
 def _arrays_in(kept: Sequence[Any]) -> Iterator[NDArray[Any]]:
@@ -579,8 +560,8 @@ class Searches:
     def __init__(self, scenarios: ScenarioRecords, n: int, full_belief: bool) -> None:
         m = int(scenarios.records["n_slots"].max())
         external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
-        counted = any(isinstance(one.occupancy, CountedOccupancy) for one in scenarios.scenarios)
-        self.needs_python = external or counted
+        self.needs_python = external or bool((scenarios.records["world"] == 0).any())
+        self._worlds: dict[int, World] = {}  # made in Python, by search
         self.scenarios = scenarios
         self.records = np.zeros(n, SEARCH)
         self.slots = np.zeros((n, m + 1), SLOT)
@@ -603,9 +584,9 @@ class Searches:
             self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
 
     def complete_arrival(self, search: int) -> None:
-        """Add what only Python can compute about a search that has just begun: an external forecast, a counted day."""
+        """Add what only Python can make for a search that has just begun: its world, its forecast."""
         scenario, record = self.scenario_of(search), self.records[search]
-        self._find_process(search)
+        self._make_world(search)
         if self.scenarios.records["prior_kind"][record["place"]] != EXTERNAL_KIND:
             return
         arrival = arrival_of(scenario, record)
@@ -619,17 +600,18 @@ class Searches:
         return self.scenarios.scenarios[int(self.records["place"][search])]
 
     def _find_scenarios(self) -> None:
-        """Write the addresses that follow from the places."""
-        place = self.records["place"]
+        """Write the addresses that follow from the places and days."""
+        place, scenarios = self.records["place"], self.scenarios.records
         self.records["scenario"] = self.records["scenarios"] + place * SCENARIO.itemsize
-        self.records["process"] = self.scenarios.records["world"][place]
+        by_day = (scenarios["world_kind"][place] == LOG_KIND) * self.records["day"] * RECORDED_DAY.itemsize
+        self.records["world"] = scenarios["world"][place] + by_day
 
-    def _find_process(self, search: int) -> None:
-        """Write the address of the process of a counted day; it differs from computer process to process."""
-        scenario = self.scenario_of(search)
-        if isinstance(scenario.occupancy, CountedOccupancy):
-            day = arrival_of(scenario, self.records[search]).day
-            self.records[search]["process"] = address_of(scenario.occupancy.process_of(day).record, PROCESS)
+    def _make_world(self, search: int) -> None:
+        """Make the world of a search whose scenario has no records of it; addresses differ between processes."""
+        scenario, record = self.scenario_of(search), self.records[search]
+        if not self.scenarios.records["world"][record["place"]]:
+            world = scenario.occupancy.world(np.uint64(record["key"]), arrival_of(scenario, record))
+            self._worlds[search], record["world"] = world, world.address
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays with a row for each search, keyed by the SEARCH field that holds the row's address."""
@@ -677,12 +659,10 @@ class Searches:
             mine[...] = array.view(mine.dtype)
         if self.needs_python:
             for search in range(len(self.records)):
-                self._find_process(search)
+                self._make_world(search)
 
 
 def arrival_of(scenario: Scenario, record: np.void) -> Arrival:
     """Return the arrival of the search in a SEARCH record."""
-    time = float(record["arrival"])
-    if isinstance(scenario.occupancy, RecordedOccupancy | CountedOccupancy):
-        return Arrival(time, scenario.occupancy.days_in(scenario.arrival)[int(record["day"])])
-    return Arrival(time)
+    days = scenario.occupancy.arrival_days(scenario.arrival)
+    return Arrival(float(record["arrival"]), days[int(record["day"])].date)

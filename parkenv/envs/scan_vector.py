@@ -19,7 +19,7 @@ from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import address_of
 from parkenv.compiled.threads import in_threads
 from parkenv.engine.kernel import take_step
-from parkenv.engine.records import PROCESS_KIND, search_at
+from parkenv.engine.records import search_at
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.engine.spaces import LATEST
 from parkenv.envs.car_footprints import CarLibrary, Scratch, draw_car, put_car, remove_car
@@ -29,7 +29,7 @@ from parkenv.envs.sensors import FARTHEST
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.lot_scene import CARS_APART, slot_lot
-from parkenv.world.occupancy.kernel import CURSOR, cursor_at, kernel, process_at, process_state
+from parkenv.world.occupancy.kernel import CURSOR, PROCESS_KIND, cursor_at, kernel, process_at, process_state
 from sim_sensors.laser.kernel import BEAMS_PER_DRAW, scan_all
 from sim_sensors.laser.scanner import NOISE_TABLE_SIZE, LaserScanner, noise_table
 from sim_sensors.rig import SensorRig
@@ -209,7 +209,7 @@ def scan_searches(
                 cursor = cursor_at(cursors, e * n_slots + slot)
                 if cursor.sojourn != 0 and time < cursor.valid_until:
                     continue
-                taken = process_state(process_at(search.process, 0), search, slot, cursor, time)
+                taken = process_state(process_at(search.world, 0), search, slot, cursor, time)
                 if cursor.sojourn == planes.shown[e, slot]:
                     continue
                 if done < capture:

@@ -23,6 +23,7 @@ from parkenv.engine.state import SearchState
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
 from parkenv.world.lot import ACTIONS
+from parkenv.world.occupancy.python_functions import raise_error
 from parkenv.world.scenario import Scenario
 
 if TYPE_CHECKING:
@@ -283,6 +284,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         number = action_number(action)
         result = self._advance(number)
         reward, over, vertex = result[0], result[-2], result[-1]
+        if self.searches.needs_python:
+            raise_error()
         state = self._state
         if vertex != state.path[-1]:
             state.path.append(vertex)

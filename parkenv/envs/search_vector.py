@@ -32,6 +32,7 @@ from parkenv.scenarios.build import ScenarioSources, make_scenarios
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.kernel import kernel
+from parkenv.world.occupancy.python_functions import raise_error
 
 OBSERVATIONS = ("full", "occupancy", "local")
 MAX_ENVS = 1_000_000
@@ -423,6 +424,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
                 self._searches.address, self._surroundings, actions, fresh, idle, self._limit, steps,
                 seen["local"], seen["action_mask"],
             )  # fmt: skip
+        if self._searches.needs_python:
+            raise_error()
 
     def _arrive(self, which: BoolArray) -> None:
         """Put the selected cars at the entries of their next worlds."""

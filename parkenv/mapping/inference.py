@@ -11,7 +11,7 @@ from scipy.stats import beta
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
-from parkenv.world.occupancy.process import Arrival, Forecast
+from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S
 
 SLOT_WEIGHT, LOT_WEIGHT = 4.0, 6.0
@@ -116,7 +116,7 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
 
 
 @dataclass(frozen=True, eq=False)
-class MapPrior:
+class MapPrior(PriorModel):
     """A map as the `prior` of a `Scenario`.
 
     Args:

@@ -53,7 +53,7 @@ SURVEYED = _priors({1.0: 0.5, 2.0: 0.5}, shape={**_SHAPE, "hour": 1.0})
 """Priors for a lot of which survey sessions alone are known; unlike a driver's trips, they are spread over the day."""
 
 
-class EmptyMap:
+class EmptyMap(PriorModel):
     """The map of a lot of which nothing is known: 50 % for every slot.
 
     Args:
@@ -74,7 +74,7 @@ class EmptyMap:
         return self._forecast
 
 
-class ReversedMap:
+class ReversedMap(PriorModel):
     """A wrong map: slots near the goal get the forecast of slots far from it, and the other way round.
 
     Args:
@@ -128,7 +128,7 @@ def map_prior(log: SessionLog, trips: Sequence[Trip], walk: ArrayLike) -> PriorM
     return learned
 
 
-class LearnedMap:
+class LearnedMap(PriorModel):
     """A map, corrected by trips.
 
     The forecast is the mean over days of the corrected map; its day error holds the day's own and what is still unknown

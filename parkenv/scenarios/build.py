@@ -172,15 +172,13 @@ def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario
     if not isinstance(day_error, DayError):
         day_error = DayError(day_error)
 
-    def changed(model: PriorModel) -> PriorModel:
-        if isinstance(model, OccupancyProcess):
-            return model.with_day_error(day_error, scenario.walk_s)
-        return dataclasses.replace(model, true=changed(model.true)) if isinstance(model, FlatMap) else model
-
-    if not isinstance(scenario.occupancy, OccupancyProcess):
-        raise InputError(f"day_error: the occupancy is a {type(scenario.occupancy).__name__}, want a process")
-    prior = scenario.prior and changed(scenario.prior)
-    return scenario.replace(occupancy=changed(scenario.occupancy), prior=prior)
+    occupancy, prior, walk = scenario.occupancy, scenario.prior, scenario.walk_s
+    if not occupancy.adjustable:
+        raise InputError(f"day_error: the occupancy is a {type(occupancy).__name__}, want a process")
+    return scenario.replace(
+        occupancy=occupancy.with_day_error(day_error, walk),
+        prior=prior and prior.with_day_error(day_error, walk),
+    )
 
 
 def _lot(spec: LotSpec) -> ParkingLot:

@@ -14,7 +14,6 @@ from parkenv.scenarios.build import make_scenario
 from parkenv.studies.bench.rows import BenchRow, duration, rate
 from parkenv.studies.bench.sumo import sumo_rows
 from parkenv.world.demand import Demand, ExponentialTime, Headways, PoissonArrivals
-from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S, HOUR_S
 
@@ -89,7 +88,7 @@ def _day(cars: int) -> Demand:
 
 def _fleet(scenario: Scenario, demand: Demand, rule: str) -> Fleet:
     occupancy = scenario.occupancy
-    if isinstance(occupancy, OccupancyProcess):
+    if occupancy.adjustable:
         scenario = scenario.replace(occupancy=occupancy.at_mean_occupancy(FULL, 0.0))
     return Fleet(scenario, demand, drivers=[DriverKind(rule=RULES[rule])])
 

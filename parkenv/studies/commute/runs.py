@@ -23,10 +23,7 @@ from parkenv.studies.commute.tables import FIXED, NONE
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import Row
 from parkenv.studies.trip_recorder import TripRecorder
-from parkenv.world.occupancy.constant_map import FlatMap
-from parkenv.world.occupancy.counted import CountedOccupancy
 from parkenv.world.occupancy.process import ArrivalWindow, PriorModel
-from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
@@ -55,7 +52,7 @@ def calendar(scenario: Scenario, days: int) -> list[Day]:
     A log with fewer days than wanted ends the commute early.
     """
     occupancy, window = scenario.occupancy, scenario.arrival
-    if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
+    if occupancy.recorded:
         dates = sorted(occupancy.days_in(window))[:days]
         counts = [date.fromisoformat(day).toordinal() for day in dates]
         first_monday = counts[0] - date.fromisoformat(dates[0]).weekday()
@@ -182,10 +179,5 @@ class CommuteRun:
 
 def with_fixed_slots(scenario: Scenario) -> Scenario:
     """Return a scenario in which every slot is the same one on all days of a log."""
-    occupancy, prior = scenario.occupancy, scenario.prior
-    if not isinstance(occupancy, RecordedOccupancy):
-        return scenario
-    fixed = occupancy.with_fixed_slots(scenario.arrival)
-    if isinstance(prior, FlatMap):
-        prior = FlatMap(prior.p_occupied, fixed)
-    return scenario.replace(occupancy=fixed, prior=prior)
+    fixed = scenario.occupancy.with_fixed_slots(scenario.arrival)
+    return scenario.replace(occupancy=fixed, prior=scenario.prior and scenario.prior.for_world(fixed))

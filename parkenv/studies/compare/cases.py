@@ -20,7 +20,7 @@ from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
 from parkenv.studies.statistics import mean_interval, summarize
 from parkenv.studies.workers import Workers
-from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
+from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
@@ -112,7 +112,7 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
     """Return the scenario with a mean occupancy of `level` at the middle of its arrival window, on its first day.
 
     Raises:
-        InputError: its occupancy is a recorded log, which cannot be changed.
+        InputError: its occupancy or forecast is not `adjustable`, such as a recorded log.
     """
     window = scenario.arrival
     middle = (window.start_s + window.end_s) / 2
@@ -123,8 +123,10 @@ def at_occupancy(scenario: Scenario, level: float) -> Scenario:
     def adjusted(model: Any) -> Any:
         if model is None:
             return None
-        if not isinstance(model, OccupancyProcess):
-            raise InputError(f"scenario {scenario.name!r}: a recorded world cannot be made {level:.0%} full")
+        if not model.adjustable:
+            raise InputError(
+                f"scenario {scenario.name!r}: a {type(model).__name__} cannot be made {level:.0%} full"
+            )
         return model.at_mean_occupancy(level, day * DAY_S + middle)
 
     return scenario.replace(

@@ -285,13 +285,11 @@ class Comparison(CaseStudy):
     def occupancy_cases(self) -> list[Cell]:
         """The cases at the occupancy levels, with a third of the episodes, at the first speeds of the grid."""
         from parkenv.studies.compare.cases import at_occupancy
-        from parkenv.world.occupancy.process import OccupancyProcess
 
         return [
             Cell(self._case(setting, agent, level), self.seeds[: max(1, self.episodes // 3)])
             for scenario in self.built
-            if isinstance(scenario.occupancy, OccupancyProcess)
-            and scenario.name not in self.constant_forecasts
+            if scenario.occupancy.adjustable and scenario.name not in self.constant_forecasts
             for level in self.grid.occupancy_levels
             for setting in self._grid_settings(at_occupancy(scenario, level), first_speeds=True)
             for agent in self._agents_in(scenario)

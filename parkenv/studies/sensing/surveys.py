@@ -18,10 +18,7 @@ from parkenv.mapping.survey import SessionResult, SurveySettings
 from parkenv.mapping.survey_score import METHODS
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, SESSION_COLUMNS
-from parkenv.world.occupancy.counted import CountedOccupancy
-from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.process import Arrival, ArrivalWindow, OccupancyModel
-from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 
@@ -167,8 +164,8 @@ def mean_occupancy(occupancy: OccupancyModel, window: ArrivalWindow) -> FloatArr
     which the slot is taken at that time.
     """
     middle = 0.5 * (window.start_s + window.end_s)
-    if isinstance(occupancy, RecordedOccupancy | CountedOccupancy):
-        arrivals = [Arrival(weekday_of(day) * DAY_S + middle, day) for day in occupancy.days_in(window)]
+    if occupancy.recorded:
+        arrivals = [Arrival(day * DAY_S + middle, date) for day, date in occupancy.arrival_days(window)]
         slots = np.arange(occupancy.n_slots)
         taken = [occupancy.world(np.uint64(0), arrival).occupied(slots, arrival.time) for arrival in arrivals]
         return np.asarray(np.mean(taken, axis=0, dtype=np.float64))

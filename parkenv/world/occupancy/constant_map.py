@@ -5,14 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from parkenv.errors import require_number
+from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
-from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
+from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
 
 
 @dataclass(frozen=True, eq=False)
-class FlatMap:
+class FlatMap(PriorModel):
     """A `prior` of a `Scenario` with the same occupancy probability for every slot.
 
     Raises:
@@ -35,6 +37,14 @@ class FlatMap:
     def n_slots(self) -> int:
         """Number of slots."""
         return self.true.n_slots
+
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> FlatMap:
+        """Return this map with the day error, if it is that of an adjustable model."""
+        return replace(self, true=self.true.with_day_error(day_error, walk))
+
+    def for_world(self, world: OccupancyModel) -> FlatMap:
+        """Return this map with the decay rates and the day error of a world."""
+        return replace(self, true=world)
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """Forecast the same probability for every slot."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.errors import InputError
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
+from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY, PROCESS_KIND
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.process import (
     DAY_NAMES,
@@ -21,6 +21,7 @@ from parkenv.world.occupancy.process import (
     Arrival,
     ArrivalWindow,
     Forecast,
+    OccupancyModel,
     OccupancyProcess,
     ProcessWorld,
 )
@@ -33,7 +34,7 @@ _PASSES = 3  # over the day; the curve of a process is periodic
 
 
 @dataclass(frozen=True, eq=False)
-class CountedOccupancy:
+class CountedOccupancy(OccupancyModel):
     """Replays days of a car park of which only the number of taken places is known.
 
     Slot s is taken with the log-odds `attraction[s]` plus the level of the moment, such that the mean over the lot
@@ -54,6 +55,8 @@ class CountedOccupancy:
         InputError: a wrong shape, or no days.
     """
 
+    kind: ClassVar[int] = PROCESS_KIND
+    recorded: ClassVar[bool] = True
     days: tuple[str, ...]
     occupied: FloatArray
     level: FloatArray
@@ -96,12 +99,6 @@ class CountedOccupancy:
                 f"{self.source}: no day on {names} was counted from {first}:00 to {end}:00, want at least one"
             )
         return days
-
-    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Draw a counted day on the window's weekdays, and a time of day, both uniform."""
-        days = self.days_in(window)
-        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
-        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
 
     def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
         """Return the world of the episode with this key, on the arrival's day."""

@@ -16,8 +16,14 @@ from typing import Any
 import numpy as np
 
 from parkenv.compiled.jit import compiled
-from parkenv.compiled.keyed_random import DAY_STREAM, OCCUPANCY_STREAM, keyed_exponential, keyed_uniform
-from parkenv.compiled.memory import ADDRESS, float64s, int64s, prefetch, record_at, uint8s
+from parkenv.compiled.keyed_random import (
+    ARRIVAL_STREAM,
+    DAY_STREAM,
+    OCCUPANCY_STREAM,
+    keyed_exponential,
+    keyed_uniform,
+)
+from parkenv.compiled.memory import ADDRESS, call_world_at, float64s, int64s, prefetch, record_at, uint8s
 from parkenv.world.occupancy.day_error import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.occupancy.decay import decay_factor
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S, hour_of_week
@@ -35,6 +41,11 @@ _MOMENT_S = 1e-6
 # No numba reference counting, which would take most of a step's time: the kernels allocate nothing.
 kernel = compiled(error_model="numpy", _nrt=False)
 inlined = compiled(error_model="numpy", _nrt=False, forceinline=True)
+
+PROCESS_KIND, LOG_KIND, EXTERNAL_KIND, SHARED_KIND = range(4)
+"""Kinds of worlds: a generating process; a replayed log; functions at addresses, such as those of a Python class; slots
+that a fleet of cars shares. Kinds of forecasts: the first two, and EXTERNAL_KIND, computed in Python at every arrival.
+"""
 
 PROCESS = np.dtype(
     [
@@ -87,6 +98,11 @@ RECORDED_DAY = np.dtype(
 """A log day replayed on a lot: its midnight, s since Monday 00:00; fields of `MappedLog`,
 `DayForecast` and `OccupancyLog`."""
 
+FUNCTIONS = np.dtype([("data", np.int64), ("state", ADDRESS), ("next_free", ADDRESS)], align=True)
+"""A world by the addresses of two functions of (int64 data, int64 slot, float64 time, s): whether the slot is taken, 1
+or 0, and the earliest time from then on at which it is free, s, infinite if never. Both return float64.
+"""
+
 CURSOR_FIELDS = [
     ("sojourn", np.int32),
     ("since", np.float64),
@@ -103,6 +119,58 @@ at least until then, and ends exactly then if end_known. Other records with thes
 
 process_at, world_at = record_at(PROCESS), record_at(WORLD)
 recorded_day_at, cursor_at = record_at(RECORDED_DAY), record_at(CURSOR)
+functions_at = record_at(FUNCTIONS)
+
+
+@kernel
+def draw_arrival(key: np.uint64, n_days: int, start_s: float, end_s: float) -> tuple[int, float]:
+    """Draw when the search with a key begins, uniform: the index of the day, and the second of the day in a window."""
+    day = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * n_days)
+    return day, start_s + keyed_uniform(key, ARRIVAL_STREAM, 0, 1) * (end_s - start_s)
+
+
+@inlined
+def begin_day(kind: int, model: int, world: Any) -> None:
+    """Draw what is special about the day of a world whose model has the record at an address; 0: there is none yet."""
+    world.day_odds, world.day_slope = 1.0, 0.0
+    if kind == PROCESS_KIND and model != 0:
+        draw_day(process_at(model, 0), world)
+
+
+@inlined
+def find_state(kind: int, model: int, world: Any, slot: int, cursor: Any, time: float) -> bool:
+    """Return whether a slot is taken, and move its cursor.
+
+    Args:
+        kind: of the world, one of the first three.
+        model: address of its PROCESS, RECORDED_DAY or FUNCTIONS record.
+        world: a WORLD record.
+        slot: index of the slot.
+        cursor: its cursor, changed in place.
+        time: s, not before the cursor's sojourn began.
+    """
+    if kind == LOG_KIND:
+        return bool(recorded_state(recorded_day_at(model, 0), slot, cursor, time))
+    if kind == EXTERNAL_KIND:
+        functions = functions_at(model, 0)
+        # `valid_until` stays in the past: the function is asked every time.
+        cursor.occupied = call_world_at(functions.state, functions.data, slot, time) != 0.0
+        return bool(cursor.occupied)
+    return bool(process_state(process_at(model, 0), world, slot, cursor, time))
+
+
+@inlined
+def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, time: float) -> float:
+    """Return when the car that stands in a slot at a time leaves, s; infinite if never. `find_state` found it there."""
+    if kind == EXTERNAL_KIND:
+        functions = functions_at(model, 0)
+        return float(call_world_at(functions.next_free, functions.data, slot, time))
+    if kind == PROCESS_KIND:
+        find_sojourn_end(process_at(model, 0), world, slot, cursor)
+        return float(cursor.valid_until)
+    while cursor.occupied and cursor.valid_until < np.inf:
+        recorded_state(recorded_day_at(model, 0), slot, cursor, cursor.valid_until + 1e-3)
+    return float(np.inf if cursor.occupied else cursor.valid_until)
 
 
 @inlined

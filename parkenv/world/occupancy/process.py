@@ -1,26 +1,31 @@
-"""Occupancy over time: the protocols of worlds and forecasts, and a process that generates worlds.
+"""Occupancy over time: the base classes of worlds and forecasts, and a process that generates worlds.
 
 Times are seconds since Monday 00:00 of the scenario's week; rates are 1/s.
 """
 
+from __future__ import annotations
+
 import math
 import os
 import re
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.occupancy import kernel as kernels
 from parkenv.world.occupancy.day_error import EXACT, DayError, centring_table, nearness
-from parkenv.world.occupancy.kernel import kernel
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, draw_arrival, kernel
+from parkenv.world.occupancy.log import weekday_of
+from parkenv.world.occupancy.python_functions import functions_of
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, hour_of_week
 
 DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
@@ -85,7 +90,7 @@ class ArrivalWindow:
 
     def draw_second(self, key: np.uint64) -> float:
         """Draw a second of the day, uniform in the window, from the world's key."""
-        return self.start_s + float(keyed_uniform(key, ARRIVAL_STREAM, 0, 1)) * (self.end_s - self.start_s)
+        return float(draw_arrival(np.uint64(key), 1, float(self.start_s), float(self.end_s))[1])
 
 
 @dataclass(frozen=True)
@@ -106,38 +111,122 @@ class Forecast:
     day_error: DayError = EXACT  # by how much whole days differ from `p_occupied`
 
 
-class World(Protocol):
+class World(ABC):
     """The hidden occupancy of one episode; accepts any slots and times from the arrival on, in any order."""
 
+    @abstractmethod
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
         """(k,) bool, whether each of the slots (k,) is taken at `time`."""
 
+    @abstractmethod
     def next_free(self, slots: ArrayLike, time: float) -> FloatArray:
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
 
+    @abstractmethod
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
         """(k,) int64, number of the current sojourn (period of constant state) of each slot; distinguishes cars."""
 
+    @property
+    def address(self) -> int:
+        """Address of the record by which compiled code asks this world; valid while this object lives.
 
-class PriorModel(Protocol):
-    """Forecasts occupancy."""
+        By default that of a FUNCTIONS record, whose functions call this object's methods. A world with compiled
+        functions of its own returns the address of a record that holds theirs.
+        """
+        return functions_of(self)
+
+
+class ArrivalDay(NamedTuple):
+    """A day on which a search may begin."""
+
+    weekday: int  # Monday = 0
+    date: str = ""  # ISO date of a recorded day; else empty
+
+
+class CompiledModel(NamedTuple):
+    """The records by which compiled code reads a model without calling Python."""
+
+    record: NDArray[np.void]  # PROCESS; or RECORDED_DAY, one for each of the days of the arrivals
+    # Arrays that the fields of a PROCESS record point to and that may be moved, by field
+    tables: Mapping[str, NDArray[Any]]
+    kept: tuple[Any, ...]  # further arrays that the record points to, or objects that hold them
+
+
+class PriorModel(ABC):
+    """Forecasts occupancy: the base class of all forecasts.
+
+    Attributes:
+        kind: which records compiled code reads, see `compiled` and `World.address`.
+        adjustable: whether `at_mean_occupancy` and `with_day_error` can be called.
+    """
+
+    kind: ClassVar[int] = EXTERNAL_KIND
+    adjustable: ClassVar[bool] = False
 
     @property
+    @abstractmethod
     def n_slots(self) -> int:
         """Number of slots."""
 
+    @abstractmethod
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast for the arrival; it does not depend on the world."""
 
+    def compiled(self, window: ArrivalWindow) -> CompiledModel | None:  # noqa: ARG002 - subclasses use it
+        """Return the records of this model, if it has any, for arrivals in a window.
 
-class OccupancyModel(PriorModel, Protocol):
-    """Draws arrivals and worlds, and forecasts occupancy."""
+        Without records, the model is asked in Python, once when a search begins, and its worlds by their `address`.
+        """
+        return None
 
-    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Draw the arrival of the episode with this key."""
+    def at_mean_occupancy(self, target: float, time: float) -> Self:
+        """Return this model with a mean occupancy of `target` at a time, s."""
+        raise NotImplementedError(f"{type(self).__name__} is not adjustable: {target}, {time}")
 
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> Self:  # noqa: ARG002
+        """Return this model with days that differ from its forecast by `day_error`, where it can be set."""
+        return self
+
+    def for_world(self, world: OccupancyModel) -> PriorModel:  # noqa: ARG002 - subclasses use it
+        """Return this forecast beside another world of the lot."""
+        return self
+
+
+class OccupancyModel(PriorModel):
+    """A kind of world: says on which days searches can begin, makes worlds, and forecasts occupancy.
+
+    A class needs `n_slots`, `forecast` and `world` to be a world everywhere: in environments and their batches, in
+    fleets and in studies.
+
+    Attributes:
+        recorded: whether worlds replay dated days, see `days_in`.
+    """
+
+    recorded: ClassVar[bool] = False
+
+    @abstractmethod
     def world(self, key: np.uint64, arrival: Arrival) -> World:
         """Return the world of the episode with this key."""
+
+    def days_in(self, window: ArrivalWindow) -> list[str]:  # noqa: ARG002 - subclasses use it
+        """Return the ISO dates of the recorded days in a window; none if days are not recorded."""
+        return []
+
+    def arrival_days(self, window: ArrivalWindow) -> list[ArrivalDay]:
+        """Return the days on which searches begin, from which each draws one."""
+        if self.recorded:
+            return [ArrivalDay(weekday_of(day), day) for day in self.days_in(window)]
+        return [ArrivalDay(weekday) for weekday in window.weekdays]
+
+    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
+        """Draw the day and the time of day at which the search with this key begins, both uniform."""
+        days = self.arrival_days(window)
+        day, second = draw_arrival(np.uint64(key), len(days), float(window.start_s), float(window.end_s))
+        return Arrival(days[day].weekday * DAY_S + second, days[day].date)
+
+    def with_fixed_slots(self, window: ArrivalWindow) -> Self:  # noqa: ARG002 - subclasses use it
+        """Return this model with every slot of its data at the same slot of the lot on all days of a window."""
+        return self
 
 
 @kernel
@@ -173,14 +262,14 @@ def _marginals(process: int, hour: int, second: float, marginals: FloatArray) ->
         marginals[slot] = kernels.process_forecast(kernels.process_at(process, 0), hour, second, slot)[0]
 
 
-class ProcessWorld:
+class ProcessWorld(World):
     """One episode of an `OccupancyProcess`: a pure function of (process, key, arrival).
 
     Evaluation is lazy: only queried slots cost time. A slot keeps a cursor on its latest sojourn; a query before the
     cursor restarts that slot, so answers never depend on the order of the queries.
     """
 
-    def __init__(self, process: "OccupancyProcess", key: np.uint64, arrival: Arrival) -> None:
+    def __init__(self, process: OccupancyProcess, key: np.uint64, arrival: Arrival) -> None:
         if not math.isfinite(arrival.time):
             raise InputError(f"Arrival.time is {arrival.time}, want finite seconds")
         # np.zeros does not touch its memory, so a million slots cost nothing until they are queried.
@@ -191,6 +280,11 @@ class ProcessWorld:
         _, hour, second = hour_of_week(float(arrival.time))
         self._record = np.array([(self.key, arrival.time, hour, second, 1.0, 0.0)], kernels.WORLD)
         _draw_day(process.address, address_of(self._record, kernels.WORLD))
+
+    @property
+    def address(self) -> int:
+        """Address of the PROCESS record."""
+        return self.process.address
 
     def occupied(self, slots: ArrayLike, time: float) -> BoolArray:
         """(k,) bool, whether each of the slots (k,) is taken at `time`, at or after the arrival."""
@@ -227,7 +321,7 @@ class ProcessWorld:
 
 
 @dataclass(frozen=True, eq=False)
-class OccupancyProcess:
+class OccupancyProcess(OccupancyModel):
     """Independent two-state continuous-time Markov chains, one per slot, with weekly periodic rates.
 
     A free slot s is taken at the rate `arrival_factor[s] * arrival_profile[h]`, a taken one becomes free at the
@@ -259,6 +353,8 @@ class OccupancyProcess:
             nearness.
     """
 
+    kind: ClassVar[int] = PROCESS_KIND
+    adjustable: ClassVar[bool] = True
     arrival_factor: FloatArray
     arrival_profile: FloatArray
     departure_factor: FloatArray
@@ -315,7 +411,7 @@ class OccupancyProcess:
     def __reduce__(self) -> tuple[Any, ...]:
         return OccupancyProcess, tuple(getattr(self, name) for name in _FIELDS)
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "OccupancyProcess":
+    def __deepcopy__(self, memo: dict[int, Any]) -> OccupancyProcess:
         return self  # immutable: copies share it
 
     @classmethod
@@ -375,14 +471,20 @@ class OccupancyProcess:
         """Address of the PROCESS record, for compiled code; valid while this process lives."""
         return address_of(self.record, kernels.PROCESS)
 
-    def take(self, slots: ArrayLike) -> "OccupancyProcess":
+    def compiled(self, window: ArrivalWindow) -> CompiledModel:  # noqa: ARG002 - the same on all days
+        """Return the PROCESS record."""
+        tables = {name: getattr(self, name) for name in _TABLES}
+        kept = tuple(array for array in (self._centring, self.nearness) if array is not None)
+        return CompiledModel(self.record, tables, kept)
+
+    def take(self, slots: ArrayLike) -> OccupancyProcess:
         """Return a process whose slot i has the rates of this process's slot `slots[i]`; (n,) int64."""
         chosen = np.asarray(slots, np.int64)
         arrival, departure = self.factors[:, chosen]
         near = None if self.nearness is None else self.nearness[chosen]
         return replace(self, arrival_factor=arrival, departure_factor=departure, nearness=near)
 
-    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> "OccupancyProcess":
+    def with_day_error(self, day_error: DayError, walk: ArrayLike | None = None) -> OccupancyProcess:
         """Return this process with days that differ from its forecast.
 
         Args:
@@ -392,7 +494,7 @@ class OccupancyProcess:
         near = self.nearness if walk is None else nearness(walk)
         return replace(self, day_error=day_error, nearness=near)
 
-    def mapped_to_lot(self, walk_m: ArrayLike) -> "OccupancyProcess":
+    def mapped_to_lot(self, walk_m: ArrayLike) -> OccupancyProcess:
         """Map the process by rank to a lot of any size: the fullest slots go nearest to the goal.
 
         Args:
@@ -407,7 +509,7 @@ class OccupancyProcess:
         taken = self.take(slots)
         return taken if self.nearness is None else taken.with_day_error(self.day_error, walk)
 
-    def at_mean_occupancy(self, target: float, time: float) -> "OccupancyProcess":
+    def at_mean_occupancy(self, target: float, time: float) -> OccupancyProcess:
         """Scale all arrival rates by one factor such that the lot's mean marginal at `time` is `target`.
 
         Scaling the arrival rates shifts every slot's attraction by the same logit.
@@ -436,11 +538,6 @@ class OccupancyProcess:
         _marginals(self.address, hour, second, marginals)
         return marginals
 
-    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Draw a weekday and a time of day, both uniform in the window."""
-        index = int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(window.weekdays))
-        return Arrival(window.weekdays[index] * DAY_S + window.draw_second(key))
-
     def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
         """Return the world of the episode with this key; its initial state is drawn from the marginal on its day."""
         return ProcessWorld(self, key, arrival)
@@ -458,6 +555,7 @@ class OccupancyProcess:
 
 _FIELDS = tuple(f.name for f in fields(OccupancyProcess) if f.init)
 _RATES = _FIELDS[:4]
+_TABLES = ("factors", "profiles", "hazards", "hourly_marginals")
 
 
 def _checked(name: str, values: Any, size: int | None = None) -> FloatArray:

@@ -9,14 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import date
 from pathlib import Path
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.keyed_random import ARRIVAL_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
 from parkenv.errors import InputError
 from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
@@ -25,6 +24,7 @@ from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
 from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.fit import fit_hourly_decay_rates
 from parkenv.world.occupancy.kernel import (
+    LOG_KIND,
     MAX_PROBABILITY,
     MIN_PROBABILITY,
     RECORDED_DAY,
@@ -35,7 +35,15 @@ from parkenv.world.occupancy.kernel import (
     recorded_index,
 )
 from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
-from parkenv.world.occupancy.process import DAY_NAMES, Arrival, ArrivalWindow, Forecast
+from parkenv.world.occupancy.process import (
+    DAY_NAMES,
+    Arrival,
+    ArrivalWindow,
+    CompiledModel,
+    Forecast,
+    OccupancyModel,
+    World,
+)
 from parkenv.world.week import DAY_S
 
 
@@ -121,7 +129,7 @@ def _day_level(days: int, second: float) -> float:
     return float(recorded_day_level(recorded_day_at(days, 0), second))
 
 
-class RecordedWorld:
+class RecordedWorld(World):
     """A replayed recorded day; after the end of the day its last state holds."""
 
     def __init__(self, occupancy: RecordedOccupancy, arrival: Arrival) -> None:
@@ -185,7 +193,7 @@ class DayForecast(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class RecordedOccupancy:
+class RecordedOccupancy(OccupancyModel):
     """A log mapped to the n slots of a lot: every episode replays a recorded day.
 
     The lot's slots, nearest to the goal first, get the log's m slots, fullest first (mean occupancy on the
@@ -206,6 +214,8 @@ class RecordedOccupancy:
             before `replay_from`. The last two need a `replay_from`.
     """
 
+    kind: ClassVar[int] = LOG_KIND
+    recorded: ClassVar[bool] = True
     log: OccupancyLog
     walk_m: FloatArray
     mapping: IntArray | None = None
@@ -257,11 +267,9 @@ class RecordedOccupancy:
         first = "" if self.replay_from is None else self.replay_from.isoformat()
         return int(np.searchsorted(self.log.days, first))
 
-    def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
-        """Draw a day to replay among those on the window's weekdays, and a time of day, both uniform."""
-        days = self.days_in(window)
-        day = days[int(keyed_uniform(key, ARRIVAL_STREAM, 0, 0) * len(days))]
-        return Arrival(weekday_of(day) * DAY_S + window.draw_second(key), day)
+    def compiled(self, window: ArrivalWindow) -> CompiledModel:
+        """Return a RECORDED_DAY record for each of the days in the window."""
+        return CompiledModel(self.day_records(self.days_in(window)), {}, (self,))
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
         """Return the days to replay on the window's weekdays; InputError if there are none."""
