@@ -7,10 +7,10 @@ import numpy as np
 from PIL import Image
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
+from planners.heuristics import POLICIES
 
 FILM_S, FRAMES_PER_S = 120, 15
 
@@ -23,8 +23,8 @@ demand = Demand(
 )
 drivers = {
     "mdp, own observations": DriverKind(weight=0.3),
-    "greedy-drive, own observations": DriverKind(weight=0.4, rule=RULES["greedy-drive"]),
-    "greedy-drive, guided": DriverKind(weight=0.3, rule=RULES["greedy-drive"], knows="reserve"),
+    "greedy-drive, own observations": DriverKind(weight=0.4, policy=POLICIES["greedy-drive"]),
+    "greedy-drive, guided": DriverKind(weight=0.3, policy=POLICIES["greedy-drive"], knows="reserve"),
 }
 # A car that parks or leaves blocks its lane for six seconds, so there are queues. Cars that know the lot to be full
 # search on, instead of giving up at once.

@@ -37,6 +37,7 @@ PLANNERS_MAY_SEE = (
     "parkenv.world",
     "parkenv.belief",
     "parkenv.driving",
+    "parkenv.engine.policy",
     "parkenv.errors",
     "parkenv.files",
 )

@@ -13,10 +13,10 @@ import pytest
 
 from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.errors import InputError
 from parkenv.studies.bench import sumo
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
+from planners.heuristics import POLICIES
 
 STREET = make_scenario("street")
 
@@ -43,7 +43,7 @@ def test_a_lot_with_two_way_lanes_is_refused():
 
 def test_sumo_gets_the_cars_of_the_fleet_and_its_stops_are_read(monkeypatch):
     demand = Demand(PoissonArrivals(60.0, 8 * 3600, 9 * 3600), ExponentialTime(3600.0))
-    kind = DriverKind(rule=RULES["greedy-drive"])
+    kind = DriverKind(policy=POLICIES["greedy-drive"])
     fleet = Fleet(STREET, demand, background="none", drivers=[kind], leave_full_lot=False)
     fleet.reset(0)
     arrival_s = fleet.cars["arrival"] - fleet.begin

@@ -343,12 +343,12 @@ def test_a_finished_folder_may_be_used_again_and_a_foreign_one_is_refused(tmp_pa
 
 def test_going_on_notices_that_an_agent_of_your_own_has_changed(tmp_path):
     module, out = tmp_path / "mine.py", tmp_path / "out"
-    module.write_text("from planners.greedy import GreedyGoalAgent as Mine\n")
+    module.write_text("from planners.heuristics.agents import GreedyGoalAgent as Mine\n")
     assert parkenv(*small(out, agents="mine:Mine"), cwd=tmp_path).returncode == 0
     others = small(out, "--resume", agents="mdp", episodes=3)
     assert parkenv(*others, cwd=tmp_path).returncode == 0
     assert parkenv(*small(out, "--resume", agents="mine:Mine", episodes=14), cwd=tmp_path).returncode == 0
-    module.write_text("from planners.greedy import RandomAgent as Mine\n")
+    module.write_text("from planners.heuristics.agents import RandomAgent as Mine\n")
     changed = parkenv(*small(out, "--resume", agents="mine:Mine", episodes=16), cwd=tmp_path)
     assert_one_line_and_exit_2(changed, "agent files: mine:Mine was", "use the same settings")
 

@@ -10,7 +10,6 @@ from small_lots import features
 
 from parkenv import ParkingLot, lot_v0, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.engine.records import CAR, N_TERMS, SEARCH
 from parkenv.envs.sb3 import FleetVecEnv, SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
@@ -21,6 +20,7 @@ from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS, METRICS, REWARD_TERMS
 from parkenv.world.demand import Demand, Headways, PoissonArrivals
 from planners import make_agent
+from planners.heuristics import POLICIES
 
 PRICE_S = 45.0
 LIMIT = 60
@@ -145,7 +145,7 @@ def test_many_cars_as_agents(scenario):
 
 
 def test_cars_of_compiled_drivers(scenario):
-    fleet = Fleet(scenario, Demand(Headways(6)), drivers=[DriverKind(rule=RULES["greedy-drive"])])
+    fleet = Fleet(scenario, Demand(Headways(6)), drivers=[DriverKind(policy=POLICIES["greedy-drive"])])
     fleet.reset(seed=0)
     fleet.run()
     cars = fleet.cars

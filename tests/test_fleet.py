@@ -18,8 +18,8 @@ from small_lots import small_lot
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
+from parkenv.studies.verify.fleets import ORDERED_ENTRY
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -30,11 +30,13 @@ from parkenv.world.demand import (
     PoissonArrivals,
 )
 from parkenv.world.occupancy.process import Forecast, PriorModel
+from planners.heuristics import POLICIES
 
+ALL_POLICIES = POLICIES | {ORDERED_ENTRY.name: ORDERED_ENTRY}
 NOISY = SensorModel(
     15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
 )
-GREEDY = DriverKind(rule=RULES["greedy-drive"])
+GREEDY = DriverKind(policy=POLICIES["greedy-drive"])
 
 
 def test_no_function_for_a_record_is_compiled_for_one_that_merely_begins_like_it():
@@ -139,14 +141,16 @@ def random_fleet(lot_seed, n_cars, background, kinds, stay_s, patience_s, option
     }
     scenario = Scenario(**fields, name="small", occupancy=process)
     demand = Demand(Headways(n_cars, 20.0), ExponentialTime(stay_s), ConstantTime(patience_s))
-    drivers = [DriverKind(rule=RULES.get(kind), knows=knows, shares=shares) for kind, knows, shares in kinds]
+    drivers = [
+        DriverKind(policy=ALL_POLICIES.get(kind), knows=knows, shares=shares) for kind, knows, shares in kinds
+    ]
     fleet = Fleet(scenario, demand, background=background, drivers=drivers, max_steps=60, **options)
     fleet.reset(seed)
     return fleet
 
 
 kinds_of_drivers = st.tuples(
-    st.sampled_from([*RULES, "python"]),
+    st.sampled_from([*ALL_POLICIES, "python"]),
     st.sampled_from(["own", "shared", "reserve", "full"]),
     st.booleans(),
 )
@@ -202,7 +206,7 @@ def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(argumen
     time = check_state(fleet, time)
     assert fleet.totals["due"] == fleet.totals["searching"] == 0
     cars = fleet.cars
-    fleet.run([None if kind.rule else object() for kind in fleet.drivers], until=fleet.time + 300.0)
+    fleet.run([None if kind.policy else object() for kind in fleet.drivers], until=fleet.time + 300.0)
     check_state(fleet, time)
     left = cars["state"] == LEFT
     np.testing.assert_allclose(cars["left_at"][left], (cars["ended_at"] + cars["stay_s"])[left])
@@ -264,27 +268,6 @@ def test_the_first_car_at_a_slot_has_it_and_the_second_fails():
     assert first["left_at"] == first["ended_at"] + 15.0
 
 
-@pytest.mark.parametrize("name", ["greedy-drive", "first-free"])
-def test_compiled_drivers_do_as_the_agents_of_their_name(name):
-    from planners.agent import make_agent
-
-    compiled, planned = [], []
-    for source in ("mini", "campus"):
-        scenario = parkenv.make_scenario(source)
-        demand = Demand(Headways(6, 30.0))
-        one = Fleet(scenario, demand, drivers=[DriverKind(rule=RULES[name])])
-        other = Fleet(scenario, demand)
-        agent = make_agent(name, scenario)
-        for seed in range(8):
-            one.reset(seed)
-            one.run()
-            other.reset(seed)
-            other.run([agent])
-            compiled += one.cars["slot"].tolist()
-            planned += other.cars["slot"].tolist()
-    assert np.mean(np.array(compiled) == planned) > 0.97  # routes of equal length may differ
-
-
 def test_residents_leave_and_do_not_come_back():
     fleet = Fleet("campus", Demand(PoissonArrivals(1.0, 0.0, 86400.0)), drivers=[GREEDY])
     fleet.reset(2)
@@ -298,7 +281,7 @@ def test_residents_leave_and_do_not_come_back():
 def test_a_car_without_patience_goes_elsewhere():
     demand = Demand(Headways(4), patience=ConstantTime(20.0))
     scenario = parkenv.make_scenario("jam", give_up_s=500.0)
-    fleet = Fleet(scenario, demand, drivers=[DriverKind(rule=RULES["random"])])
+    fleet = Fleet(scenario, demand, drivers=[DriverKind(policy=POLICIES["random"])])
     fleet.reset(0)
     fleet.run()
     cars = fleet.cars[np.array(fleet.state_names()) == "balked"]
@@ -324,7 +307,7 @@ def test_goals_and_entries_are_drawn_by_weight():
 def test_more_drivers_of_a_kind_are_those_before_and_others():
     kinds = []
     for share in (0.25, 0.5):
-        drivers = [DriverKind(share, RULES["random"]), DriverKind(1.0 - share, RULES["greedy-drive"])]
+        drivers = [DriverKind(share, POLICIES["random"]), DriverKind(1.0 - share, POLICIES["greedy-drive"])]
         fleet = Fleet("mini", Demand(Headways(200)), drivers=drivers)
         fleet.reset(4)
         kinds.append(fleet.cars["kind"] == 0)
@@ -341,7 +324,7 @@ def test_ordered_entry_loses_as_erlang_says():
     process = OccupancyProcess.from_demand(np.zeros(n), np.zeros(168))
     scenario = Scenario(lot=lot, name="row", occupancy=process)
     demand = Demand(PoissonArrivals(500.0, 0.0, 40 * 3600.0), ExponentialTime(36.0))
-    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(rule=RULES["ordered-entry"])])
+    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=ORDERED_ENTRY)])
     fleet.reset(0)
     fleet.run()
     load, blocking = 5.0, 1.0
@@ -374,9 +357,9 @@ def test_a_forecast_computed_in_python_reaches_every_car():
 @pytest.mark.slow
 def test_another_process_gives_the_same_run():
     program = (
-        "from parkenv.engine.fleet import *; from parkenv.engine.fleet_rules import *;"
+        "from parkenv.engine.fleet import *; from planners.heuristics import *;"
         "from parkenv.world.demand import *;"
-        "f = Fleet('campus', Demand(Headways(40)), drivers=[DriverKind(rule=RULES['greedy-drive'])]);"
+        "f = Fleet('campus', Demand(Headways(40)), drivers=[DriverKind(policy=POLICIES['greedy-drive'])]);"
         "f.reset(5); f.run(); print(f.cars['slot'].tolist(), f.cars['ended_at'].tolist())"
     )
     runs = {
@@ -404,7 +387,7 @@ def recorded(scenario, demand, days):
     from parkenv import OccupancyLog
 
     n, seconds = scenario.lot.n_slots, np.arange(0.0, 86400.0, 600.0)
-    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(rule=RULES["ordered-entry"])])
+    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=ORDERED_ENTRY)])
     taken = np.zeros((days, n, len(seconds)), bool)
     for day in range(days):
         fleet.reset(day)
@@ -464,7 +447,7 @@ class Raises:
         (lambda: DriverKind(weight=-0.1), "DriverKind.weight is -0.1"),
         (lambda: Fleet("mini", delay_s=math.inf), "delay_s is inf"),
         (lambda: DriverKind(knows="everything"), "DriverKind.knows is 'everything'"),
-        (lambda: DriverKind(rule="random"), "want a Rule"),
+        (lambda: DriverKind(policy="random"), "want a CompiledPolicy"),
     ],
 )
 def test_bad_input_is_refused_in_a_line(make, words):

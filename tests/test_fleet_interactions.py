@@ -6,7 +6,6 @@ import pytest
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, lot_v0
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.engine.records import SEARCHING
 from parkenv.lots import grid_lot
 from parkenv.world.demand import (
@@ -18,6 +17,7 @@ from parkenv.world.demand import (
     PoissonArrivals,
 )
 from parkenv.world.lot import PARK
+from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
 
 LOT = grid_lot(1, 8)
@@ -162,7 +162,7 @@ def test_crowded_lots_stay_sound(rule):
     fleet = Fleet(
         "mini",
         demand,
-        drivers=[DriverKind(rule=RULES[rule])],
+        drivers=[DriverKind(policy=POLICIES[rule])],
         manoeuvre_s=8.0,
         leaving_soon_s=10.0,
         leave_full_lot=False,
@@ -187,7 +187,7 @@ def test_crowded_lots_stay_sound(rule):
 @pytest.mark.parametrize("tick_s", [1.0, 0.3])
 def test_queues_keep_to_ticks(tick_s):
     demand = Demand(Headways(30, 3.0))
-    kinds = [DriverKind(rule=RULES["greedy-drive"])]
+    kinds = [DriverKind(policy=POLICIES["greedy-drive"])]
     fleet = Fleet("mini", demand, drivers=kinds, tick_s=tick_s, manoeuvre_s=7.7, background="none")
     fleet.reset(0)
     fleet.run()

@@ -8,7 +8,6 @@ import pytest
 
 import parkenv
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
-from parkenv.engine.fleet_rules import RULES
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -18,6 +17,7 @@ from parkenv.world.demand import (
     PoissonArrivals,
 )
 from planners.agent import make_agent
+from planners.heuristics import POLICIES
 
 TWO = Demand(ListedArrivals((36000.0, 36060.0)))
 
@@ -62,7 +62,7 @@ def test_reports_arrive_after_their_delay():
 
 def test_many_reports_wait_for_their_delay():
     demand = Demand(PoissonArrivals(400.0, 36000.0, 43200.0), ExponentialTime(600.0), ConstantTime(600.0))
-    kinds = [DriverKind(rule=RULES["random"], knows="shared", shares=True)]
+    kinds = [DriverKind(policy=POLICIES["random"], knows="shared", shares=True)]
     fleet = Fleet("mini", demand, drivers=kinds, delay_s=1800.0)
     fleet.reset(0)
     fleet.run()
@@ -119,7 +119,7 @@ def test_every_agent_drives_to_its_reserved_slot(name):
 
 
 def means(knows, demand, **options):
-    kinds = [DriverKind(rule=RULES["first-free"], knows=knows, shares=True)]
+    kinds = [DriverKind(policy=POLICIES["first-free"], knows=knows, shares=True)]
     fleet = Fleet("campus", demand, drivers=kinds, leave_full_lot=False, **options)
     found = []
     for seed in range(12):
@@ -144,8 +144,8 @@ def test_knowing_more_helps_and_guidance_helps_most():
 def test_others_may_take_a_reserved_slot():
     demand = Demand(PoissonArrivals(240.0, 32400.0, 36000.0), ExponentialTime(3600.0), ConstantTime(600.0))
     kinds = [
-        DriverKind(0.5, RULES["greedy-drive"], knows="reserve"),
-        DriverKind(0.5, RULES["greedy-drive"]),
+        DriverKind(0.5, POLICIES["greedy-drive"], knows="reserve"),
+        DriverKind(0.5, POLICIES["greedy-drive"]),
     ]
     fleet = Fleet("campus", demand, drivers=kinds, leave_full_lot=False)
     fleet.reset(0)
@@ -159,7 +159,7 @@ def test_others_may_take_a_reserved_slot():
 @pytest.mark.parametrize("knows", ["own", "full", "reserve"])
 def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
     demand = Demand(Headways(25, 1.0), ConstantTime(math.inf), ConstantTime(300.0))
-    kinds = [DriverKind(rule=RULES["greedy-drive"], knows=knows)]
+    kinds = [DriverKind(policy=POLICIES["greedy-drive"], knows=knows)]
     searched = {}
     for leave in (True, False):
         fleet = Fleet("mini", demand, background="none", drivers=kinds, leave_full_lot=leave)

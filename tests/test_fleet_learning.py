@@ -14,17 +14,17 @@ from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
-from parkenv.engine.network import NetworkRule
+from parkenv.engine.network import NetworkPolicy
 from parkenv.engine.records import SEARCHING
-from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_rule
+from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_policy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.drivers import MixedFleet, driver_of
+from parkenv.studies.fleet.drivers import MixedFleet, policy_of
 from parkenv.studies.training.fleet import FleetTraining
 from parkenv.studies.training.spec import TrainingSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
+from planners.heuristics import POLICIES
 from planners.model_file import save_model
 
 MINI = make_scenario("mini")
@@ -57,7 +57,7 @@ def test_every_episode_is_the_search_of_one_car_from_its_arrival_to_its_end():
         for i, fleet in enumerate(venv.fleets):
             car = fleet.cars[venv._cars[i]]
             assert car["state"] == SEARCHING
-            assert car["rule"] == 0
+            assert car["policy"] == 0
         observed, rewards, done, infos = venv.step(random_actions(venv.action_masks(), rng))
         returns, lengths = returns + rewards, lengths + 1
         for i in np.flatnonzero(done):
@@ -88,7 +88,7 @@ def test_the_other_cars_choose_as_the_learning_one_does():
         _, _, done, infos = venv.step(actions)
         ended += [info["total_s"] for info in infos if done[0]]
     fleet = Fleet(
-        MINI, DEMAND, drivers=[DriverKind(rule=network_rule(model.policy, 5))], leave_full_lot=False
+        MINI, DEMAND, drivers=[DriverKind(policy=network_policy(model.policy, 5))], leave_full_lot=False
     )
     fleet.reset(1, 0)
     fleet.run()
@@ -105,12 +105,12 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
     save_model(model, path)
     name = {PPO: "ppo", MaskablePPO: "maskable-ppo", DQN: "dqn"}[algorithm]
     agent = make_agent(f"{name}:{path}", MINI)
-    rule, none = driver_of(AgentSpec(name=f"{name}:{path}"), MINI)
+    policy, none = policy_of(AgentSpec(name=f"{name}:{path}"), MINI)
     assert none is None
-    assert rule.sampled == (algorithm is not DQN), "policies draw their actions in fleets"
-    rule = network_rule(model.policy, 5)
+    assert policy.sampled == (algorithm is not DQN), "policies draw their actions in fleets"
+    policy = network_policy(model.policy, 5)
     found = []
-    for kind, agents in ((DriverKind(rule=rule), None), (DriverKind(), [agent])):
+    for kind, agents in ((DriverKind(policy=policy), None), (DriverKind(), [agent])):
         fleet = Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False)
         fleet.reset(3)
         fleet.run(agents)
@@ -121,9 +121,9 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
 def test_drawn_actions_have_the_probabilities_of_the_policy():
     venv = batch()
     model = small(MaskablePPO, venv)
-    rule = pickle.loads(pickle.dumps(network_rule(model.policy, 5, sampled=True)))
+    policy = pickle.loads(pickle.dumps(network_policy(model.policy, 5, sampled=True)))
     demand = Demand(PoissonArrivals(600.0, 8 * 3600, 9 * 3600))
-    fleet = Fleet(MINI, demand, drivers=[DriverKind(rule=rule)], max_steps=1, background="none")
+    fleet = Fleet(MINI, demand, drivers=[DriverKind(policy=policy)], max_steps=1, background="none")
     actual = []
     for day in range(6):
         fleet.reset(0, day)
@@ -164,7 +164,7 @@ def test_a_search_that_is_cut_off_says_so_and_one_that_balks_does_not():
 
 @pytest.mark.parametrize("algorithm", [PPO, MaskablePPO])
 def test_stable_baselines3_learns_with_others_in_the_same_fleet(algorithm):
-    kinds = [DriverKind(0.5), DriverKind(0.5, RULES["greedy-drive"])]
+    kinds = [DriverKind(0.5), DriverKind(0.5, POLICIES["greedy-drive"])]
     venv = batch(4, kinds, reward_scale=0.01)
     model = small(algorithm, venv, n_steps=32, batch_size=64)
     before = [weights.copy() for weights, _ in venv.network.layers]
@@ -180,8 +180,8 @@ def test_stable_baselines3_learns_with_others_in_the_same_fleet(algorithm):
     [
         ({"n": 0}, "num_envs is 0"),
         ({"reward_scale": -1.0}, "reward_scale is -1.0"),
-        ({"drivers": [DriverKind(rule=RULES["random"])]}, r"drivers\[0\] has a rule"),
-        ({"drivers": [DriverKind(), DriverKind()]}, r"drivers\[1\] has no rule"),
+        ({"drivers": [DriverKind(policy=POLICIES["random"])]}, r"drivers\[0\] has a policy"),
+        ({"drivers": [DriverKind(), DriverKind()]}, r"drivers\[1\] has no policy"),
         ({"k": 0}, "k is 0"),
     ],
 )
@@ -192,9 +192,9 @@ def test_bad_arguments_are_named(options, wanted):
 
 def test_layers_that_do_not_fit_are_named():
     with pytest.raises(InputError, match="want a chain from 91 numbers to 5"):
-        NetworkRule([(np.zeros((5, 7), np.float32), np.zeros(5, np.float32))])
+        NetworkPolicy([(np.zeros((5, 7), np.float32), np.zeros(5, np.float32))])
     with pytest.raises(InputError, match="activation is 'elu'"):
-        NetworkRule([(np.zeros((5, 91), np.float32), np.zeros(5, np.float32))], activation="elu")
+        NetworkPolicy([(np.zeros((5, 91), np.float32), np.zeros(5, np.float32))], activation="elu")
 
 
 def test_members_of_a_mixed_fleet_are_those_asked_for():
@@ -203,7 +203,7 @@ def test_members_of_a_mixed_fleet_are_those_asked_for():
     fleet = Fleet(
         MINI,
         DEMAND,
-        drivers=[DriverKind(0.25, RULES["random"]), DriverKind(0.75, RULES["greedy-drive"])],
+        drivers=[DriverKind(0.25, POLICIES["random"]), DriverKind(0.75, POLICIES["greedy-drive"])],
         leave_full_lot=False,
     )
     fleet.reset(0, 0)
@@ -234,7 +234,7 @@ def test_specifications_that_make_no_sense_are_refused(fields, wanted):
     ("fields", "wanted"),
     [
         ({"scenarios": ["mini", "campus"]}, "want one with --env fleet"),
-        ({"among": "belief"}, "want a compiled driver"),
+        ({"among": "belief"}, "want a compiled policy"),
         ({"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with env fleet"),
         ({"agents": ["oracle"]}, "knows the future"),
     ],

@@ -12,12 +12,12 @@ from timetable_world import Timetable
 import parkenv
 from parkenv.compiled.memory import address_of
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.studies.compare.cases import Case
 from parkenv.world.demand import Demand, Headways
 from parkenv.world.occupancy.kernel import FUNCTIONS
 from planners.agent import make_agent
+from planners.heuristics import POLICIES
 
 
 def scenario(kind=Timetable, **changes):
@@ -69,7 +69,7 @@ def test_a_batch_a_saved_state_and_a_pickle_go_on_as_the_single_search_does():
 
 @pytest.mark.parametrize("background", ["process", "residents"])
 def test_a_fleet_shares_it(background):
-    kinds = [DriverKind(rule=RULES["first-free"]), DriverKind(knows="full")]
+    kinds = [DriverKind(policy=POLICIES["first-free"]), DriverKind(knows="full")]
     fleet = Fleet(scenario(), Demand(Headways(8, 20.0)), drivers=kinds, background=background)
     fleet.reset(0)
     world = fleet.scenario.occupancy

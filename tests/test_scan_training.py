@@ -18,7 +18,7 @@ from parkenv.envs.scan_observation import FIXED, PER_SCAN, SCANS, WAVELENGTHS_M,
 from parkenv.envs.scan_vector import StackedScanVectorEnv
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.fleet.drivers import driver_of
+from parkenv.studies.fleet.drivers import policy_of
 from parkenv.studies.simulate import make_search, simulate
 from parkenv.studies.training.search import episode_times
 from parkenv.studies.training.training import train_one
@@ -140,7 +140,7 @@ def test_a_model_needs_scans(tmp_path):
     with pytest.raises(InputError, match="observes 338 numbers, got 184 for its k = 4"):
         agent.predict(ScanObservation(scan_env(), k=2).reset(seed=0)[0])
     with pytest.raises(InputError, match="observes laser scans, which the cars of a fleet do not have"):
-        driver_of(AgentSpec(name=name), MINI)
+        policy_of(AgentSpec(name=name), MINI)
     with pytest.raises(InputError, match="observes laser scans, this environment has none"):
         DrivenSearch(MINI, name)
     with pytest.raises(InputError, match='observation is "scan", want a rig with a laser'):

@@ -9,7 +9,7 @@ from command_line import parkenv
 
 AGENT = """
 from pathlib import Path
-from planners.greedy import FirstFreeAgent
+from planners.heuristics.agents import FirstFreeAgent
 
 Path("was_run").touch()
 

@@ -6,12 +6,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv.engine.fleet_rules import RULES
 from parkenv.studies.verify import balance, blocking, entry, game, stays, strategies
-from parkenv.studies.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
+from parkenv.studies.verify.fleets import (
+    ORDERED_ENTRY,
+    erlang_b,
+    independent_runs,
+    lane,
+    loaded_fleet,
+    mean_parked,
+)
 from parkenv.studies.verify.rows import disagreeing
 from parkenv.world.demand import ExponentialTime
 from parkenv.world.week import HOUR_S
+from planners.heuristics import POLICIES
 
 
 @pytest.mark.parametrize(("slots", "load"), [(1, 0.3), (5, 5.0), (10, 8.0), (100, 200.0)])
@@ -52,7 +59,7 @@ def test_slots_are_taken_as_often_as_erlang_says(monkeypatch):
 def test_other_drivers_are_found_out(monkeypatch):
     monkeypatch.setattr(entry, "RUNS", 30)
     monkeypatch.setattr(entry, "HOURS", 200.0)
-    monkeypatch.setattr(entry, "RULES", {"ordered-entry": strategies.Rule("meek", strategies.decide_meek)})
+    monkeypatch.setattr(entry, "ORDERED_ENTRY", strategies.CompiledPolicy("meek", strategies.decide_meek))
     assert len(disagreeing(entry.rows(1))) > 3
 
 
@@ -62,11 +69,11 @@ def test_the_law_of_the_stay_does_not_matter(law):
     assert not disagreeing(made), made
 
 
-@pytest.mark.parametrize("rule", ["ordered-entry", "greedy-drive"])
-def test_the_lot_turns_away_as_many_as_erlang_says(rule, monkeypatch):
+@pytest.mark.parametrize("policy", [ORDERED_ENTRY, POLICIES["greedy-drive"]], ids=lambda p: p.name)
+def test_the_lot_turns_away_as_many_as_erlang_says(policy, monkeypatch):
     monkeypatch.setattr(blocking, "RUNS", 40)
     monkeypatch.setattr(blocking, "HOURS", 150.0)
-    assert not disagreeing(blocking.row(rule, 3, ExponentialTime(HOUR_S), ""))
+    assert not disagreeing(blocking.row(policy, 3, ExponentialTime(HOUR_S), ""))
 
 
 def test_no_car_is_lost_at_any_event():
@@ -93,7 +100,7 @@ def test_strategies_on_the_half_line():
 
 def test_a_driver_at_the_threshold_takes_the_first_free_slot_of_its_zone():
     fleet = loaded_fleet(
-        lane(strategies.ZONE_SLOTS), strategies.Rule("half", strategies.decide_half), 20.0, 2.0
+        lane(strategies.ZONE_SLOTS), strategies.CompiledPolicy("half", strategies.decide_half), 20.0, 2.0
     )
     (cars,) = independent_runs(fleet, 1, 0, 2.0)
     # An empty zone of 100 slots: the first car stops at its far end, the others behind it, towards the goal.
@@ -121,7 +128,7 @@ def test_drivers_who_compete_pay_for_places_and_failed_searches():
 
 
 def test_a_full_lot_is_left_by_ordered_entry():
-    fleet = loaded_fleet(lane(1), RULES["ordered-entry"], 50.0, 3.0)
+    fleet = loaded_fleet(lane(1), ORDERED_ENTRY, 50.0, 3.0)
     (cars,) = independent_runs(fleet, 1, 0, 3.0)
     parked = cars["slot"] >= 0
     assert 0 < parked.sum() < len(cars)

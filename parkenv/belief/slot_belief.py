@@ -19,6 +19,7 @@ _SURE = np.zeros(2)
 _SURE.flags.writeable = False
 
 UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2  # result of a slot's last observation
+_SURELY_LEFT = 8.0  # decay rate times age up to which something of an observation is left
 
 
 @dataclass(eq=False)
@@ -142,6 +143,12 @@ class SlotBelief:
         states: NDArray[np.int8] = _states(self.parts)
         return states
 
+    @cached_property
+    def recent_state(self) -> NDArray[np.uint8]:
+        """(n_slots,) uint8, as `state`, but `UNOBSERVED` where "taken" has decayed to the forecast by now."""
+        states: NDArray[np.uint8] = _recent_states(self.parts, self.p_occupied, self.time)
+        return states
+
     @property
     def observed_free(self) -> BoolArray:
         """(n_slots,) bool, see `state`."""
@@ -227,17 +234,43 @@ def bayes_update(p: float, observed_taken: bool, hit_rate: float, false_alarm_ra
     return if_taken * p / evidence
 
 
+@compiled(forceinline=True)
+def observed_state(forecast: float, p_observed: float) -> int:
+    """State of an observed slot, see `SlotBelief.state`; `UNOBSERVED` if the observation changed nothing."""
+    if p_observed < forecast or p_observed == 0.0:
+        return OBSERVED_FREE
+    if p_observed > forecast or p_observed == 1.0:
+        return OBSERVED_TAKEN
+    return UNOBSERVED
+
+
+@compiled(forceinline=True)
+def may_have_decayed(decay_rate: float, time: float, observed_at: float) -> bool:
+    """Whether an observation is so old that P(taken) may be the forecast again; times in s, rate in 1/s."""
+    return bool(np.float64(decay_rate) * (np.float64(time) - np.float64(observed_at)) > _SURELY_LEFT)
+
+
 @compiled
 def _states(parts: NDArray[np.floating]) -> NDArray[np.int8]:
     n = len(parts) // 4
-    states = np.empty(n, np.int8)
+    states = np.full(n, UNOBSERVED, np.int8)
     for s in range(n):
-        forecast, p_observed, observed_at = parts[s], parts[2 * n + s], parts[3 * n + s]
-        states[s] = UNOBSERVED
-        if observed_at >= 0.0 and (p_observed < forecast or p_observed == 0.0):
-            states[s] = OBSERVED_FREE
-        elif observed_at >= 0.0 and (p_observed > forecast or p_observed == 1.0):
-            states[s] = OBSERVED_TAKEN
+        if parts[3 * n + s] >= 0.0:
+            states[s] = observed_state(parts[s], parts[2 * n + s])
+    return states
+
+
+@compiled
+def _recent_states(
+    parts: NDArray[np.floating], p_occupied: NDArray[np.floating], time: float
+) -> NDArray[np.uint8]:
+    n = len(parts) // 4
+    states = np.full(n, UNOBSERVED, np.uint8)
+    for s in range(n):
+        if parts[3 * n + s] >= 0.0:
+            state = observed_state(parts[s], parts[2 * n + s])
+            is_old = may_have_decayed(parts[n + s], time, parts[3 * n + s]) and p_occupied[s] == parts[s]
+            states[s] = UNOBSERVED if state == OBSERVED_TAKEN and is_old else state
     return states
 
 

@@ -101,6 +101,7 @@ def _arrays(item: Any) -> Any:
 # In compiled code, `float32_array(address, (m, n))` is the array at an address.
 float64_array, float32_array = _arrays(types.float64), _arrays(types.float32)
 int64_array, int32_array, int16_array = _arrays(types.int64), _arrays(types.int32), _arrays(types.int16)
+uint8_array = _arrays(types.uint8)
 
 
 @intrinsic

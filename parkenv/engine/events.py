@@ -66,13 +66,13 @@ from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
     FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,
 ) = range(-1, -9, -1)  # fmt: skip
 """Why `advance_at` returned, if not for a car to decide: all searches are over; the time limit; more SEARCH records are
-needed; Python must compute the forecast of the car `pending`; a compiled driver chose an unknown action; more room for
+needed; Python must compute the forecast of the car `pending`; a compiled policy chose an unknown action; more room for
 reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
 LEAVE = -1
-"""Action of compiled drivers: give up and park elsewhere."""
+"""Action of compiled policies: give up and park elsewhere."""
 TAKE_SLOT = 16
-"""Action of compiled drivers: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
+"""Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
 _ON_TICK = 1e-9  # fraction of a tick
 
 
@@ -97,7 +97,7 @@ def begin_world_at(address: int) -> None:
 
 @kernel
 def advance_at(address: int, until: float) -> int:
-    """Carry out events and the decisions of compiled drivers.
+    """Carry out events and the decisions of compiled policies.
 
     Args:
         address: address of the FLEET record.
@@ -117,11 +117,11 @@ def advance_at(address: int, until: float) -> int:
         if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
             number = int64s(fleet.ready)[fleet.first_ready]
             car = car_at(fleet.cars, number)
-            if car.rule == 0 or car.state != SEARCHING:
+            if car.policy == 0 or car.state != SEARCHING:
                 return NEEDS_RESERVATIONS if _lacks_reservation(fleet, car) else int(number)
             if _lacks_reservation(fleet, car):
                 return NEEDS_RESERVATIONS
-            if not act(fleet, number, call_at(car.rule, address, number)):
+            if not act(fleet, number, call_at(car.policy, address, number)):
                 return WRONG_ACTION
             continue
         if until == np.inf and fleet.n_searching == 0 and fleet.next_car == fleet.n_cars:
@@ -415,7 +415,7 @@ def _end_search(fleet: Any, number: int, state: int) -> None:
     if state == TRUNCATED:
         car.gave_up_s += scenario_at(search.scenario, 0).give_up_s
     car.total_s = sum_of_costs(car)
-    if car.rule == 0:
+    if car.policy == 0:
         _make_ready(fleet, number)
     else:
         _free_search(fleet, car)

@@ -32,14 +32,13 @@ from parkenv.engine.events import (
     init_forecast_at,
     release_at,
 )
-from parkenv.engine.fleet_rules import Rule
 from parkenv.engine.kernel import (
     shared_slots_taken_at,
     step_info,
     step_result_at,
 )
 from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings_at
-from parkenv.engine.network import NetworkRule
+from parkenv.engine.policy import CompiledPolicy
 from parkenv.engine.records import (
     BACKGROUNDS,
     CAR,
@@ -82,7 +81,8 @@ class DriverKind:
     Args:
         weight: relative number of such drivers. A car's kind follows from its own random number, so with two kinds and
             equal demand, the drivers of the first kind stay the same, and more join them, as its weight grows.
-        rule: compiled driver that decides, see `parkenv.engine.fleet_rules.RULES`; None: Python decides.
+        policy: compiled policy that decides, such as `planners.heuristics.policies.POLICIES["greedy-drive"]`; None:
+            Python decides.
         knows: what these drivers know of the slots besides the forecast: `own`, their own observations; `shared`, also
             those on the live map; `reserve`, the slot that a guidance system has reserved for them; `full`, the true
             state of every slot.
@@ -93,7 +93,7 @@ class DriverKind:
     """
 
     weight: float = 1.0
-    rule: Rule | None = None
+    policy: CompiledPolicy | None = None
     knows: str = "own"
     shares: bool = False
 
@@ -101,9 +101,10 @@ class DriverKind:
         good = isinstance(self.weight, (int, float, np.number)) and math.isfinite(self.weight)
         if not good or self.weight < 0.0:
             raise InputError(f"DriverKind.weight is {self.weight!r}, want a finite number of at least 0")
-        if self.rule is not None and not isinstance(self.rule, Rule):
+        if self.policy is not None and not isinstance(self.policy, CompiledPolicy):
             raise InputError(
-                f"DriverKind.rule is {self.rule!r:.60}, want a Rule such as RULES['greedy-drive'], or None"
+                f"DriverKind.policy is {self.policy!r:.60}, want a CompiledPolicy, such as POLICIES['greedy-drive'], "
+                "or None"
             )
         if self.knows not in KNOWLEDGE:
             raise InputError(f"DriverKind.knows is {self.knows!r}, want one of {', '.join(KNOWLEDGE)}")
@@ -127,7 +128,7 @@ class CarPoses(NamedTuple):
 
 
 class Fleet:
-    """Many cars in one lot, decided by compiled drivers, by agents in Python, or by both.
+    """Many cars in one lot, decided by compiled policies, by agents in Python, or by both.
 
     Every car is a search as in `parkenv/Search-v2`, with the same actions, observations and costs; its forecast is that
     of the scenario for its arrival. The slots are shared. Events happen in continuous time: at each moment, first
@@ -183,9 +184,9 @@ class Fleet:
         InputError: a value out of its range; the message names the field.
 
     Examples:
-        >>> from parkenv.engine.fleet_rules import RULES
+        >>> from planners.heuristics.policies import POLICIES
         >>> from parkenv.world.demand import Demand, Headways
-        >>> fleet = Fleet("campus", Demand(Headways(cars=3)), drivers=[DriverKind(rule=RULES["greedy-drive"])])
+        >>> fleet = Fleet("campus", Demand(Headways(cars=3)), drivers=[DriverKind(policy=POLICIES["greedy-drive"])])
         >>> fleet.reset(seed=1)
         >>> fleet.run()
         >>> fleet.state_names()
@@ -223,7 +224,7 @@ class Fleet:
         self._weighted("entry_weights", self.demand.entry_weights, len(lot.entries))
         entry = None if self.demand.entry_weights else self.scenario.entry
         self._entries = lot.entry_vertices if entry is None else lot.entry_vertices[[entry]]
-        self.full_belief = any(kind.rule is None for kind in self.drivers)
+        self.full_belief = any(kind.policy is None for kind in self.drivers)
         self.records = np.zeros(1, FLEET)
         self._record = self.records[0]
         self._address = address_of(self.records, FLEET)
@@ -251,14 +252,8 @@ class Fleet:
             "blocked_until": np.zeros(lot.n_vertices),
             "blocked_by": np.zeros(lot.n_vertices, np.int64),
             "by_cost": np.argsort(cost_s, axis=1, kind="stable").astype(np.int64),
-            "median_cost_s": np.median(cost_s, axis=1),
-            "route_seconds": np.zeros(lot.n_vertices),
-            "route_from": np.zeros(lot.n_vertices, np.int64),
-            "route_stamp": np.zeros(lot.n_vertices, np.int64),
-            "route_keys": np.zeros(4 * lot.n_vertices + 1),
-            "route_vertices": np.zeros(4 * lot.n_vertices + 1, np.int64),
         }
-        work["networks"] = self._networks()
+        work["policy_data"] = self._policy_data()
         self._kept: dict[str, NDArray[Any]] = {}
         self._keep(work)
         if delay_s > 0.0:
@@ -289,13 +284,12 @@ class Fleet:
             )
         return range(len(weights))
 
-    def _networks(self) -> NDArray[np.int64]:
-        """Return the address of the NETWORK record of each kind of driver, 0 for those without."""
-        rules = [kind.rule for kind in self.drivers]
-        return np.array(
-            [rule.address_for(self.scenarios) if isinstance(rule, NetworkRule) else 0 for rule in rules],
-            np.int64,
-        )
+    def _policy_data(self) -> NDArray[np.int64]:
+        """Return the address of the data of each kind's compiled policy, 0 for those without."""
+        self._data = [
+            None if kind.policy is None else kind.policy.data_for(self.scenarios) for kind in self.drivers
+        ]
+        return np.array([0 if data is None else data.address for data in self._data], np.int64)
 
     def _keep(self, arrays: Mapping[str, NDArray[Any]]) -> None:
         """Keep arrays alive, and write their addresses into the fields of the FLEET record."""
@@ -341,8 +335,8 @@ class Fleet:
         cars["kind"] = np.minimum(
             np.searchsorted(shares / shares[-1], plans.kind, side="right"), len(self.drivers) - 1
         )
-        rules = [0 if kind.rule is None else kind.rule.address for kind in self.drivers]
-        cars["rule"] = np.array(rules, np.int64)[cars["kind"]]
+        policies = [0 if kind.policy is None else kind.policy.address for kind in self.drivers]
+        cars["policy"] = np.array(policies, np.int64)[cars["kind"]]
         cars["knows"] = np.array([KNOWLEDGE.index(kind.knows) for kind in self.drivers])[cars["kind"]]
         cars["shares"] = np.array([kind.shares for kind in self.drivers])[cars["kind"]]
         cars["state"], cars["slot"] = DUE, NO_CAR
@@ -397,19 +391,19 @@ class Fleet:
         """Run the world until all searches are over, or until a time; a later call goes on from there.
 
         Args:
-            agents: for each kind of driver without a rule an agent with `predict(observation, state)`, None for the
-                others; not needed if all have rules.
+            agents: for each kind of driver without a policy an agent with `predict(observation, state)`, None for the
+                others; not needed if all have policies.
             until: s since Monday 00:00; parked cars leave until then, also after the last search.
 
         Raises:
-            InputError: a kind of driver has neither a rule nor an agent, or an agent raised an error (the cause of this
-                one) or chose an action that does not exist: the message names car and time, and the world stays as it
-                was before that decision.
+            InputError: a kind of driver has neither a policy nor an agent, or an agent raised an error (the cause of
+                this one) or chose an action that does not exist: the message names car and time, and the world stays as
+                it was before that decision.
         """
         agents = tuple(agents or ())
         for kind, driver in enumerate(self.drivers):
-            if driver.rule is None and (kind >= len(agents) or agents[kind] is None):
-                raise InputError(f"drivers[{kind}] has no rule, want an agent for it in `agents`")
+            if driver.policy is None and (kind >= len(agents) or agents[kind] is None):
+                raise InputError(f"drivers[{kind}] has no policy, want an agent for it in `agents`")
         memory = self._memory
         while (car := self.next_decision(until)) is not None:
             agent = agents[int(self._cars["kind"][car])]
@@ -433,7 +427,7 @@ class Fleet:
     def next_decision(self, until: float = math.inf) -> int | None:
         """Return the car that must decide next, in Python; None if there is no such decision before the end.
 
-        Compiled drivers decide in between.
+        Compiled policies decide in between.
         """
         while (car := self.next_car(until)) is not None and self._cars["state"][car] != SEARCHING:
             self.release()
@@ -466,7 +460,7 @@ class Fleet:
             self._grow_steps()
         else:
             assert status == WRONG_ACTION
-            raise InputError("a compiled driver chose an action that does not exist")
+            raise InputError("a compiled policy chose an action that does not exist")
 
     def ready_cars(self) -> list[int]:
         """Return the cars that are to decide, or whose end Python has not handled yet, now, in their order."""
@@ -614,7 +608,7 @@ class Fleet:
         if address == 0:
             raise InputError(f"car {car} is {self.state_names()[car]}, want one that searches")
         if not self.full_belief:
-            raise InputError("observations are kept only if a kind of driver has no rule")
+            raise InputError("observations are kept only if a kind of driver has no policy")
         return self._row[address]
 
     @property

@@ -1,16 +1,17 @@
-"""A trained policy network as a compiled driver of a fleet."""
+"""A trained policy network as a compiled policy of a fleet."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
+from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.keyed_random import RULE_STREAM, keyed_uniform
+from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import (
     ADDRESS,
     address_of,
@@ -24,7 +25,6 @@ from parkenv.compiled.memory import (
     record_at,
     uint8s,
 )
-from parkenv.engine.fleet_rules import Rule
 from parkenv.engine.local_observation import (
     FIRST_NEAR,
     N_MOVES,
@@ -33,6 +33,7 @@ from parkenv.engine.local_observation import (
     Surroundings,
     observe_surroundings,
 )
+from parkenv.engine.policy import CompiledPolicy, PolicyData
 from parkenv.engine.records import N_ACTIONS, N_REGIONS, car_at, fleet_at, scenario_at, search_at
 from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import inlined, kernel
@@ -83,7 +84,7 @@ def decide_by_network(address: int, number: int) -> int:
     fleet = fleet_at(address, 0)
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
-    network = network_at(int64s(fleet.networks)[car.kind], 0)
+    network = network_at(int64s(fleet.policy_data)[car.kind], 0)
     around = _surroundings_of(network)
     width = FIRST_NEAR + PER_NEAR * surroundings_at(network.surroundings, 0).k
     observe_surroundings(search, around, float32_array(network.local, (width,)))
@@ -95,7 +96,7 @@ def observe_locally(address: int, number: int, local: NDArray[np.float32]) -> No
     """Write the `local` observation of a car whose kind is driven by a network; call once at each of its decisions."""
     fleet = fleet_at(address, 0)
     car = car_at(fleet.cars, number)
-    network = network_at(int64s(fleet.networks)[car.kind], 0)
+    network = network_at(int64s(fleet.policy_data)[car.kind], 0)
     observe_surroundings(search_at(car.search, 0), _surroundings_of(network), local)
 
 
@@ -179,7 +180,7 @@ def _choose(network: Any, search: Any, logits_at: int) -> int:
     for action in range(N_ACTIONS):
         if not network.masked or masks[search.vertex * N_ACTIONS + action]:
             total += math.exp(logits[action] - highest)
-    left = keyed_uniform(search.key, RULE_STREAM, 0, search.n_steps) * total
+    left = keyed_uniform(search.key, POLICY_STREAM, 0, search.n_steps) * total
     for action in range(N_ACTIONS):
         if not network.masked or masks[search.vertex * N_ACTIONS + action]:
             left -= math.exp(logits[action] - highest)
@@ -188,15 +189,8 @@ def _choose(network: Any, search: Any, logits_at: int) -> int:
     return best
 
 
-class _Bound(NamedTuple):
-    """The NETWORK record of a rule in some scenarios, and what its addresses point to."""
-
-    record: NDArray[np.void]
-    kept: tuple[Any, ...]
-
-
-class NetworkRule(Rule):
-    """A policy network, a multilayer perceptron on the `local` observation, as a compiled driver of a fleet.
+class NetworkPolicy(CompiledPolicy):
+    """A policy network, a multilayer perceptron on the `local` observation, as a compiled policy of a fleet.
 
     Several fleets may share one; its weights may change at any time.
 
@@ -223,12 +217,12 @@ class NetworkRule(Rule):
         name: str = "network",
     ) -> None:
         super().__init__(name, decide_by_network)
-        self._known: dict[tuple[int, ...], _Bound] = {}
+        self._data: WeakSet[PolicyData] = WeakSet()
         self.k, self.sampled = k, sampled
         self.set_layers(layers, activation=activation, masked=masked)
 
     def set_layers(self, layers: Sequence[Layer], *, activation: str = "tanh", masked: bool = True) -> None:
-        """Replace the network, in all fleets that use this rule.
+        """Replace the network, in all fleets that use this policy.
 
         Raises:
             InputError: layers that do not fit.
@@ -250,30 +244,26 @@ class NetworkRule(Rule):
             "weights": np.concatenate(flat).astype(np.float32),
             "values": np.zeros(2 * max(widths), np.float32),
         }
-        for bound in self._known.values():
-            self._write(bound.record)
+        for data in self._data:
+            self._write(data.record)
 
-    def address_for(self, problems: Sequence[SearchProblem]) -> int:
-        """Return the address of a NETWORK record for fleets in these scenarios; it lives as long as this rule."""
-        key = tuple(map(id, problems))
-        if key not in self._known:
-            around = Surroundings.of(problems, self.k)
-            arrays = [np.ascontiguousarray(array) for array in around]
-            its = np.zeros(1, SURROUNDINGS)
-            for name, array in zip(Surroundings._fields, arrays, strict=True):
-                its[name] = address_of(array, array.dtype)
-            width = FIRST_NEAR + PER_NEAR * self.k
-            its["n_lots"], its["n_vertices"] = len(around.first), len(around.numbers)
-            its["n_numbers"], its["n_indices"] = around.numbers.shape[1], around.indices.shape[1]
-            its["k"] = self.k
-            record, local = np.zeros(1, NETWORK), np.zeros(width, np.float32)
-            record["surroundings"], record["local"] = (
-                address_of(its, SURROUNDINGS),
-                address_of(local, np.float32),
-            )
-            self._write(record)
-            self._known[key] = _Bound(record, (its, local, arrays, tuple(problems)))
-        return address_of(self._known[key].record, NETWORK)
+    def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
+        """Return a NETWORK record for a fleet, which follows `set_layers`."""
+        around = Surroundings.of(problems, self.k)
+        arrays = [np.ascontiguousarray(array) for array in around]
+        its = np.zeros(1, SURROUNDINGS)
+        for name, array in zip(Surroundings._fields, arrays, strict=True):
+            its[name] = address_of(array, array.dtype)
+        its["n_lots"], its["n_vertices"] = len(around.first), len(around.numbers)
+        its["n_numbers"], its["n_indices"] = around.numbers.shape[1], around.indices.shape[1]
+        its["k"] = self.k
+        record, local = np.zeros(1, NETWORK), np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32)
+        record["surroundings"] = address_of(its, SURROUNDINGS)
+        record["local"] = address_of(local, np.float32)
+        self._write(record)
+        data = PolicyData(record, (its, local, arrays))
+        self._data.add(data)
+        return data
 
     def _write(self, record: NDArray[np.void]) -> None:
         for name, array in self._arrays.items():
@@ -285,8 +275,8 @@ class NetworkRule(Rule):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the network; records hold addresses of this process."""
         options = {name: getattr(self, name) for name in ("activation", "masked", "sampled", "name")}
-        return _network_rule, (self.layers, self.k, options)
+        return _network_policy, (self.layers, self.k, options)
 
 
-def _network_rule(layers: Sequence[Layer], k: int, options: dict[str, Any]) -> NetworkRule:
-    return NetworkRule(layers, k, **options)
+def _network_policy(layers: Sequence[Layer], k: int, options: dict[str, Any]) -> NetworkPolicy:
+    return NetworkPolicy(layers, k, **options)

@@ -287,8 +287,8 @@ CAR = _with_costs(
         ("arrival", np.float64),
         ("stay_s", np.float64),
         ("patience_s", np.float64),
-        # The driver: address of the compiled decide function, or 0 if Python decides; what it knows.
-        ("rule", ADDRESS),
+        # The driver: address of the compiled policy, or 0 if Python decides; what it knows.
+        ("policy", ADDRESS),
         ("knows", np.int64),
         # Whether it reports to the live map; until when it knows that map, s; the slot reserved for it, or -1.
         ("shares", np.bool_),
@@ -309,7 +309,7 @@ CAR = _with_costs(
         ("holds", np.int64),
         # Sums of the search, complete when it has ended.
         *_SUMS,
-        # Its SEARCH record, 0 unless searching. For compiled drivers: the target slot, or -1; the moves to it,
+        # Its SEARCH record, 0 unless searching. For compiled policies: the target slot, or -1; the moves to it,
         # (n_vertices,) uint8 from the last to the first, and how many are left.
         ("search", ADDRESS),
         ("target", np.int64),
@@ -396,18 +396,10 @@ FLEET = np.dtype(
         ("steps", ADDRESS),
         ("step_capacity", np.int64),
         ("n_kept_steps", np.int64),
-        # For compiled drivers, by place: (n_slots,) int64 slots by cost of arrival; float64 median of that cost, s.
+        # By place: (n_slots,) int64 slots by cost of arrival. By kind of driver: int64 address of the data of its
+        # compiled policy, or 0.
         ("by_cost", ADDRESS),
-        ("median_cost_s", ADDRESS),
-        # For trained networks that drive: (n_kinds,) int64 addresses of NETWORK records by kind of driver.
-        ("networks", ADDRESS),
-        # Work space of searches for routes: (n_vertices,) float64, int64, int64; (4 n_vertices + 1,) float64, int64.
-        ("route_seconds", ADDRESS),
-        ("route_from", ADDRESS),
-        ("route_stamp", ADDRESS),
-        ("route_number", np.int64),
-        ("route_keys", ADDRESS),
-        ("route_vertices", ADDRESS),
+        ("policy_data", ADDRESS),
     ],
     align=True,
 )

@@ -19,7 +19,7 @@ from parkenv.engine.events import act_at, advance_at, release_at
 from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.kernel import step_cost_s
 from parkenv.engine.local_observation import local_space
-from parkenv.engine.network import Layer, NetworkRule, observe_locally
+from parkenv.engine.network import Layer, NetworkPolicy, observe_locally
 from parkenv.engine.records import (
     CAR,
     N_ACTIONS,
@@ -302,7 +302,7 @@ class FleetVecEnv(SharedVecEnv):
         num_envs: number of worlds.
         scenario: a scenario, as of `parkenv.make_scenario`.
         demand: when cars arrive, how long they stay and search.
-        drivers: the kinds of drivers; the first one learns, and has no rule; the others have rules.
+        drivers: the kinds of drivers; the first one learns, and has no policy; the others have compiled ones.
         reward_scale: factor of the rewards in seconds.
         k: number of slots in the `local` observation.
         max_steps: limit of a car's decisions.
@@ -341,19 +341,21 @@ class FleetVecEnv(SharedVecEnv):
         if not (np.isfinite(reward_scale) and reward_scale > 0.0):
             raise InputError(f"reward_scale is {reward_scale}, want a number above 0")
         kinds = tuple(drivers)
-        if not kinds or kinds[LEARNERS].rule is not None or not kinds[LEARNERS].weight > 0.0:
-            raise InputError("drivers[0] has a rule, or weight 0; want the kind that learns")
+        if not kinds or kinds[LEARNERS].policy is not None or not kinds[LEARNERS].weight > 0.0:
+            raise InputError("drivers[0] has a policy, or weight 0; want the kind that learns")
         for i, kind in enumerate(kinds[1:], 1):
-            if kind.rule is None:
-                raise InputError(f"drivers[{i}] has no rule, want a compiled one beside the cars that learn")
+            if kind.policy is None:
+                raise InputError(
+                    f"drivers[{i}] has no policy, want a compiled one beside the cars that learn"
+                )
         space = local_space(k)
         super().__init__(num_envs, space, spaces.Discrete(N_ACTIONS))
         shape = space["local"].shape
         assert shape is not None
         uniform = np.zeros((N_ACTIONS, N_ACTIONS + shape[0]), np.float32), np.zeros(N_ACTIONS, np.float32)
-        self.network = NetworkRule([uniform], k, sampled=True)
+        self.network = NetworkPolicy([uniform], k, sampled=True)
         its = make_scenario(scenario)
-        kinds = (replace(kinds[LEARNERS], rule=self.network), *kinds[1:])
+        kinds = (replace(kinds[LEARNERS], policy=self.network), *kinds[1:])
         self.fleets = [
             Fleet(its, demand, drivers=kinds, max_steps=max_steps, **options) for _ in range(num_envs)
         ]
@@ -494,7 +496,7 @@ class ShareNetwork(BaseCallback):  # type: ignore[misc]
         return True
 
 
-def network_rule(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> NetworkRule:
+def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> NetworkPolicy:
     """Return a policy of stable-baselines3 or sb3-contrib as a compiled driver of a fleet.
 
     Args:
@@ -507,14 +509,14 @@ def network_rule(policy: Any, k: int, *, sampled: bool = False, name: str = "net
         InputError: a policy that is no multilayer perceptron.
     """
     layers, activation, masked = layers_of(policy)
-    return NetworkRule(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
+    return NetworkPolicy(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
 
 
 def layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
     """Return the layers of a policy network, their activation, and whether actions are masked.
 
     Raises:
-        InputError: a policy that is no multilayer perceptron with one of the activations of `NetworkRule`.
+        InputError: a policy that is no multilayer perceptron with one of the activations of `NetworkPolicy`.
     """
     from torch import nn
 
@@ -604,7 +606,7 @@ def _next_learner(fleet: Any, first: int) -> int:
     for number in range(max(fleet.next_car, first), fleet.n_cars):
         car = car_at(fleet.cars, number)
         if car.kind == LEARNERS:
-            car.rule = 0
+            car.policy = 0
             return int(number)
     return NO_CAR
 

@@ -8,7 +8,6 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.bench.rows import BenchRow, duration, rate
@@ -16,6 +15,7 @@ from parkenv.studies.bench.sumo import sumo_rows
 from parkenv.world.demand import Demand, ExponentialTime, Headways, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S, HOUR_S
+from planners.heuristics import POLICIES
 
 WORLDS, CARS = 64, 50
 """Worlds of the batch, and cars of each."""
@@ -65,10 +65,10 @@ def fleet_rows(
         "rows": make_scenario(grid_lot(max(large // 200, 1), 200)),
     }
     for name, scenario in lots.items():
-        for rule in ("greedy-drive", "first-free"):
-            day = _fleet(scenario, _day(day_cars), rule)
+        for policy in ("greedy-drive", "first-free"):
+            day = _fleet(scenario, _day(day_cars), policy)
             took = _seconds_a_day(day, seed, seconds)
-            case = f"{name} of {scenario.lot.n_slots:,} slots, {day_cars:,} cars a day, {rule}"
+            case = f"{name} of {scenario.lot.n_slots:,} slots, {day_cars:,} cars a day, {policy}"
             rows += duration("day", case, took, "s")
             rows += rate("memory", case, day.n_bytes / 2**20, "MiB")
     for cars in growth:
@@ -86,11 +86,11 @@ def _day(cars: int) -> Demand:
     return Demand(PoissonArrivals(cars * HOUR_S / DAY_S, 0.0, DAY_S), ExponentialTime(2 * HOUR_S))
 
 
-def _fleet(scenario: Scenario, demand: Demand, rule: str) -> Fleet:
+def _fleet(scenario: Scenario, demand: Demand, policy: str) -> Fleet:
     occupancy = scenario.occupancy
     if occupancy.adjustable:
         scenario = scenario.replace(occupancy=occupancy.at_mean_occupancy(FULL, 0.0))
-    return Fleet(scenario, demand, drivers=[DriverKind(rule=RULES[rule])])
+    return Fleet(scenario, demand, drivers=[DriverKind(policy=POLICIES[policy])])
 
 
 def _decisions_per_second(fleets: Sequence[Fleet], seed: int, seconds: float) -> float:

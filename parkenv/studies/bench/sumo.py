@@ -22,12 +22,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
-from parkenv.engine.fleet_rules import RULES
 from parkenv.errors import InputError
 from parkenv.studies.bench.rows import BenchRow, absent, duration
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import HOUR_S
+from planners.heuristics import POLICIES
 
 PARKING_WEIGHTS = {
     "parking.distanceto.weight": 1,  # the nearest of the areas not known to be full
@@ -104,7 +104,7 @@ def sumo_rows(seed: int = 0, days: int = 3, per_hour: float = 60.0) -> list[Benc
     if folder is None:
         return absent("day", "SUMO: not installed", "s")
     demand = Demand(PoissonArrivals(per_hour, *_WINDOW), ExponentialTime(HOUR_S))
-    kind = DriverKind(rule=RULES["greedy-drive"])
+    kind = DriverKind(policy=POLICIES["greedy-drive"])
     fleet = Fleet("street", demand, background="none", drivers=[kind], leave_full_lot=False)
     end_s = _WINDOW[1] - _WINDOW[0] + HOUR_S
     peers = {f"{sumo_version(folder)}, steps of {step:g} s": step for step in STEPS_S}

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES, Rule
+from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.results import Row
@@ -19,16 +19,18 @@ from parkenv.studies.workers import Workers
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
+from planners.heuristics import POLICIES
+from planners.heuristics.agents import TargetAgent
 from planners.learned import LearnedAgent
 from planners.names import EXPECTS_RIVALS
 
-_WITHOUT_NETWORK_RULE = ("recurrent-ppo",)
+_WITHOUT_NETWORK_POLICY = ("recurrent-ppo",)
 
 
-def driver_of(
+def policy_of(
     spec: AgentSpec, scenario: Scenario, arrivals_per_hour: float | None = None
-) -> tuple[Rule | None, Any]:
-    """Return the compiled driver of an agent, or else the agent itself, which decides in Python.
+) -> tuple[CompiledPolicy | None, Any]:
+    """Return the compiled policy of an agent, or else the agent itself, which decides in Python.
 
     Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
     actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
@@ -37,11 +39,13 @@ def driver_of(
     Raises:
         InputError: there is no such agent, or it is none for fleets.
     """
-    if not spec.options and spec.name in RULES:
-        return RULES[spec.name], None
+    if not spec.options and spec.name in POLICIES:
+        return POLICIES[spec.name], None
     expects = spec.name == EXPECTS_RIVALS and arrivals_per_hour is not None
     known = {"arrivals_per_hour": arrivals_per_hour} if expects else {}
     agent = make_agent(spec.name, scenario, **known | spec.options)
+    if spec.name in POLICIES and isinstance(agent, TargetAgent):
+        return agent.compiled_policy(), None
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
     if isinstance(agent, LearnedAgent):
@@ -49,11 +53,11 @@ def driver_of(
             raise InputError(
                 f"agent {spec.label!r} observes laser scans, which the cars of a fleet do not have"
             )
-        if agent.card.algorithm not in _WITHOUT_NETWORK_RULE:
-            from parkenv.envs.sb3 import network_rule
+        if agent.card.algorithm not in _WITHOUT_NETWORK_POLICY:
+            from parkenv.envs.sb3 import network_policy
 
             sampled = agent.card.algorithm != "dqn"
-            return network_rule(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
+            return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     return None, agent
 
 
@@ -107,7 +111,7 @@ class MixedFleet:
         """The fleet in a table: `every car`, or `0.1 among greedy-drive`."""
         return "every car" if self.among is None else f"{self.share:g} among {self.among.label}"
 
-    def run_day(self, member: AgentSpec | Rule, seed: int, day: int) -> Row:
+    def run_day(self, member: AgentSpec | CompiledPolicy, seed: int, day: int) -> Row:
         """Run a day; return mean times, s, of members and others, and the fraction of the members that parked.
 
         Args:
@@ -115,11 +119,13 @@ class MixedFleet:
             seed: seed of the days.
             day: index of the day.
         """
-        rule, agent = (member, None) if isinstance(member, Rule) else driver_of(member, self.scenario)
-        kinds, agents = [DriverKind(self.share, rule, self.knows, shares=self.knows == "shared")], [agent]
+        policy, agent = (
+            (member, None) if isinstance(member, CompiledPolicy) else policy_of(member, self.scenario)
+        )
+        kinds, agents = [DriverKind(self.share, policy, self.knows, shares=self.knows == "shared")], [agent]
         if self.among is not None:
-            other_rule, other = driver_of(self.among, self.scenario)
-            kinds.append(DriverKind(1.0 - self.share, other_rule))
+            other_policy, other = policy_of(self.among, self.scenario)
+            kinds.append(DriverKind(1.0 - self.share, other_policy))
             agents.append(other)
         fleet = Fleet(
             self.scenario, self.demand, drivers=kinds, max_steps=self.max_steps, leave_full_lot=False
@@ -135,7 +141,9 @@ class MixedFleet:
             "others_s": _mean(cars["total_s"][~members]),
         }
 
-    def row(self, member: AgentSpec | Rule, seed: int, days: int, workers: Workers | None = None) -> Row:
+    def row(
+        self, member: AgentSpec | CompiledPolicy, seed: int, days: int, workers: Workers | None = None
+    ) -> Row:
         """Return means over days, with 95 % intervals; see `run_day`."""
         tasks = [partial(self.run_day, member, seed, day) for day in range(days)]
         return summary([task() for task in tasks] if workers is None else list(workers.in_order(tasks)))

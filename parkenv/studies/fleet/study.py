@@ -232,12 +232,12 @@ class FleetStudy(Study):
         """
         from parkenv.engine.fleet import DriverKind, Fleet
         from parkenv.studies.fleet.decision_limit import LimitedAgent
-        from parkenv.studies.fleet.drivers import demand_in, driver_of
+        from parkenv.studies.fleet.drivers import demand_in, policy_of
 
-        rule, agent = driver_of(setting.agent, self.built, setting.arrivals_per_hour)
+        policy, agent = policy_of(setting.agent, self.built, setting.arrivals_per_hour)
         kinds = [
-            DriverKind(setting.share, rule, setting.knows, shares=setting.knows == "shared"),
-            DriverKind(1.0 - setting.share, rule),
+            DriverKind(setting.share, policy, setting.knows, shares=setting.knows == "shared"),
+            DriverKind(1.0 - setting.share, policy),
         ]
         fleet = Fleet(
             self.built,

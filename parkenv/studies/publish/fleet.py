@@ -136,12 +136,13 @@ class FleetPublication(Publication):
         return f"""import parkenv
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.drivers import demand_in, driver_of
+from parkenv.studies.fleet.drivers import demand_in, policy_of
 
 scenario = parkenv.make_scenario("{next(iter(self.scenarios))}")
 demand = demand_in(scenario, {self.fleets.arrivals_per_hour[0]:g}, {self.fleets.stay_s:g}, {self.fleets.patience_s:g})
-rule, _ = driver_of(AgentSpec(name="{self.card.algorithm}:{MODEL}"), scenario)
-fleet = Fleet(scenario, demand, drivers=[DriverKind(rule=rule, knows="{self.fleets.knows[0]}")], leave_full_lot=False)
+policy, _ = policy_of(AgentSpec(name="{self.card.algorithm}:{MODEL}"), scenario)
+kind = DriverKind(policy=policy, knows="{self.fleets.knows[0]}")
+fleet = Fleet(scenario, demand, drivers=[kind], leave_full_lot=False)
 fleet.reset(seed=0)
 fleet.run()
 print(fleet.cars["total_s"].mean(), "s")"""

@@ -12,14 +12,13 @@ import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.engine.fleet import DriverKind
-from parkenv.engine.fleet_rules import RULES
-from parkenv.envs.sb3 import FleetVecEnv, network_rule
+from parkenv.envs.sb3 import FleetVecEnv, network_policy
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.drivers import MixedFleet, demand_in, driver_of
+from parkenv.studies.fleet.drivers import MixedFleet, demand_in, policy_of
 from parkenv.studies.study import Progress
 from parkenv.studies.training.configs import FLEET_CONFIGS, REWARD_SCALE, TrainingConfig
 from parkenv.studies.training.curve_file import Row
@@ -85,12 +84,10 @@ class FleetTraining(RLTraining):
         """See `Training`."""
         super().check()
         among = self.spec.among
-        if among is not None and driver_of(among, self.scenario)[0] is None:
-            raise InputError(
-                f"--among is {among.label!r}, want a compiled driver: {', '.join(RULES)}, or a model"
-            )
+        if among is not None and policy_of(among, self.scenario)[0] is None:
+            raise InputError(f"--among is {among.label!r}, want a compiled policy: X, or a model")
         for agent in (*self.spec.agents, *self.spec.test_among):
-            driver_of(agent, self.scenario)
+            policy_of(agent, self.scenario)
         _ = self.fleet
 
     def settings(self) -> Row:
@@ -115,7 +112,7 @@ class FleetTraining(RLTraining):
         fleet = self.fleet
         kinds = [DriverKind(fleet.share, None, fleet.knows, shares=fleet.knows == "shared")]
         if fleet.among is not None:
-            kinds.append(DriverKind(1.0 - fleet.share, driver_of(fleet.among, fleet.scenario)[0]))
+            kinds.append(DriverKind(1.0 - fleet.share, policy_of(fleet.among, fleet.scenario)[0]))
         return FleetVecEnv(
             self.config.n_envs, fleet.scenario, fleet.demand, kinds, REWARD_SCALE, self.spec.k, fleet.max_steps,
             leave_full_lot=False,
@@ -138,7 +135,7 @@ class FleetTraining(RLTraining):
         """Run the held-out days."""
         del env
         row = self.fleet.row(
-            network_rule(policy, self.spec.k, sampled=True), EVALUATION_SEED, self.evaluation_episodes
+            network_policy(policy, self.spec.k, sampled=True), EVALUATION_SEED, self.evaluation_episodes
         )
         low, high = row["total_s_ci95"]
         found = (row["total_s"], low, high, row["parked_fraction"], row["search_s"])

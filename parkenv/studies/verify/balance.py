@@ -11,11 +11,11 @@ from functools import partial
 import numpy as np
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.verify.rows import Row, Task, certain_row
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.week import HOUR_S
+from planners.heuristics import POLICIES
 
 SOURCE = "conservation of cars"
 LITTLE = "Little 1961"
@@ -31,7 +31,7 @@ def made_fleet(name: str) -> Fleet:
         ExponentialTime(HOUR_S),
         ConstantTime(600.0),
     )
-    kinds = [DriverKind(rule=RULES[rule]) for rule in ("greedy-drive", "first-free", "random")]
+    kinds = [DriverKind(policy=POLICIES[name]) for name in ("greedy-drive", "first-free", "random")]
     return Fleet(make_scenario(name), demand, background="residents", drivers=kinds)
 
 

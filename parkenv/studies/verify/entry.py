@@ -12,8 +12,14 @@ from functools import partial
 
 import numpy as np
 
-from parkenv.engine.fleet_rules import RULES
-from parkenv.studies.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
+from parkenv.studies.verify.fleets import (
+    ORDERED_ENTRY,
+    erlang_b,
+    independent_runs,
+    lane,
+    loaded_fleet,
+    mean_parked,
+)
 from parkenv.studies.verify.rows import Row, Task, mean_row
 from parkenv.world.week import HOUR_S
 
@@ -26,7 +32,7 @@ RUNS, WARM_UP_H, HOURS = 200, 10.0, 1000.0
 
 def rows(seed: int) -> list[Row]:
     """Return rows for some slots, and for the mean index of the slot."""
-    fleet = loaded_fleet(lane(SLOTS), RULES["ordered-entry"], LOAD, HOURS)
+    fleet = loaded_fleet(lane(SLOTS), ORDERED_ENTRY, LOAD, HOURS)
     taken, index = [], []
     for cars in independent_runs(fleet, RUNS, seed, HOURS):
         begin = fleet.begin + WARM_UP_H * HOUR_S

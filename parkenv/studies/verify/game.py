@@ -12,13 +12,13 @@ from __future__ import annotations
 from functools import partial
 
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.engine.fleet_rules import RULES
 from parkenv.lots.generators import Slots, grid_lot
 from parkenv.studies.verify.fleets import lane
 from parkenv.studies.verify.rows import Row, Task, certain_row
 from parkenv.world.demand import ConstantTime, Demand, Headways
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
+from planners.heuristics import POLICIES
 
 SOURCE = "Kokolaki et al. 2012"
 PLACES, STREET, GARAGE, FAILED = 50, 1.0, 5.0, 7.0  # R; costs: 1, beta, gamma
@@ -62,8 +62,8 @@ class Game:
         return self._costs[competing]
 
     def _drive(self, demand: Demand) -> float:
-        rule = DriverKind(rule=RULES["greedy-drive"])
-        fleet = Fleet(self._scenario, demand, background="none", drivers=(rule,))
+        kind = DriverKind(policy=POLICIES["greedy-drive"])
+        fleet = Fleet(self._scenario, demand, background="none", drivers=(kind,))
         fleet.reset(self._seed)
         fleet.run()
         return float((fleet.cars["parking_cost_s"] + fleet.cars["gave_up_s"]).sum())

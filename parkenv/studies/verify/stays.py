@@ -8,9 +8,10 @@ from __future__ import annotations
 
 from functools import partial
 
-from parkenv.engine.fleet_rules import RULES
+from parkenv.engine.policy import CompiledPolicy
 from parkenv.lots.generators import grid_lot
 from parkenv.studies.verify.fleets import (
+    ORDERED_ENTRY,
     STAY_S,
     erlang_b,
     independent_runs,
@@ -22,6 +23,7 @@ from parkenv.studies.verify.rows import Row, Task, mean_row
 from parkenv.world.demand import ConstantTime, Duration, EmpiricalTime, ExponentialTime, LogNormalTime
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import HOUR_S
+from planners.heuristics import POLICIES
 
 SOURCE = "Sevast'yanov 1957"
 LITTLE = "Little 1961, M/G/infinity"
@@ -39,7 +41,7 @@ WARM_UP_H = 30.0
 def loss_row(law: str, seed: int, runs: int = 200, hours: float = 600.0) -> list[Row]:
     """Return the row of a small lot that turns cars away."""
     expected = LOAD * (1.0 - erlang_b(SLOTS, LOAD))
-    samples = _mean_taken(lane(SLOTS), "ordered-entry", LOAD, law, seed, runs, hours)
+    samples = _mean_taken(lane(SLOTS), ORDERED_ENTRY, LOAD, law, seed, runs, hours)
     return [
         mean_row(f"{SLOTS} slots, A = {LOAD:g}, stays {law}: mean number taken", expected, samples, SOURCE)
     ]
@@ -49,15 +51,15 @@ def drivers_row(law: str, seed: int, runs: int = 50, hours: float = 200.0) -> li
     """Return the row of a lot in which cars drive and search."""
     lot = grid_lot(ROWS, COLUMNS)
     scenario = lane(1).replace(lot=lot, occupancy=lane(lot.n_slots).occupancy)
-    samples = _mean_taken(scenario, "greedy-drive", DRIVERS_LOAD, law, seed, runs, hours)
+    samples = _mean_taken(scenario, POLICIES["greedy-drive"], DRIVERS_LOAD, law, seed, runs, hours)
     case = f"{lot.n_slots} slots, A = {DRIVERS_LOAD:g}, stays {law}: mean number taken, greedy-drive"
     return [mean_row(case, DRIVERS_LOAD, samples, LITTLE)]
 
 
 def _mean_taken(
-    scenario: Scenario, rule: str, load: float, law: str, seed: int, runs: int, hours: float
+    scenario: Scenario, policy: CompiledPolicy, load: float, law: str, seed: int, runs: int, hours: float
 ) -> list[float]:
-    fleet = loaded_fleet(scenario, RULES[rule], load, hours, LAWS[law])
+    fleet = loaded_fleet(scenario, policy, load, hours, LAWS[law])
     return [
         float(
             mean_parked(

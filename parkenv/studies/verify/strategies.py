@@ -21,8 +21,8 @@ from typing import Any
 
 from parkenv.compiled.memory import int64s
 from parkenv.engine.events import LEAVE, TAKE_SLOT
-from parkenv.engine.fleet_rules import Rule
 from parkenv.engine.kernel import is_shared_slot_taken
+from parkenv.engine.policy import CompiledPolicy
 from parkenv.engine.records import car_at, fleet_at
 from parkenv.studies.verify.fleets import erlang_b, independent_runs, lane, loaded_fleet, mean_parked
 from parkenv.studies.verify.rows import Row, Task, mean_row
@@ -99,7 +99,7 @@ THRESHOLDS: dict[float, Any] = {0.25: decide_quarter, 0.5: decide_half, 0.75: de
 
 def meek_row(load: float, seed: int, runs: int = 200, hours: float = 2000.0) -> list[Row]:
     """Return the row of the first slot where all cars are meek."""
-    fleet = loaded_fleet(lane(MEEK_SLOTS), Rule("meek", decide_meek), load, hours)
+    fleet = loaded_fleet(lane(MEEK_SLOTS), CompiledPolicy("meek", decide_meek), load, hours)
     taken = [
         mean_parked(cars, MEEK_SLOTS, fleet.begin + WARM_UP_H * HOUR_S, fleet.begin + hours * HOUR_S)[-1]
         for cars in independent_runs(fleet, runs, seed, hours)
@@ -111,7 +111,9 @@ def meek_row(load: float, seed: int, runs: int = 200, hours: float = 2000.0) -> 
 def threshold_row(tau: float, seed: int, runs: int = 30, hours: float = 200.0) -> list[Row]:
     """Return the row of the best slot of the zone."""
     zone = round(tau * ZONE_LOAD)
-    fleet = loaded_fleet(lane(ZONE_SLOTS), Rule(f"threshold {tau:g}", THRESHOLDS[tau]), ZONE_LOAD, hours)
+    fleet = loaded_fleet(
+        lane(ZONE_SLOTS), CompiledPolicy(f"threshold {tau:g}", THRESHOLDS[tau]), ZONE_LOAD, hours
+    )
     best = []
     for cars in independent_runs(fleet, runs, seed, hours):
         since = cars["arrival"] >= fleet.begin + WARM_UP_H * HOUR_S

@@ -1,0 +1,165 @@
+"""Compiled policies: how compiled code decides for a car of a fleet, and what it may know for that.
+
+A compiled policy is a function `(address of the FLEET record, index of the car) -> action`, called by its address.
+Actions are those of `parkenv/Search-v2`, and `LEAVE` and `TAKE_SLOT + slot` of `parkenv.engine.events`. The functions
+below give a policy what an agent's observation holds: position, actions, the last observation of each slot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, may_have_decayed, observed_state
+from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
+from parkenv.compiled.memory import address_of, call_address, int32s, int64s, uint8s
+from parkenv.engine.kernel import belief_now
+from parkenv.engine.records import (
+    BLOCK_BITS,
+    BLOCK_SIZE,
+    N_ACTIONS,
+    SENTINEL,
+    block_at,
+    car_at,
+    fleet_at,
+    scenario_at,
+    search_at,
+    slot_at,
+)
+from parkenv.world.occupancy.kernel import inlined, kernel
+from parkenv.world.scenario import SearchProblem
+
+
+class PolicyData:
+    """The data of a compiled policy for one fleet, such as tables or a network.
+
+    Args:
+        record: (1,) structured array with the addresses of other arrays.
+        kept: what these addresses point to.
+    """
+
+    def __init__(self, record: NDArray[np.void], kept: Any) -> None:
+        self.record, self._kept = record, kept
+
+    @property
+    def address(self) -> int:
+        """Address of the record."""
+        return address_of(self.record, self.record.dtype)
+
+
+@dataclass(frozen=True, eq=False)
+class CompiledPolicy:
+    """A policy that decides for the cars of a fleet without Python.
+
+    Args:
+        name: for tables.
+        decide: compiled function (int64 address of the FLEET record, int64 index of the car) -> int64 action.
+    """
+
+    name: str
+    decide: Callable[[int, int], int]
+
+    @cached_property
+    def address(self) -> int:
+        """Address of the compiled function; it is compiled when first asked for."""
+        return call_address(self.decide)
+
+    def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData | None:
+        """Return what the policy needs in a fleet, which keeps it; None by default.
+
+        Args:
+            problems: problem of each place, by `place` of the CAR record.
+        """
+        del problems
+        return None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the policy without its address in this process."""
+        return type(self), (self.name, self.decide)
+
+
+@inlined
+def car_of(address: int, number: int) -> Any:
+    """Return the CAR record of a car that decides.
+
+    A policy reads `place`, and may change `target`, `n_moves` and the array at `moves`, its memory of the search: -1,
+    0 and anything at first.
+    """
+    return car_at(fleet_at(address, 0).cars, number)
+
+
+@inlined
+def search_of(car: Any) -> Any:
+    """Return the SEARCH record of a car, of which a policy reads `vertex`."""
+    return search_at(car.search, 0)
+
+
+@inlined
+def policy_data(address: int, car: Any) -> int:
+    """Return the address of the `PolicyData` of a car's policy."""
+    return int(int64s(fleet_at(address, 0).policy_data)[car.kind])
+
+
+@inlined
+def is_allowed(search: Any, action: int) -> bool:
+    """Return whether the graph has an action where the car is."""
+    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
+    return bool(masks[search.vertex * N_ACTIONS + action])
+
+
+@inlined
+def draw_uniform(search: Any) -> float:
+    """Return a random number from [0, 1) that depends on the world, the car and its step alone."""
+    return float(keyed_uniform(search.key, POLICY_STREAM, 0, search.n_steps))
+
+
+# ---- what was observed
+
+
+@inlined
+def recent_state(search: Any, slot: int) -> int:
+    """Return the state of a slot as in `SlotBelief.recent_state`, from numbers rounded as in the observation."""
+    return int(_state_in(search, np.int64(int32s(search.columns)[slot])))
+
+
+@kernel
+def write_recent_states(search: Any, states: NDArray[np.uint8]) -> None:
+    """Write the states of all slots, (n_slots,), into an array of `UNOBSERVED`."""
+    for column in range(SENTINEL + 1, search.n_columns + 1):
+        states[slot_at(search.slots, column).slot] = _state_in(search, column)
+
+
+@kernel
+def clear_states(search: Any, states: NDArray[np.uint8]) -> None:
+    """Undo `write_recent_states`; the cost does not grow with the lot."""
+    for column in range(SENTINEL + 1, search.n_columns + 1):
+        states[slot_at(search.slots, column).slot] = UNOBSERVED
+
+
+@kernel
+def write_p_occupied(search: Any, p_occupied: FloatArray) -> None:
+    """Write P(taken) of the slots that were observed, as in the observation, into an array, (n_slots,)."""
+    for column in range(SENTINEL + 1, search.n_columns + 1):
+        p_occupied[slot_at(search.slots, column).slot] = np.float32(belief_now(search, column))
+
+
+@inlined
+def _state_in(search: Any, column: int) -> int:
+    """Return the state of the slot of a column."""
+    if not slot_at(search.slots, column).observed:
+        return UNOBSERVED
+    block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+    prior = np.float32(block.prior[i])
+    state = observed_state(prior, np.float32(block.p_observed[i]))
+    if state == OBSERVED_TAKEN:
+        observed_at = np.float32(block.observed_at[i] - search.arrival)
+        is_old = may_have_decayed(np.float32(block.decay_rate[i]), search.clock[1], observed_at)
+        if is_old and np.float32(belief_now(search, column)) == prior:
+            return UNOBSERVED
+    return int(state)

@@ -1,0 +1,160 @@
+"""Heuristic baselines: how people search, from their observations and without a forecast."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, SlotBelief
+from parkenv.engine.policy import CompiledPolicy
+from parkenv.errors import InputError
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation, PlanPreview, SearchAgent
+from planners.heuristics.policies import TargetPolicy, near_cost_s
+from planners.heuristics.rules import (
+    FIRST_FREE,
+    GREEDY_DRIVE,
+    GREEDY_GOAL,
+    NO_SLOT,
+    DriveGraph,
+    choose_target,
+    keeps_target,
+    likeliest_target,
+    plan_route,
+)
+
+
+@dataclass
+class GreedyState:
+    """Memory of a heuristic: the slot to drive to, or `NO_SLOT`, and the moves to it, the last one first."""
+
+    moves: NDArray[np.uint8]
+    target: int = NO_SLOT
+    n_moves: int = 0
+
+
+class TargetAgent(SearchAgent[GreedyState]):
+    """Drives to one slot after another, parks if the target is free, and drops it once it is observed taken.
+
+    Its decisions are those of `planners.heuristics.rules`, as are those of its compiled policy.
+    """
+
+    heuristic: ClassVar[int]
+    within_m: float | None = None
+
+    def __init__(self, problem: SearchProblem) -> None:
+        super().__init__(problem)
+        self.graph = DriveGraph.of(self.problem)
+        self._arrival_cost_s = np.array(self.problem.arrival_cost_s, np.float64)
+        self._near_s = near_cost_s(self.problem, self.within_m)
+
+    def begin(self, observation: Observation, belief: SlotBelief) -> GreedyState:
+        """Start without a target."""
+        del observation, belief
+        return GreedyState(np.zeros(self.problem.lot.n_vertices, np.uint8))
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
+        """Keep the target while it is a candidate, else choose another one; park on arrival."""
+        states, vertex, target = belief.recent_state, int(observation["vertex"]), memory.target
+        if not keeps_target(self.heuristic, target, states[target] if target != NO_SLOT else UNOBSERVED):
+            tables = self.graph, self._arrival_cost_s
+            chosen = choose_target(self.heuristic, *tables, self._near_s, states, vertex, target)
+            if chosen == NO_SLOT:
+                p_occupied = belief.p_occupied.astype(np.float64)
+                chosen = likeliest_target(*tables, states, p_occupied, vertex)
+            if chosen != target or states[target] == OBSERVED_TAKEN:
+                memory.target = chosen
+                memory.n_moves = plan_route(self.graph, vertex, chosen, memory.moves)
+        if memory.n_moves == 0:
+            return PARK
+        memory.n_moves -= 1
+        return int(memory.moves[memory.n_moves])
+
+    def plan_preview(self, observation: Observation, action: int, memory: GreedyState) -> PlanPreview:
+        """Return the shortest route to the target."""
+        path = [int(observation["vertex"])]
+        moves = [] if action == PARK else [action, *memory.moves[: memory.n_moves][::-1]]
+        for move in moves:
+            path.append(int(self.graph.neighbors[path[-1], move]))
+        return PlanPreview(tuple(path[1:]))
+
+    def compiled_policy(self) -> CompiledPolicy:
+        """Return the policy that decides as this agent for the cars of a fleet, without Python."""
+        return TargetPolicy(self.name, self.heuristic, self.within_m)
+
+
+class GreedyGoalAgent(TargetAgent):
+    """`greedy-goal`: drives to the candidate nearest to the goal, then to the next one.
+
+    Nearest means the lowest arrival cost: where slots have a price, a cheaper one may come before a nearer one. Among
+    equals it is the one with the shortest drive.
+    """
+
+    name: ClassVar[str] = "greedy-goal"
+    heuristic = GREEDY_GOAL
+
+
+class GreedyDriveAgent(TargetAgent):
+    """`greedy-drive`: drives to the nearest candidate, however far it is from the goal.
+
+    Among equals it is the one with the lowest arrival cost.
+    """
+
+    name: ClassVar[str] = "greedy-drive"
+    heuristic = GREEDY_DRIVE
+
+
+class FirstFreeAgent(TargetAgent):
+    """`first-free`: drives towards the goal and takes the first free slot that is near enough.
+
+    If it has found none when it reaches the slot nearest to the goal, it drives on to the nearest unobserved slot, and
+    so on, and takes any free slot.
+
+    Args:
+        problem: the problem.
+        within_m: maximum distance from the goal, m, at which a free slot is good enough; None: the lot's median. A
+            slot's price counts as the distance that one walks in as many seconds.
+
+    Raises:
+        InputError: no slot is within `within_m`.
+    """
+
+    name: ClassVar[str] = "first-free"
+    heuristic = FIRST_FREE
+
+    def __init__(self, problem: SearchProblem, within_m: float | None = None) -> None:
+        self.within_m = within_m
+        super().__init__(problem)
+        least_m = self._arrival_cost_s.min() * self.problem.v_walk
+        if within_m is not None and not within_m >= least_m:
+            raise InputError(
+                f"within_m is {within_m}, want at least {least_m:.1f}, the shortest walk of the lot"
+            )
+
+
+class RandomAgent(SearchAgent[np.random.Generator]):
+    """`random`: chooses any available action, all with equal probability.
+
+    The `seed`, the time of arrival and the entry determine the actions.
+    """
+
+    name: ClassVar[str] = "random"
+
+    def __init__(self, problem: SearchProblem, seed: int = 0) -> None:
+        super().__init__(problem)
+        self.seed = seed
+
+    def begin(self, observation: Observation, belief: SlotBelief) -> np.random.Generator:
+        """Return a generator that depends only on the seed and the time of arrival."""
+        del belief
+        moment = int(np.float32(observation["time"][0]).view(np.uint32))
+        return np.random.default_rng([self.seed, moment, int(observation["vertex"])])
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: np.random.Generator) -> int:
+        """Choose one of the actions that the mask allows."""
+        del belief
+        return int(memory.choice(np.flatnonzero(observation["action_mask"])))

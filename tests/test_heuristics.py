@@ -1,0 +1,179 @@
+"""Heuristic baselines: agents against a plain reference, compiled policies against agents, to the last bit."""
+
+import itertools
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from small_lots import cut_in_two, small_lot
+
+import parkenv
+from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, SlotBelief
+from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.studies.simulate import simulate
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
+from parkenv.world.lot import PARK
+from parkenv.world.scenario import SearchProblem
+from planners.agent import make_agent
+from planners.heuristics import POLICIES
+from planners.routes import DriveRoutes
+
+NAMES = ("greedy-goal", "greedy-drive", "first-free")
+NOISY = SensorModel(
+    15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
+)
+
+
+# ---- a plain reference
+
+
+def reference_target(name, problem, routes, belief, vertex, previous):
+    """The slot to drive to, by its definition."""
+    n = problem.lot.n_slots
+    seconds = routes.seconds_from(vertex)[:n]
+    cost_s, reachable = problem.arrival_cost_s, np.isfinite(seconds)
+    decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
+    state = np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
+    candidates = (state != OBSERVED_TAKEN) & reachable
+    good = (state == OBSERVED_FREE) & (cost_s <= np.median(cost_s)) & reachable
+    kept = previous >= 0 and state[previous] != OBSERVED_TAKEN
+    if name == "first-free" and good.any() and not (kept and state[previous] == OBSERVED_FREE):
+        return first(good, seconds)
+    if kept:
+        return previous
+    if not candidates.any():
+        others = reachable & (np.arange(n) != vertex)
+        return first(others, belief.p_occupied) if others.any() else vertex
+    if name == "greedy-goal" or (name == "first-free" and previous < 0):
+        return first(candidates, cost_s, seconds)
+    return first(candidates, seconds, cost_s) if name == "greedy-drive" else first(candidates, seconds)
+
+
+def first(slots, *keys):
+    """The slot with the least keys, the second one among equals of the first one, and then the least index."""
+    indices = np.flatnonzero(slots)
+    return int(indices[np.lexsort([key[indices] for key in reversed(keys)])[0]])
+
+
+def drive_s(problem, path):
+    """Drive time along vertices."""
+    neighbors, move_s = problem.lot.neighbors, problem.move_s
+    return sum(move_s[u][neighbors[u] == v].min() for u, v in itertools.pairwise(path))
+
+
+def random_belief(rng, problem):
+    """A belief in which slots were observed at any time with sharp or dull sensors, some long ago."""
+    n = problem.lot.n_slots
+    belief = SlotBelief.of_forecast(rng.uniform(0.01, 0.99, n), rng.choice([1e-3, 0.5], n))
+    for _ in range(rng.integers(4)):
+        slots = np.flatnonzero(rng.random(n) < rng.choice([0.2, 0.6, 1.0]))
+        hit, false_alarm = rng.choice([(1.0, 0.0), (0.8, 0.3)])
+        belief = belief.update(slots, rng.random(len(slots)) < 0.7, hit, false_alarm).decay(
+            rng.choice([3.0, 60.0])
+        )
+    observation = belief.to_observation()
+    return SlotBelief(observation["p_occupied"], observation["belief"], float(np.float32(belief.time)))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_agents_decide_as_the_definition_of_their_rule(name):
+    rng, decisions = np.random.default_rng(1), 0
+    for seed in range(40):
+        problem = small_lot(seed)[0]
+        if seed % 10 == 9:
+            problem = SearchProblem(lot=cut_in_two())
+        routes, agent = DriveRoutes(problem), make_agent(name, problem)
+        entry = int(problem.lot.entry_vertices[0])
+        for _ in range(25):
+            vertex, target = entry, -1
+            memory = agent.begin({}, None)
+            for _ in range(3):
+                belief = random_belief(rng, problem)
+                target = reference_target(name, problem, routes, belief, vertex, target)
+                action = agent.decide({"vertex": vertex}, belief, memory)
+                assert memory.target == target
+                path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory).path)
+                assert path[-1] == target
+                assert drive_s(problem, path) == pytest.approx(routes.seconds_from(vertex)[target])
+                assert problem.lot.neighbors[vertex, action] == path[1] if len(path) > 1 else action == PARK
+                decisions += 1
+                if action == PARK:
+                    break
+                vertex = int(problem.lot.neighbors[vertex, action])
+    assert decisions > 2000
+
+
+# ---- compiled policies
+
+
+def random_world(seed):
+    """A small lot, cars that compete for it, what they know, and options of the fleet."""
+    rng = np.random.default_rng([5, seed])
+    problem, p, _ = small_lot(seed)
+    process = OccupancyProcess.from_demand(np.log(p / (1 - p)), np.zeros(168), rng.choice([20.0, 900.0]))
+    fields = {name: getattr(problem, name) for name in ("lot", "v_drive", "v_walk", "give_up_s")}
+    sensor = NOISY if seed % 3 == 0 else problem.sensor_model
+    scenario = Scenario(**fields, name="small", occupancy=process, sensor_model=sensor)
+    demand = Demand(Headways(int(rng.integers(1, 12)), 10.0), ExponentialTime(300.0), ConstantTime(400.0))
+    kind = {"knows": ("own", "shared", "full", "reserve")[seed % 4], "shares": True}
+    options = {
+        "background": ("process", "residents")[seed // 4 % 2],
+        "max_steps": 120,
+        "leave_full_lot": False,
+    }
+    return scenario, demand, kind, options
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
+    decisions = 0
+    for seed in range(48):
+        scenario, demand, kind, options = random_world(seed)
+        runs = []
+        for policy in (POLICIES[name], None):
+            fleet = Fleet(scenario, demand, drivers=[DriverKind(policy=policy, **kind)], **options)
+            fleet.keep_steps()
+            fleet.reset(seed)
+            fleet.run(None if policy else [make_agent(name, scenario)])
+            runs.append(fleet)
+        compiled, planned = runs
+        np.testing.assert_array_equal(compiled.steps, planned.steps)
+        for field in ("slot", "state", "ended_at", "n_steps", "failed_parks"):
+            np.testing.assert_array_equal(compiled.cars[field], planned.cars[field])
+        decisions += int(compiled.totals["decisions"])
+    assert decisions > 5000
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("source", ["mini", "campus", "jam"])
+def test_a_fleet_of_one_car_with_a_policy_is_the_search_of_its_agent(name, source):
+    scenario = parkenv.make_scenario(source)
+    fleet = Fleet(
+        scenario, Demand(Headways(1)), background="process", drivers=[DriverKind(policy=POLICIES[name])]
+    )
+    agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v2", scenario=scenario)
+    for seed in range(10):
+        fleet.reset(seed)
+        fleet.run()
+        (car,) = fleet.cars
+        episode = simulate(env, agent, seed)
+        for field in ("drive_s", "failed_s", "walk_s", "driven_m", "failed_parks"):
+            assert car[field] == episode.info[field]
+
+
+def test_a_policy_takes_the_options_of_its_agent():
+    scenario = parkenv.make_scenario("campus")
+    agent = make_agent("first-free", scenario, within_m=150.0)
+    slots = []
+    for kind, agents in ((DriverKind(policy=agent.compiled_policy()), None), (DriverKind(), [agent])):
+        fleet = Fleet(scenario, Demand(Headways(20, 30.0)), drivers=[kind])
+        fleet.reset(3)
+        fleet.run(agents)
+        slots.append(fleet.cars["slot"].tolist())
+    assert slots[0] == slots[1]
+
+
+def test_a_kind_of_driver_wants_a_compiled_policy():
+    with pytest.raises(InputError, match=r"DriverKind\.policy"):
+        DriverKind(policy="greedy-drive")
