@@ -270,7 +270,7 @@ def assert_one_line_and_exit_2(done, *wanted):
         (["--speed", "3"], ["--speed"]),
         (["--v-drive-kmh", "1e-300"], ["--v-drive-kmh is 1e-300"]),
         (["--days", "someday"], ["someday"]),
-        (["--resume"], ["holds no run to go on with"]),
+        (["--resume"], ["holds no run to resume"]),
         (["--agents", "mdp(failure_s=90"], ["agent 'mdp(failure_s=90', want NAME or NAME(OPTION=VALUE,...)"]),
         (["--agents", "mdp(failre_s=90)"], ["has no option 'failre_s'", "failure_s"]),
         (["--agents", "mdp,mdp"], ["agents has 'mdp' twice"]),

@@ -85,7 +85,7 @@ def test_a_folder_of_another_run_is_kept_unless_it_is_replaced(tmp_path):
             run(TOY.changed(offset=1), tmp_path, **options)
         assert files_of(tmp_path) == before
     assert run(TOY.changed(offset=1), tmp_path, overwrite=True).rows[0]["sum"] == 61
-    with pytest.raises(InputError, match="holds no toy to go on with"):
+    with pytest.raises(InputError, match="holds no toy run to resume"):
         run(TOY, tmp_path / "new", resume=True)
     assert not (tmp_path / "new").exists()
 

@@ -688,7 +688,7 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
             ["sac", "--env", "drive", "--agents", "mdp"],
             "agents has 'mdp', want planner or none with env drive",
         ),
-        (["ppo", "--resume"], "to go on with"),
+        (["ppo", "--resume"], "to resume"),
         (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
         (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
         (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),

@@ -71,7 +71,7 @@ def test_a_cluster_in_a_run_folder_asks_for_trust_whoever_searches(tmp_path):
     command = ("compare", "--resume", "--agents", "mdp", "--out", tmp_path)
     refused = " ".join(parkenv(*command).stderr.split())
     assert "would run tasks on the cluster at tcp://theirs.example:8786; read" in refused
-    assert "holds no comparison to go on with" in parkenv(*command, "--backend", "loky").stderr
+    assert "holds no compare run to resume" in parkenv(*command, "--backend", "loky").stderr
 
 
 def test_a_run_folder_that_names_a_class_asks_for_trust_and_the_class_names_the_agent(module, tmp_path):

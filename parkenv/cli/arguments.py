@@ -431,7 +431,7 @@ def saved(folder: Path, kind: type[SpecT]) -> SpecT:
 
     file = folder / SPEC_FILE
     if not file.exists():
-        raise InputError(f"--resume: {folder} holds no run to go on with: no {SPEC_FILE}")
+        raise InputError(f"--resume: {folder} holds no run to resume: no {SPEC_FILE}")
     return kind.read(file)
 
 

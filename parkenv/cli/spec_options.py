@@ -191,11 +191,12 @@ def given_spec(
     """
     if resume:
         base = saved(out, type(base))
-        fields = {option.path[0] for option in field_options(type(base)) if option.name in given}
-        require_trust(base, out, trust, given=fields)
     if "--backend" in given and "--address" not in given:
         # The address belongs to the other backend.
         base = base.changed(address=None)
+    if resume:
+        fields = {option.path[0] for option in field_options(type(base)) if option.name in given}
+        require_trust(base, out, trust, given=fields)
     given = dict(given)
     if trust_model and "--agents" in given:
         given["--agents"] = ",".join(readable_models(split_agents(given["--agents"]), trust_model))

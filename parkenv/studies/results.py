@@ -270,7 +270,7 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
     """
     before = read_settings(folder)
     if before is None:
-        raise InputError(f"--resume: {folder} holds no {kind} to go on with")
+        raise InputError(f"--resume: {folder} holds no {kind} run to resume")
     now = parse_json(json.dumps(dict(settings)), "settings")
     both = {}
     for name in sorted(before.keys() | now.keys()):
