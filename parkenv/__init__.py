@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from parkenv.scenarios.build import make_scenario, make_scenarios
     from parkenv.studies.runner import Result, open_run
     from parkenv.studies.simulate import simulate
-    from parkenv.studies.verbs import compare, fleet, survey
+    from parkenv.studies.verbs import compare, fleet, survey, train
     from parkenv.world.lot import Lane, Mouth, ParkingLot
     from parkenv.world.occupancy.log import OccupancyLog
     from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
@@ -53,6 +53,7 @@ _EXPORTS = {
     "open_run": "parkenv.studies.runner",
     "simulate": "parkenv.studies.simulate",
     "survey": "parkenv.studies.verbs",
+    "train": "parkenv.studies.verbs",
 }
 
 __all__ = [
@@ -80,6 +81,7 @@ __all__ = [
     "open_run",
     "simulate",
     "survey",
+    "train",
 ]
 
 

@@ -10,6 +10,7 @@ from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.runner import Result, run
 from parkenv.studies.sensing.survey_study import SurveyStudy
 from parkenv.studies.study import Progress, Study
+from parkenv.studies.training.spec import TrainingSpec
 
 
 def compare(
@@ -82,6 +83,30 @@ def survey(
         InputError: see `compare`.
     """
     return _run(SurveyStudy, fields, folder, resume, overwrite, progress)
+
+
+def train(
+    *,
+    folder: Path | str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    **fields: Any,
+) -> Result:
+    """Train agents by reinforcement learning, one model per seed, and test them; the result's folder holds the models.
+
+    Args:
+        folder: see `compare`.
+        resume: see `compare`; each training goes on from its checkpoint.
+        overwrite: see `compare`.
+        progress: see `compare`.
+        fields: fields of the specification, as in a file of kind `train`: `env`, `algorithm`, `scenarios`, `steps`,
+            `trainings`, `seed` and others.
+
+    Raises:
+        InputError: see `compare`.
+    """
+    return _run(TrainingSpec, fields, folder, resume, overwrite, progress)
 
 
 def _run(
