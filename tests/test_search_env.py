@@ -447,7 +447,7 @@ def test_sight_differs_by_distance_and_side():
     ("wrong", "message"),
     [
         ({"seen_rate": 1.5}, "seen_rate is 1.5"),
-        ({"up_to": -1.0}, "up_to is -1.0 m"),
+        ({"up_to": -1.0}, "up_to is -1.0"),
         ({"hit_rate": 0.0}, "hit_rate"),
     ],
 )

@@ -33,8 +33,8 @@ from parkenv.engine.events import (
     release_at,
 )
 from parkenv.engine.kernel import (
+    read_step,
     shared_slots_taken_at,
-    step_info,
     step_result_at,
 )
 from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings_at
@@ -597,10 +597,10 @@ class Fleet:
     def outcome(self, car: int) -> StepOutcome:
         """Return the result of a car's last step."""
         searches, row = self._search_of(car)
-        result = step_result_at(searches.address + row * SEARCH.itemsize)
-        info = step_info(self.scenarios[self._cars["place"][car]].name, *result)
+        place = self.scenarios[self._cars["place"][car]].name
+        reward, over, _, info = read_step(place, step_result_at(searches.address + row * SEARCH.itemsize))
         begun = bool(searches.records["n_steps"][row])
-        return StepOutcome(begun, result[0], info["parked"], result[-2], info)
+        return StepOutcome(begun, reward, info["parked"], over, info)
 
     def _search_of(self, car: int) -> tuple[Searches, int]:
         """Return the searches that hold a car's record, and its row there."""

@@ -13,8 +13,8 @@ from parkenv.compiled.keyed_random import seed_state
 from parkenv.engine.kernel import (
     begin_search_at,
     init_external_forecast_at,
+    read_step,
     step_exact_at,
-    step_info,
     step_noisy_at,
 )
 from parkenv.engine.records import ScenarioRecords, Searches
@@ -282,16 +282,14 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if self._over:
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
         number = action_number(action)
-        result = self._advance(number)
-        reward, over, vertex = result[0], result[-2], result[-1]
+        # A wrapper's time limit may end the episode at any step, so every step has the metrics.
+        reward, over, vertex, info = read_step(self._name, self._advance(number))
         if self.searches.needs_python:
             raise_error()
         state = self._state
         if vertex != state.path[-1]:
             state.path.append(vertex)
         self._over = over
-        # A wrapper's time limit may end the episode at any step, so every step has the metrics.
-        info = step_info(self._name, *result)
         if self.render_mode == "human":
             self.render()
         return self._observation(vertex), reward, over, False, info
