@@ -18,8 +18,9 @@ if TYPE_CHECKING:
     from parkenv.studies.simulate import simulate
     from parkenv.studies.verbs import compare, fleet, survey, train
     from parkenv.world.lot import Lane, Mouth, ParkingLot
+    from parkenv.world.occupancy.arrival_window import ArrivalWindow
     from parkenv.world.occupancy.log import OccupancyLog
-    from parkenv.world.occupancy.process import ArrivalWindow, OccupancyProcess
+    from parkenv.world.occupancy.process import OccupancyProcess
     from parkenv.world.occupancy.recorded import RecordedOccupancy
     from parkenv.world.scenario import Scenario, SearchProblem
     from parkenv.world.sensor_model import SensorBand, SensorModel
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _EXPORTS = {
-    "ArrivalWindow": "parkenv.world.occupancy.process",
+    "ArrivalWindow": "parkenv.world.occupancy.arrival_window",
     "InputError": "parkenv.errors",
     "Lane": "parkenv.world.lot",
     "Mouth": "parkenv.world.lot",

@@ -14,7 +14,7 @@ from parkenv.compiled.keyed_random import (
     world_key,
 )
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy.day_error import centred_logits
+from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.process import OccupancyProcess
 

@@ -21,8 +21,8 @@ from parkenv.studies.commute.runs import TRIP, CommuteRun, calendar
 from parkenv.studies.commute.study import Commute
 from parkenv.studies.results import DECISIONS
 from parkenv.studies.runner import run
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.log import OccupancyLog
-from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 from planners.agent import make_agent
 

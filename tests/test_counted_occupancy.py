@@ -16,8 +16,9 @@ from parkenv import make_scenario
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.counted import CountedOccupancy, level_of_mean, process_of_curve
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow
+from parkenv.world.occupancy.process import Arrival
 
 N = 120
 ATTRACTION = 1.6 * np.linspace(1.0, -1.0, N) + np.random.default_rng(4).normal(0.0, 0.6, N)

@@ -8,7 +8,8 @@ import pytest
 from parkenv.belief import day_belief
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.world.occupancy.day_error import DayError, centred_logits, nearness
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import DayError, nearness
 
 
 def forecast_of(n, seed=0, level=0.8, slope=0.0, decay_rate=0.0, least=0.3):

@@ -15,7 +15,8 @@ from scipy.stats import norm
 
 from parkenv import InputError, OccupancyProcess
 from parkenv.compiled.keyed_random import world_key
-from parkenv.world.occupancy.day_error import DayError, centred_logits, centring_table, nearness
+from parkenv.world.occupancy.centred_logits import centred_logits, centring_table
+from parkenv.world.occupancy.day_error import DayError, nearness
 from parkenv.world.occupancy.process import Arrival
 
 

@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from parkenv.compiled.keyed_random import keyed_exponential, keyed_uniform, world_key
 from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow, OccupancyProcess
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.occupancy.process import Arrival, OccupancyProcess
 from parkenv.world.week import HOUR_S, WEEK_S
 
 NINE = Arrival(9 * HOUR_S)

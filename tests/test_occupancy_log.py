@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.log import OccupancyLog, day_class, weekday_of
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow
+from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping
 from parkenv.world.week import DAY_S, HOUR_S
 

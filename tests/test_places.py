@@ -25,7 +25,8 @@ from parkenv.studies.training.cloning import clone
 from parkenv.studies.training.search import SearchTraining, episode_times
 from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.real_week import DAY_ERROR, real_week_occupancy
+from parkenv.world.occupancy.real_week import real_week_occupancy
+from parkenv.world.occupancy.real_week_figures import DAY_ERROR
 from parkenv.world.occupancy.typical_week import typical_occupancy
 from planners.model_file import ModelCard
 

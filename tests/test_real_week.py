@@ -13,8 +13,8 @@ from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
 from parkenv.lots import grid_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.world.occupancy import real_week
-from parkenv.world.occupancy.real_week import LEVELS, OCCUPIED, real_week_occupancy
+from parkenv.world.occupancy.real_week import real_week_occupancy
+from parkenv.world.occupancy.real_week_figures import DAY_ERROR, LEVELS, OCCUPIED
 
 GERMAN = Path(__file__).parents[2] / "shared" / "data" / "german_car_parks" / "hourly_2023_2024.csv.gz"
 
@@ -86,4 +86,4 @@ def test_the_table_is_that_of_the_counts():
     assert fitted is not None
     np.testing.assert_allclose(100.0 * fitted.occupied.ravel(), OCCUPIED, atol=0.51)
     np.testing.assert_allclose(fitted.levels, LEVELS, atol=0.006)
-    assert np.nanmedian(fitted.day_errors) == pytest.approx(real_week.DAY_ERROR, abs=0.05)
+    assert np.nanmedian(fitted.day_errors) == pytest.approx(DAY_ERROR, abs=0.05)

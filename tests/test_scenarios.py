@@ -11,9 +11,10 @@ from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.constant_map import FlatMap
 from parkenv.world.occupancy.day_error import DayError, nearness
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow
+from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.occupancy.typical_week import typical_occupancy
 

@@ -10,9 +10,9 @@ from search_reference import ReferenceSearch
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.lots import grid_lot
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.log import OccupancyLog
-from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 
 LIMIT = 40

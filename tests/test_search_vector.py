@@ -12,9 +12,10 @@ from parkenv.belief.slot_belief import bayes_update
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.log import OccupancyLog
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow, Forecast, PriorModel
+from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 
 LIMIT = 40

@@ -18,7 +18,7 @@ from parkenv.studies.runner import run
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.sensing.survey_study import SurveyStudy
 from parkenv.studies.sensing.surveys import map_error
-from parkenv.world.occupancy.process import ArrivalWindow
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount, SensorRig
 

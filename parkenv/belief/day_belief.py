@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from parkenv.belief.slot_belief import SlotBelief, decay_to_prior
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.world.occupancy.day_error import DayError, centred_logits
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import DayError
 
 NEGLIGIBLE = 5e-4
 """Hypotheses with less weight are left out of a plan; they return if observations speak for them."""

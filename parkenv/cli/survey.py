@@ -230,7 +230,7 @@ def show_map(
     from parkenv.mapping.store import MapStore
     from parkenv.scenarios.build import build
     from parkenv.show.figures.survey import save_map
-    from parkenv.world.occupancy.process import DAY_NAMES
+    from parkenv.world.occupancy.arrival_window import DAY_NAMES
     from parkenv.world.week import DAY_S, HOUR_S
 
     its = build(args.World(lot=lot).spec(scenario))

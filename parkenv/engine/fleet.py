@@ -65,7 +65,8 @@ from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, 
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.python_functions import raise_error
 from parkenv.world.scenario import SearchProblem
-from parkenv.world.week import DAY_S, hour_of_week
+from parkenv.world.week import DAY_S
+from parkenv.world.week_hours import hour_of_week
 
 _FIRST_CHUNK = 16
 _UNREACHABLE_S = 1e9

@@ -54,7 +54,8 @@ from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy import kernel as worlds
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND, SHARED_KIND, inlined, kernel
-from parkenv.world.week import DAY_S, WEEK_HOURS, hour_of_week
+from parkenv.world.week import DAY_S, WEEK_HOURS
+from parkenv.world.week_hours import hour_of_week
 
 STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
 """Names of the numbers that a step returns; metrics are those of the episode so far."""

@@ -13,7 +13,8 @@ from parkenv.errors import InputError
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
 from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
-from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError, centred_logits, nearness
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError, nearness
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S

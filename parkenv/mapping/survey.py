@@ -24,7 +24,8 @@ from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_vers
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.lot_scene import LotScenes, slot_lot
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow, World
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.occupancy.process import Arrival, World
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
 from sim_sensors.rig import RIG_NAMES, Capture, SensorRig, TimedCapture, poses_along

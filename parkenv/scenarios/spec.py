@@ -29,9 +29,9 @@ from parkenv.files.known_names import (
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Option, numbers_in
 from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
-from parkenv.world.occupancy import real_week
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
-from parkenv.world.occupancy.process import ArrivalWindow
+from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
@@ -123,14 +123,14 @@ class RealWeek(Spec):
     """A week as counted in real car parks: what a lot file alone has."""
 
     fuller_than: Probability = Field(
-        real_week.FULLER_THAN,
+        FULLER_THAN,
         description="Fraction of real car parks that are less full; 0.5 for the typical one.",
     )
     pull: float = Field(
-        real_week.PULL, ge=-10, le=10, description="Logits by which demand rises from the middle to the goal."
+        PULL, ge=-10, le=10, description="Logits by which demand rises from the middle to the goal."
     )
     unevenness: float = Field(
-        real_week.UNEVENNESS, ge=0, le=5, description="Standard deviation between equally near slots, logits."
+        UNEVENNESS, ge=0, le=5, description="Standard deviation between equally near slots, logits."
     )
     mean_stay_s: float = Field(7200.0, ge=60.0, le=1e7)
 
@@ -571,7 +571,7 @@ def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
         InputError: neither a packaged lot nor a file.
     """
     name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
-    tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": real_week.DAY_ERROR}}
+    tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": DAY_ERROR}}
     return ScenarioSpec.parse(tables, str(lot) if source is None else source).of_file(lot)
 
 

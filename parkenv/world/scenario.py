@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, require_number
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow, Forecast, OccupancyModel, PriorModel
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
 from parkenv.world.traffic import Traffic
 

@@ -7,7 +7,8 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.world.occupancy.day_error import DayError, centred_logits, nearness
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import DayError, nearness
 
 LEVELS, SLOPES = 13, 7  # numbers of levels and slopes of the grid, from -3.6 to 3.6 standard deviations
 _MOST_DEVIATIONS = 3.6

@@ -21,7 +21,8 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.keyed_random import OBSERVATION_STREAM, VIEW_STREAM, keyed_uniform
 from parkenv.errors import InputError
-from parkenv.world.occupancy.day_error import EXACT, DayError, centred_logits, nearness
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
 from planners.belief.planning_graph import PlanningGraph

@@ -37,7 +37,7 @@ from parkenv.show.scene import (
     posed,
 )
 from parkenv.world.lot import ParkingLot
-from parkenv.world.occupancy.process import DAY_NAMES
+from parkenv.world.occupancy.arrival_window import DAY_NAMES
 from parkenv.world.week import DAY_S
 
 WIDTH, HEIGHT = 640, 480

@@ -30,8 +30,8 @@ from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct, 
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import Key, Row
 from parkenv.studies.study import Cell
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.process import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent

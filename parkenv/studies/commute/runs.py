@@ -23,7 +23,8 @@ from parkenv.studies.commute.tables import FIXED, NONE
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import Row
 from parkenv.studies.trip_recorder import TripRecorder
-from parkenv.world.occupancy.process import ArrivalWindow, PriorModel
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.occupancy.process import PriorModel
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name

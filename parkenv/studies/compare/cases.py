@@ -20,7 +20,7 @@ from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
 from parkenv.studies.statistics import mean_interval, summarize
 from parkenv.studies.workers import Workers
-from parkenv.world.occupancy.process import ArrivalWindow
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name

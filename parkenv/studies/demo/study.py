@@ -181,7 +181,7 @@ def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) ->
     from parkenv.show.figures.survey import save_map
     from parkenv.show.plurals import plural
     from parkenv.studies.sensing.surveys import mean_occupancy
-    from parkenv.world.occupancy.process import DAY_NAMES
+    from parkenv.world.occupancy.arrival_window import DAY_NAMES
     from parkenv.world.week import DAY_S
 
     shown = replace(scenario.arrival, weekdays=scenario.arrival.weekdays[:2][-1:])

@@ -103,7 +103,7 @@ class SurveyStudy(Study):
         """Settings of the drives."""
         from parkenv.mapping.odometry import PoseNoise
         from parkenv.mapping.survey import SurveySettings
-        from parkenv.world.occupancy.process import ArrivalWindow
+        from parkenv.world.occupancy.arrival_window import ArrivalWindow
 
         days = self.scenario.arrivals.days
         return SurveySettings(

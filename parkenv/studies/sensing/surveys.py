@@ -18,7 +18,8 @@ from parkenv.mapping.survey import SessionResult, SurveySettings
 from parkenv.mapping.survey_score import METHODS
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, SESSION_COLUMNS
-from parkenv.world.occupancy.process import Arrival, ArrivalWindow, OccupancyModel
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.occupancy.process import Arrival, OccupancyModel
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S
 

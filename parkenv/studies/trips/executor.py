@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, NamedTuple, Protocol
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.world.occupancy.process import World
 
 if TYPE_CHECKING:
+    from parkenv.world.occupancy.process import World
     from sim_sensors.movers import Movers
 
 

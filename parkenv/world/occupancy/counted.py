@@ -12,14 +12,13 @@ from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
+from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY, PROCESS_KIND
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.process import (
-    DAY_NAMES,
     MAX_RATE,
     Arrival,
-    ArrivalWindow,
     Forecast,
     OccupancyModel,
     OccupancyProcess,

@@ -7,28 +7,16 @@ On a day with level L ~ N(0, level²) and slope S ~ N(0, slope²), slot i is tak
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.compiled.jit import compiled
 from parkenv.errors import require_number
 
 MAX_LOGITS = 5.0
 """Largest standard deviation of a level or slope; days then are almost empty or almost full."""
-
-# A sum over equally spaced z converges faster here than Gauss-Hermite quadrature, as both the normal density and the
-# sigmoid are analytic in a strip: the error is below 1e-9 for deviations up to 3, and below 1e-4 up to 7.
-_Z_STEP, _Z_MOST = 0.25, 8.0
-_NODES = np.arange(-_Z_MOST, _Z_MOST + _Z_STEP / 2, _Z_STEP)
-_WEIGHTS = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
-_ITERATIONS = 100
-_FAR = 500.0  # logits
-_LAST_STEP = 1e-7  # Newton's method: the error after a step is of the order of its square
 
 
 @dataclass(frozen=True)
@@ -74,79 +62,3 @@ def nearness(walk: ArrayLike) -> FloatArray:
     """
     rank = np.argsort(np.argsort(walk, kind="stable"), kind="stable")
     return np.asarray(1.0 - 2.0 * rank / max(rank.size - 1, 1))
-
-
-def centred_logits(p: ArrayLike, deviation: ArrayLike) -> FloatArray:
-    """Return the logits x with E[sigmoid(x + deviation·Z)] = p for a standard normal Z.
-
-    Args:
-        p: probabilities, any shape; infinite logits for 0 and 1.
-        deviation: standard deviations, logits, of a shape that broadcasts with `p`.
-    """
-    each = [np.array(a) for a in np.broadcast_arrays(np.asarray(p, float), np.asarray(deviation, float))]
-    return np.asarray(_centred_logits(*(a.ravel() for a in each))).reshape(each[0].shape)
-
-
-@compiled(error_model="numpy")
-def _centred_logit(p: float, deviation: float, factors: FloatArray) -> float:
-    """Return `centred_logits` of one probability; `factors` are exp(deviation·z) at the nodes."""
-    wanted = math.log(p / (1.0 - p))
-    if p <= 0.0 or p >= 1.0 or deviation == 0.0:
-        return wanted
-    far = wanted + math.copysign(0.5 * deviation * deviation, wanted)  # where the sigmoid is an exponential
-    if abs(wanted) > _FAR:
-        return far
-    # Newton's method on the logit of the mean, which is nearly linear in x; the approximation by a probit starts it.
-    x = wanted * math.sqrt(1.0 + math.pi * deviation * deviation / 8.0)
-    x = math.copysign(min(abs(x), abs(far)), wanted)
-    for _ in range(_ITERATIONS):
-        taken = free = slope = 0.0
-        odds = math.exp(x)
-        for k in range(_NODES.size):
-            # Both tails by themselves: 1 - taken would lose all digits near 1.
-            p_free = 1.0 / (1.0 + odds * factors[k])
-            p_taken = odds * factors[k] * p_free
-            taken += _WEIGHTS[k] * p_taken
-            free += _WEIGHTS[k] * p_free
-            slope += _WEIGHTS[k] * p_taken * p_free
-        step = (wanted - math.log(taken / free)) * taken * free / slope
-        x += step
-        if abs(step) < _LAST_STEP * max(1.0, abs(x)):
-            break
-    return x
-
-
-TABLE_STEPS, TABLE_ROWS = 256, 8
-
-
-@lru_cache(maxsize=64)
-def centring_table(day_error: DayError) -> FloatArray:
-    """Tabulate by which factor centring changes the odds of a slot, for compiled code.
-
-    Returns:
-        (rows, 257) float64, exp(centred_logits(p) - logit(p)). Column k is for p = k / 256; row j is for
-        nearness² = j / 8. Without a slope there is one row for all.
-    """
-    if not day_error:
-        return np.ones((1, TABLE_STEPS + 1))
-    p = np.arange(TABLE_STEPS + 1) / TABLE_STEPS
-    rows = np.sqrt(np.arange(TABLE_ROWS + 1) / TABLE_ROWS) if day_error.slope > 0.0 else np.zeros(1)
-    deviation = day_error.deviations(rows)[:, None]
-    factors = np.empty((rows.size, p.size))
-    inner = p[1:-1]
-    factors[:, 1:-1] = np.exp(centred_logits(inner, deviation) - np.log(inner / (1.0 - inner)))
-    # For p near 0, E[sigmoid(x + deviation·Z)] approaches E[exp(x + deviation·Z)]; near 1, likewise.
-    factors[:, :1], factors[:, -1:] = np.exp(-0.5 * deviation**2), np.exp(0.5 * deviation**2)
-    factors.flags.writeable = False
-    return factors
-
-
-@compiled(error_model="numpy")
-def _centred_logits(p: FloatArray, deviation: FloatArray) -> FloatArray:
-    centres, factors = np.empty_like(p), np.ones(_NODES.size)
-    for i in range(p.size):
-        if i == 0 or deviation[i] != deviation[i - 1]:
-            for k in range(_NODES.size):
-                factors[k] = math.exp(deviation[i] * _NODES[k])
-        centres[i] = _centred_logit(p[i], deviation[i], factors)
-    return centres

@@ -24,9 +24,10 @@ from parkenv.compiled.keyed_random import (
     keyed_uniform,
 )
 from parkenv.compiled.memory import ADDRESS, call_world_at, float64s, int64s, prefetch, record_at, uint8s
-from parkenv.world.occupancy.day_error import TABLE_ROWS, TABLE_STEPS
+from parkenv.world.occupancy.centred_logits import TABLE_ROWS, TABLE_STEPS
 from parkenv.world.occupancy.decay import decay_factor
-from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S, hour_of_week
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, HOUR_S, PERIOD_S, WEEK_HOURS, WEEK_S
+from parkenv.world.week_hours import hour_of_week
 
 # Forecasts are never certain, so that a planner can recover from a wrong one.
 MIN_PROBABILITY = 0.001

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 import os
-import re
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
@@ -22,75 +21,17 @@ from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.occupancy import kernel as kernels
-from parkenv.world.occupancy.day_error import EXACT, DayError, centring_table, nearness
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.occupancy.centred_logits import centring_table
+from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, draw_arrival, kernel
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.python_functions import functions_of
-from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, hour_of_week
-
-DAY_NAMES = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
-DAY_GROUPS = {"weekdays": (0, 1, 2, 3, 4), "weekend": (5, 6), "all": (0, 1, 2, 3, 4, 5, 6)}
+from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS
+from parkenv.world.week_hours import hour_of_week
 
 MAX_RATE = 1e3
 _FORMAT = JsonFormat("parkenv-occupancy-process", 1, "an occupancy process")
-
-
-@dataclass(frozen=True)
-class ArrivalWindow:
-    """Weekdays and times of day at which searches begin.
-
-    Args:
-        weekdays: Monday = 0 ... Sunday = 6, without repeats.
-        start_s: first second of the day, in [0, 86400).
-        end_s: end of the window (exclusive), in [start_s, 86400]; if equal to start_s, all searches begin then.
-    """
-
-    weekdays: tuple[int, ...] = (0, 1, 2, 3, 4)
-    start_s: float = 8 * HOUR_S
-    end_s: float = 13 * HOUR_S
-
-    def __post_init__(self) -> None:
-        days = tuple(self.weekdays)
-        if not days or len(set(days)) != len(days) or not set(days) <= set(range(7)):
-            raise InputError(
-                f"ArrivalWindow.weekdays is {days}, want different numbers from 0 (Mon) to 6 (Sun)"
-            )
-        if not 0 <= self.start_s < DAY_S:
-            raise InputError(f"ArrivalWindow.start_s is {self.start_s}, want seconds in [0, 86400)")
-        if not self.start_s <= self.end_s <= DAY_S:
-            raise InputError(
-                f"ArrivalWindow.end_s is {self.end_s}, want seconds in [start_s={self.start_s}, 86400]"
-            )
-        object.__setattr__(self, "weekdays", days)
-
-    @classmethod
-    def parse(cls, hours: str, days: str = "weekdays") -> Self:
-        """Parse a window as typed by a user.
-
-        >>> ArrivalWindow.parse("08:00-09:30", days="mon,sat")
-        ArrivalWindow(weekdays=(0, 5), start_s=28800.0, end_s=34200.0)
-
-        Args:
-            hours: `HH:MM-HH:MM`, with 24:00 allowed as the end.
-            days: `weekdays`, `weekend`, `all`, or names as in `mon,tue`.
-        """
-        match = re.fullmatch(r"\s*(\d{1,2}):([0-5]\d)\s*-\s*(\d{1,2}):([0-5]\d)\s*", hours)
-        if match is None:
-            raise InputError(f"arrival hours are {hours!r}, want HH:MM-HH:MM, for example 08:00-13:00")
-        start_h, start_min, end_h, end_min = map(int, match.groups())
-        names = [name.strip() for name in days.lower().split(",")]
-        if days.lower() in DAY_GROUPS:
-            weekdays: tuple[int, ...] = DAY_GROUPS[days.lower()]
-        elif set(names) <= set(DAY_NAMES):
-            weekdays = tuple(DAY_NAMES.index(name) for name in names)
-        else:
-            wanted = f"{', '.join(DAY_GROUPS)}, or some of {','.join(DAY_NAMES)}"
-            raise InputError(f"arrival days are {days!r}, want {wanted}")
-        return cls(weekdays, start_h * HOUR_S + start_min * 60.0, end_h * HOUR_S + end_min * 60.0)
-
-    def draw_second(self, key: np.uint64) -> float:
-        """Draw a second of the day, uniform in the window, from the world's key."""
-        return float(draw_arrival(np.uint64(key), 1, float(self.start_s), float(self.end_s))[1])
 
 
 @dataclass(frozen=True)

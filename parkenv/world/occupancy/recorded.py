@@ -21,6 +21,7 @@ from parkenv.errors import InputError
 from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
+from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.fit import fit_hourly_decay_rates
 from parkenv.world.occupancy.kernel import (
@@ -35,15 +36,7 @@ from parkenv.world.occupancy.kernel import (
     recorded_index,
 )
 from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
-from parkenv.world.occupancy.process import (
-    DAY_NAMES,
-    Arrival,
-    ArrivalWindow,
-    CompiledModel,
-    Forecast,
-    OccupancyModel,
-    World,
-)
+from parkenv.world.occupancy.process import Arrival, CompiledModel, Forecast, OccupancyModel, World
 from parkenv.world.week import DAY_S
 
 

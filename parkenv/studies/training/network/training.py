@@ -32,7 +32,8 @@ from parkenv.studies.training.network.fit import Network, fit
 from parkenv.studies.training.search import SearchTraining
 from parkenv.studies.training.spec import NetworkTrainingSpec
 from parkenv.studies.training.training import MODEL, TRAINING_SEEDS
-from parkenv.world.occupancy.real_week import DAY_ERROR, real_week_occupancy
+from parkenv.world.occupancy.real_week import real_week_occupancy
+from parkenv.world.occupancy.real_week_figures import DAY_ERROR
 from parkenv.world.scenario import KMH, Scenario
 from planners.agent import make_agent
 from planners.model_file import algorithm_class
