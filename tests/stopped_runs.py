@@ -40,18 +40,19 @@ class Run:
     """A command of `COMMANDS` that runs in processes of its own, as in a terminal."""
 
     def __init__(self, name, out, *options):
-        script = out.with_name("parkenv")
-        script.write_text(
-            # What `parkenv.__main__.main` begins with.
-            "import signal\nsignal.signal(signal.SIGINT, signal.SIG_DFL)\n"
-            "from few_searches import few_searches\nfrom parkenv.__main__ import main\n"
-            "if __name__ == '__main__':\n    with few_searches():\n        main()\n"
-        )
+        program = ["-m", "parkenv"]
+        if name == "benchmark":
+            script = out.with_name("parkenv")
+            script.write_text(
+                "from few_searches import few_searches\nfrom parkenv.__main__ import main\n"
+                "if __name__ == '__main__':\n    with few_searches():\n        main()\n"
+            )
+            program = [str(script)]
         path = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
         self.mark = f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
         self.started = time.monotonic()
         self.process = subprocess.Popen(
-            [sys.executable, script, *COMMANDS[name].split(), "--jobs", "2", "--out", out, *options],
+            [sys.executable, *program, *COMMANDS[name].split(), "--jobs", "2", "--out", out, *options],
             env={**os.environ, "PYTHONPATH": path} | dict([self.mark.split("=")]),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -62,8 +63,25 @@ class Run:
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
         )
 
+    def wait_for_entry(self):
+        """Wait until the entry point runs, or the process has ended: until then, Ctrl-C ends Python with a traceback.
+
+        Python catches SIGINT from its start. The entry point, after the import of the package and thus of NumPy, gives
+        it back to the system; the command then catches it with SIGTERM.
+        """
+        of_process, deadline = Path(f"/proc/{self.process.pid}"), time.monotonic() + 60.0
+        while self.process.poll() is None:
+            caught = int(of_process.joinpath("status").read_text().partition("SigCgt:")[2].split()[0], 16)
+            by_python, by_command = (caught >> (n - 1) & 1 for n in (signal.SIGINT, signal.SIGTERM))
+            if (by_command or not by_python) and "/numpy/" in of_process.joinpath("maps").read_text():
+                return
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+
     def stop(self, number):
         """Send a signal; Ctrl-C goes to all processes of the terminal. Return exit code, output, errors."""
+        if number == signal.SIGINT:
+            self.wait_for_entry()
         (os.killpg if number == signal.SIGINT else os.kill)(self.process.pid, number)
         sent = time.monotonic()
         while living := self.processes():
