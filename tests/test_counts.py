@@ -170,8 +170,11 @@ def test_car_parks_without_use_are_named(tmp_path):
     [
         ("a,b\n1,2\n", "want the columns car_park,capacity,hour,free"),
         ("car_park,capacity,hour,free\n", "has no readings"),
-        ("car_park,capacity,hour,free\na,100,yesterday,5\n", "line 2: want an ISO time and numbers"),
-        ("car_park,capacity,hour,free\na,100,2024-01-01T00,five\n", "line 2: want an ISO time and numbers"),
+        ("car_park,capacity,hour,free\na,100,yesterday,5\n", "line 2 is .*, want an ISO time and numbers"),
+        (
+            "car_park,capacity,hour,free\na,100,2024-01-01T00,five\n",
+            "line 2 is .*, want an ISO time and numbers",
+        ),
         (
             "car_park,capacity,hour,free\na,100,0001-01-01,5\na,100,9999-12-31,5\n",
             "over 3,652,059 days, want at",

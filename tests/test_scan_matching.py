@@ -181,7 +181,7 @@ def test_surveys_with_drift_on_the_command_line(tmp_path):
     [
         (("--odometry-drift", "2"), "odometry_drift"),
         (("--odometry-drift", "nan"), "odometry_drift"),
-        (("--localise", "gps"), "'gps' is not one of 'none', 'scan-matching'"),
+        (("--localise", "gps"), "--localise is 'gps', want 'none' or 'scan-matching'"),
     ],
 )
 def test_wrong_options_are_answered_in_a_line(words, said, tmp_path):

@@ -14,7 +14,8 @@ from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
 from parkenv.lots.generators import KERB_SIZE, NO_SLOTS, Slots
 from parkenv.lots.infer.centers import CenterRow, describe_rows, spaces_from_centers
 from parkenv.lots.infer.draft import draft_inferred_lot
-from parkenv.lots.infer.layout import infer_lot
+from parkenv.lots.infer.layout import InferredLot, infer_lot
+from parkenv.lots.infer.spaces import Spaces
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.lot import Mouth
 
@@ -130,7 +131,7 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
     rows: list[CenterRow] = []
     try:
         spaces, index, rows = spaces_from_centers(listed.ids, listed.xy, listed.yaw)
-        lot = infer_lot(spaces, entries=entries)
+        lot = _infer_along_rows(spaces, entries)
         strays = np.setdiff1d(np.arange(len(listed.ids)), index)
         draft = draft_inferred_lot(
             path.stem,
@@ -159,6 +160,28 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
         )
     found = [f"{len(listed.ids)} slot centres", *([describe_rows(rows)] if rows else [])]
     return replace(draft, found=(*found, *draft.found))
+
+
+def _infer_along_rows(spaces: Spaces, entries: FloatArray) -> InferredLot:
+    """Infer the lot with its rows along x: a list that is turned gives the same lot, turned."""
+    double = np.exp(2j * np.arctan2(spaces.axis[:, 1], spaces.axis[:, 0])).mean()
+    angle, middle = float(np.angle(double)) / 2, spaces.xy.mean(axis=0)
+    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+
+    def back(xy: FloatArray) -> FloatArray:
+        return np.asarray(xy @ turn.T + middle)
+
+    opens = None if spaces.opens is None else spaces.opens @ turn
+    along = replace(spaces, xy=(spaces.xy - middle) @ turn, axis=spaces.axis @ turn, opens=opens)
+    lot = infer_lot(along, entries=(entries - middle) @ turn)
+    return replace(
+        lot,
+        slots=replace(lot.slots, xy=back(lot.slots.xy), yaw=lot.slots.yaw + angle),
+        lanes=tuple(replace(lane, points=back(lane.points)) for lane in lot.lanes),
+        entries=back(lot.entries),
+        goal=back(lot.goal),
+        entry=None if lot.entry is None else replace(lot.entry, points=back(lot.entry.points)),
+    )
 
 
 def _as_listed(slots: Slots, index: IntArray, listed: SlotList) -> Slots:

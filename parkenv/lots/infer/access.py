@@ -94,6 +94,14 @@ def _outermost(lines: Sequence[Line]) -> Entry:
     return Entry(np.array([before, ends[k]]), "the outermost end of a lane: no free way leads out", 0.0)
 
 
+def _outline(shapes: shapely.Geometry) -> shapely.Geometry:
+    """Return the concave hull; the convex one where GEOS cannot triangulate, as with many corners on one line."""
+    try:
+        return shapely.concave_hull(shapes, ratio=0.3)
+    except shapely.errors.GEOSException:
+        return shapely.convex_hull(shapes)
+
+
 def _best_way_out(
     lines: Sequence[Line],
     spaces_xy: FloatArray,
@@ -102,9 +110,8 @@ def _best_way_out(
     longest: float,
 ) -> Entry | None:
     tree = shapely.STRtree(list(blocked))
-    ground = shapely.concave_hull(
-        shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)]),
-        ratio=0.3,
+    ground = _outline(
+        shapely.union_all([*blocked, *(shapely.LineString(line.points).buffer(2.0) for line in lines)])
     )
     shapely.prepare(ground)
     ends = np.concatenate([line.points[[0, -1]] for line in lines])
