@@ -316,8 +316,7 @@ class FleetVecEnv(SharedVecEnv):
         InputError: an argument out of its range; the message names it.
 
     Examples:
-        >>> from parkenv.world.cost_terms import METRICS
-    from parkenv.world.demand import Demand, PoissonArrivals
+        >>> from parkenv.world.demand import Demand, PoissonArrivals
         >>> venv = FleetVecEnv(4, "mini", Demand(PoissonArrivals(30, 8 * 3600, 9 * 3600)))
         >>> venv.seed(0)
         [0, 1, 2, 3]

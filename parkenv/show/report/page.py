@@ -90,9 +90,7 @@ def page_data(
             "seed": summary.get("seed"),
             "notes": list(notes),
         },
-        "terms": [
-            {"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS
-        ],
+        "terms": terms(),
         "learning": list(learning),
         "tables": tables_of(kind, summary, sessions),
         "lots": lots,
@@ -100,6 +98,11 @@ def page_data(
         "drives": [{**d["drive"], "lot": lot(d["lot"])} for d in drives],
         "fleets": [{**f["fleet"], "lot": lot(f["lot"])} for f in fleets],
     }
+
+
+def terms() -> list[dict[str, Any]]:
+    """Return what a step can cost, for the legends of a page."""
+    return [{"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS]
 
 
 def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()) -> None:

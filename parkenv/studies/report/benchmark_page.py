@@ -8,7 +8,7 @@ from typing import Any
 
 from parkenv import __version__
 from parkenv.errors import InputError
-from parkenv.show.report.page import FORMAT, VERSION
+from parkenv.show.report.page import FORMAT, VERSION, terms
 from parkenv.show.report.tables import Cell, Column, described, table_of
 from parkenv.studies.benchmark.suite import Suite, score_interval
 from parkenv.studies.results import Row
@@ -76,6 +76,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
             "seed": suite.seeds[0],
             "notes": [],
         },
+        "terms": terms(),
         "learning": [],
         "tables": [
             _table("scores", "Scores", columns, lines),
