@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, Union
 
 from pydantic import Field, model_validator
 
@@ -11,6 +11,10 @@ from parkenv.files.spec_file import Several, Spec
 
 Number = float | None
 Ends = Annotated[tuple[Number, Number], Field(strict=False)]
+
+
+# A row holds rows. The oldest pydantic wants the name before the class.
+Cell = Union[Number, bool, str, list[Union[Number, "SummaryRow"]], "SummaryRow"]
 
 
 class SummaryRow(Spec, extra="allow"):
@@ -36,7 +40,6 @@ class SummaryRow(Spec, extra="allow"):
         return self
 
 
-Cell = Number | bool | str | list[Number | SummaryRow] | SummaryRow
 SummaryRow.model_rebuild()
 
 

@@ -56,8 +56,8 @@ class DetectorStudy(Study):
 
     @cached_property
     def surveys(self) -> list[SurveyStudy]:
-        """The survey of each rig and detector."""
-        return [
+        """The survey of each rig and detector, all of one scenario."""
+        surveys = [
             SurveyStudy(
                 scenario=self.scenario, sessions=self.sessions, rig=rig, detector=detector, every=self.every,
                 seed=self.seed,
@@ -65,6 +65,9 @@ class DetectorStudy(Study):
             for rig in self.rigs
             for detector in self.detectors
         ]  # fmt: skip
+        for other in surveys[1:]:
+            other.built = surveys[0].built
+        return surveys
 
     def check(self) -> None:
         """See `Study`."""
