@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -129,6 +130,27 @@ class SharedVecEnv(VecEnv):  # type: ignore[misc]
         return [issubclass(wrapper_class, Monitor) for _ in self._get_indices(indices)]
 
 
+class MaskedVecEnv(SharedVecEnv):
+    """A batch whose environments have masks of their actions, for sb3-contrib."""
+
+    @abstractmethod
+    def action_masks(self) -> NDArray[np.bool_]:
+        """Return the action masks, (n_envs, n_actions) bool."""
+
+    def env_method(
+        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+    ) -> list[Any]:
+        """Return a row of `action_masks` per environment, which sb3-contrib calls.
+
+        Raises:
+            NotImplementedError: for any other method.
+        """
+        if method_name != "action_masks" or method_args or method_kwargs:
+            raise NotImplementedError(f"environments of a batch have no method {method_name} of their own")
+        masks = self.action_masks()
+        return [masks[i] for i in self._get_indices(indices)]
+
+
 # ---- searches
 
 
@@ -162,7 +184,7 @@ def search_batch(
     )
 
 
-class SearchVecEnv(SharedVecEnv):
+class SearchVecEnv(MaskedVecEnv):
     """`ParkSearchVectorEnv` for stable-baselines3 and sb3-contrib.
 
     When a search ends, its `info` has `terminal_observation`, `TimeLimit.truncated`, `episode` (return in seconds and
@@ -259,19 +281,6 @@ class SearchVecEnv(SharedVecEnv):
         value = getattr(self.batch, attr_name)
         return [value for _ in self._get_indices(indices)]
 
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Return a row of `action_masks` per search, which sb3-contrib calls.
-
-        Raises:
-            NotImplementedError: for any other method.
-        """
-        if method_name != "action_masks" or method_args or method_kwargs:
-            raise NotImplementedError(f"searches of a batch have no method {method_name} of their own")
-        masks = self.action_masks()
-        return [masks[i] for i in self._get_indices(indices)]
-
 
 # ---- many cars
 
@@ -282,7 +291,7 @@ _DECIDED, _UNDER_WAY, _OVER, _OBSERVED = range(4)
 _CAR_BYTES = CAR.itemsize
 
 
-class FleetVecEnv(SharedVecEnv):
+class FleetVecEnv(MaskedVecEnv):
     """Worlds of many cars for stable-baselines3 and sb3-contrib, in which one network drives all cars that learn.
 
     An environment of the batch is a world: `parkenv.engine.fleet.Fleet`, day after day. Its decisions are those of one
@@ -470,19 +479,6 @@ class FleetVecEnv(SharedVecEnv):
         """Return the action masks, (n_envs, 5) bool."""
         masks: BoolArray = self._masks[0].astype(np.bool_)
         return masks
-
-    def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
-    ) -> list[Any]:
-        """Return a row of `action_masks` per world, which sb3-contrib calls.
-
-        Raises:
-            NotImplementedError: for any other method.
-        """
-        if method_name != "action_masks" or method_args or method_kwargs:
-            raise NotImplementedError(f"worlds of a batch have no method {method_name} of their own")
-        masks = self.action_masks()
-        return [masks[i] for i in self._get_indices(indices)]
 
 
 class ShareNetwork(BaseCallback):  # type: ignore[misc]
