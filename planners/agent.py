@@ -120,7 +120,7 @@ class SearchAgent(ABC, Generic[Memory]):
     def wait(self, vertex: int) -> int:
         """Return a move without an edge, which waits; the shortest move if all four have edges."""
         missing = np.flatnonzero(self.problem.lot.neighbors[vertex] < 0)
-        return int(missing[0]) if len(missing) else int(self.problem.move_s[vertex].argmin())
+        return int(missing[0]) if len(missing) else int(self.problem.move_cost_s[vertex].argmin())
 
     def plan_preview(self, observation: Observation, action: int, memory: Memory) -> PlanPreview:
         """Return where the agent intends to drive, right after `predict` chose `action`, without side effects.

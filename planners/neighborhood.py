@@ -59,7 +59,7 @@ class Neighborhood:
         views["slot"], views["rate"], views["hit"], views["false_alarm"] = slots, *rates
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         neighbors, starts = neighbors.copy(), starts.copy()
-        table, own_rate = RoadTable.over(neighbors, problem.move_s[vertices]), np.zeros(n_slots)
+        table, own_rate = RoadTable.over(neighbors, problem.move_cost_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
         own_rate[slots[own]] = rates.seen[own]
         cost_s = problem.arrival_cost_s[vertices[:n_slots]]
@@ -153,7 +153,7 @@ class Neighborhoods:
         """Return the first vertex on a shortest route to the best slot that is within a given time of it."""
         while enough_s < least_s[vertex] < np.inf:
             onward = self._problem.lot.neighbors[vertex]
-            through = np.where(onward >= 0, self._problem.move_s[vertex] + least_s[onward], np.inf)
+            through = np.where(onward >= 0, self._problem.move_cost_s[vertex] + least_s[onward], np.inf)
             if through.min() > least_s[vertex] + 1e-6:
                 break
             vertex = int(onward[through.argmin()])
@@ -167,7 +167,7 @@ class Neighborhoods:
 
     def _expand(self, entry: int, least_s: FloatArray) -> Neighborhood:
         lot = self._problem.lot
-        found = _first_by_bound(entry, least_s, lot.neighbors, self._problem.move_s, self._most)
+        found = _first_by_bound(entry, least_s, lot.neighbors, self._problem.move_cost_s, self._most)
         return Neighborhood.of(self._problem, np.sort(found).astype(np.int64), entry)
 
 

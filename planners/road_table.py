@@ -30,7 +30,7 @@ class RoadTable:
     @classmethod
     def of(cls, problem: SearchProblem) -> Self:
         """Make the table of the whole lot."""
-        return cls.over(problem.lot.neighbors, problem.move_s)
+        return cls.over(problem.lot.neighbors, problem.move_cost_s)
 
     @classmethod
     def over(cls, neighbors: NDArray[np.int32], move_s: FloatArray) -> Self:

@@ -29,7 +29,7 @@ class DriveRoutes:
 
     def __init__(self, problem: SearchProblem) -> None:
         # Copies: numba would compile every function again for read-only arrays.
-        self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_s.copy()
+        self._neighbors, self._move_s = problem.lot.neighbors.copy(), problem.move_cost_s.copy()
         n_moves = len(MOVES)
         self._out_start = np.arange(0, n_moves * len(self._neighbors) + 1, n_moves, dtype=np.int32)
         self._out_target, self._out_s = self._neighbors.ravel(), self._move_s.ravel()

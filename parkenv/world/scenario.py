@@ -81,6 +81,14 @@ class SearchProblem:
         """Drive time of each edge, (n_vertices, 4) s; 0 where there is none (eq. 3.22)."""
         return _read_only(self.lot.edge_length / self.v_drive)
 
+    @property
+    def move_cost_s(self) -> FloatArray:
+        """Cost of each move, (n_vertices, 4) s: its drive time and what else it costs (nothing yet).
+
+        Agents minimise this and `arrival_cost_s`; clocks, and beliefs that decay, count `move_s`.
+        """
+        return self.move_s
+
     @cached_property
     def action_masks(self) -> NDArray[np.int8]:
         """(n_vertices, 5), 1 if the graph has the action: an edge to drive along, or a slot to park in."""

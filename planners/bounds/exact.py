@@ -205,7 +205,7 @@ def _small_lot(problem: SearchProblem, days: Days, table: RoadTable) -> _SmallLo
     as_good &= len(days.chance) == 1
     dominated_by = np.array([bits_of(row) for row in as_good], dtype=np.int64)
     stay_s = np.where((lot.neighbors < 0).any(axis=1), problem.wait_s, np.inf)
-    edges = lot.neighbors, problem.move_s, table.seconds
+    edges = lot.neighbors, problem.move_cost_s, table.seconds
     return _SmallLot(shows, *edges, cost, dominated_by, *days, problem.give_up_s, stay_s)
 
 

@@ -92,7 +92,9 @@ class ChangingSolution:
         moves = np.concatenate([lot.neighbors, np.arange(lot.n_vertices)[:, None]], axis=1).astype(np.int64)
         waits = (lot.neighbors < 0).any(axis=1)
         moves[~waits, _STAY] = -1
-        seconds = np.concatenate([problem.move_s, np.full((lot.n_vertices, 1), problem.wait_s)], axis=1)
+        wait_s = np.full((lot.n_vertices, 1), problem.wait_s)
+        seconds = np.concatenate([problem.move_s, wait_s], axis=1)
+        cost_s = np.concatenate([problem.move_cost_s, wait_s], axis=1)
         steps = np.maximum(np.rint(seconds / step_s), 1).astype(np.int64)
         made = moves >= 0
         self.rounding_error = float(np.abs(steps[made] * step_s / seconds[made] - 1.0).max())
@@ -104,7 +106,7 @@ class ChangingSolution:
             self._choices,
             self._free,
             moves,
-            seconds,
+            cost_s,
             steps,
             starts,
             slots,

@@ -62,7 +62,7 @@ class DriveGraph(NamedTuple):
     def of(cls, problem: SearchProblem) -> DriveGraph:
         """Return the graph of a problem's lot."""
         # Copies: numba would compile every function again for read-only arrays.
-        neighbors, move_s = problem.lot.neighbors.astype(np.int32), problem.move_s.copy()
+        neighbors, move_s = problem.lot.neighbors.astype(np.int32), problem.move_cost_s.copy()
         in_start, in_source, _, in_s = edges_in(neighbors, move_s)
         n = len(neighbors)
         room = _N_MOVES * n + 1

@@ -81,7 +81,7 @@ class NetworkAgent(BeliefAgent):
         self.last_features: Features | None = None  # of the last decision; None if it needed none
         self.last_scores: NDArray[np.float64] | None = None  # (6,) of that decision
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
-        self._neighbors, self._move_s = self.problem.lot.neighbors.copy(), self.problem.move_s.copy()
+        self._neighbors, self._move_s = self.problem.lot.neighbors.copy(), self.problem.move_cost_s.copy()
 
     def _search_of(self, near: Neighborhood, belief: SlotBelief) -> NetworkSearch:
         base = super()._search_of(near, belief)

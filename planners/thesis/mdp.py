@@ -29,7 +29,7 @@ def discount(problem: SearchProblem) -> float:
     Driving in circles for ever costs min(d_min, Δt)/(1 - γ) at least. That has to be more than a search may cost, the
     give-up penalty and the most expensive arrival. Stops of mapped lots may be a millimetre apart, and then it is 4 s.
     """
-    edges = problem.move_s[problem.lot.neighbors >= 0]
+    edges = problem.move_cost_s[problem.lot.neighbors >= 0]
     shortest = max(min(float(edges.min(initial=np.inf)), problem.wait_s), SHORTEST_S)
     return max(
         USUAL_DISCOUNT, 1.0 - shortest / (problem.give_up_s + float(problem.arrival_cost_s.max()) + 1.0)
@@ -47,7 +47,7 @@ class ParkingMDP:
 
     Args:
         neighbors: (n, 4) int, the vertex that up, down, left, right lead to, or -1.
-        move_s: (n, 4) float64, s, drive time of each edge.
+        move_s: (n, 4) float64, s, cost of each edge: its drive time and what else it costs.
         p_free: (n,) float64, probability that a parking attempt succeeds; 0 where there is no slot.
         arrival_cost_s: (n,) float64, s, arrival cost of parking at each vertex (`SearchProblem.arrival_cost_s`).
         failure_s: s, the planner's cost of a failed attempt.
@@ -133,7 +133,7 @@ class ParkingMDP:
         arrival_cost_s[:n_slots] = problem.arrival_cost_s
         return cls(
             neighbors=problem.lot.neighbors.astype(np.int64),
-            move_s=problem.move_s,
+            move_s=problem.move_cost_s,
             p_free=p_free,
             arrival_cost_s=arrival_cost_s,
             failure_s=problem.failure_s if failure_s is None else failure_s,
