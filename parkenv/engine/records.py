@@ -12,7 +12,7 @@ from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
-from parkenv.world.lot import MOVES, PARK
+from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import (
     CURSOR_FIELDS,
     EXTERNAL_KIND,
@@ -22,15 +22,9 @@ from parkenv.world.occupancy.kernel import (
     WORLD_FIELDS,
 )
 from parkenv.world.occupancy.process import Arrival, CompiledModel, PriorModel, World
-from parkenv.world.scenario import Scenario
+from parkenv.world.scenario import EDGE, Scenario
 
 N_ACTIONS = PARK + 1
-
-EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
-"""Result of an action at a vertex: the vertex that it leads to, s, m.
-
-Parking, and actions that the graph does not have, lead back to the same vertex.
-"""
 
 SCENARIO = np.dtype(
     [
@@ -463,14 +457,6 @@ class ScenarioRecords:
 
     def _write_search(self, record: np.void, scenario: Scenario) -> None:
         lot, masks = scenario.lot, scenario.action_masks
-        edges = np.zeros(masks.shape, EDGE)
-        edges["target"] = np.arange(lot.n_vertices)[:, None]
-        edges["seconds"] = scenario.wait_s
-        moves = masks[:, : len(MOVES)] == 1
-        edges["target"][:, :PARK][moves] = lot.neighbors[moves]
-        edges["seconds"][:, :PARK][moves] = scenario.move_s[moves]
-        edges["metres"][:, :PARK][moves] = lot.edge_length[moves]
-        edges["seconds"][: lot.n_slots, PARK] = 0.0
         entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
         starts, viewed = scenario.slots_in_view
         rates = scenario.sensor_rates
@@ -484,7 +470,7 @@ class ScenarioRecords:
             "window_end": scenario.arrival.end_s,
             "n_entries": len(entries),
             "entries": self._keep(entries, np.int64),
-            "edges": self._keep(edges, EDGE),
+            "edges": self._keep(scenario.edges, EDGE),
             "action_masks": self._keep(masks, np.uint8),
             "walk_s": self._keep(scenario.walk_s),
             "walk_m": self._keep(lot.walk_m(scenario.goal)),

@@ -12,8 +12,9 @@ import numpy as np
 from parkenv.compiled.arrays import IntArray
 from parkenv.compiled.memory import int32s, int64s, prefetch
 from parkenv.engine.local_observation import Surroundings
-from parkenv.engine.records import EDGE, N_ACTIONS, SEARCH, SENTINEL, edge_at, scenario_at, search_at
+from parkenv.engine.records import N_ACTIONS, SEARCH, SENTINEL, edge_at, scenario_at, search_at
 from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, prefetch_forecast
+from parkenv.world.scenario import EDGE
 
 _APART = 2  # searches between two stages
 _LINE = 64  # bytes of a cache line

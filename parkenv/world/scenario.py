@@ -22,6 +22,12 @@ from parkenv.world.traffic import Traffic
 
 KMH = 1 / 3.6  # 1 km/h in m/s
 
+EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
+"""Result of an action at a vertex: the vertex that it leads to, s, m.
+
+Parking, and actions that the graph does not have, lead back to the same vertex.
+"""
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SearchProblem:
@@ -88,6 +94,22 @@ class SearchProblem:
         Agents minimise this and `arrival_cost_s`; clocks, and beliefs that decay, count `move_s`.
         """
         return self.move_s
+
+    @cached_property
+    def edges(self) -> NDArray[Any]:
+        """What each action does at each vertex, (n_vertices, 5) `EDGE` records."""
+        edges = np.zeros((self.lot.n_vertices, len(ACTIONS)), EDGE)
+        edges["target"] = np.arange(self.lot.n_vertices)[:, None]
+        edges["seconds"] = self.wait_s
+        moves = self.lot.neighbors >= 0
+        for name, of_moves in (
+            ("target", self.lot.neighbors),
+            ("seconds", self.move_s),
+            ("metres", self.lot.edge_length),
+        ):
+            edges[name][:, :PARK][moves] = of_moves[moves]
+        edges["seconds"][: self.lot.n_slots, PARK] = 0.0
+        return edges
 
     @cached_property
     def action_masks(self) -> NDArray[np.int8]:
