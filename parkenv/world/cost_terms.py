@@ -1,7 +1,8 @@
 """What a step of a search can cost: one table, from which records, sums, `info`, columns, tables and legends are made.
 
-A new term is a row here, a line of `parkenv.engine.kernel` that charges it, and, where planners can foresee it, a part
-of what `parkenv.world.scenario.SearchProblem` says that an arrival or a move costs.
+A new term is a row here, a line of `parkenv.engine.kernel` that charges it, and its data in
+`parkenv.world.scenario.SearchProblem`: what a move costs belongs to `edges` and `move_cost_s`, what an arrival costs
+to `arrival_cost_s`, so that planners foresee it.
 """
 
 from __future__ import annotations
