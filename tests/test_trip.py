@@ -24,6 +24,7 @@ from parkenv.lots import packaged_lot
 from parkenv.scenarios.blind import blind_scenario
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.colors import BELIEF_SCALE, PALETTE
 from parkenv.studies.runner import run
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import calibrate
@@ -747,6 +748,9 @@ def test_the_commands_calibrate_compare_and_film(tmp_path):
     with Image.open(film) as picture:
         assert picture.size == (640, 480)
         assert picture.n_frames > 40
+        colors = {color for _, color in picture.convert("RGB").getcolors(1 << 16)}
+    assert {PALETTE["asphalt"], PALETTE["ground"]} <= colors, "common colours are exact"
+    assert len(colors & {tuple(color) for color in BELIEF_SCALE.reshape(-1, 3).tolist()}) > 10, "with a key"
     recording = tmp_path / "trip.rrd"
     words = ["trip", "--scenario", "mini", "--seed", "3", "--rig", "laser", "--rerun", str(recording)]
     result = command(app, [*words, "--out", str(film)])

@@ -71,8 +71,7 @@ def save_film(
     """
     pictures = [Image.fromarray(frame) for frame in frames]
     if colors is not None:
-        some = np.concatenate([*frames[:: max(1, len(frames) // 6)], frames[-1]])
-        palette = Image.fromarray(some).quantize(colors, Image.Quantize.MAXCOVERAGE)
+        palette = _palette(np.concatenate([*frames[:: max(1, len(frames) // 6)], frames[-1]]), colors)
         pictures = [picture.quantize(palette=palette, dither=Image.Dither.NONE) for picture in pictures]
     with atomic_write(path) as beside:
         pictures[0].save(
@@ -84,3 +83,13 @@ def save_film(
             loop=0,
             optimize=colors is not None,  # store only what changes
         )
+
+
+def _palette(image: NDArray[np.uint8], n: int) -> Image.Image:
+    """Return a palette of n colours: the most frequent ones exactly, and others that cover the rest."""
+    seen, counts = np.unique(image.reshape(-1, 3), axis=0, return_counts=True)
+    frequent = seen[np.argsort(-counts, kind="stable")[: n // 2]]
+    spread = Image.fromarray(image).quantize(n - len(frequent), Image.Quantize.MAXCOVERAGE).getpalette() or []
+    palette = Image.new("P", (1, 1))
+    palette.putpalette([*frequent.ravel().tolist(), *spread])
+    return palette

@@ -49,7 +49,7 @@ class SearchRenderer:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.frames = LotFrames(scenario.lot)
-        self._key = _key()
+        self._key = strip_with_key()
         self.window = Window(f"parkenv: {scenario.name}")
 
     def frame(self, state: SearchState, occupied: NDArray[np.bool_]) -> Image:
@@ -147,8 +147,8 @@ class SearchRenderer:
         return ["".join(row).rstrip() for row in rows]
 
 
-def _key() -> Image:
-    """Return the background of the line of text, with the key of colours."""
+def strip_with_key() -> Image:
+    """Return an empty line of text with the key of the colours of beliefs at the right, `KEY_WIDTH` px wide."""
     image = strip()
     top, right = HUD // 2 - 6, image.shape[1] - HUD_MARGIN
     write_label(image, "taken", (right - 18.0, top + 6.0), "white", 13, 400)

@@ -12,8 +12,8 @@ from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.vehicle import SPEED
 from parkenv.show.colors import PALETTE, belief_colors, mixed_color
 from parkenv.show.frames.drive import movers, steered_car
-from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, LotFrames, clock, paint_goal, strip, write_line
-from parkenv.show.frames.search import walk
+from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, LotFrames, clock, paint_goal, write_line
+from parkenv.show.frames.search import KEY_WIDTH, strip_with_key, walk
 from parkenv.show.painters.opencv import paint
 from parkenv.show.scene import DISC, Layer, Lines, Marks, posed
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip
@@ -47,6 +47,7 @@ class TripFrames:
         west, south, east, north = lot.bounds()
         rows = self._far.whole(np.array([[west, south], [east, north], [west, north], [east, south]]))[:, 1]
         self._rows = slice(max(0, int(rows.min() - 10.0)), min(HEIGHT - HUD, int(rows.max() + 10.0)))
+        self._key = strip_with_key()
         self.trail: list[FloatArray] = []
 
     @property
@@ -86,14 +87,14 @@ class TripFrames:
 
     def _line(self) -> Image:
         """Return the line of text below the map."""
-        driver, state, image = self._search.driver, self._search.env.state, strip()
+        driver, state, image = self._search.driver, self._search.env.state, self._key.copy()
         parts = (
             clock(driver.time),
             f"{driver.time - state.arrival.time:.0f} s",
             f"{3.6 * abs(float(driver.state[SPEED])):.0f} km/h",
         )
         text = f"parked in {driver.log.attempts[-1].slot}" if state.parked else driver.doing
-        write_line(image, parts, (text,), "warning" if ":" in text else "car")
+        write_line(image, parts, (text,), "warning" if ":" in text else "car", KEY_WIDTH)
         return image
 
 
