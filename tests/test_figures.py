@@ -20,7 +20,7 @@ from parkenv.studies.compare import figures as comparison_figures
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.figures import FIGURES, ComparisonResults, draw_figures, remove_figures
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import episode_key
+from parkenv.studies.results import EPISODES
 from parkenv.world.occupancy.process import OccupancyProcess
 from planners.agent import make_agent
 from planners.names import AGENT_NAMES
@@ -287,7 +287,7 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
     mini = make_scenario("mini")
     cases = [(Case(mini, name), range(2)) for name in ("mdp", "first-free")]
     rows = {case.agent: case.run(seeds) for case, seeds in cases}
-    episodes = {episode_key(row): row for its in rows.values() for row in its}
+    episodes = {EPISODES.key(row): row for its in rows.values() for row in its}
     table = [{**row(case.agent), "scenario": "mini"} for case, _ in cases]
     results = ComparisonResults(cases, episodes, table)
     files = draw_figures(results, tmp_path)

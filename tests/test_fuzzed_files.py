@@ -34,8 +34,8 @@ from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.suite import Suite, check_result
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.report.run_folder import RunFolder
-from parkenv.studies.results import Results, decision_s
+from parkenv.studies.report import RunFolder
+from parkenv.studies.results import EPISODES, Results, decision_s
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.sensing.surveys import detection_by_distance
 from parkenv.studies.trips.calibration_study import CalibrationStudy
@@ -109,8 +109,8 @@ def resumed_trips(path):
 
 def reported(path):
     run = RunFolder.read(path.parent)
-    run.totals()
-    write_page(run.page_data(), path.with_name("report.html"), run.figures)
+    EPISODES.read(path.parent)
+    write_page(run.data(), path.with_name("report.html"), run.figures)
 
 
 def reported_kind(path):
@@ -185,7 +185,7 @@ MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text()
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
 SUITE = Suite.named("v1")
-EPISODES = {"total_s": [100.0] * 3, "bound_s": [90.0] * 3}
+SEARCHES = {"total_s": [100.0] * 3, "bound_s": [90.0] * 3}
 RESULT = {
     "format": "parkenv-benchmark-result", "version": 1, "suite": "v1", "suite_sha256": SUITE.fingerprint,
     "parkenv": "0.1.0", "command": ["parkenv", "benchmark"], "scores": {"mdp": 0.9},
@@ -196,7 +196,7 @@ RESULT = {
             "decision_ms": 1.0, "decision_ms_p99": 2.0, "score": 0.9,
         } for t in SUITE.tasks
     ],
-    "episodes": {"mdp": {t.name: EPISODES for t in SUITE.tasks}},
+    "episodes": {"mdp": {t.name: SEARCHES for t in SUITE.tasks}},
 }  # fmt: skip
 SUMMARY_ROW = {
     "scenario": "mini",

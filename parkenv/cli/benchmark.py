@@ -111,9 +111,9 @@ def page(results: list[Path], /, out: Path = Path("results/benchmark.html")) -> 
     """
     from parkenv.files.atomic_write import make_folder
     from parkenv.show.report.page import write_page
+    from parkenv.studies.benchmark.page import benchmark_data
     from parkenv.studies.benchmark.study import RESULT
     from parkenv.studies.benchmark.suite import check_result
-    from parkenv.studies.report.benchmark_page import benchmark_data
 
     files = [each for path in results for each in (sorted(path.rglob(RESULT)) if path.is_dir() else [path])]
     if not files:

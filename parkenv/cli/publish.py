@@ -105,7 +105,7 @@ def _best(folder: Path, trust: bool) -> tuple[TrainingSpec, Path, Sequence[Scena
     Raises:
         InputError: the folder holds no finished training.
     """
-    from parkenv.studies.report.run_folder import RunFolder
+    from parkenv.studies.report import RunFolder
     from parkenv.studies.training.spec import PlacesTrainingSpec, TrainingSpec
     from parkenv.studies.training.training import MODEL
 

@@ -84,8 +84,7 @@ def make_report(
             are not trusted.
     """
     from parkenv.studies.agent_spec import split_agents
-    from parkenv.studies.report.run_folder import RunFolder
-    from parkenv.studies.report.write import ReportOptions, write_report
+    from parkenv.studies.report import ReportOptions, RunFolder, write_report
 
     run = RunFolder.read(folder)
     notes: list[str] = []

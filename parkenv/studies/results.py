@@ -301,11 +301,6 @@ def _parts(name: str, was: Any, its: Any) -> list[tuple[str, Any, Any]]:
     return parts
 
 
-def episode_key(row: Mapping[str, Any]) -> Key:
-    """Return the key of an episode: its setting, agent and seed."""
-    return EPISODES.key(row)
-
-
 class Results:
     """Finished rows of a study, in memory and in its folder.
 

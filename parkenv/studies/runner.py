@@ -90,8 +90,7 @@ class Result:
         Raises:
             InputError: the run is not finished, or the page cannot be written.
         """
-        from parkenv.studies.report.run_folder import RunFolder
-        from parkenv.studies.report.write import write_report
+        from parkenv.studies.report import RunFolder, write_report
 
         with self.study.workers() as workers:
             return write_report(RunFolder.read(self.folder), self.study, out=out, workers=workers)[0]

@@ -30,8 +30,8 @@ from parkenv.studies.results import (
 from parkenv.studies.workers import Task, Workers
 
 if TYPE_CHECKING:
-    from parkenv.studies.replays import Replays
-    from parkenv.studies.results import Results
+    from parkenv.show.report.page import Page
+    from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
 
 STUDIES: Mapping[str, str] = {
@@ -149,16 +149,33 @@ class Study(ExecutionSpec):
         del result
         return []
 
-    def replays(self, folder: Path) -> Replays:
-        """Return what a report may run again; nothing by default.
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
+        """Return what a report says about a finished run.
+
+        Args:
+            summary: content of `summary.json`.
+            folder: folder of the run.
 
         Raises:
-            InputError, OSError: the run in the folder cannot be repeated.
+            InputError: a file in the folder is damaged.
         """
-        from parkenv.studies.replays import Replays
+        from parkenv.show.report.page import Page
+        from parkenv.show.report.tables import tables_of
 
         del folder
-        return Replays()
+        return Page(
+            f"parkenv {cls.model_fields['kind'].default}", tables=tables_of(summary, {"rows": "Results"})
+        )
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
+        """Return what of the run in a folder a report may show again; nothing by default.
+
+        Raises:
+            InputError, OSError: the run cannot be repeated.
+        """
+        del folder
+        return ()
 
     def keys(self, work: Any, item: Any) -> list[Key]:
         """Return the keys of the rows of an item."""

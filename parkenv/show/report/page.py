@@ -9,18 +9,15 @@ import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from PIL import Image as PillowImage
 
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.images import image_text, read_image
-from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.picture_files import CAPTION
-from parkenv.show.plurals import plural
 from parkenv.show.report.drive_recording import data_uri
-from parkenv.show.report.tables import tables_of
 from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
@@ -48,61 +45,69 @@ _WHITE = 0.5
 """Least white share of a chart, which is inverted in dark mode; pictures of lots and photographs are not."""
 
 
+class Page(NamedTuple):
+    """What a study says about a run.
+
+    Attributes:
+        title: heading of the page.
+        findings: the results in sentences.
+        tables: from `tables.table_of`.
+        learning: from `learning.learning_panels`.
+    """
+
+    title: str
+    findings: Sequence[str] = ()
+    tables: Sequence[Mapping[str, Any]] = ()
+    learning: Sequence[Mapping[str, Any]] = ()
+
+
 def page_data(
     kind: str,
+    page: Page,
     summary: Mapping[str, Any],
-    *,
-    sessions: Sequence[Row] = (),
-    learning: Sequence[Mapping[str, Any]] = (),
-    encounters: Sequence[Mapping[str, Any]] = (),
-    drives: Sequence[Mapping[str, Any]] = (),
-    fleets: Sequence[Mapping[str, Any]] = (),
+    recordings: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Build the data of a page, without the figures; see `report.schema.json`.
 
     Args:
         kind: kind of the run: compare, survey, demo, train, ...
-        summary: content of its `summary.json`.
-        sessions: drives of a survey, rows of `sessions.csv`.
-        learning: from `learning.learning_panels`.
-        encounters: from `search_recording.record`.
-        drives: from `drive_recording.record_drive`.
-        fleets: from `fleet_recording.FleetDay.record`.
+        page: what is said about it.
+        summary: its `command`, `version` and `seed`.
+        recordings: what is replayed: a `lot`, and on it a `world` with searches, a `drive`, or a day of a `fleet`.
         notes: notes for the reader, such as why there is no replay.
     """
     lots: list[Any] = []
 
-    def lot(described: Any) -> int:
-        if described not in lots:
-            lots.append(described)
-        return lots.index(described)
+    def placed(name: str) -> list[dict[str, Any]]:
+        found = [recording for recording in recordings if name in recording]
+        for recording in found:
+            if recording["lot"] not in lots:
+                lots.append(recording["lot"])
+        return [{**recording[name], "lot": lots.index(recording["lot"])} for recording in found]
 
     return {
         "format": FORMAT,
         "version": VERSION,
         "run": {
             "kind": kind,
-            "title": _title(kind, summary),
-            "findings": _findings(kind, summary),
+            "title": page.title,
+            "findings": list(page.findings),
             "command": shlex.join(str(word) for word in summary["command"]),
             "parkenv": summary["version"],
             "seed": summary.get("seed"),
             "notes": list(notes),
         },
-        "terms": terms(),
-        "learning": list(learning),
-        "tables": tables_of(kind, summary, sessions),
+        "terms": [
+            {"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS
+        ],
+        "learning": list(page.learning),
+        "tables": list(page.tables),
         "lots": lots,
-        "worlds": [{**e["world"], "lot": lot(e["lot"]), "searches": e["searches"]} for e in encounters],
-        "drives": [{**d["drive"], "lot": lot(d["lot"])} for d in drives],
-        "fleets": [{**f["fleet"], "lot": lot(f["lot"])} for f in fleets],
+        "worlds": placed("world"),
+        "drives": placed("drive"),
+        "fleets": placed("fleet"),
     }
-
-
-def terms() -> list[dict[str, Any]]:
-    """Return what a step can cost, for the legends of a page."""
-    return [{"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS]
 
 
 def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()) -> None:
@@ -171,106 +176,20 @@ def _webp(picture: PillowImage.Image, *, chart: bool) -> str:
     return data_uri("image/webp", content.getvalue())
 
 
-def _title(kind: str, summary: Mapping[str, Any]) -> str:
-    named = [str(row["scenario"]).split(",") for row in summary["rows"] if "scenario" in row]
+def on_scenarios(rows: Sequence[Row], most: int = 4) -> str:
+    """Return the scenarios of the rows of a summary, for a title; empty if they name none.
+
+    Examples:
+        >>> on_scenarios([{"scenario": "campus,street"}, {"scenario": "jam"}])
+        ' on campus, street and jam'
+    """
+    named = [str(row["scenario"]).split(",") for row in rows if "scenario" in row]
     names = list(dict.fromkeys(name for its in named for name in its))
-    where = f" on {_listed(names)}" if names else ""
-    if kind == "compare":
-        return f"Agents compared{where}"
-    if kind == "commute":
-        return f"Maps that learn from every trip{where}"
-    if kind == "fleet":
-        return f"Many cars{where}"
-    if kind == "survey":
-        return f"Survey{where}"
-    if kind == "demo":
-        return f"From a survey to a search{where}"
-    if kind == "train":
-        return f"{_listed(list(dict.fromkeys(str(r.get('agent', 'agent')) for r in summary['rows'])))} trained{where}"
-    return f"parkenv {kind}"
+    return f" on {listed(names, most)}" if names else ""
 
 
-def _listed(names: Sequence[str], most: int = 4) -> str:
+def listed(names: Sequence[str], most: int = 4) -> str:
+    """Join names by commas and "and"; of more than `most`, the first ones and a count."""
     if len(names) > most:
         return f"{', '.join(names[:most])} and {len(names) - most} more"
     return " and ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-
-
-def _findings(kind: str, summary: Mapping[str, Any]) -> list[str]:
-    """Summarise the results in sentences."""
-    if kind == "compare":
-        return _comparison_findings(summary["rows"])
-    if kind == "fleet":
-        return _fleet_findings(summary["rows"])
-    if kind == "survey":
-        return [_survey_finding(row) for row in summary["rows"]]
-    if kind == "demo":
-        return [_survey_finding(summary["survey"]), *_comparison_findings(summary["rows"])]
-    if kind == "train":
-        return _training_findings(summary)
-    return []
-
-
-def _fleet_findings(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence for each agent and demand: what competition costs, and what the best guidance saves."""
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        groups.setdefault((row["agents"], row["arrivals_per_hour"]), []).append(row)
-    findings = []
-    for (agent, per_hour), its in groups.items():
-        own = next((row for row in its if row["knows"] == "own"), its[0])
-        finding = (
-            f"{agent}, {per_hour:g} cars an hour, {own['occupancy']:.0%} of the slots taken: {own['total_s']:.1f} s a "
-            f"car, {own['balked_fraction']:.1%} find no slot"
-        )
-        interval = own["price_of_anarchy_ci95"]
-        if own["price_of_anarchy"] is not None and None not in interval and own["knows"] == "own":
-            finding += f"; the price of anarchy is {own['price_of_anarchy']:.3f} [{interval[0]:.3f}, {interval[1]:.3f}]"
-        findings.append(f"{finding}.")
-    return findings
-
-
-def _training_findings(summary: Mapping[str, Any]) -> list[str]:
-    rows = [row for row in summary["rows"] if isinstance(row.get("total_s"), float)]
-    if not rows:
-        return []
-    times = sorted(row["total_s"] for row in rows)
-    name = rows[0]["scenario"]
-    between = f"{times[0]:.1f} s"
-    if len(times) > 1:
-        between = f"{times[0]:.1f} to {times[-1]:.1f} s over {len(times)} trainings"
-    finding = f"Tested on {name} in held-out worlds, the models take {between}"
-    planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
-    if planners:
-        best = min(planners, key=lambda row: float(row["total_s"]))
-        finding += f"; the best planner there, {best['agent']}, takes {best['total_s']:.1f} s"
-    return [f"{finding}."]
-
-
-def _survey_finding(row: Row) -> str:
-    return (
-        f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: "
-        f"{row['car_detection_rate']:.1%} of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots "
-        "classified correctly."
-    )
-
-
-def _comparison_findings(rows: Sequence[Row]) -> list[str]:
-    settings: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
-    findings = []
-    speeds = len({key[2:] for key in settings}) > 1
-    for (name, failure, walk, drive), its in settings.items():
-        agents = [row for row in its if row["agent"] != "oracle"]
-        if len(agents) < 2:
-            continue
-        best = min(agents, key=lambda row: float(row["total_s"]))
-        at = f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
-        interval = best["total_s_ci95"]
-        between = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if None not in interval else ""
-        findings.append(
-            f"{name}, failure cost {failure:g} s{at}: {best['agent']} has the lowest mean total time, "
-            f"{best['total_s']:.1f} s{between}; the clairvoyant lower bound is {best['bound_s']:.1f} s."
-        )
-    return findings

@@ -136,7 +136,7 @@ _ORDER = (
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
-_OF_FLEETS = {
+OF_FLEETS = {
     column.key: column
     for column in (
         Column("difference_s", "minus own", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
@@ -238,39 +238,41 @@ def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
     return made
 
 
-def tables_of(kind: str, summary: Mapping[str, Any], sessions: Sequence[Row]) -> list[dict[str, Any]]:
-    """Build the tables of a command's summary.
+def tables_of(
+    summary: Mapping[str, Any],
+    titles: Mapping[str, str],
+    columns: Mapping[str, Column] = MappingProxyType({}),
+) -> list[dict[str, Any]]:
+    """Build the tables of a command's summary: of its entry `rows`, and of others unless they are empty.
 
     Args:
-        kind: name of the command.
         summary: summary of the command.
-        sessions: rows of `sessions.csv`, for a survey.
+        titles: title of the table of each entry.
+        columns: formats of columns that differ from `column_of`.
     """
-    rows = summary["rows"]
-    surveyed = rows[0] if kind == "survey" and rows else summary.get("survey")
-    tables = []
-    if kind != "survey":
-        title = {"train": "Trained models", "demo": "Searches with simulated sensors"}.get(kind, "Results")
-        tables.append(table_of("rows", title, rows, columns=_OF_FLEETS if kind == "fleet" else {}))
-    if summary.get("transfer"):
-        tables.append(table_of("transfer", "Test in held-out worlds", summary["transfer"]))
-    if summary.get("planners"):
-        tables.append(table_of("planners", "Planners in the same worlds", summary["planners"]))
-    if summary.get("weeks"):
-        tables.append(table_of("weeks", "By five days", summary["weeks"]))
-    if summary.get("occupancy_rows"):
-        tables.append(table_of("occupancy_rows", "By occupancy level", summary["occupancy_rows"]))
-    if surveyed:
-        tables.append(table_of("survey", "The survey", [surveyed], facts=True))
-        if by_weather := surveyed.get("by_weather"):
-            its = [{"weather": _plain(w), **row} for w, row in by_weather.items()]
-            tables.append(table_of("by_weather", "By weather", its))
-        if found := surveyed.get("detection_by_distance"):
-            its = [{**row, "weather": _plain(row["weather"])} for row in found]
-            tables.append(table_of("detection_by_distance", "Detection rate by distance", its))
+    return [
+        table_of(name, title, summary[name], columns=columns)
+        for name, title in titles.items()
+        if name == "rows" or summary.get(name)
+    ]
+
+
+def survey_tables(surveyed: Row, sessions: Sequence[Row]) -> list[dict[str, Any]]:
+    """Build the tables of a survey.
+
+    Args:
+        surveyed: its row in the summary.
+        sessions: rows of `sessions.csv`.
+    """
+    tables = [table_of("survey", "The survey", [surveyed], facts=True)]
+    if by_weather := surveyed.get("by_weather"):
+        its = [{"weather": _plain(w), **row} for w, row in by_weather.items()]
+        tables.append(table_of("by_weather", "By weather", its))
+    if found := surveyed.get("detection_by_distance"):
+        its = [{**row, "weather": _plain(row["weather"])} for row in found]
+        tables.append(table_of("detection_by_distance", "Detection rate by distance", its))
     if sessions:
-        kept = [c for c in _SESSION if c in sessions[0]]
-        its = [{c: _plain(row[c]) if c == "weather" else row[c] for c in kept} for row in sessions]
+        its = [{c: _plain(row[c]) if c == "weather" else row[c] for c in _SESSION} for row in sessions]
         tables.append(table_of("sessions", "Survey drives", its))
     return tables
 

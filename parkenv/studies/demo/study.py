@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,18 +13,19 @@ from pydantic import Field
 from parkenv import __version__
 from parkenv.files.known_names import RigName
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.compare.comparison import CaseStudy
+from parkenv.studies.compare.comparison import CaseStudy, fastest_agents
 from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, ScenarioItem, Seed
-from parkenv.studies.results import EPISODES, Results, Row, Table
+from parkenv.studies.results import EPISODES, Results, Row, Table, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
-from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
+from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy, survey_finding
 from parkenv.studies.study import Cell, Stage
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
     from parkenv.mapping.survey import SessionResult
-    from parkenv.studies.replays import Replays
+    from parkenv.show.report.page import Page
+    from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -167,12 +168,25 @@ class Demo(CaseStudy):
             ]
         return tasks
 
-    def replays(self, folder: Path) -> Replays:
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
-        from parkenv.studies.replays import Replays
+        from parkenv.show.report.page import Page, on_scenarios
+        from parkenv.show.report.tables import survey_tables, tables_of
 
-        drives = self.survey.replays(folder)
-        return Replays(self.cases_in(folder), drives.survey, drives.sessions)
+        rows, surveyed = summary["rows"], summary["survey"]
+        tables = [
+            *tables_of(summary, {"rows": "Searches with simulated sensors"}),
+            *survey_tables(surveyed, without_nan(SESSIONS.read(folder))),
+        ]
+        findings = [survey_finding(surveyed), *fastest_agents(rows)]
+        return Page(f"From a survey to a search{on_scenarios(rows)}", findings, tables)
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
+        """See `Study`."""
+        from parkenv.studies.compare.search_replay import SearchReplay
+
+        return [SearchReplay(self.cases_in(folder), folder), *self.survey.replays(folder)]
 
 
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:

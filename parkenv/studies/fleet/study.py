@@ -40,8 +40,9 @@ from parkenv.studies.workers import Task
 if TYPE_CHECKING:
     from parkenv.engine.fleet import Fleet
     from parkenv.scenarios.calibration import Calibration
+    from parkenv.show.report.page import Page
     from parkenv.studies.fleet.measures import Roads
-    from parkenv.studies.replays import Replays
+    from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -339,10 +340,35 @@ class FleetStudy(Study):
             )
         ]
 
-    def replays(self, folder: Path) -> Replays:
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
+        """See `Study`: a sentence for each agent and demand says what competition costs."""
+        from parkenv.show.report.page import Page, on_scenarios
+        from parkenv.show.report.tables import OF_FLEETS, tables_of
+
+        del folder
+        rows = summary["rows"]
+        shown: dict[tuple[Any, ...], Row] = {}
+        for row in sorted(rows, key=lambda row: row["knows"] != OWN):
+            shown.setdefault((row["agents"], row["arrivals_per_hour"]), row)
+        findings = []
+        for agent, per_hour in dict.fromkeys((row["agents"], row["arrivals_per_hour"]) for row in rows):
+            row = shown[agent, per_hour]
+            finding = (
+                f"{agent}, {per_hour:g} cars an hour, {row['occupancy']:.0%} of the slots taken: {row['total_s']:.1f} "
+                f"s a car, {row['balked_fraction']:.1%} find no slot"
+            )
+            low, high = row["price_of_anarchy_ci95"]
+            if None not in (row["price_of_anarchy"], low, high) and row["knows"] == OWN:
+                finding += f"; the price of anarchy is {row['price_of_anarchy']:.3f} [{low:.3f}, {high:.3f}]"
+            findings.append(f"{finding}.")
+        tables = tables_of(summary, {"rows": "Results"}, OF_FLEETS)
+        return Page(f"Many cars{on_scenarios(rows)}", findings, tables)
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
         from parkenv.studies.fingerprints import require_unchanged
-        from parkenv.studies.replays import Replays
+        from parkenv.studies.fleet.day_replay import FleetReplay
 
         require_unchanged(self, folder)
-        return Replays(fleet=self)
+        return [FleetReplay(self, folder)]

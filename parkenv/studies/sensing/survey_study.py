@@ -14,15 +14,17 @@ from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.files.option import Option
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import Hours, ScenarioSpec, scenario_spec
+from parkenv.show.plurals import plural
 from parkenv.studies.fields import BUSY, CaptureDistance, Detector, OneScenario, Seed
-from parkenv.studies.results import Key, Results, Row
+from parkenv.studies.results import Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings
-    from parkenv.studies.replays import Replays
+    from parkenv.show.report.page import Page
+    from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -192,8 +194,27 @@ class SurveyStudy(Study):
         shown, _ = result.results.kept.get(SHOWN, (None, None))
         return [partial(draw_survey, self.built, self.drive_settings, result.rows[0], shown, result.folder)]
 
-    def replays(self, folder: Path) -> Replays:
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
-        from parkenv.studies.replays import Replays
+        from parkenv.show.report.page import Page, on_scenarios
+        from parkenv.show.report.tables import survey_tables
 
-        return Replays(survey=(self.built, self.drive_settings), sessions=len(self.table.read(folder)))
+        (row,) = summary["rows"]
+        tables = survey_tables(row, without_nan(cls.table.read(folder)))
+        return Page(f"Survey{on_scenarios([row])}", [survey_finding(row)], tables)
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
+        """See `Study`."""
+        from parkenv.studies.sensing.drive_replay import DriveReplay
+
+        return [DriveReplay(self.built, self.drive_settings, len(self.table.read(folder)))]
+
+
+def survey_finding(row: Row) -> str:
+    """Return the result of a survey in a sentence."""
+    return (
+        f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: "
+        f"{row['car_detection_rate']:.1%} of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots "
+        "classified correctly."
+    )

@@ -29,7 +29,8 @@ from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.suite import suite_lots
 from parkenv.studies.compare.cases import Case, rows_of
-from parkenv.studies.replays import Replays
+from parkenv.studies.compare.search_replay import SearchReplay
+from parkenv.studies.report import Replay
 from parkenv.studies.simulate import charge_truncation
 from parkenv.studies.statistics import mean_interval
 from parkenv.studies.study import Progress
@@ -286,10 +287,10 @@ class SearchTraining(RLTraining):
         low, high = row["total_s_ci95"]
         return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]"
 
-    def replays(self, summary: Row, folder: Path) -> Replays:
+    def replays(self, summary: Row, folder: Path) -> Sequence[Replay]:
         """Return the tests of the best model and of the best planners; nothing without a test."""
         if not summary.get("transfer"):
-            return Replays()
+            return ()
         best = min(summary["rows"], key=lambda row: float(row["total_s"]))
         model = folder / f"seed_{int(best['seed'])}" / MODEL
         seeds = range(TEST_SEED, TEST_SEED + int(summary["transfer"][0]["episodes"]))
@@ -301,7 +302,7 @@ class SearchTraining(RLTraining):
             compared = (Case(scenario, agent.name, options=agent.options) for agent in self.compared)
             made = {case.label: case for case in compared}
             cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
-        return Replays(cases)
+        return [SearchReplay(cases, folder)]
 
     def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
         """See `Training`."""

@@ -19,13 +19,14 @@ from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentItem, AgentSpec
 from parkenv.studies.fields import MAX_EPISODES, ArrivalRate, Level, Scenarios, Stay
-from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row
+from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row, without_nan
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.training.curve_file import CURVE, read_curve
 from planners.names import PARKING_PLANNER
 
 if TYPE_CHECKING:
-    from parkenv.studies.replays import Replays
+    from parkenv.show.report.page import Page
+    from parkenv.studies.report import Replay
     from parkenv.studies.results import Results
     from parkenv.studies.training.training import Training
 
@@ -204,7 +205,26 @@ class TrainingSpec(Study):
         summary = self.training.report(results.progress, results.workers, trained, results.path / FIGURE)
         return {"settings": self.settings(), **summary}
 
-    def replays(self, folder: Path) -> Replays:
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
+        """See `Study`."""
+        from parkenv.show.report.learning import learning_panels
+        from parkenv.show.report.page import Page, listed, on_scenarios
+        from parkenv.show.report.tables import tables_of
+
+        rows = summary["rows"]
+        agents = list(dict.fromkeys(str(row.get("agent", "agent")) for row in rows))
+        curves = [without_nan(read_curve(folder / f"seed_{row['seed']}" / CURVE)) for row in rows]
+        titles = {
+            "rows": "Trained models",
+            "transfer": "Test in held-out worlds",
+            "planners": "Planners in the same worlds",
+        }
+        title = f"{listed(agents)} trained{on_scenarios(rows)}"
+        tables = tables_of(summary, titles)
+        return Page(title, _test_finding(summary), tables, learning_panels(summary, curves))
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
         return self.training.replays(read_json(folder / SUMMARY), folder)
 
@@ -212,6 +232,24 @@ class TrainingSpec(Study):
     def tested(self) -> Scenarios | None:
         """Scenarios of the tests in the end; None for made ones."""
         return self.scenarios
+
+
+def _test_finding(summary: Row) -> list[str]:
+    """Return the result of the test in a sentence, if the models search."""
+    rows = [row for row in summary["rows"] if isinstance(row.get("total_s"), float)]
+    if not rows:
+        return []
+    times = sorted(row["total_s"] for row in rows)
+    name = rows[0]["scenario"]
+    between = f"{times[0]:.1f} s"
+    if len(times) > 1:
+        between = f"{times[0]:.1f} to {times[-1]:.1f} s over {len(times)} trainings"
+    finding = f"Tested on {name} in held-out worlds, the models take {between}"
+    planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
+    if planners:
+        best = min(planners, key=lambda row: float(row["total_s"]))
+        finding += f"; the best planner there, {best['agent']}, takes {best['total_s']:.1f} s"
+    return [f"{finding}."]
 
 
 class TestedTrainingSpec(TrainingSpec):

@@ -18,7 +18,7 @@ from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import COLORS
 from parkenv.studies.fingerprints import fingerprints, flat_tables
-from parkenv.studies.replays import Replays
+from parkenv.studies.report import Replay
 from parkenv.studies.results import SETTINGS, read_settings
 from parkenv.studies.study import Progress
 from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve
@@ -178,10 +178,10 @@ class Training(ABC):
             over.set()
             watcher.join()
 
-    def replays(self, summary: Row, folder: Path) -> Replays:
-        """Return what a report may run again; nothing by default."""
+    def replays(self, summary: Row, folder: Path) -> Sequence[Replay]:
+        """Return what a report may show again; nothing by default."""
         del summary, folder
-        return Replays()
+        return ()
 
     @abstractmethod
     def train(self, seed: int, folder: Path) -> list[Row]:

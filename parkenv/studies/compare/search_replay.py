@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -13,24 +14,22 @@ from numpy.typing import NDArray
 from parkenv.engine.state import SearchState
 from parkenv.show.scene import LotScene
 from parkenv.studies.compare.cases import Case
+from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording, ReportOptions
+from parkenv.studies.results import EPISODES
 from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.occupancy.process import World
 from planners.agent import Agent
 
-MOST_SLOTS = 20_000
-"""Lots with more slots are not replayed: the page would not load."""
 STEADY_S = 600.0
 """Time, s, up to which the true occupancy is recorded every second; later it is recorded only at decisions."""
 FULL = 255
 """Recorded value of a belief of 1."""
-AGREES_S = 1e-6
+SEARCHES, SENSED = 20, 4
+"""Default number of replayed searches: in general, and with rendered sensors at every step."""
 
-Recording = dict[str, Any]
 
-
-@dataclass(frozen=True, eq=False)
-class Encounter:
+class Encounter(NamedTuple):
     """Several agents in the same world.
 
     Attributes:
@@ -40,6 +39,47 @@ class Encounter:
 
     cases: tuple[Case, ...]
     seed: int
+
+
+class SearchReplay(NamedTuple):
+    """The searches of a run.
+
+    Attributes:
+        cases: cases, each with the seeds of its searches.
+        folder: folder of the run; totals are compared with those in `episodes.csv`, if it is there.
+    """
+
+    cases: Sequence[tuple[Case, Sequence[int]]]
+    folder: Path
+
+    def again(self, options: ReportOptions) -> Again:
+        """See `Replay`; lots with too many slots are left out."""
+        agents = options.chosen_agents([case.label for case, _ in self.cases])
+        cases = [(case, seeds) for case, seeds in self.cases if case.label in agents]
+        wanted = options.chosen_numbers(cases[0][1] if cases else ())
+        lots = {case.scenario.name: case.scenario.lot.n_slots for case, _ in cases}
+        notes = [
+            f"{name} has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"
+            for name, n in lots.items()
+            if n > MOST_SLOTS
+        ]
+        drawn = [
+            (case, seeds if wanted is None else wanted)
+            for case, seeds in cases
+            if case.scenario.lot.n_slots <= MOST_SLOTS
+        ]
+        count = options.episodes
+        if count is None:
+            count = SENSED if any(case.rig is not None for case, _ in self.cases) else SEARCHES
+        encounters = choose(drawn, count) if count else []
+        totals = (
+            {EPISODES.key(row): row["total_s"] for row in EPISODES.read(self.folder)} if encounters else {}
+        )
+        tasks = []
+        for encounter in encounters:
+            keys = [case.key(encounter.seed) for case in encounter.cases]
+            tasks.append(partial(record, encounter, {key: totals[key] for key in keys if key in totals}))
+        return Again(tasks, notes)
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:
@@ -102,8 +142,15 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
         "sensors": first.rig,
         "forecast": _bytes(state.belief.forecast),
         **_truth(state.world, scenario.lot.n_slots, start, sorted(moments)),
+        "searches": searches,
     }
-    return {"lot": LotScene.of(scenario.lot).data(), "world": world, "searches": searches}
+    differences = [
+        f"{search['agent']}, {scenario.name}, seed {encounter.seed}: run again it took {search['total_s']:.2f} s, "
+        f"episodes.csv says {search['counted_s']:.2f} s"
+        for search in searches
+        if search["agrees"] is False
+    ]
+    return {"lot": LotScene.of(scenario.lot).data(), "world": world, "differences": differences}
 
 
 def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -> Recording:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +15,12 @@ from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
 from parkenv.studies.fleet.setting import Setting
-from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording, ReportOptions
+from parkenv.studies.results import Key
 from parkenv.world.scenario import Scenario
+
+if TYPE_CHECKING:
+    from parkenv.studies.fleet.study import FleetStudy
 
 MOST_CARS = 5_000
 """Days on which more cars are expected are not replayed: the page would not load."""
@@ -23,63 +28,91 @@ DRIVE, FAIL, QUEUE, WAIT = range(4)
 """What a car does on its way to a point of its track: drive; a failed attempt, a queue and a wait leave it there."""
 STRAIGHT_M = 0.1
 """A car that drives on at the same speed needs no point in between if it is that close to a straight line, m."""
-AGREES_S = 1e-6
+DAYS = 8
+"""Default number of replayed days."""
 
-Recording = dict[str, Any]
 
-
-@dataclass(frozen=True, eq=False)
-class FleetDay:
-    """A day of a setting.
+class FleetReplay(NamedTuple):
+    """The days of a study of many cars.
 
     Attributes:
         study: the study.
-        setting: one of its settings.
-        day: number of the day.
+        folder: folder of the run; means are compared with those in `days.csv`.
     """
 
     study: FleetStudy
-    setting: Setting
-    day: int
+    folder: Path
 
-    def record(self, counted: Mapping[tuple[Any, ...], float]) -> Recording:
-        """Repeat the day, and record it: times in centiseconds since the day's arrivals begin.
+    def again(self, options: ReportOptions) -> Again:
+        """See `Replay`; lots with too many slots, and days with too many cars, are left out."""
+        study = self.study
+        agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
+        numbers = options.chosen_numbers(range(study.days))
+        if (n := study.built.lot.n_slots) > MOST_SLOTS:
+            return Again(
+                notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
+            )
+        window = study.built.arrival
+        most = MOST_CARS / ((window.end_s - window.start_s) / 3600.0)
+        settings = [one for one in study.fleet_settings if one.agent.label in agents]
+        rates = dict.fromkeys(one.arrivals_per_hour for one in settings if one.arrivals_per_hour > most)
+        notes = [
+            f"days with {rate:g} cars an hour have more than the {MOST_CARS} cars that are drawn: no replay"
+            for rate in rates
+        ]
+        settings = [one for one in settings if one.arrivals_per_hour <= most]
+        chosen = choose_days(study, settings, DAYS if options.episodes is None else options.episodes, numbers)
+        rows = study.table.read(self.folder) if chosen else []
+        totals = {study.table.key(row): row["total_s"] for row in rows}
+        return Again([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
 
-        Args:
-            counted: mean total time, s, of the days in the original run, by `FleetStudy.keys`.
-        """
-        study, scenario = self.study, self.study.built
-        fleet, agents = study.fleet(self.setting)
-        fleet.keep_steps()
-        fleet.reset(study.seed, self.day)
-        fleet.run(agents, until=fleet.begin)
-        residents = fleet.slots["leaves_at"].copy()
-        fleet.run(agents)
-        cars, begin = fleet.cars, fleet.begin
-        mean_s = float(cars["total_s"].mean())
-        before = counted.get(study.keys(self.setting, self.day)[0])
-        return {
-            "lot": LotScene.of(scenario.lot).data(),
-            "fleet": {
-                "scenario": scenario.name,
-                **self.setting.columns,
-                "day": self.day,
-                "begin_s": round(begin, 3),
-                "goal": scenario.goal,
-                "duration": _centiseconds(float(cars["ended_at"].max()) - begin),
-                "total_s": mean_s,
-                "counted_s": before,
-                "agrees": None if before is None else abs(before - mean_s) <= AGREES_S,
-                "residents": _residents(residents, begin),
-                **_cars(cars, begin),
-                "tracks": _tracks(fleet, scenario),
-            },
-        }
+
+def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:
+    """Repeat a day, and record it: times in centiseconds since the day's arrivals begin.
+
+    Args:
+        study: the study.
+        setting: one of its settings.
+        day: number of the day.
+        counted: mean total time, s, of the days in the original run, by `FleetStudy.keys`.
+    """
+    scenario = study.built
+    fleet, agents = study.fleet(setting)
+    fleet.keep_steps()
+    fleet.reset(study.seed, day)
+    fleet.run(agents, until=fleet.begin)
+    residents = fleet.slots["leaves_at"].copy()
+    fleet.run(agents)
+    cars, begin = fleet.cars, fleet.begin
+    mean_s = float(cars["total_s"].mean())
+    before = counted.get(study.keys(setting, day)[0])
+    agrees = None if before is None else abs(before - mean_s) <= AGREES_S
+    return {
+        "lot": LotScene.of(scenario.lot).data(),
+        "fleet": {
+            "scenario": scenario.name,
+            **setting.columns,
+            "day": day,
+            "begin_s": round(begin, 3),
+            "goal": scenario.goal,
+            "duration": _centiseconds(float(cars["ended_at"].max()) - begin),
+            "total_s": mean_s,
+            "counted_s": before,
+            "agrees": agrees,
+            "residents": _residents(residents, begin),
+            **_cars(cars, begin),
+            "tracks": _tracks(fleet, scenario),
+        },
+        "differences": [
+            f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says {before:.2f} s"
+        ]
+        * (agrees is False),
+    }
 
 
 def choose_days(
     study: FleetStudy, settings: Sequence[Setting], count: int, days: Sequence[int] | None = None
-) -> list[FleetDay]:
+) -> list[tuple[Setting, int]]:
     """Choose days for a replay.
 
     Args:
@@ -89,25 +122,13 @@ def choose_days(
             then the next day.
         days: all of these days instead.
     """
-    if not settings:
-        return []
-    if days is not None:
-        return [FleetDay(study, setting, day) for setting in settings for day in days]
+    if days is not None or not settings:
+        return [(setting, day) for setting in settings for day in days or ()]
     most = max(setting.share for setting in settings)
     order = sorted(range(len(settings)), key=lambda i: settings[i].share not in (0.0, most))
     needed = min(study.days, -(-count // len(settings)))
     chosen = [(i, day) for day in range(needed) for i in order][:count]
-    return [FleetDay(study, settings[i], day) for i, day in sorted(chosen)]
-
-
-def differing_days(recorded: Sequence[Recording]) -> list[str]:
-    """Return a note for every day whose mean total time differs from that in the results."""
-    return [
-        f"{its['agents']}, {its['knows']}, share {its['share']:g}, {its['arrivals_per_hour']:g} cars an hour, day "
-        f"{its['day']}: run again the mean was {its['total_s']:.2f} s, days.csv says {its['counted_s']:.2f} s"
-        for its in (one["fleet"] for one in recorded)
-        if its["agrees"] is False
-    ]
+    return [(settings[i], day) for i, day in sorted(chosen)]
 
 
 def _residents(leaves_at: FloatArray, begin: float) -> list[int]:
@@ -116,7 +137,7 @@ def _residents(leaves_at: FloatArray, begin: float) -> list[int]:
     return [number for slot in slots for number in (int(slot), _centiseconds(leaves_at[slot] - begin))]
 
 
-def _cars(cars: NDArray[np.void], begin: float) -> Recording:
+def _cars(cars: NDArray[np.void], begin: float) -> dict[str, list[int]]:
     """Return lists over cars: arrival, end of the search, slot or -1, departure or -1, member or not."""
     parked = np.isin(cars["state"], (PARKED, LEFT))
     leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], np.inf)

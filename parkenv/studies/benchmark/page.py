@@ -8,7 +8,7 @@ from typing import Any
 
 from parkenv import __version__
 from parkenv.errors import InputError
-from parkenv.show.report.page import FORMAT, VERSION, terms
+from parkenv.show.report.page import Page, page_data
 from parkenv.show.report.tables import Cell, Column, described, table_of
 from parkenv.studies.benchmark.suite import Suite, score_interval
 from parkenv.studies.results import Row
@@ -60,34 +60,20 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
     commands: list[list[Cell]] = [
         [", ".join(r["episodes"]), shlex.join(r["command"]), *_origin(r).values()] for r in results
     ]
-    return {
-        "format": FORMAT,
-        "version": VERSION,
-        "run": {
-            "kind": "benchmark",
-            "title": f"Benchmark suite {suite.name}",
-            "findings": [
-                suite.description,
-                f"{len(tasks)} tasks of {len(suite.seeds)} searches each, the same worlds for every agent. The "
-                "score is the mean time of the clairvoyant lower bound over the agent's, averaged over the tasks.",
-            ],
-            "command": shlex.join(command),
-            "parkenv": __version__,
-            "seed": suite.seeds[0],
-            "notes": [],
-        },
-        "terms": terms(),
-        "learning": [],
-        "tables": [
-            _table("scores", "Scores", columns, lines),
-            _table("commands", "How the results were made", [Column("agent", "agent"), _COMMAND, *_WHO], commands),
-            table_of("tasks", "Every task", details),
-        ],
-        "lots": [],
-        "worlds": [],
-        "drives": [],
-        "fleets": [],
-    }  # fmt: skip
+    findings = [
+        suite.description,
+        f"{len(tasks)} tasks of {len(suite.seeds)} searches each, the same worlds for every agent. The score is the "
+        "mean time of the clairvoyant lower bound over the agent's, averaged over the tasks.",
+    ]
+    tables = [
+        _table("scores", "Scores", columns, lines),
+        _table(
+            "commands", "How the results were made", [Column("agent", "agent"), _COMMAND, *_WHO], commands
+        ),
+        table_of("tasks", "Every task", details),
+    ]
+    made = {"command": command, "version": __version__, "seed": suite.seeds[0]}
+    return page_data("benchmark", Page(f"Benchmark suite {suite.name}", findings, tables), made)
 
 
 def _origin(result: Row) -> Row:

@@ -1,0 +1,274 @@
+"""The page on a finished run: what its study says about it, its figures, and what it replays, run again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self, Union
+
+from pydantic import Field, model_validator
+
+from parkenv import __version__
+from parkenv.errors import InputError, nearest
+from parkenv.files.atomic_write import make_folder
+from parkenv.files.limited_reading import read_json
+from parkenv.files.spec_file import Several, Spec, read_tables
+from parkenv.show.report.page import Page, page_data, write_page
+from parkenv.show.report.tables import tables_of
+from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL
+from parkenv.studies.study import STUDIES, Progress, Study, read_study, study_class
+from parkenv.studies.workers import SERIAL, Task, Workers
+
+MOST_SLOTS = 20_000
+"""Lots with more slots are not replayed: the page would not load."""
+AGREES_S = 1e-6
+"""Total times of a search or a day that differ by less agree, s."""
+Recording = dict[str, Any]
+"""Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes."""
+
+
+@dataclass(frozen=True)
+class ReportOptions:
+    """What a page replays.
+
+    Args:
+        episodes: about how many searches or days, all agents together; None for the default of their kind.
+        numbers: seeds of the searches, or numbers of the days; None to choose them.
+        agents: agents of the searches or days; None for all.
+        sessions: number of survey drives.
+        frames: captures of them to keep, all drives together.
+        drives: survey drives that are already recorded, instead of driving them again.
+    """
+
+    episodes: int | None = None
+    numbers: Sequence[float] | None = None
+    agents: Sequence[str] | None = None
+    sessions: int = 1
+    frames: int = 120
+    drives: Sequence[Recording] | None = None
+
+    def chosen_agents(self, known: Sequence[str]) -> Sequence[str]:
+        """Return which of the agents of a run are replayed.
+
+        Raises:
+            InputError: the run has no such agent.
+        """
+        for name in self.agents or ():
+            if name not in known:
+                raise InputError(f"--agents has {name!r}; {nearest(name, list(dict.fromkeys(known)))}")
+        return known if self.agents is None else self.agents
+
+    def chosen_numbers(self, known: Sequence[int]) -> list[int] | None:
+        """Return which seeds or days of a run are replayed; None to choose them.
+
+        Raises:
+            InputError: the run has no such seed or day.
+        """
+        for number in self.numbers or ():
+            if number not in known:
+                theirs = f"{known[0]} to {known[-1]}" if known else "none"
+                raise InputError(f"--replay has {number:g}; this run's are {theirs}")
+        return None if self.numbers is None else [int(number) for number in self.numbers]
+
+
+class Again(NamedTuple):
+    """What runs again for a page.
+
+    Attributes:
+        tasks: each returns a recording.
+        notes: what is left out, and why.
+    """
+
+    tasks: Sequence[Task[Recording]] = ()
+    notes: Sequence[str] = ()
+
+
+class Replay(Protocol):
+    """Something in a run that a page can show again, such as its searches."""
+
+    def again(self, options: ReportOptions) -> Again:
+        """Return what runs again.
+
+        Raises:
+            InputError: the run has not the chosen agents, seeds or days, or a table is damaged.
+        """
+
+
+Number = float | None
+# A row holds rows. The oldest pydantic wants the name before the class.
+Cell = Union[Number, bool, str, list[Union[Number, "SummaryRow"]], "SummaryRow"]
+
+
+class SummaryRow(Spec, extra="allow"):
+    """A row of a table: numbers, texts, lists of numbers, and rows in rows."""
+
+    __pydantic_extra__: dict[str, Cell]
+
+    scenario: str = ""
+    agent: str = ""
+    seed: int = Field(0, ge=0, le=10**15)
+    total_s: Number = None
+
+    @model_validator(mode="after")
+    def _intervals(self) -> Self:
+        for name, value in (self.model_extra or {}).items():
+            if name.endswith("_ci95"):
+                if not (isinstance(value, list) and len(value) == 2) or any(
+                    isinstance(v, Spec) for v in value
+                ):
+                    raise ValueError(f"{name} to be the two ends of an interval")
+            elif isinstance(value, list) and None in value:
+                raise ValueError(f"{name} to hold no null")
+        return self
+
+
+SummaryRow.model_rebuild()
+
+
+class _CurveRow(SummaryRow):
+    steps: Any
+
+
+_Curves = Several[_CurveRow] | dict[str, Several[_CurveRow]]
+
+
+class Summary(Spec, extra="allow"):
+    """Content of `summary.json`, of any kind of run."""
+
+    command: Several[str] = Field(min_length=2)
+    version: str
+    seed: int | None = None
+    rows: Several[SummaryRow]
+    transfer: Several[SummaryRow] = ()
+    planners: Several[SummaryRow] = ()
+    weeks: Several[SummaryRow] = ()
+    occupancy_rows: Several[SummaryRow] = ()
+    survey: SummaryRow | None = None
+    curve: _Curves = ()
+    evaluated: dict[str, Number] = Field(default_factory=dict)
+    beside: dict[str, _Curves] = Field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """A finished run.
+
+    Attributes:
+        path: the folder.
+        summary: content of `summary.json`.
+        kind: compare, survey, demo, train, ...; the command's name if the folder holds no specification.
+        page: what its study says about it.
+    """
+
+    path: Path
+    summary: Mapping[str, Any]
+    kind: str
+    page: Page
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """Read a run folder.
+
+        Raises:
+            InputError: there is no folder or no finished run in it, the run is of another version, or a file is
+                damaged.
+        """
+        if not path.is_dir():
+            raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
+        file = path / SUMMARY
+        if not file.exists():
+            if (path / SUMMARY_PARTIAL).exists() or (path / SETTINGS).exists():
+                raise InputError(
+                    f"{path}: holds a run that was interrupted; finish it (--resume), then report it"
+                )
+            raise InputError(f"{path}: holds no {SUMMARY}; want a folder that a command with --out wrote")
+        summary = read_json(file, finite=True)
+        if not isinstance(summary, dict):
+            raise InputError(f"{file}: want the summary of a command")
+        damaged = f"{file}: is not as a command wrote it"
+        Summary.parse(summary, damaged)
+        if summary["version"] != __version__:
+            raise InputError(
+                f"{file}: was written by parkenv {summary['version']}, this is {__version__}, whose searches may "
+                "differ; run the command again, or report it with that version"
+            )
+        spec = path / SPEC_FILE
+        kind = str((spec.exists() and read_tables(spec).get("kind")) or summary["command"][1])
+        if kind not in STUDIES:
+            page = Page(f"parkenv {kind}", tables=tables_of(summary, {"rows": "Results"}))
+            return cls(path, summary, kind, page)
+        try:
+            return cls(path, summary, kind, study_class(kind).page(summary, path))
+        except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            raise InputError(f"{damaged}: {error!r}") from error
+
+    def spec(self) -> Study | None:
+        """Read the specification that the run kept; None for a command that keeps none.
+
+        Raises:
+            InputError: the file is missing or damaged.
+        """
+        return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
+
+    @property
+    def figures(self) -> list[Path]:
+        """The PNG files in the folder, by name."""
+        return sorted(self.path.glob("*.png"))
+
+    def data(self, recordings: Sequence[Recording] = (), notes: Sequence[str] = ()) -> dict[str, Any]:
+        """Return the data of the run's page; see `page_data`."""
+        return page_data(self.kind, self.page, self.summary, recordings, notes)
+
+
+def write_report(
+    run: RunFolder,
+    study: Study | None,
+    options: ReportOptions | None = None,
+    *,
+    out: Path | None = None,
+    notes: Sequence[str] = (),
+    workers: Workers = SERIAL,
+    progress: Progress = lambda *_: None,
+    doing: str = "Running again",
+) -> tuple[Path, list[str]]:
+    """Write the page on a run.
+
+    Args:
+        run: the run.
+        study: its study; None to replay nothing.
+        options: what to replay.
+        out: the page; None for `report.html` in the folder of the run.
+        notes: notes for the reader.
+        workers: where searches, drives and days run again.
+        progress: called as they finish.
+        doing: what `progress` is called with.
+
+    Returns:
+        The page, and all notes on it.
+
+    Raises:
+        InputError: the run has not the chosen searches, or the page cannot be written.
+    """
+    options = options or ReportOptions()
+    path = out or run.path / PAGE
+    make_folder(path.parent)
+    said, replays = [*notes], list[Replay]()
+    try:
+        replays += study.replays(run.path) if study is not None else ()
+    except (InputError, OSError) as error:
+        # The page still has tables and figures.
+        said.append(f"There is no replay: {error}")
+    again = [replay.again(options) for replay in replays]
+    said += [note for its in again for note in its.notes]
+    tasks = [task for its in again for task in its.tasks]
+    recordings = [*(options.drives or ())]
+    progress(doing, 0, len(tasks))
+    for number, recording in enumerate(workers.in_order(tasks), start=1):
+        recordings.append(recording)
+        progress(doing, number, len(tasks))
+    said += [note for recording in recordings for note in recording.get("differences", ())]
+    write_page(run.data(recordings, said), path, run.figures)
+    return path, said
