@@ -250,18 +250,20 @@ class NetworkPolicy(CompiledPolicy):
     def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
         """Return a NETWORK record for a fleet, which follows `set_layers`."""
         around = Surroundings.of(problems, self.k)
-        arrays = [np.ascontiguousarray(array) for array in around]
-        its = np.zeros(1, SURROUNDINGS)
-        for name, array in zip(Surroundings._fields, arrays, strict=True):
-            its[name] = address_of(array, array.dtype)
-        its["n_lots"], its["n_vertices"] = len(around.first), len(around.numbers)
-        its["n_numbers"], its["n_indices"] = around.numbers.shape[1], around.indices.shape[1]
-        its["k"] = self.k
-        record, local = np.zeros(1, NETWORK), np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32)
-        record["surroundings"] = address_of(its, SURROUNDINGS)
-        record["local"] = address_of(local, np.float32)
-        self._write(record)
-        data = PolicyData(record, (its, local, arrays))
+        arrays = {name: np.ascontiguousarray(array) for name, array in around._asdict().items()}
+        numbers = {
+            "n_lots": len(around.first),
+            "n_vertices": len(around.numbers),
+            "n_numbers": around.numbers.shape[1],
+            "n_indices": around.indices.shape[1],
+            "k": self.k,
+        }
+        its, local = (
+            PolicyData(SURROUNDINGS, numbers, arrays),
+            np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32),
+        )
+        data = PolicyData(NETWORK, {}, {"surroundings": its.record, "local": local}, its)
+        self._write(data.record)
         self._data.add(data)
         return data
 

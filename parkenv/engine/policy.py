@@ -7,7 +7,7 @@ below give a policy what an agent's observation holds: position, actions, the la
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, may_have_decayed, observed_state
-from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_address, int32s, int64s, uint8s
 from parkenv.engine.kernel import belief_now
@@ -32,7 +31,7 @@ from parkenv.engine.records import (
     search_at,
     slot_at,
 )
-from parkenv.world.occupancy.kernel import inlined, kernel
+from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
 
 
@@ -40,17 +39,30 @@ class PolicyData:
     """The data of a compiled policy for one fleet, such as tables or a network.
 
     Args:
-        record: (1,) structured array with the addresses of other arrays.
-        kept: what these addresses point to.
+        dtype: of the record.
+        numbers: fields of the record.
+        arrays: arrays whose addresses are the fields of these names.
+        kept: what arrays point to.
+
+    Attributes:
+        record: (1,) of the dtype.
+        arrays: the arrays.
+        address: address of the record.
     """
 
-    def __init__(self, record: NDArray[np.void], kept: Any) -> None:
-        self.record, self._kept = record, kept
-
-    @property
-    def address(self) -> int:
-        """Address of the record."""
-        return address_of(self.record, self.record.dtype)
+    def __init__(
+        self,
+        dtype: np.dtype[Any],
+        numbers: Mapping[str, float],
+        arrays: Mapping[str, NDArray[Any]],
+        kept: Any = None,
+    ) -> None:
+        self.record, self.arrays, self._kept = np.zeros(1, dtype), arrays, kept
+        for name, number in numbers.items():
+            self.record[name] = number
+        for name, array in arrays.items():
+            self.record[name] = address_of(array, array.dtype)
+        self.address = address_of(self.record, dtype)
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +107,9 @@ def car_of(address: int, number: int) -> Any:
 
 
 @inlined
-def search_of(car: Any) -> Any:
-    """Return the SEARCH record of a car, of which a policy reads `vertex`."""
-    return search_at(car.search, 0)
+def search_of(address: int) -> Any:
+    """Return the SEARCH record at an address, `search` of a CAR record, of which a policy reads `vertex`."""
+    return search_at(address, 0)
 
 
 @inlined
@@ -123,35 +135,21 @@ def draw_uniform(search: Any) -> float:
 
 
 @inlined
-def recent_state(search: Any, slot: int) -> int:
-    """Return the state of a slot as in `SlotBelief.recent_state`, from numbers rounded as in the observation."""
-    return int(_state_in(search, np.int64(int32s(search.columns)[slot])))
-
-
-@kernel
-def write_recent_states(search: Any, states: NDArray[np.uint8]) -> None:
-    """Write the states of all slots, (n_slots,), into an array of `UNOBSERVED`."""
-    for column in range(SENTINEL + 1, search.n_columns + 1):
-        states[slot_at(search.slots, column).slot] = _state_in(search, column)
-
-
-@kernel
-def clear_states(search: Any, states: NDArray[np.uint8]) -> None:
-    """Undo `write_recent_states`; the cost does not grow with the lot."""
-    for column in range(SENTINEL + 1, search.n_columns + 1):
-        states[slot_at(search.slots, column).slot] = UNOBSERVED
-
-
-@kernel
-def write_p_occupied(search: Any, p_occupied: FloatArray) -> None:
-    """Write P(taken) of the slots that were observed, as in the observation, into an array, (n_slots,)."""
-    for column in range(SENTINEL + 1, search.n_columns + 1):
-        p_occupied[slot_at(search.slots, column).slot] = np.float32(belief_now(search, column))
+def known_slot(search: Any, i: int) -> int:
+    """Return the i-th of the `n_columns` slots of which something may have been observed."""
+    return int(slot_at(search.slots, SENTINEL + 1 + i).slot)
 
 
 @inlined
-def _state_in(search: Any, column: int) -> int:
-    """Return the state of the slot of a column."""
+def p_occupied(search: Any, slot: int) -> float:
+    """Return P(taken) of an observed slot, rounded as in the observation."""
+    return float(np.float32(belief_now(search, np.int64(int32s(search.columns)[slot]))))
+
+
+@inlined
+def recent_state(search: Any, slot: int) -> int:
+    """Return the state of a slot as in `SlotBelief.recent_state`, from numbers rounded as in the observation."""
+    column = np.int64(int32s(search.columns)[slot])
     if not slot_at(search.slots, column).observed:
         return UNOBSERVED
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)

@@ -3,28 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from functools import cached_property
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, SlotBelief
-from parkenv.engine.policy import CompiledPolicy
+from parkenv.belief.slot_belief import UNOBSERVED, SlotBelief
+from parkenv.engine.policy import CompiledPolicy, PolicyData
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
-from planners.heuristics.policies import TargetPolicy, near_cost_s
+from planners.heuristics.policies import TargetPolicy
 from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,
     GREEDY_GOAL,
     NO_SLOT,
-    DriveGraph,
-    choose_target,
+    choose_route,
+    heuristic_tables,
     keeps_target,
-    likeliest_target,
-    plan_route,
 )
 
 
@@ -48,9 +47,15 @@ class TargetAgent(SearchAgent[GreedyState]):
 
     def __init__(self, problem: SearchProblem) -> None:
         super().__init__(problem)
-        self.graph = DriveGraph.of(self.problem)
-        self._arrival_cost_s = np.array(self.problem.arrival_cost_s, np.float64)
-        self._near_s = near_cost_s(self.problem, self.within_m)
+        self._neighbors = self.problem.lot.neighbors
+
+    @cached_property
+    def _tables(self) -> PolicyData:
+        return heuristic_tables(self.heuristic, [self.problem], self.within_m)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Copies and pickles make tables of their own: these hold addresses."""
+        return {name: value for name, value in vars(self).items() if name != "_tables"}
 
     def begin(self, observation: Observation, belief: SlotBelief) -> GreedyState:
         """Start without a target."""
@@ -61,14 +66,11 @@ class TargetAgent(SearchAgent[GreedyState]):
         """Keep the target while it is a candidate, else choose another one; park on arrival."""
         states, vertex, target = belief.recent_state, int(observation["vertex"]), memory.target
         if not keeps_target(self.heuristic, target, states[target] if target != NO_SLOT else UNOBSERVED):
-            tables = self.graph, self._arrival_cost_s
-            chosen = choose_target(self.heuristic, *tables, self._near_s, states, vertex, target)
-            if chosen == NO_SLOT:
-                p_occupied = belief.p_occupied.astype(np.float64)
-                chosen = likeliest_target(*tables, states, p_occupied, vertex)
-            if chosen != target or states[target] == OBSERVED_TAKEN:
-                memory.target = chosen
-                memory.n_moves = plan_route(self.graph, vertex, chosen, memory.moves)
+            tables = self._tables
+            tables.arrays["states"][:], tables.arrays["p_occupied"][:] = states, belief.p_occupied
+            memory.target, memory.n_moves = choose_route(
+                tables.address, 0, 0, vertex, target, memory.moves, memory.n_moves
+            )
         if memory.n_moves == 0:
             return PARK
         memory.n_moves -= 1
@@ -79,7 +81,7 @@ class TargetAgent(SearchAgent[GreedyState]):
         path = [int(observation["vertex"])]
         moves = [] if action == PARK else [action, *memory.moves[: memory.n_moves][::-1]]
         for move in moves:
-            path.append(int(self.graph.neighbors[path[-1], move]))
+            path.append(int(self._neighbors[path[-1], move]))
         return PlanPreview(tuple(path[1:]))
 
     def compiled_policy(self) -> CompiledPolicy:
@@ -129,7 +131,7 @@ class FirstFreeAgent(TargetAgent):
     def __init__(self, problem: SearchProblem, within_m: float | None = None) -> None:
         self.within_m = within_m
         super().__init__(problem)
-        least_m = self._arrival_cost_s.min() * self.problem.v_walk
+        least_m = self.problem.arrival_cost_s.min() * self.problem.v_walk
         if within_m is not None and not within_m >= least_m:
             raise InputError(
                 f"within_m is {within_m}, want at least {least_m:.1f}, the shortest walk of the lot"

@@ -5,79 +5,102 @@ Each rule is written here once. Agents (`planners.heuristics.agents`) and compil
 
 A slot is a candidate unless it was recently observed taken. Slots are ranked by the drive, or by arrival cost
 (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
+
+Rules ask for the states of few slots. In a fleet they are computed from the tables of the search when they are asked
+for; an agent writes those of its observation into its `TABLES`.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN
-from parkenv.compiled.arrays import FloatArray
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.jit import compiled
+from parkenv.compiled.memory import (
+    ADDRESS,
+    float64_array,
+    float64s,
+    int32_array,
+    int32s,
+    record_at,
+    uint8s,
+)
+from parkenv.engine.policy import PolicyData, known_slot, p_occupied, recent_state, search_of
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
-from planners.thesis.label_setting import edges_in
 
 GREEDY_GOAL, GREEDY_DRIVE, FIRST_FREE = range(3)
 NO_SLOT = -1
 _N_MOVES = len(MOVES)
-_TOLERANCE = 1e-9  # of a drive time, for sums of its parts in another order
 
 rule = compiled(error_model="numpy", _nrt=False)
 inlined_rule = compiled(error_model="numpy", _nrt=False, forceinline=True)
 
+TABLES = np.dtype(
+    [
+        ("heuristic", np.int64),
+        ("n_slots", np.int64),
+        ("n_vertices", np.int64),
+        # The drive graph, (n_vertices, 4): int32 vertex that each move leads to, -1 for none; float64 its cost, s.
+        ("neighbors", ADDRESS),
+        ("move_s", ADDRESS),
+        # By place: (n_slots,) float64 arrival costs, s; float64, arrival cost up to which `FIRST_FREE` takes a free
+        # slot at once, s.
+        ("arrival_cost_s", ADDRESS),
+        ("near_s", ADDRESS),
+        # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken).
+        ("states", ADDRESS),
+        ("p_occupied", ADDRESS),
+        # Of the last search in the graph: (n_vertices,) float64 drive times, s, inf where it did not arrive;
+        # (n_vertices,) int32, the last edge of the shortest route to each vertex, 4 v + move from vertex v;
+        # (n_vertices + 1,) int32, how many vertices it reached, and then these.
+        ("seconds", ADDRESS),
+        ("last_edge", ADDRESS),
+        ("reached", ADDRESS),
+        # A heap: (4 n_vertices + 1,) float64 keys, int32 vertices.
+        ("keys", ADDRESS),
+        ("vertices", ADDRESS),
+    ],
+    align=True,
+)
+"""What a heuristic needs in a lot, and its work space."""
+tables_at = record_at(TABLES)
 
-class DriveGraph(NamedTuple):
-    """The drive graph of a lot, and work space for searches in it.
 
-    Attributes:
-        neighbors: (n_vertices, 4) int32, the vertex that each move leads to; -1 for none.
-        move_s: (n_vertices, 4) float64, s.
-        in_start: (n_vertices + 1,) int32; edges into v are rows `in_start[v]` to `in_start[v + 1]` of the next two.
-        in_source: (n_edges,) int32, the vertex that the edge comes from.
-        in_s: (n_edges,) float64, s.
-        seconds: (n_vertices,) float64, drive times of the last search, s; inf where it did not arrive.
-        last_edge: (n_vertices,) int32, the last edge of its shortest route to each vertex, 4 v + move from vertex v.
-        reached: (n_vertices + 1,) int32, how many vertices the last search reached, and then these.
-        keys: (4 n_vertices + 1,) float64, of a heap.
-        vertices: (4 n_vertices + 1,) int32, of that heap.
+def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m: float | None) -> PolicyData:
+    """Return the tables of a heuristic.
+
+    Args:
+        heuristic: `GREEDY_GOAL`, `GREEDY_DRIVE` or `FIRST_FREE`.
+        problems: the problem of each place, all in one lot.
+        within_m: distance from the goal up to which `FIRST_FREE` takes a free slot at once, m; None: the median's.
     """
-
-    neighbors: NDArray[np.int32]
-    move_s: FloatArray
-    in_start: NDArray[np.int32]
-    in_source: NDArray[np.int32]
-    in_s: FloatArray
-    seconds: FloatArray
-    last_edge: NDArray[np.int32]
-    reached: NDArray[np.int32]
-    keys: FloatArray
-    vertices: NDArray[np.int32]
-
-    @classmethod
-    def of(cls, problem: SearchProblem) -> DriveGraph:
-        """Return the graph of a problem's lot."""
-        # Copies: numba would compile every function again for read-only arrays.
-        neighbors, move_s = problem.lot.neighbors.astype(np.int32), problem.move_cost_s.copy()
-        in_start, in_source, _, in_s = edges_in(neighbors, move_s)
-        n = len(neighbors)
-        room = _N_MOVES * n + 1
-        return cls(
-            neighbors,
-            move_s,
-            in_start,
-            in_source,
-            in_s,
-            np.full(n, np.inf),
-            np.zeros(n, np.int32),
-            np.zeros(n + 1, np.int32),
-            np.zeros(room),
-            np.zeros(room, np.int32),
-        )
+    lot, costs_s = problems[0].lot, np.array([one.arrival_cost_s for one in problems], np.float64)
+    n, room = lot.n_vertices, _N_MOVES * lot.n_vertices + 1
+    near_s = [
+        np.median(cost_s) if within_m is None else within_m / one.v_walk
+        for one, cost_s in zip(problems, costs_s, strict=True)
+    ]
+    numbers = {"heuristic": heuristic, "n_slots": lot.n_slots, "n_vertices": n}
+    arrays: dict[str, NDArray[Any]] = {
+        "neighbors": lot.neighbors.astype(np.int32),
+        "move_s": np.array(problems[0].move_cost_s, np.float64),
+        "arrival_cost_s": costs_s,
+        "near_s": np.array(near_s, np.float64),
+        "states": np.full(lot.n_slots, UNOBSERVED, np.uint8),
+        "p_occupied": np.zeros(lot.n_slots),
+        "seconds": np.full(n, np.inf),
+        "last_edge": np.zeros(n, np.int32),
+        "reached": np.zeros(n + 1, np.int32),
+        "keys": np.zeros(room),
+        "vertices": np.zeros(room, np.int32),
+    }
+    return PolicyData(TABLES, numbers, arrays)
 
 
 @rule
@@ -95,182 +118,186 @@ def keeps_target(heuristic: int, target: int, state: int) -> bool:
 
 
 @rule
-def choose_target(
-    heuristic: int,
-    graph: DriveGraph,
-    arrival_cost_s: FloatArray,
-    near_s: float,
-    states: NDArray[np.uint8],
-    vertex: int,
-    previous: int,
-) -> int:
-    """Return the slot to drive to where `keeps_target` is False; `NO_SLOT` if every slot was observed taken.
+def choose_route(
+    address: int, place: int, search: int, vertex: int, target: int, moves: NDArray[np.uint8], n_moves: int
+) -> tuple[int, int]:
+    """Choose the slot to drive to where `keeps_target` is False, and plan a shortest route to it.
 
     Args:
-        heuristic: `GREEDY_GOAL`, `GREEDY_DRIVE` or `FIRST_FREE`.
-        graph: the drive graph; its work space holds the drive times afterwards.
-        arrival_cost_s: (n_slots,) s.
-        near_s: arrival cost up to which `FIRST_FREE` takes a free slot at once, s.
-        states: (n_slots,) uint8, recent states.
+        address: address of the TABLES record.
+        place: index of the problem.
+        search: address of the SEARCH record whose tables hold what was observed; 0: those of the heuristic do.
         vertex: where the car is.
-        previous: the target so far, or `NO_SLOT`.
+        target: the target so far, or `NO_SLOT`.
+        moves: (n_vertices,) the moves to the target, the last one first; changed in place.
+        n_moves: how many there are.
+
+    Returns:
+        The target, and the number of moves to it.
     """
-    is_kept = previous != NO_SLOT and states[previous] != OBSERVED_TAKEN
-    if heuristic == FIRST_FREE:
-        for slot in range(len(states)):
-            if states[slot] == OBSERVED_FREE and arrival_cost_s[slot] <= near_s:
-                found = _nearest(graph, arrival_cost_s, states, vertex, True, near_s, False)
-                if found != NO_SLOT:
-                    return int(found)
-                break
-        if is_kept:
-            return previous
-    if heuristic == GREEDY_DRIVE:
-        return int(_nearest(graph, arrival_cost_s, states, vertex, False, np.inf, True))
-    if heuristic == FIRST_FREE and previous != NO_SLOT:
-        return int(_nearest(graph, arrival_cost_s, states, vertex, False, np.inf, False))
-    return int(_cheapest(graph, arrival_cost_s, states, vertex))
+    tables = tables_at(address, 0)
+    chosen = _choose_target(tables, place, search, vertex, target)
+    if chosen == NO_SLOT:
+        chosen = _likeliest_target(tables, place, search, vertex)
+    if chosen == target and _state(tables, search, target) != OBSERVED_TAKEN:
+        return target, n_moves
+    n_moves, v = 0, np.int64(chosen)
+    while v != vertex:
+        edge = np.int64(int32s(tables.last_edge)[v])
+        moves[n_moves] = edge % _N_MOVES
+        v = edge // _N_MOVES
+        n_moves += 1
+    return chosen, n_moves
+
+
+# ---- what was observed
+
+
+@inlined_rule
+def _state(tables: Any, search: int, slot: int) -> int:
+    return int(recent_state(search_of(search), slot) if search else uint8s(tables.states)[slot])
+
+
+@inlined_rule
+def _p_occupied(tables: Any, search: int, slot: int) -> float:
+    return float(p_occupied(search_of(search), slot) if search else float64s(tables.p_occupied)[slot])
+
+
+@inlined_rule
+def _n_known(tables: Any, search: int) -> int:
+    """Return of how many slots something may have been observed."""
+    return int(search_of(search).n_columns if search else tables.n_slots)
+
+
+@inlined_rule
+def _known_slot(search: int, i: int) -> int:
+    """Return the i-th of these slots."""
+    return int(known_slot(search_of(search), i) if search else i)
+
+
+@inlined_rule
+def _arrival_cost_s(tables: Any, place: int) -> Any:
+    return float64s(tables.arrival_cost_s + 8 * tables.n_slots * place)
+
+
+# ---- the choice
 
 
 @rule
-def likeliest_target(
-    graph: DriveGraph,
-    arrival_cost_s: FloatArray,
-    states: NDArray[np.uint8],
-    p_occupied: FloatArray,
-    vertex: int,
-) -> int:
+def _choose_target(tables: Any, place: int, search: int, vertex: int, previous: int) -> int:
+    """Return the slot to drive to; `NO_SLOT` if every slot in reach was observed taken."""
+    if tables.heuristic == FIRST_FREE:
+        near_s, cost_s = float64s(tables.near_s)[place], _arrival_cost_s(tables, place)
+        for i in range(_n_known(tables, search)):
+            slot = _known_slot(search, i)
+            if cost_s[slot] <= near_s and _state(tables, search, slot) == OBSERVED_FREE:
+                found = _nearest(tables, place, search, vertex, True, near_s, False)
+                if found != NO_SLOT:
+                    return int(found)
+                break
+        if previous != NO_SLOT and _state(tables, search, previous) != OBSERVED_TAKEN:
+            return previous
+    if tables.heuristic == GREEDY_DRIVE:
+        return int(_nearest(tables, place, search, vertex, False, np.inf, True))
+    if tables.heuristic == FIRST_FREE and previous != NO_SLOT:
+        return int(_nearest(tables, place, search, vertex, False, np.inf, False))
+    return int(_cheapest(tables, place, search, vertex))
+
+
+@rule
+def _likeliest_target(tables: Any, place: int, search: int, vertex: int) -> int:
     """Return the slot most likely to be free by now, for where every slot in reach was observed taken.
 
     It is another one than the slot before which the car stands, if there is one; `NO_SLOT` if none can be reached.
-
-    Args:
-        graph: the drive graph; its work space holds the drive times afterwards.
-        arrival_cost_s: (n_slots,) s.
-        states: (n_slots,) uint8, recent states.
-        p_occupied: (n_slots,) P(taken).
-        vertex: where the car is.
     """
-    _search_everywhere(graph, arrival_cost_s, states, vertex)
-    best = NO_SLOT
-    for slot in range(len(states)):
-        other = slot != vertex and graph.seconds[slot] < np.inf
-        if other and (best == NO_SLOT or p_occupied[slot] < p_occupied[best]):
-            best = slot
-    if best == NO_SLOT and vertex < len(states):
+    _search_everywhere(tables, place, search, vertex)
+    seconds, best, least = float64s(tables.seconds), NO_SLOT, np.inf
+    for slot in range(tables.n_slots):
+        if slot != vertex and seconds[slot] < np.inf:
+            p = _p_occupied(tables, search, slot)
+            if p < least:
+                best, least = slot, p
+    if best == NO_SLOT and vertex < tables.n_slots:
         return vertex
     return best
 
 
 @rule
-def plan_route(graph: DriveGraph, vertex: int, target: int, moves: NDArray[np.uint8]) -> int:
-    """Write the moves of a shortest route to the target of the last search; return their number.
-
-    Args:
-        graph: the drive graph, after `choose_target` or `likeliest_target` from this vertex.
-        vertex: where the car is.
-        target: the slot that it returned.
-        moves: (n_vertices,) output: the moves, the last one first.
-    """
-    n = 0
-    while target != vertex:
-        edge = graph.last_edge[target]
-        moves[n] = edge % _N_MOVES
-        target = edge // _N_MOVES
-        n += 1
-    return n
-
-
-@rule
-def _cheapest(graph: DriveGraph, arrival_cost_s: FloatArray, states: NDArray[np.uint8], vertex: int) -> int:
+def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
     """Return the candidate with the lowest arrival cost; among equals, the one with the shortest drive."""
-    least = np.inf
-    for slot in range(len(states)):
-        if states[slot] != OBSERVED_TAKEN:
-            least = min(least, arrival_cost_s[slot])
-    found = int(_nearest(graph, arrival_cost_s, states, vertex, False, least, False))
+    seconds, cost_s, least = float64s(tables.seconds), _arrival_cost_s(tables, place), np.inf
+    for slot in range(tables.n_slots):
+        if cost_s[slot] < least and _state(tables, search, slot) != OBSERVED_TAKEN:
+            least = cost_s[slot]
+    found = int(_nearest(tables, place, search, vertex, False, least, False))
     if found == NO_SLOT and least < np.inf:
         # It cannot be reached: among those that can.
-        _search_everywhere(graph, arrival_cost_s, states, vertex)
-        least = np.inf
-        for slot in range(len(states)):
-            if states[slot] != OBSERVED_TAKEN and graph.seconds[slot] < np.inf:
-                least = min(least, arrival_cost_s[slot])
-        found = NO_SLOT
-        for slot in range(len(states)):
-            nearer = graph.seconds[slot] < (np.inf if found == NO_SLOT else graph.seconds[found])
-            if states[slot] != OBSERVED_TAKEN and arrival_cost_s[slot] == least and nearer:
+        _search_everywhere(tables, place, search, vertex)
+        for slot in range(tables.n_slots):
+            if seconds[slot] == np.inf or _state(tables, search, slot) == OBSERVED_TAKEN:
+                continue
+            if found == NO_SLOT or (cost_s[slot], seconds[slot]) < (cost_s[found], seconds[found]):
                 found = slot
     return found
 
 
 @rule
-def _search_everywhere(
-    graph: DriveGraph, arrival_cost_s: FloatArray, states: NDArray[np.uint8], vertex: int
-) -> None:
+def _search_everywhere(tables: Any, place: int, search: int, vertex: int) -> None:
     """Compute the drive times from a vertex to all others."""
-    _nearest(graph, arrival_cost_s, states, vertex, False, -np.inf, False)
+    _nearest(tables, place, search, vertex, False, -np.inf, False)
 
 
 @rule
 def _nearest(
-    graph: DriveGraph,
-    arrival_cost_s: FloatArray,
-    states: NDArray[np.uint8],
-    vertex: int,
-    only_free: bool,
-    limit_s: float,
-    by_cost: bool,
+    tables: Any, place: int, search: int, vertex: int, only_free: bool, limit_s: float, by_cost: bool
 ) -> int:
     """Return the nearest of some slots (Dijkstra's algorithm); among equals, the first one; `NO_SLOT` if there is none.
 
     Args:
-        graph: the drive graph, whose work space is used; drive times are exact up to the slot, upper bounds beyond.
-        arrival_cost_s: (n_slots,) s.
-        states: (n_slots,) uint8, recent states.
+        tables: the TABLES record; drive times are exact up to the slot afterwards, upper bounds beyond.
+        place: index of the problem.
+        search: address of the SEARCH record, or 0.
         vertex: where the car is.
         only_free: whether only slots observed free count, not all candidates.
         limit_s: arrival cost up to which slots count, s.
         by_cost: whether that with the lowest arrival cost comes first among equals.
     """
-    seconds, reached = graph.seconds, graph.reached
+    seconds, reached, last_edge = float64s(tables.seconds), int32s(tables.reached), int32s(tables.last_edge)
+    neighbors, move_s = int32s(tables.neighbors), float64s(tables.move_s)
+    room = _N_MOVES * tables.n_vertices + 1
+    keys, vertices = float64_array(tables.keys, (room,)), int32_array(tables.vertices, (room,))
+    cost_s = _arrival_cost_s(tables, place)
     for i in range(1, reached[0] + 1):
         seconds[reached[i]] = np.inf
     seconds[vertex], reached[0], reached[1] = 0.0, 1, vertex
-    size = push(graph.keys, graph.vertices, 0, 0.0, vertex)
+    size = push(keys, vertices, 0, 0.0, vertex)
     best, best_s = NO_SLOT, np.inf
     while size > 0:
-        far, v = graph.keys[0], np.int64(graph.vertices[0])
+        far, v = keys[0], np.int64(vertices[0])
         if far > best_s:
             break
-        size = pop(graph.keys, graph.vertices, size)
+        size = pop(keys, vertices, size)
         if far > seconds[v]:
             continue
-        counts = v < len(states) and arrival_cost_s[v] <= limit_s and _counts(states[v], only_free)
-        if counts and (best == NO_SLOT or _comes_first(v, best, arrival_cost_s, by_cost)):
-            best, best_s = int(v), far
-        for move in range(_N_MOVES):
-            u = np.int64(graph.neighbors[v, move])
-            if u < 0:
-                continue
-            after = far + graph.move_s[v, move]
-            if after < seconds[u]:
+        if v < tables.n_slots and cost_s[v] <= limit_s:
+            state = _state(tables, search, v)
+            counts = state == OBSERVED_FREE or not (only_free or state == OBSERVED_TAKEN)
+            if counts and (best == NO_SLOT or _comes_first(v, best, cost_s, by_cost)):
+                best, best_s = int(v), far
+        for edge in range(v * _N_MOVES, (v + 1) * _N_MOVES):
+            u, after = np.int64(neighbors[edge]), far + move_s[edge]
+            if u >= 0 and after < seconds[u]:
                 if seconds[u] == np.inf:
                     reached[0] += 1
                     reached[reached[0]] = u
-                seconds[u], graph.last_edge[u] = after, v * _N_MOVES + move
-                size = push(graph.keys, graph.vertices, size, after, u)
+                seconds[u], last_edge[u] = after, edge
+                size = push(keys, vertices, size, after, u)
     return best
 
 
 @inlined_rule
-def _counts(state: int, only_free: bool) -> bool:
-    return state == OBSERVED_FREE or not (only_free or state == OBSERVED_TAKEN)
-
-
-@inlined_rule
-def _comes_first(slot: int, other: int, arrival_cost_s: FloatArray, by_cost: bool) -> bool:
+def _comes_first(slot: int, other: int, cost_s: Any, by_cost: bool) -> bool:
     """Return whether of two slots at the same drive time the first one is chosen."""
-    if by_cost and arrival_cost_s[slot] != arrival_cost_s[other]:
-        return bool(arrival_cost_s[slot] < arrival_cost_s[other])
+    if by_cost and cost_s[slot] != cost_s[other]:
+        return bool(cost_s[slot] < cost_s[other])
     return slot < other
