@@ -87,6 +87,11 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
     mean_s = float(cars["total_s"].mean())
     before = counted.get(study.keys(setting, day)[0])
     agrees = None if before is None else abs(before - mean_s) <= AGREES_S
+    differences = []
+    if before is not None and not agrees:
+        differences.append(
+            f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says {before:.2f} s"
+        )
     return {
         "lot": LotScene.of(scenario.lot).data(),
         "fleet": {
@@ -103,10 +108,7 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
             **_cars(cars, begin),
             "tracks": _tracks(fleet, scenario),
         },
-        "differences": [
-            f"{setting}, day {day}: run again the mean was {mean_s:.2f} s, days.csv says {before:.2f} s"
-        ]
-        * (agrees is False),
+        "differences": differences,
     }
 
 
