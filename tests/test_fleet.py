@@ -19,7 +19,7 @@ import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
-from parkenv.studies.verify.fleets import ORDERED_ENTRY
+from parkenv.studies.verify.queues import ORDERED_ENTRY
 from parkenv.world.demand import (
     ConstantTime,
     Demand,

@@ -11,7 +11,7 @@ from pictures import shows_color
 from parkenv.errors import InputError
 from parkenv.show.figures.verification import AGREES
 from parkenv.studies.runner import run
-from parkenv.studies.verify import line, looks
+from parkenv.studies.verify import line
 from parkenv.studies.verify.line import CHANCES, EQUAL_COSTS, THESIS_SPEEDS, Line
 from parkenv.studies.verify.rows import certain_row, disagreeing, mean_row
 from parkenv.studies.verify.study import Verification
@@ -96,14 +96,14 @@ def test_an_agent_that_takes_the_first_free_slot_is_found_out():
     assert takes.all()
 
 
-def test_looks_follow_from_how_many_slots_are_free():
-    seen = np.array(looks.looks(0, 1500))
-    for free in looks.FREE:
+def test_inspections_follow_from_how_many_slots_are_free():
+    seen = np.array(line.inspections(0, 1500))
+    for free in line.FREE:
         mine = seen[seen[:, 0] == free, 1]
-        assert mine.max() <= looks.SLOTS - free + 1
-        assert mean_row("", (looks.SLOTS + 1) / (free + 1), mine, "").agrees
+        assert mine.max() <= line.SLOTS - free + 1
+        assert mean_row("", (line.SLOTS + 1) / (free + 1), mine, "").agrees
         if free < 4:
-            assert not mean_row("", looks.SLOTS / free, mine, "").agrees, "with replacement"
+            assert not mean_row("", line.SLOTS / free, mine, "").agrees, "with replacement"
 
 
 def test_unknown_cases_are_named():
@@ -112,8 +112,9 @@ def test_unknown_cases_are_named():
 
 
 def test_the_command_writes_rows_and_a_picture(tmp_path, monkeypatch):
-    monkeypatch.setattr(looks, "EPISODES", 300)
-    done = parkenv("verify", "--cases", "looks", "--jobs", 1, "--out", tmp_path)
+    inspections = line.inspections
+    monkeypatch.setattr(line, "inspections", lambda first, _: inspections(first, 300))
+    done = parkenv("verify", "--cases", "inspections", "--jobs", 1, "--out", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "5 of 5 rows agree with theory" in done.stdout
     summary = json.loads((tmp_path / "summary.json").read_text())
@@ -122,16 +123,16 @@ def test_the_command_writes_rows_and_a_picture(tmp_path, monkeypatch):
         assert {"case", "expected", "found", "found_ci95", "source"} <= row.keys()
         assert row["agrees"]
     assert shows_color(tmp_path / "verify.png", AGREES, within=40)
-    again = parkenv("verify", "--cases", "looks", "--jobs", 1, "--out", tmp_path / "again")
+    again = parkenv("verify", "--cases", "inspections", "--jobs", 1, "--out", tmp_path / "again")
     assert again.returncode == 0
     assert json.loads((tmp_path / "again" / "summary.json").read_text())["rows"] == summary["rows"]
 
 
 def test_a_row_that_disagrees_is_said_and_makes_the_exit_code(monkeypatch):
-    monkeypatch.setattr(looks, "looks", lambda *_: [(m, 1) for m in looks.FREE for _ in range(9)])
-    done = parkenv("verify", "--cases", "looks", "--jobs", 1)
+    monkeypatch.setattr(line, "inspections", lambda *_: [(m, 1) for m in line.FREE for _ in range(9)])
+    done = parkenv("verify", "--cases", "inspections", "--jobs", 1)
     assert done.returncode == 1
-    assert done.stdout.count("DISAGREES") == len(looks.FREE)
+    assert done.stdout.count("DISAGREES") == len(line.FREE)
     assert parkenv("verify", "--cases", "nothing").returncode == 2
 
 

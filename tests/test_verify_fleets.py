@@ -6,18 +6,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv.studies.verify import balance, blocking, entry, game, stays, strategies
-from parkenv.studies.verify.fleets import (
-    ORDERED_ENTRY,
-    erlang_b,
-    independent_runs,
-    lane,
-    loaded_fleet,
-    mean_parked,
-)
+from parkenv.studies.verify import balance, game, queues
+from parkenv.studies.verify.queues import MEEK, ORDERED_ENTRY, Queue, Run, erlang_b, lane
 from parkenv.studies.verify.rows import disagreeing
-from parkenv.world.demand import ExponentialTime
-from parkenv.world.week import HOUR_S
 from planners.heuristics import POLICIES
 
 
@@ -45,35 +36,25 @@ def test_mean_parked_counts_the_time_in_a_window():
     cars["slot"] = 0, 2, 2, -1
     cars["ended_at"] = 0.0, 5.0, 30.0, 1.0
     cars["left_at"] = 15.0, 20.0, np.inf, np.inf
-    assert mean_parked(cars, 3, 10.0, 50.0) == pytest.approx([5 / 40, 0.0, 30 / 40])
+    assert Run(cars, 10.0, 50.0).mean_parked(3) == pytest.approx([5 / 40, 0.0, 30 / 40])
 
 
-def test_slots_are_taken_as_often_as_erlang_says(monkeypatch):
-    monkeypatch.setattr(entry, "RUNS", 30)
-    monkeypatch.setattr(entry, "HOURS", 200.0)
-    made = entry.rows(1)
-    assert not disagreeing(made)
-    assert len(made) == len(entry.SHOWN) + 1
+@pytest.mark.parametrize(("policy", "wrong"), [(ORDERED_ENTRY, range(1)), (MEEK, range(4, 7))])
+def test_slots_are_taken_as_often_as_erlang_says_and_by_other_drivers_not(policy, wrong):
+    made = queues.entry_rows(1, policy, 30, 200.0)
+    assert len(disagreeing(made)) in wrong
+    assert len(made) == len(queues.SHOWN) + 1
 
 
-def test_other_drivers_are_found_out(monkeypatch):
-    monkeypatch.setattr(entry, "RUNS", 30)
-    monkeypatch.setattr(entry, "HOURS", 200.0)
-    monkeypatch.setattr(entry, "ORDERED_ENTRY", strategies.CompiledPolicy("meek", strategies.decide_meek))
-    assert len(disagreeing(entry.rows(1))) > 3
-
-
-@pytest.mark.parametrize("law", stays.LAWS)
+@pytest.mark.parametrize("law", queues.LAWS)
 def test_the_law_of_the_stay_does_not_matter(law):
-    made = [*stays.loss_row(law, 2, 40, 150.0), *stays.drivers_row(law, 2, 10, 100.0)]
+    made = [*queues.loss_row(law, 2, 40, 150.0), *queues.drivers_row(law, 2, 10, 100.0)]
     assert not disagreeing(made), made
 
 
 @pytest.mark.parametrize("policy", [ORDERED_ENTRY, POLICIES["greedy-drive"]], ids=lambda p: p.name)
-def test_the_lot_turns_away_as_many_as_erlang_says(policy, monkeypatch):
-    monkeypatch.setattr(blocking, "RUNS", 40)
-    monkeypatch.setattr(blocking, "HOURS", 150.0)
-    assert not disagreeing(blocking.row(policy, 3, ExponentialTime(HOUR_S), ""))
+def test_the_lot_turns_away_as_many_as_erlang_says(policy):
+    assert not disagreeing(queues.blocking_row(policy, 3, queues.EXPONENTIAL, "", 40, 150.0))
 
 
 def test_no_car_is_lost_at_any_event():
@@ -94,17 +75,19 @@ def test_a_lost_car_is_found():
 
 
 def test_strategies_on_the_half_line():
-    made = [*strategies.meek_row(1.0, 6, 40, 300.0), *strategies.threshold_row(0.5, 6, 8, 60.0)]
+    made = [*queues.meek_row(1.0, 6, 40, 300.0), *queues.threshold_row(0.5, 6, 8, 60.0)]
     assert not disagreeing(made), made
 
 
+def cars_of(n_slots, policy, load, hours):
+    (cars,) = Queue(lane(n_slots), policy, load, 1, 0.0, hours).samples(0, lambda run: run.cars.copy())
+    return cars
+
+
 def test_a_driver_at_the_threshold_takes_the_first_free_slot_of_its_zone():
-    fleet = loaded_fleet(
-        lane(strategies.ZONE_SLOTS), strategies.CompiledPolicy("half", strategies.decide_half), 20.0, 2.0
-    )
-    (cars,) = independent_runs(fleet, 1, 0, 2.0)
+    cars = cars_of(queues.ZONE_SLOTS, queues.CompiledPolicy("half", queues.decide_half), 20.0, 2.0)
     # An empty zone of 100 slots: the first car stops at its far end, the others behind it, towards the goal.
-    first = strategies.ZONE_SLOTS - strategies.ZONE_LOAD // 2
+    first = queues.ZONE_SLOTS - queues.ZONE_LOAD // 2
     assert cars["slot"][0] == first
     assert (cars["slot"] >= first).all()
     assert (cars["n_moves"] == 0).all(), "never a single free slot"
@@ -128,8 +111,7 @@ def test_drivers_who_compete_pay_for_places_and_failed_searches():
 
 
 def test_a_full_lot_is_left_by_ordered_entry():
-    fleet = loaded_fleet(lane(1), ORDERED_ENTRY, 50.0, 3.0)
-    (cars,) = independent_runs(fleet, 1, 0, 3.0)
+    cars = cars_of(1, ORDERED_ENTRY, 50.0, 3.0)
     parked = cars["slot"] >= 0
     assert 0 < parked.sum() < len(cars)
     assert (cars["gave_up_s"][~parked] > 0.0).all()

@@ -28,7 +28,7 @@ def verify(given: dict[str, Any], /, out: Path | None = None) -> None:
 
     Examples:
         parkenv verify --out results/verify
-        parkenv verify --cases line,looks --seed 7
+        parkenv verify --cases line,inspections --seed 7
 
     Options:
         out, -o (DIR): Folder for summary.json and verify.png.  [default: none]

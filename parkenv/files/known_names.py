@@ -31,5 +31,5 @@ BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
-VERIFY_CASES = ("line", "looks", "entry", "stays", "blocking", "balance", "strategies", "game")
-"""Cases of `parkenv verify`: modules of `parkenv.studies.verify`."""
+VERIFY_CASES = ("line", "inspections", "entry", "stays", "blocking", "balance", "strategies", "game")
+"""Cases of `parkenv verify`."""

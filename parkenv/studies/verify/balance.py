@@ -6,6 +6,7 @@ searching cars is the sum of their search times. The engine counts the one while
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -102,6 +103,6 @@ def checked_events(fleet: Fleet, seed: int, world: int, times: np.ndarray, cars:
     return good
 
 
-def tasks(seed: int) -> list[Task]:
-    """Return the tasks of this case."""
-    return [partial(rows, name, seed) for name in SCENARIOS]
+CASES: dict[str, Callable[[int], list[Task]]] = {
+    "balance": lambda seed: [partial(rows, name, seed) for name in SCENARIOS]
+}

@@ -9,11 +9,12 @@ up to N0; beyond, everybody expects beta in equilibrium, and it is beta N/(R + b
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
 
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots.generators import Slots, grid_lot
-from parkenv.studies.verify.fleets import lane
+from parkenv.studies.verify.queues import lane
 from parkenv.studies.verify.rows import Row, Task, certain_row
 from parkenv.world.demand import ConstantTime, Demand, Headways
 from parkenv.world.lot import ParkingLot
@@ -112,6 +113,4 @@ def rows(seed: int) -> list[Row]:
     return [*made, certain_row(f"parking game, {max(DRIVERS)} drivers: compete", compete, found, SOURCE)]
 
 
-def tasks(seed: int) -> list[Task]:
-    """Return the tasks of this case."""
-    return [partial(rows, seed)]
+CASES: dict[str, Callable[[int], list[Task]]] = {"game": lambda seed: [partial(rows, seed)]}

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import copy
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -293,14 +294,11 @@ def searches_row(name: str, line: Line, episodes: int, seed: int, **options: Any
     return [mean_row(case, line.mean_s, total_s, SOURCE)]
 
 
-def tasks(seed: int) -> list[Task]:
-    """Return the tasks of this case."""
+def _line(seed: int) -> list[Task]:
     short, longer = Line(0.5, THESIS_SPEEDS, 4, 20), Line(0.8, THESIS_SPEEDS, 10, 60)
     cautious = {"failure_s": best_failure_s(short), "gamma": 1.0}
     return [
-        *(partial(exact_row, q, EQUAL_COSTS) for q in CHANCES),
-        *(partial(belief_row, q, EQUAL_COSTS) for q in CHANCES),
-        *(partial(mdp_row, q, EQUAL_COSTS) for q in CHANCES),
+        *(partial(row, q, EQUAL_COSTS) for row in (exact_row, belief_row, mdp_row) for q in CHANCES),
         partial(exact_row, 0.9, THESIS_SPEEDS),
         partial(belief_row, 0.9, THESIS_SPEEDS),
         partial(mdp_row, 0.9, THESIS_SPEEDS),
@@ -309,3 +307,48 @@ def tasks(seed: int) -> list[Task]:
         partial(searches_row, "mdp", short, 8000, seed + 8000, **cautious),
         partial(searches_row, "belief", longer, 4000, seed, day=False),
     ]
+
+
+# Slots inspected in random order
+
+SLOTS = 10
+TAKEN = 0.6  # probability that a slot is taken: all numbers of free slots from 2 to 6 are frequent
+FREE = (2, 3, 4, 5, 6)
+
+
+def inspections(first: int, episodes: int) -> list[tuple[int, int]]:
+    """Return for each search how many slots were free, and how many were inspected up to the first free one.
+
+    All slots are equally likely to be free, so given how many are, those are a random subset: slots in the order of the
+    lane are slots in random order. `greedy-drive` inspects one after the other.
+    """
+    scenario = Line(TAKEN, THESIS_SPEEDS, SLOTS - 1, 0).scenario()
+    runner = EpisodeRunner(scenario, "greedy-drive", make_agent("greedy-drive", scenario))
+    rows = (runner.run(seed).row for seed in range(first, first + episodes))
+    return [(round(SLOTS * (1.0 - row["occupancy"])), row["slots_passed"]) for row in rows]
+
+
+def inspection_rows(seed: int, episodes: int = 24_000) -> list[Row]:
+    """Return a row for each number of free slots, all from the same searches.
+
+    If m of n slots are free, (n + 1)/(m + 1) are inspected until a free one: the m free slots cut the other n - m into
+    m + 1 stretches. In a random order all stretches have the same mean length, (n - m)/(m + 1), and the first free slot
+    comes right after the first stretch.
+    """
+    found = np.array(inspections(seed, episodes))
+    return [
+        mean_row(
+            f"inspections, {m} of {SLOTS} slots free: greedy-drive",
+            (SLOTS + 1) / (m + 1),
+            found[found[:, 0] == m, 1],
+            "order statistics without replacement",
+        )
+        for m in FREE
+    ]
+
+
+CASES: dict[str, Callable[[int], list[Task]]] = {
+    "line": _line,
+    "inspections": lambda seed: [partial(inspection_rows, seed)],
+}
+"""The tasks of each case, from the first seed."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
-from importlib import import_module
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
@@ -28,7 +27,7 @@ PICTURE = "verify.png"
 
 
 class _Case(NamedTuple):
-    """A module of `parkenv.studies.verify`, with tasks."""
+    """A case, whose items are tasks."""
 
     name: str
 
@@ -72,7 +71,10 @@ class Verification(Study):
         for case in self.cases:
             if case not in VERIFY_CASES:
                 raise InputError(f"cases: there is no case {case!r}; {nearest(case, VERIFY_CASES)}")
-        return {case: import_module(f"parkenv.studies.verify.{case}").tasks(self.seed) for case in self.cases}
+        from parkenv.studies.verify import balance, game, line, queues
+
+        made = line.CASES | queues.CASES | balance.CASES | game.CASES
+        return {case: made[case](self.seed) for case in self.cases}
 
     def check(self) -> None:
         """See `Study`."""
