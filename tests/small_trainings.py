@@ -8,7 +8,7 @@ from parkenv.studies.training import configs
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.drive.training import DriveTraining
 from parkenv.studies.training.fleet import FleetTraining
-from parkenv.studies.training.search import SearchTraining
+from parkenv.studies.training.search import ScanTraining, SearchTraining
 from parkenv.studies.training.spec import (
     DriveTrainingSpec,
     FleetTrainingSpec,
@@ -58,7 +58,7 @@ def search_training(algorithm, steps, every, places, held_out=(), episodes=4, **
 
 def scan_training(steps, episodes):
     spec = ScanTrainingSpec(steps=steps, evaluate_every=128, evaluation_episodes=episodes)
-    return SearchTraining(spec.changed(scenarios=["mini"]))
+    return ScanTraining(spec.changed(scenarios=["mini"]))
 
 
 def fleet_training(fleet, steps=2_048, every=1_024):

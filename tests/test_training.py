@@ -42,7 +42,7 @@ from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import across_seeds, read_curve
-from parkenv.studies.training.search import SearchTraining, episode_times, search_times
+from parkenv.studies.training.search import SearchTraining, episode_times
 from parkenv.studies.training.spec import (
     DriveTrainingSpec,
     FleetTrainingSpec,
@@ -216,8 +216,9 @@ def test_algorithms_without_cloning_are_refused():
 
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
     campus = make_scenario("campus")
-    row = search_times(LearnedAgent(campus, "maskable-ppo", trained / "model.safetensors"), campus, range(4))
-    assert row["episodes"] == 4
+    model = LearnedAgent(campus, "maskable-ppo", trained / "model.safetensors").model
+    times, parked = episode_times(model, campus, range(4))
+    assert len(times) == len(parked) == 4
 
 
 def test_a_model_decides_on_driven_trips(trained):
@@ -531,7 +532,13 @@ def test_the_command_trains_is_killed_resumes_and_its_models_can_be_compared(tmp
 
 
 def training_in(folder, **changed):
-    settings = {"algorithm": "dqn", "scenario": ["mini"], "evaluation_episodes": 16, "clone": None, **changed}
+    settings = {
+        "algorithm": "dqn",
+        "scenario": ["mini"],
+        "held_out": [],
+        "evaluation_episodes": 16,
+        **changed,
+    }
     (folder / "seed_0").mkdir(parents=True)
     (folder / "seed_0" / "curve.csv").write_text("steps,total_s\n0,300.0\n10,90.0\n")
     (folder / "settings.json").write_text(json.dumps(settings))
@@ -617,7 +624,7 @@ def curve_of_another_kind(folder):
         (
             {"scenario": ["mini", "jam"]},
             None,
-            r"scenario is \['mini', 'jam'\] in .* and 'mini' here; their eval",
+            r"scenario is \['mini', 'jam'\] in .* and \['mini'\] here; their eval",
         ),
         ({"evaluation_episodes": 8}, None, "evaluation_episodes is 8 in .* and 16 here"),
         ({"scenario": 5}, None, r"other/settings\.json: scenario is 5, want a list"),

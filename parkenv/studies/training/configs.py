@@ -19,6 +19,7 @@ class TrainingConfig:
     settings: Mapping[str, Any]  # arguments of the algorithm's constructor
     # fraction of the learning rate at the end of training; it falls linearly
     final_learning_rate: float = 1.0
+    steps: int = 0  # decisions of a training whose specification does not say how many
 
 
 _ON_POLICY: dict[str, Any] = {
@@ -117,7 +118,6 @@ class DriveTrainingConfig(TrainingConfig):
     reward: str  # `sparse`, with hindsight experience replay, or `dense`
     reward_scale: float  # factor from seconds to rewards
     contact_cost: float  # cost of a contact in training, s
-    steps: int  # default number of decisions
     curriculum: tuple[CurriculumLevel, ...] = CURRICULUM  # levels, from the easiest to the full task
 
 

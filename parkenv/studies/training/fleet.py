@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -15,16 +14,14 @@ from parkenv.engine.fleet import DriverKind
 from parkenv.envs.sb3 import FleetVecEnv, network_policy
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
-from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, demand_in, policy_of
-from parkenv.studies.study import Progress
-from parkenv.studies.training.configs import FLEET_CONFIGS, REWARD_SCALE, TrainingConfig
+from parkenv.studies.training.configs import FLEET_CONFIGS, REWARD_SCALE
 from parkenv.studies.training.curve_file import Row
 from parkenv.studies.training.learning import RLTraining
 from parkenv.studies.training.spec import FleetTrainingSpec
-from parkenv.studies.training.training import EVALUATION_SEED, TEST_SEED, Tested, Trained
+from parkenv.studies.training.training import EVALUATION_SEED, TEST_SEED, Tested
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 
@@ -37,21 +34,8 @@ class FleetTraining(RLTraining):
 
     spec: FleetTrainingSpec
     heading = "Mean total time, s, of a driver's cars and [of the others], {episodes} held-out days"
-
-    @property
-    def config(self) -> TrainingConfig:
-        """See `RLTraining`."""
-        return FLEET_CONFIGS[self.algorithm]
-
-    @property
-    def steps(self) -> int:
-        """Decisions of the cars that are learned from, in total."""
-        return self.spec.steps
-
-    @property
-    def evaluate_every(self) -> int:
-        """See `RLTraining`."""
-        return self.spec.evaluate_every or max(1, self.steps // 10)
+    evaluated_by = ("env", "scenario", "fleet", "demand", "evaluation_episodes")
+    configs = FLEET_CONFIGS
 
     @cached_property
     def scenario(self) -> Scenario:
@@ -69,11 +53,16 @@ class FleetTraining(RLTraining):
         return MixedFleet(self.scenario, demand, spec.knows, share, spec.among)
 
     @cached_property
-    def tests(self) -> list[MixedFleet]:
-        """The fleets of the tests in the end: that of the training, every car, and few among others."""
+    def tests(self) -> dict[str, MixedFleet]:
+        """See `Training`: the fleet of the training, every car, and few among others."""
         whole = replace(self.fleet, share=1.0, among=None)
         few = [replace(self.fleet, share=FEW, among=agent) for agent in self.spec.test_among]
-        return list(dict.fromkeys([self.fleet, whole, *few]))
+        return {fleet.name: fleet for fleet in (self.fleet, whole, *few)}
+
+    @property
+    def compared(self) -> tuple[AgentSpec, ...]:
+        """See `Training`."""
+        return self.spec.agents
 
     @property
     def measures(self) -> tuple[str, ...]:
@@ -96,11 +85,6 @@ class FleetTraining(RLTraining):
             "scenario": [self.scenario.name], "evaluate_every": self.evaluate_every, "fleet": self.fleet.name,
             "demand": str(self.fleet.demand),
         }  # fmt: skip
-
-    def evaluation_settings(self, settings: Row) -> Row:
-        """See `Training`."""
-        names = ("env", "scenario", "fleet", "demand", "evaluation_episodes")
-        return {name: settings.get(name) for name in names}
 
     @property
     def metrics(self) -> tuple[str, ...]:
@@ -141,36 +125,34 @@ class FleetTraining(RLTraining):
         found = (row["total_s"], low, high, row["parked_fraction"], row["search_s"])
         return dict(zip(self.metrics, found, strict=True))
 
-    def score(self, row: Row) -> tuple[float, ...]:
-        """Return minus the mean total time."""
-        return (-row["total_s"],)
-
     def description(self) -> dict[str, Any]:
         """Return scenario and settings for the model file."""
-        config, fleet = self.config, self.fleet
-        settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
-        settings |= {"fleet": fleet.name, "knows": fleet.knows, "demand": str(fleet.demand)}
+        fleet = self.fleet
+        settings = self.settings_of_model(fleet=fleet.name, knows=fleet.knows, demand=str(fleet.demand))
         return {"scenarios": [fleet.scenario.name], "settings": settings}
 
-    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+    def evaluate_planners(self, workers: Workers) -> dict[str, float]:
         """See `Training`."""
-        lines, rows, days = dict[str, float](), list[Row](), self.evaluation_episodes
-        for agent in self.spec.agents:
-            progress(f"{agent.label} drives on the same days", 0, 1)
-            lines[agent.label] = self.fleet.row(agent, EVALUATION_SEED, days, workers)["total_s"]
-            named = {"agent": agent.label}
-            rows += [
-                named | {"scenario": test.name, **test.row(agent, TEST_SEED, 2 * days, workers)}
-                for test in self.tests
-            ]
-            progress(f"{agent.label} drives on the same days", 1, 1)
-        return lines, rows
+        days = self.evaluation_episodes
+        return {
+            agent.label: self.fleet.row(agent, EVALUATION_SEED, days, workers)["total_s"]
+            for agent in self.compared
+        }
+
+    def test_planners(self, name: str, workers: Workers) -> list[Row]:
+        """See `Training`."""
+        test, days = self.tests[name], len(self.test_seeds)
+        return [
+            {"agent": agent.label, "scenario": name, **test.row(agent, TEST_SEED, days, workers)}
+            for agent in self.compared
+        ]
 
     def test(self, model: Path, workers: Workers) -> Tested:
         """See `Training`."""
-        member, days = AgentSpec(name=f"{self.algorithm}:{model}"), 2 * self.evaluation_episodes
+        member, days = AgentSpec(name=f"{self.algorithm}:{model}"), len(self.test_seeds)
         transfer = [
-            {"test_scenario": test.name, **test.row(member, TEST_SEED, days, workers)} for test in self.tests
+            {"test_scenario": name, **test.row(member, TEST_SEED, days, workers)}
+            for name, test in self.tests.items()
         ]
         own = {c: transfer[0][c] for c in ("total_s", "total_s_ci95", "search_s")}
         return Tested(self.scenario.name, own, transfer)
@@ -181,10 +163,8 @@ class FleetTraining(RLTraining):
         others = "" if row["others_s"] != row["others_s"] else f"; others {row['others_s']:.1f}"
         return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]{others}"
 
-    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+    @property
+    def title(self) -> str:
         """See `Training`."""
         rate, days = self.spec.arrivals_per_hour, plural(self.evaluation_episodes, "held-out day")
-        title = f"{self.scenario.name}, {rate:g} cars an hour, {self.fleet.name}: {days}"
-        drawn = {self.algorithm: trained.curves} | trained.beside
-        means = {label: self.across_seeds(its) for label, its in drawn.items()}
-        save_learning_curves(drawn, means, lines, title, figure)
+        return f"{self.scenario.name}, {rate:g} cars an hour, {self.fleet.name}: {days}"

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 from abc import abstractmethod
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from stable_baselines3.common.callbacks import BaseCallback
@@ -28,16 +29,25 @@ class RLTraining(Training):
     """Base class of trainings with stable-baselines3."""
 
     spec: RLTrainingSpec
+    configs: ClassVar[Mapping[str, TrainingConfig]]
+    """Training config of each algorithm."""
+    evaluations: ClassVar[int] = 10
+    """How many evaluations there are if the specification does not say."""
 
     @property
-    @abstractmethod
     def config(self) -> TrainingConfig:
         """Training config of the algorithm."""
+        return self.configs[self.algorithm]
 
     @property
-    @abstractmethod
+    def steps(self) -> int:
+        """See `Training`."""
+        return self.spec.steps or self.config.steps
+
+    @property
     def evaluate_every(self) -> int:
         """Decisions between evaluations."""
+        return self.spec.evaluate_every or max(1, self.steps // self.evaluations)
 
     @abstractmethod
     def make_env(self) -> VecEnv:
@@ -47,13 +57,17 @@ class RLTraining(Training):
     def evaluate(self, policy: Any, env: VecEnv) -> Row:
         """Evaluate a policy in the held-out worlds, which never change; return the `metrics`."""
 
-    @abstractmethod
     def score(self, row: Row) -> tuple[float, ...]:
-        """Return the score of an evaluation, for comparing checkpoints; higher is better."""
+        """Return the score of an evaluation, for comparing checkpoints; higher is better: minus the mean total time."""
+        return (-row["total_s"],)
 
     @abstractmethod
     def description(self) -> dict[str, Any]:
         """Return `scenarios` and `settings` for `planners.model_file.save_model`."""
+
+    def settings_of_model(self, **others: Any) -> dict[str, Any]:
+        """Return the settings of a model for its file: those of the config, and others."""
+        return {"n_envs": self.config.n_envs, "policy": self.config.policy, **self.config.settings, **others}
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the algorithm's constructor, without the learning rate."""

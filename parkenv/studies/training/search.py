@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium.vector import AutoresetMode
@@ -25,7 +25,6 @@ from parkenv.scenarios.places import (
     split_places,
 )
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.show.figures.learning_curves import save_learning_curves
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.suite import suite_lots
 from parkenv.studies.compare.cases import Case, rows_of
@@ -45,13 +44,15 @@ from parkenv.studies.training.configs import (
 from parkenv.studies.training.curve_file import Row
 from parkenv.studies.training.learning import RLTraining
 from parkenv.studies.training.spec import ScanTrainingSpec, SearchTrainingSpec
-from parkenv.studies.training.training import MODEL, TEST_SEED, Tested, Trained, name_of
+from parkenv.studies.training.training import MODEL, TEST_SEED, Tested, name_of
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
 from planners.model_file import SEARCH_OBSERVATIONS, observation_of
 
+Times = tuple[NDArray[np.float64], NDArray[np.bool_]]
+"""Total time of each episode, s, and whether its car parked."""
 METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
 HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
 BESIDE_MODELS = 3
@@ -72,29 +73,10 @@ class SearchTraining(RLTraining):
 
     spec: SearchTrainingSpec | ScanTrainingSpec
     heading = "Mean total time, s, in held-out worlds"
-    demonstrations: Demonstrations | None = None
-    """Cloned before training; made by `begin`."""
-
-    @property
-    def folder(self) -> str:
-        """See `Training`."""
-        return f"scan-{self.algorithm}" if self.spec.observation == "scan" else super().folder
-
-    @property
-    def config(self) -> TrainingConfig:
-        """See `RLTraining`."""
-        configs = SCAN_CONFIGS if self.spec.observation == "scan" else SEARCH_CONFIGS
-        return configs[self.algorithm]
-
-    @property
-    def steps(self) -> int:
-        """See `Training`."""
-        return self.spec.steps
-
-    @property
-    def evaluate_every(self) -> int:
-        """See `RLTraining`."""
-        return self.spec.evaluate_every
+    evaluated_by = ("scenario", "held_out", "evaluation_episodes")
+    configs: ClassVar[Mapping[str, TrainingConfig]] = SEARCH_CONFIGS
+    shared: Demonstrations | None = None
+    """Demonstrations to clone before training."""
 
     @property
     def given_scenarios(self) -> tuple[ScenarioSpec, ...]:
@@ -108,7 +90,7 @@ class SearchTraining(RLTraining):
 
     @property
     def compared(self) -> tuple[AgentSpec, ...]:
-        """Agents to compare with."""
+        """See `Training`."""
         usual = PLANNERS_OF_PLACES if self.holds_out else PLANNERS
         return usual if self.spec.agents is None else self.spec.agents
 
@@ -130,7 +112,7 @@ class SearchTraining(RLTraining):
 
     @cached_property
     def tests(self) -> dict[str, Sequence[Scenario]]:
-        """The tests in the end, by name: each in one scenario, or in many of which every search draws one."""
+        """See `Training`: each is in one scenario, or in many of which every search draws one."""
         learned, held_out = self.sides
         if self.spec.test_on is None and self.holds_out:
             return {f"{_places(learned)} trained on": learned, f"{_places(held_out)} held out": held_out}
@@ -160,10 +142,6 @@ class SearchTraining(RLTraining):
         """See `Training`."""
         super().check()
         learned = self.sides[0]
-        if self.spec.observation == "scan":
-            # What gives no scans in a batch is refused before training, not at the tests in the end.
-            for place in (*learned, *itertools.chain(*self.tests.values())):
-                search_batch(1, learned if place in learned else place, "scan", self.spec.k)
         if self.spec.clone is not None:
             require_cloneable(self.algorithm, self.spec.clone, learned[0])
         for world in (learned[0], *(places[0] for places in self.tests.values())):
@@ -179,15 +157,6 @@ class SearchTraining(RLTraining):
         }
         return super().settings() | names
 
-    def evaluation_settings(self, settings: Row) -> Row:
-        """See `Training`."""
-        first, *others = settings.get("scenario") or [None]
-        return {
-            "scenario": [first, *others] if others else first,
-            "held_out": settings.get("held_out") or [],
-            "evaluation_episodes": settings.get("evaluation_episodes"),
-        }
-
     def begin(self, progress: Progress) -> None:
         """Record the searches of the planner to clone."""
         planner = self.spec.clone
@@ -195,7 +164,7 @@ class SearchTraining(RLTraining):
             count = self.spec.demonstrations or 2000
             seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
             progress(f"Recording searches of {planner}", 0, count)
-            self.demonstrations = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
+            self.shared = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
             progress(f"Recording searches of {planner}", count, count)
 
     def make_env(self) -> SearchVecEnv:
@@ -217,48 +186,38 @@ class SearchTraining(RLTraining):
 
     def prepare(self, model: Any, seed: int) -> None:
         """Clone the demonstrations, if any."""
-        if self.demonstrations is not None:
-            clone(model, self.demonstrations, seed)
+        if self.shared is not None:
+            clone(model, self.shared, seed)
 
     def evaluate(self, policy: Any, env: VecEnv) -> Row:
         """Run one episode in each held-out world, in the places trained on and in those held out."""
         del env
-        found: list[float] = []
-        for places in filter(None, self.sides):
-            times, parked = episode_times(policy, places, self.evaluation_seeds)
-            found += [*mean_interval(times), float(parked.mean())]
-        return dict(zip(self.metrics, found, strict=True))
+        found = (episode_times(policy, places, self.evaluation_seeds) for places in filter(None, self.sides))
+        return self.metrics_of(found)
 
-    def score(self, row: Row) -> tuple[float, ...]:
-        """Return minus the mean total time."""
-        return (-row["total_s"],)
+    def metrics_of(self, found: Iterable[Times]) -> Row:
+        """Return the `metrics` of the times in the places trained on, and in those held out."""
+        values = ((*mean_interval(times), float(parked.mean())) for times, parked in found)
+        return dict(zip(self.metrics, itertools.chain.from_iterable(values), strict=True))
 
     def description(self) -> dict[str, Any]:
         """Return scenarios and settings for the model file."""
-        config, (learned, held_out) = self.config, self.sides
-        settings = {"n_envs": config.n_envs, "policy": config.policy, **config.settings}
-        settings |= {"clone": self.spec.clone, "curriculum": self.spec.curriculum}
+        learned, held_out = self.sides
         return {
             "scenarios": [place.name for place in learned],
             "held_out": [place.name for place in held_out],
-            "settings": settings,
+            "settings": self.settings_of_model(clone=self.spec.clone, curriculum=self.spec.curriculum),
         }
 
-    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
-        """See `Training`."""
-        if not self.compared:
-            return {}, []
+    def evaluate_planners(self, workers: Workers) -> dict[str, float]:
+        """See `Training`; also the clairvoyant bound."""
         learned, held_out = self.sides
-        rows = list[Row]()
-        doing, count = "Planners search in the same worlds", 1 + len(self.tests)
-        progress(doing, 0, count)
-        evaluated = rows_of(self.compared, held_out or learned, self.evaluation_seeds, workers)
-        for number, (name, places) in enumerate(self.tests.items(), start=1):
-            progress(doing, number, count)
-            rows += rows_of(self.compared, places, self.test_seeds, workers, name)
-        progress(doing, count, count)
-        lines = {row["agent"]: row["total_s"] for row in evaluated}
-        return lines | {"clairvoyant bound": evaluated[0]["bound_s"]}, rows
+        rows = rows_of(self.compared, held_out or learned, self.evaluation_seeds, workers)
+        return {row["agent"]: row["total_s"] for row in rows} | {"clairvoyant bound": rows[0]["bound_s"]}
+
+    def test_planners(self, name: str, workers: Workers) -> list[Row]:
+        """See `Training`."""
+        return rows_of(self.compared, self.tests[name], self.test_seeds, workers, name)
 
     def test(self, model: Path, workers: Workers) -> Tested:
         """See `Training`."""
@@ -275,9 +234,7 @@ class SearchTraining(RLTraining):
         own = {c: main[c] for c in ("total_s", "total_s_ci95")}
         return Tested(main["test_scenario"], own, transfer, by_place)
 
-    def times_of(
-        self, model: Path, places: Sequence[Scenario]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def times_of(self, model: Path, places: Sequence[Scenario]) -> Times:
         """Test a model: return the times of the test's episodes, s, and whether the car parked."""
         agent = LearnedAgent(self.sides[0][0], self.algorithm, model)
         return episode_times(agent.model, places, self.test_seeds)
@@ -304,18 +261,21 @@ class SearchTraining(RLTraining):
             cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
         return [SearchReplay(cases, folder)]
 
-    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+    @property
+    def title(self) -> str:
         """See `Training`."""
-        (learned, held_out), name, curves = self.sides, name_of(self.settings()), trained.curves
-        where, drawn = learned[0].name if len(learned) == 1 else _places(learned), {name: curves}
-        if self.holds_out:
-            where = f"{_places(held_out)} held out"
-            apart = [[row | {"total_s": row["held_out_s"]} for row in curve] for curve in curves]
-            drawn = {f"{name}, {_places(learned)} trained on": curves, f"{name}, held out": apart}
-        title = f"{where}: {self.evaluation_episodes} searches in held-out worlds"
-        drawn |= trained.beside
-        means = {label: self.across_seeds(its) for label, its in drawn.items()}
-        save_learning_curves(drawn, means, lines, title, figure)
+        learned, held_out = self.sides
+        where = learned[0].name if len(learned) == 1 else _places(learned)
+        where = f"{_places(held_out)} held out" if self.holds_out else where
+        return f"{where}: {self.evaluation_episodes} searches in held-out worlds"
+
+    def drawn(self, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
+        """See `Training`."""
+        name = name_of(self.settings())
+        if not self.holds_out:
+            return {name: curves}
+        apart = [[row | {"total_s": row["held_out_s"]} for row in curve] for curve in curves]
+        return {f"{name}, {_places(self.sides[0])} trained on": curves, f"{name}, held out": apart}
 
     def _rows_by_place(
         self, places: Sequence[Scenario], times: NDArray[np.float64], parked: NDArray[np.bool_]
@@ -327,6 +287,26 @@ class SearchTraining(RLTraining):
             for i, place in enumerate(places)
             if (its := place_of == i).any()
         ]
+
+
+class ScanTraining(SearchTraining):
+    """Training of a search agent that observes raw laser scans, in one scenario."""
+
+    spec: ScanTrainingSpec
+    configs = SCAN_CONFIGS
+
+    @property
+    def folder(self) -> str:
+        """See `Training`."""
+        return f"scan-{self.algorithm}"
+
+    def check(self) -> None:
+        """See `Training`."""
+        super().check()
+        # What gives no scans in a batch is refused before training, not at the tests in the end.
+        learned = self.sides[0]
+        for place in (*learned, *itertools.chain(*self.tests.values())):
+            search_batch(1, learned if place in learned else place, "scan", self.spec.k)
 
 
 def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
@@ -365,11 +345,6 @@ def _places(scenarios: Sequence[Scenario]) -> str:
     return f"{len(scenarios)} place{'s' * (len(scenarios) != 1)}"
 
 
-def search_times(agent: LearnedAgent, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Row:
-    """Run a model, and return its total times as columns of `parkenv compare`."""
-    return times_row(*episode_times(agent.model, places, seeds))
-
-
 def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
     """Return the total times of episodes as columns of `parkenv compare`."""
     mean, low, high = mean_interval(times)
@@ -381,9 +356,7 @@ def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
     }
 
 
-def episode_times(
-    model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequence[int]) -> Times:
     """Run episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
 
     An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.

@@ -42,12 +42,12 @@ class _Seeds(NamedTuple):
 
     Attributes:
         folder: that of the run; a training keeps its checkpoint there.
-        demonstrations: to clone, if any.
+        shared: see `Training`.
         command: command line of the run.
     """
 
     folder: Path = Path()
-    demonstrations: Any = None
+    shared: Any = None
     command: tuple[str, ...] = ()
     columns: Row = {}  # noqa: RUF012 - never changed
 
@@ -167,16 +167,13 @@ class TrainingSpec(Study):
     def input_of(self, work: _Seeds, items: Sequence[int], results: Results) -> _Seeds:
         """See `Study`."""
         del items
-        shared = getattr(self.training, "demonstrations", None)
-        return work._replace(folder=results.path, demonstrations=shared, command=tuple(results.command))
+        return work._replace(folder=results.path, shared=self.training.shared, command=tuple(results.command))
 
     def run(self, work: _Seeds, items: Sequence[int]) -> list[Row]:
         """See `Study`; a training goes on from its checkpoint."""
         from parkenv.studies.training.training import train_one
 
-        self.training.command = work.command
-        if work.demonstrations is not None:
-            self.training.demonstrations = work.demonstrations  # type: ignore[attr-defined]
+        self.training.command, self.training.shared = work.command, work.shared
         rows: list[Row] = []
         for seed in items:
             trained = train_one(self.training, seed, work.folder / f"seed_{seed}")
@@ -327,7 +324,7 @@ class ScanTrainingSpec(TestedTrainingSpec):
     """Training to search in one scenario, from raw laser scans and poses alone."""
 
     chosen_by: ClassVar[str] = "observation scan"
-    trained_by: ClassVar[str] = "search:SearchTraining"
+    trained_by: ClassVar[str] = "search:ScanTraining"
     # What other trainings to search may choose.
     held_out: ClassVar[None] = None
     evaluate_on: ClassVar[None] = None

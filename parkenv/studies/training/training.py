@@ -16,7 +16,7 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import write_csv
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.show.figures.learning_curves import COLORS
+from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
 from parkenv.studies.fingerprints import fingerprints, flat_tables
 from parkenv.studies.report import Replay
 from parkenv.studies.results import SETTINGS, read_settings
@@ -25,6 +25,7 @@ from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_c
 from parkenv.studies.workers import Workers
 
 if TYPE_CHECKING:
+    from parkenv.studies.agent_spec import AgentSpec
     from parkenv.studies.training.spec import TrainingSpec
 
 EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
@@ -84,6 +85,10 @@ class Training(ABC):
     """Of the table of tests; `{episodes}` is their number."""
     table_by: ClassVar[tuple[str, ...]] = ()
     """Columns of a test beside its name that have a column each in the table of tests."""
+    evaluated_by: ClassVar[tuple[str, ...]]
+    """Settings that evaluations depend on: curves are comparable if these are equal."""
+    shared: Any = None
+    """What the trainings with all seeds share; made by `begin`."""
 
     def __init__(self, spec: TrainingSpec, command: tuple[str, ...] = ()) -> None:
         self.spec, self.command = spec, command
@@ -147,10 +152,6 @@ class Training(ABC):
             "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in given},
             "files": fingerprints([file for s in given for file in s.files()]),
         }
-
-    @abstractmethod
-    def evaluation_settings(self, settings: Row) -> Row:
-        """Return the settings that evaluations depend on: curves are comparable if these are equal."""
 
     def begin(self, progress: Progress) -> None:
         """Make what the trainings with all seeds share."""
@@ -218,17 +219,59 @@ class Training(ABC):
             "beside": {name: self.across_seeds(its) for name, its in trained.beside.items()},
         }  # fmt: skip
 
+    @property
     @abstractmethod
+    def compared(self) -> tuple[AgentSpec, ...]:
+        """Agents to compare with."""
+
+    @property
+    @abstractmethod
+    def tests(self) -> Mapping[str, Any]:
+        """The tests in the end, by name: what is run in each."""
+
     def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
         """Run the agents to compare with; return their scores in the evaluations by name, and their rows of tests."""
+        lines, rows = dict[str, float](), list[Row]()
+        if self.compared:
+            doing, count = "Planners in the same worlds", 1 + len(self.tests)
+            progress(doing, 0, count)
+            lines = self.evaluate_planners(workers)
+            for number, name in enumerate(self.tests, start=1):
+                progress(doing, number, count)
+                rows += self.test_planners(name, workers)
+            progress(doing, count, count)
+        return lines, rows
+
+    @abstractmethod
+    def evaluate_planners(self, workers: Workers) -> dict[str, float]:
+        """Return the scores of the agents to compare with in the worlds of the evaluations, by name."""
+
+    @abstractmethod
+    def test_planners(self, name: str, workers: Workers) -> list[Row]:
+        """Return the rows of a test of the agents to compare with: agent, scenario (the test's name) and results."""
 
     @abstractmethod
     def test(self, model: Path, workers: Workers) -> Tested:
         """Test a model."""
 
+    @property
     @abstractmethod
+    def title(self) -> str:
+        """Title of the figure of learning curves."""
+
+    def drawn(self, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
+        """Return the curves to draw, by name."""
+        return {self.algorithm: curves}
+
     def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
         """Draw the learning curves, and scores of planners as lines."""
+        curves = self.drawn(trained.curves) | trained.beside
+        means = {label: self.across_seeds(its) for label, its in curves.items()}
+        self.save_curves(curves, means, lines, self.title, figure)
+
+    def save_curves(self, *drawn: Any) -> None:
+        """Draw curves, their means and lines, with a title, into a file."""
+        save_learning_curves(*drawn)
 
     def across_seeds(self, curves: list[list[Row]]) -> Any:
         """Return the mean of the curves, for the summary."""
@@ -340,12 +383,12 @@ def curves_beside(folders: Sequence[str], out: Path, training: Training) -> dict
         if settings is None or not curves or "algorithm" not in settings:
             raise InputError(f"--beside: {folder} holds no training")
         label = name_of(settings, str(folder / SETTINGS))
-        theirs = training.evaluation_settings(settings)
-        for name, value in training.evaluation_settings(own).items():
-            if theirs[name] != value:
+        for name in training.evaluated_by:
+            theirs, ours = settings.get(name), own.get(name)
+            if theirs != ours:
                 raise InputError(
-                    f"--beside: {name} is {theirs[name]!r} in {folder} and {value!r} here; their evaluations cannot "
-                    "be compared"
+                    f"--beside: {name} is {theirs!r} in {folder} and {ours!r} here; their evaluations cannot be "
+                    "compared"
                 )
         if label == name_of(own) or label in beside:
             label = f"{label} ({folder})"

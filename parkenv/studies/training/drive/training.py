@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from parkenv.compiled.keyed_random import world_key
 from parkenv.scenarios.build import build
 from parkenv.show.figures.learning_curves import save_success_curves
-from parkenv.studies.study import Progress
+from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.training.configs import DRIVE_CONFIGS, DriveTrainingConfig
 from parkenv.studies.training.curve_file import Row, across_seeds
 from parkenv.studies.training.drive.batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
@@ -30,7 +30,7 @@ from parkenv.studies.training.drive.env import (
 )
 from parkenv.studies.training.learning import RLTraining
 from parkenv.studies.training.spec import DriveTrainingSpec
-from parkenv.studies.training.training import Tested, Trained
+from parkenv.studies.training.training import Tested
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, parking_table
 from parkenv.studies.workers import Workers
 from parkenv.world.lot import ParkingLot
@@ -46,21 +46,13 @@ class DriveTraining(RLTraining):
     spec: DriveTrainingSpec
     heading = "Parkings that succeed, contacts, median s of those, in held-out tasks"
     table_by = ("kind",)
+    evaluated_by = ("env", "lot", "evaluation_episodes")
+    evaluations = 20
 
     @property
     def config(self) -> DriveTrainingConfig:
         """See `RLTraining`."""
         return DRIVE_CONFIGS[self.algorithm]
-
-    @property
-    def steps(self) -> int:
-        """See `Training`."""
-        return self.spec.steps or self.config.steps
-
-    @property
-    def evaluate_every(self) -> int:
-        """See `RLTraining`."""
-        return self.spec.evaluate_every or max(1, self.steps // 20)
 
     @cached_property
     def lots(self) -> tuple[ParkingLot, ...]:
@@ -68,9 +60,15 @@ class DriveTraining(RLTraining):
         return tuple(build(scenario).lot for scenario in self.scenarios)
 
     @cached_property
-    def tested(self) -> list[ParkingLot]:
-        """Lots to test on."""
-        return [build(scenario).lot for scenario in self.spec.test_on or self.scenarios]
+    def tests(self) -> dict[str, ParkingLot]:
+        """See `Training`: one on each lot."""
+        lots = [build(scenario).lot for scenario in self.spec.test_on or self.scenarios]
+        return {lot.name: lot for lot in lots}
+
+    @property
+    def compared(self) -> tuple[AgentSpec, ...]:
+        """See `Training`: the planner, or none."""
+        return self.spec.agents
 
     @property
     def measures(self) -> tuple[str, ...]:
@@ -80,17 +78,13 @@ class DriveTraining(RLTraining):
     def check(self) -> None:
         """See `Training`."""
         super().check()
-        for lots in (self.lots, self.tested):
-            slot_groups(lots)
+        for lots in (self.lots, self.tests.values()):
+            slot_groups(tuple(lots))
 
     def settings(self) -> Row:
         """See `Training`."""
         lots = [lot.name for lot in self.lots]
         return super().settings() | {"lot": lots, "steps": self.steps, "evaluate_every": self.evaluate_every}
-
-    def evaluation_settings(self, settings: Row) -> Row:
-        """See `Training`."""
-        return {name: settings.get(name) for name in ("env", "lot", "evaluation_episodes")}
 
     @cached_property
     def groups(self) -> tuple[SlotGroup, ...]:
@@ -170,31 +164,26 @@ class DriveTraining(RLTraining):
             ]
         return tasks
 
-    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
-        """See `Training`."""
-        if not self.spec.agents:
-            return {}, []
-        rows = list[Row]()
-        doing, count = "The planner parks in the same tasks", 1 + len(self.tested)
-        progress(doing, 0, count)
+    def evaluate_planners(self, workers: Workers) -> dict[str, float]:
+        """See `Training`: the success rate in each kind of slot."""
         parkings = parked_on(self.lots, self.evaluation_seeds, workers, PARKING_PLANNER)
-        for number, lot in enumerate(self.tested, start=1):
-            progress(doing, number, count)
-            table = parking_table(parked_on([lot], self.test_seeds, workers, PARKING_PLANNER))
-            rows += [{"agent": PARKING_PLANNER, "scenario": lot.name, **row} for row in table]
-        progress(doing, count, count)
-        return {row["kind"]: row["success"] for row in parking_table(parkings)}, rows
+        return {row["kind"]: row["success"] for row in parking_table(parkings)}
+
+    def test_planners(self, name: str, workers: Workers) -> list[Row]:
+        """See `Training`."""
+        parkings = parked_on([self.tests[name]], self.test_seeds, workers, PARKING_PLANNER)
+        return [{"agent": PARKING_PLANNER, "scenario": name, **row} for row in parking_table(parkings)]
 
     def test(self, model: Path, workers: Workers) -> Tested:
         """See `Training`."""
         parkings, transfer = list[Row](), list[Row]()
-        for lot in self.tested:
+        for name, lot in self.tests.items():
             some = parked_on([lot], self.test_seeds, workers, f"{self.algorithm}:{model}")
             parkings += some
-            transfer += [{"test_scenario": lot.name, **row} for row in parking_table(some)]
+            transfer += [{"test_scenario": name, **row} for row in parking_table(some)]
         total = parking_table(parkings)[-1]
         own = {c: total[c] for c in ("success", "success_ci95", "contacts", "time_s")}
-        return Tested(",".join(lot.name for lot in self.tested), own, transfer)
+        return Tested(",".join(self.tests), own, transfer)
 
     def test_text(self, row: Row) -> str:
         """See `Training`."""
@@ -205,13 +194,15 @@ class DriveTraining(RLTraining):
         """See `Training`."""
         return {kind: across_seeds(curves, f"{kind}_success") for kind in self.kinds}
 
-    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
+    @property
+    def title(self) -> str:
         """See `Training`."""
         lots = " and ".join(lot.name for lot in self.lots)
-        title = f"{lots}: {self.evaluation_episodes} parkings of each kind in held-out tasks"
-        drawn = {self.algorithm: trained.curves} | trained.beside
-        means = {label: self.across_seeds(its) for label, its in drawn.items()}
-        save_success_curves(drawn, means, lines, title, figure)
+        return f"{lots}: {self.evaluation_episodes} parkings of each kind in held-out tasks"
+
+    def save_curves(self, *drawn: Any) -> None:
+        """See `Training`."""
+        save_success_curves(*drawn)
 
 
 def evaluate_parking(

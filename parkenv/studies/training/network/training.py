@@ -17,19 +17,16 @@ from pathlib import Path
 import numpy as np
 import torch
 from gymnasium.wrappers import TimeLimit
-from numpy.typing import NDArray
 
-from parkenv.envs.search import SearchEnv
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.places import seeds_by_place
 from parkenv.studies.simulate import STEP_LIMIT, simulate
-from parkenv.studies.statistics import mean_interval
 from parkenv.studies.training.curve_file import CURVE, Row, read_curve
 from parkenv.studies.training.network.data import Labelled, Pairs, Place, label_searches, play_pairs
 from parkenv.studies.training.network.fit import Network, fit
-from parkenv.studies.training.search import SearchTraining
+from parkenv.studies.training.search import SearchTraining, Times
 from parkenv.studies.training.spec import NetworkTrainingSpec
 from parkenv.studies.training.training import MODEL, TRAINING_SEEDS
 from parkenv.world.occupancy.real_week import real_week_occupancy
@@ -37,7 +34,6 @@ from parkenv.world.occupancy.real_week_figures import DAY_ERROR
 from parkenv.world.scenario import KMH, Scenario
 from planners.agent import make_agent
 from planners.model_file import algorithm_class
-from planners.network.agent import NetworkAgent
 from planners.network.policy import NetworkCard, NetworkPolicy
 
 STUDENT_DRIVES = (False, True)  # in the rounds with labels
@@ -83,11 +79,10 @@ class NetworkTraining(SearchTraining):
             for agent in self.compared:
                 make_agent(agent.name, places[0], **agent.options)
 
-    def times_of(
-        self, model: Path, places: Sequence[Scenario]
-    ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    def times_of(self, model: Path, places: Sequence[Scenario]) -> Times:
         """See `SearchTraining`."""
-        return Evaluation(places, self.test_seeds).times(NetworkPolicy.load(model))
+        policy = NetworkPolicy.load(model)
+        return student_times([Place.of(place, policy) for place in places], policy, self.test_seeds)
 
     def train(self, seed: int, folder: Path) -> list[Row]:
         """Train with one seed; a training that has ended is not repeated."""
@@ -95,27 +90,21 @@ class NetworkTraining(SearchTraining):
         done = read_curve(folder / CURVE, self.columns)
         if done and (folder / MODEL).exists() and len(done) == 1 + len(STUDENT_DRIVES) + PAIR_ROUNDS:
             return done
-        return self._train(seed, folder)
-
-    def _train(self, seed: int, folder: Path) -> list[Row]:
         torch.manual_seed(seed)
         begin, curve = time.monotonic(), list[Row]()
         network = Network(NetworkCard(seed=seed, without=self.spec.without))
-        order = np.random.default_rng(seed).permutation(len(self.places))
-        places = [Place.of(self.places[i], network.policy()) for i in order]
+        sides = [
+            [Place.of(scenario, network.policy()) for scenario in side]
+            for side in (self.places, self.sides[1])
+            if side
+        ]
+        places = [sides[0][i] for i in np.random.default_rng(seed).permutation(len(self.places))]
         worlds, decisions = TRAINING_SEEDS * (seed + 1), 0
 
-        sides = filter(None, (self.places, self.sides[1]))
-        evaluations = [Evaluation(side, self.evaluation_seeds) for side in sides]
-
         def evaluate() -> None:
-            for place in places:
-                place.student.policy = network.policy()
-            found: list[float] = []
-            for evaluation in evaluations:
-                times, parked = evaluation.times(network.policy())
-                found += [*mean_interval(times), float(parked.mean())]
-            row = {"steps": decisions, **dict(zip(self.metrics, found, strict=True))}
+            policy = network.policy()
+            found = [student_times(side, policy, self.evaluation_seeds) for side in sides]
+            row = {"steps": decisions, **self.metrics_of(found)}
             curve.append({**row, "wall_s": time.monotonic() - begin})
 
         evaluate()
@@ -160,35 +149,18 @@ class NetworkTraining(SearchTraining):
         return curve
 
 
-class Evaluation:
-    """Searches in some places, to run a network in again and again.
+def student_times(places: Sequence[Place], policy: NetworkPolicy, seeds: Sequence[int]) -> Times:
+    """Let the students of some places search with a policy, which they keep; each seed draws the place of an episode.
 
-    Args:
-        places: scenarios, of which each seed draws one.
-        seeds: one episode each.
+    A search that has not ended after `STEP_LIMIT` decisions is charged `give_up_s`, as in `parkenv compare`.
     """
-
-    def __init__(self, places: Sequence[Scenario], seeds: Sequence[int]) -> None:
-        self._seeds = seeds
-        self._places = [
-            (TimeLimit(SearchEnv(place), STEP_LIMIT), NetworkAgent(place), its)
-            for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True)
-            if its
-        ]
-
-    def times(self, policy: NetworkPolicy) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-        """Run the episodes; return their total times, (n,) s, and whether the car parked, (n,) bool.
-
-        A search that has not ended after `STEP_LIMIT` decisions is charged `give_up_s`, as in `parkenv compare`.
-        """
-        times, parked = dict[int, float](), dict[int, bool]()
-        for env, agent, seeds in self._places:
-            agent.policy = policy
-            for seed in seeds:
-                info = simulate(env, agent, seed).info
-                times[seed], parked[seed] = float(info["total_s"]), bool(info["parked"])
-        found = [times[seed] for seed in self._seeds], [parked[seed] for seed in self._seeds]
-        return np.array(found[0]), np.array(found[1])
+    infos = dict[int, Row]()
+    for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
+        place.student.policy = policy
+        env = TimeLimit(place.env, STEP_LIMIT)
+        infos |= {seed: simulate(env, place.student, seed).info for seed in its}
+    times = np.array([infos[seed]["total_s"] for seed in seeds], np.float64)
+    return times, np.array([infos[seed]["parked"] for seed in seeds], np.bool_)
 
 
 def made_places() -> list[Scenario]:
