@@ -17,7 +17,8 @@ from parkenv.files.onnx_file import read_onnx
 from parkenv.perception.detector import Detections
 from parkenv.perception.detector_registry import MODELS, detector_version, make_detector
 from parkenv.perception.lab.car_datasets import Crops, LabelledImage
-from parkenv.perception.lab.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
+from parkenv.perception.lab.simulated_scenes import SimulatedScene, simulated_scenes
+from parkenv.perception.lab.simulated_streets import FRAMES
 from parkenv.perception.lab.training_crops import SIZES, ExampleMaker
 from parkenv.perception.onnx_detector import OnnxDetector, OnnxSettings
 from parkenv.perception.onnx_outputs import class_columns, decode_centers, guess_layout

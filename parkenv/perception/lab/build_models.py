@@ -14,7 +14,8 @@ from rich.progress import track
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.lab.simulated_photos import FRAMES, SimulatedPhoto, simulated_photos
+from parkenv.perception.lab.simulated_photos import SimulatedPhoto, simulated_photos
+from parkenv.perception.lab.simulated_streets import FRAMES
 from parkenv.perception.lab.training import TrainingSettings, train
 
 FOLDER = Path(__file__).parents[1] / "models"

@@ -18,7 +18,8 @@ from torch import Tensor, nn
 from parkenv.errors import InputError, require_whole
 from parkenv.perception.detector import overlaps
 from parkenv.perception.lab.center_network import GREY_MEAN, GREY_STD, STRIDE, CenterNetwork, sides, to_onnx
-from parkenv.perception.lab.simulated_scenes import FRAMES, SimulatedScene, simulated_scenes
+from parkenv.perception.lab.simulated_scenes import SimulatedScene, simulated_scenes
+from parkenv.perception.lab.simulated_streets import FRAMES
 from parkenv.perception.lab.training_crops import Example, ExampleMaker, draw_size
 
 Float32Array = NDArray[np.float32]

@@ -15,21 +15,15 @@ from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SID
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.lab.backdrops import with_backdrop
 from parkenv.perception.lab.car_datasets import LabelledImage
-from parkenv.perception.lab.simulated_streets import LongLens, Street
-from sim_sensors.camera.models import PinholeCamera, camera_pose
-from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.ground_truth import VehicleBoxes, View, vehicle_boxes
+from parkenv.perception.lab.simulated_streets import LongLens, Street, StreetPictures
+from sim_sensors.camera.models import Frame, PinholeCamera, camera_pose
+from sim_sensors.ground_truth import VehicleBoxes, View
 
 _CLEAR = 0.8  # visible fraction from which a car is a positive
 _NEGLIGIBLE = 0.25  # visible fraction below which a car may be missed
 _LEAST_WIDTH = 36  # px
-_WEATHERS = 4
-_FROM_AFAR = 0.6  # fraction of images with a long focal length
 _TEXTURED = 0.9  # fraction of images with a backdrop
 _ACROSS = LongLens((400, 300), (7.0, 32.0), (0.9, 2.4), (90.0, 230.0), (56.0, 170.0), aside=0.17, roll=0.015)
-_SEEDS = 1 << 20
-
-FRAMES = 20  # number of images per street
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,13 +46,10 @@ def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
         n_scenes: number of streets.
         seed: 0 or more.
     """
+    pictures = StreetPictures(_ACROSS, 0.6, _as_rigs_see, 0.4, 5)
     for number in range(n_scenes):
-        rng = np.random.default_rng([seed, number])
-        street = Street.draw(rng)
-        weathers = [_weather(rng) for _ in range(_WEATHERS)]
-        for frame in range(FRAMES):
-            name = f"street {number}, frame {frame}"
-            yield _photo(street, weathers[frame % _WEATHERS], rng, name, empty=frame % 5 == 4)
+        for i, (frame, boxes, rng) in enumerate(pictures.of_street(number, seed)):
+            yield _photo(frame, boxes, rng, f"street {number}, frame {i}")
 
 
 def roughened(image: Image, rng: np.random.Generator) -> Image:
@@ -81,20 +72,7 @@ def roughened(image: Image, rng: np.random.Generator) -> Image:
     return np.asarray(np.clip(255.0 * values, 0, 255), dtype=np.uint8)
 
 
-def _weather(rng: np.random.Generator) -> Weather:
-    return Weather.draw(str(rng.choice(PRESETS)), int(rng.integers(_SEEDS)))
-
-
-def _photo(
-    street: Street, weather: Weather, rng: np.random.Generator, name: str, *, empty: bool
-) -> SimulatedPhoto:
-    scene, aimed_at = street.draw_scene(rng, 0.4, empty=empty)
-    if rng.random() < _FROM_AFAR:
-        camera, pose = _ACROSS.aim(street, aimed_at, rng)
-    else:
-        camera, pose = _as_rigs_see(street, rng)
-    frame = camera.render(scene, pose, weather, int(rng.integers(_SEEDS)))
-    boxes = vehicle_boxes(camera, scene, pose, frame)
+def _photo(frame: Frame, boxes: VehicleBoxes, rng: np.random.Generator, name: str) -> SimulatedPhoto:
     there_at_all = boxes.visible_fraction > _NEGLIGIBLE
     grey, clear = as_grey(frame.image), boxes.visible_fraction > _CLEAR
     if rng.random() < _TEXTURED:

@@ -19,25 +19,18 @@ from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError
 from parkenv.files.archives import read_arrays
 from parkenv.perception.hog_detector import as_grey
-from parkenv.perception.lab.simulated_streets import LongLens, Street
-from sim_sensors.camera.models import PinholeCamera, camera_pose
-from sim_sensors.camera.weather import PRESETS, Weather
-from sim_sensors.ground_truth import vehicle_boxes
+from parkenv.perception.lab.simulated_streets import FRAMES, LongLens, Street, StreetPictures
+from sim_sensors.camera.models import Frame, PinholeCamera, camera_pose
+from sim_sensors.ground_truth import VehicleBoxes
 
 Float32Array = NDArray[np.float32]
 
-FRAMES = 20
-"""Pictures of a street; each street has four weathers, and every tenth picture has no cars."""
 DEPTH_STEPS = 32.0
 """Steps of the stored depth for a factor of e: they are 3 % apart."""
 
-_WEATHERS = 4
-_EMPTY_EVERY = 10
 _NEAR_SIZE = (512, 384)  # px
-_LONG_LENS = 0.55  # fraction of pictures taken from across the street with a long focal length
 _LEAST_PIXELS = 12  # of a car that is seen at all
 _ACROSS = LongLens((400, 300), (6.0, 32.0), (0.7, 2.8), (90.0, 300.0), (56.0, 200.0), aside=0.22, roll=0.02)
-_SEEDS = 1 << 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,34 +75,19 @@ def simulated_scenes(n_streets: int, seed: int = 0, cache: Path | None = None) -
     Raises:
         InputError: a file of the folder cannot be read.
     """
+    pictures = StreetPictures(_ACROSS, 0.55, _in_passing, 0.3, 10)
     for number in range(n_streets):
         file = None if cache is None else cache / f"street_{seed}_{number}.npz"
         if file is not None and file.is_file():
             yield from _read(file)
             continue
-        scenes = list(_street(number, seed))
+        scenes = [_scene(frame, boxes) for frame, boxes, _ in pictures.of_street(number, seed)]
         if file is not None:
             _write(file, scenes)
         yield from scenes
 
 
-def _street(number: int, seed: int) -> Iterator[SimulatedScene]:
-    rng = np.random.default_rng([seed, number])
-    street = Street.draw(rng)
-    weathers = [Weather.draw(str(rng.choice(PRESETS)), int(rng.integers(_SEEDS))) for _ in range(_WEATHERS)]
-    for frame in range(FRAMES):
-        empty = frame % _EMPTY_EVERY == _EMPTY_EVERY - 1
-        yield _picture(street, weathers[frame % _WEATHERS], rng, empty=empty)
-
-
-def _picture(street: Street, weather: Weather, rng: np.random.Generator, *, empty: bool) -> SimulatedScene:
-    scene, aimed_at = street.draw_scene(rng, 0.3, empty=empty)
-    if rng.random() < _LONG_LENS:
-        camera, pose = _ACROSS.aim(street, aimed_at, rng)
-    else:
-        camera, pose = _in_passing(street, rng)
-    frame = camera.render(scene, pose, weather, int(rng.integers(_SEEDS)))
-    boxes = vehicle_boxes(camera, scene, pose, frame)
+def _scene(frame: Frame, boxes: VehicleBoxes) -> SimulatedScene:
     row = np.zeros(max(int(frame.ids.max(initial=0)), int(boxes.ids.max(initial=0))) + 1, dtype=np.uint8)
     pixels = np.bincount(frame.ids.ravel(), minlength=len(row))
     shown = np.flatnonzero(pixels[boxes.ids] >= _LEAST_PIXELS)[:255]

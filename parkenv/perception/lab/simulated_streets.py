@@ -1,8 +1,9 @@
-"""Random streets and car parks for training images: rows of cars with foreground and background objects."""
+"""Pictures of random streets and car parks: rows of cars with foreground and background objects, in random light."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -10,7 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from sim_sensors.camera.models import PinholeCamera, camera_pose
+from sim_sensors.camera.models import Frame, PinholeCamera, camera_pose
+from sim_sensors.camera.weather import PRESETS, Weather
+from sim_sensors.ground_truth import VehicleBoxes, vehicle_boxes
 from sim_sensors.scene import Fleet, Scene
 from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
@@ -18,6 +21,10 @@ from sim_sensors.vehicles.vehicle import VehicleModel
 BODY_SHARE = {"hatchback": 0.26, "sedan": 0.34, "estate": 0.14, "suv": 0.14, "van": 0.09, "pickup": 0.03}
 """Frequency of each body type; flatter than in a European lot, as photographs come from all regions and decades."""
 
+FRAMES = 20
+"""Number of pictures of a street."""
+
+_WEATHERS = 4  # of a street
 _KINDS = ("along", "across", "aslant")
 _REACH = 24.0  # m, half the length of a row
 _DEPTH = {"along": 2.3, "across": 5.4, "aslant": 5.4}  # m, of a row
@@ -49,18 +56,6 @@ class Street:
         around = _surroundings(rng, front, back, _DEPTH[kind])
         return cls(kind, np.array(poses), first, front, Fleet(tuple(models), around))
 
-    def scene(self, there: NDArray[np.bool_], turned: NDArray[np.bool_]) -> Scene:
-        """Return the street with some of its cars.
-
-        Args:
-            there: (n,) bool, cars that are present.
-            turned: (n,) bool, cars that head the other way.
-        """
-        chosen = np.flatnonzero(there)
-        pose = self.pose[chosen].copy()
-        pose[:, 2] += math.pi * turned[chosen]
-        return Scene(pose, chosen, self.fleet)
-
     def draw_scene(self, rng: np.random.Generator, least: float, *, empty: bool) -> tuple[Scene, int]:
         """Return the street with a random part of its cars, and a car of the first row that is there unless `empty`.
 
@@ -74,7 +69,10 @@ class Street:
         car = int(rng.integers(self.first))
         if not empty:
             there[car] = True
-        return self.scene(there, rng.random(n) < 0.5), car
+        chosen, turned = np.flatnonzero(there), rng.random(n) < 0.5
+        pose = self.pose[chosen].copy()
+        pose[:, 2] += math.pi * turned[chosen]
+        return Scene(pose, chosen, self.fleet), car
 
 
 class LongLens(NamedTuple):
@@ -105,6 +103,31 @@ class LongLens(NamedTuple):
             rng.normal(0.0, self.roll),
         )  # fmt: skip
         return camera, pose
+
+
+class StreetPictures(NamedTuple):
+    """How streets are photographed: `FRAMES` pictures of each in four weathers."""
+
+    from_afar: LongLens
+    share: float  # fraction of pictures from across the street; the others are taken in passing
+    in_passing: Callable[[Street, np.random.Generator], tuple[PinholeCamera, FloatArray]]
+    least: float  # least probability of a car to be there
+    empty_every: int  # every how many-th picture has no cars
+
+    def of_street(self, number: int, seed: int) -> Iterator[tuple[Frame, VehicleBoxes, np.random.Generator]]:
+        """Draw a street; yield its pictures, their cars, and the random numbers, which may be used in between."""
+        rng = np.random.default_rng([seed, number])
+        street = Street.draw(rng)
+        weathers = [
+            Weather.draw(str(rng.choice(PRESETS)), int(rng.integers(_SEEDS))) for _ in range(_WEATHERS)
+        ]
+        for i in range(FRAMES):
+            empty = i % self.empty_every == self.empty_every - 1
+            scene, car = street.draw_scene(rng, self.least, empty=empty)
+            far = rng.random() < self.share
+            camera, pose = self.from_afar.aim(street, car, rng) if far else self.in_passing(street, rng)
+            frame = camera.render(scene, pose, weathers[i % _WEATHERS], int(rng.integers(_SEEDS)))
+            yield frame, vehicle_boxes(camera, scene, pose, frame), rng
 
 
 def _row(
