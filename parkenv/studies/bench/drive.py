@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -16,7 +16,7 @@ from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import advance
 from parkenv.envs.drive import SUBSTEPS
 from parkenv.lots import packaged_lot
-from parkenv.studies.bench.rows import BenchRow, absent, duration, rate, seconds_each
+from parkenv.studies.bench.rows import BenchRow, absent, duration, median_of, rate, seconds_each
 from planners.driving.parking import ParkingAgent
 
 STEPS = 100  # steps of an environment between two resets
@@ -92,29 +92,24 @@ def reset_and_plan(lot: str, seed: int, seconds: float) -> tuple[float, float]:
     return reset, seconds_each(lambda i: agent.plan(seen[i % len(seen)]), seconds, least=20)
 
 
-def _pedalling(seed: int) -> Callable[[int], Any]:
-    rng = np.random.default_rng(seed)
-    steering = rng.uniform(-0.3, 0.3, STEPS).astype(np.float32)
-
-    def action(i: int) -> Any:
-        return np.array([0.3 if i % 20 < 10 else -0.3, steering[i]], dtype=np.float32)
-
-    return action
+def _pedalling(seed: int) -> list[Any]:
+    steering = np.random.default_rng(seed).uniform(-0.3, 0.3, STEPS)
+    pedal = np.where(np.arange(STEPS) % 20 < 10, 0.3, -0.3)
+    return list(np.column_stack([pedal, steering]).astype(np.float32))
 
 
-def _steps(env: gym.Env[Any, Any], action: Callable[[int], Any], seconds: float) -> float:
-    """Return steps per second, the median over runs of up to `STEPS` steps."""
-    rates: list[float] = []
-    actions = [action(i) for i in range(STEPS)]
-    end = time.perf_counter() + seconds
-    while len(rates) < 4 or time.perf_counter() < end:
+def _steps(env: gym.Env[Any, Any], actions: Sequence[Any], seconds: float) -> float:
+    """Return steps per second, the median over runs until an episode ends."""
+
+    def run(number: int) -> float:
+        del number
         env.reset()
-        done = 0
-        began = time.perf_counter()
-        for chosen in actions:
-            _, _, terminated, truncated, _ = env.step(chosen)
+        done, began = 0, time.perf_counter()
+        for action in actions:
+            _, _, terminated, truncated, _ = env.step(action)
             done += 1
             if terminated or truncated:
                 break
-        rates.append(done / (time.perf_counter() - began))
-    return float(np.median(rates[1:]))
+        return done / (time.perf_counter() - began)
+
+    return median_of(run, seconds)

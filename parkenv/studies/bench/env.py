@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
@@ -14,7 +15,7 @@ import numpy as np
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import ScenarioSources, make_scenario
-from parkenv.studies.bench.rows import BenchRow, absent, rate
+from parkenv.studies.bench.rows import BenchRow, absent, medians, rate
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.typical_week import typical_occupancy
@@ -63,23 +64,18 @@ def env_rows(
     scenario = make_scenario(grid_lot(*SLOTS))
     days = scenario.replace(occupancy=typical_occupancy(scenario.lot).with_day_error(DayError(0.8)))
     city = make_scenario(city_lot(large, seed))
+    slots = f"batch of {batch}, {scenario.lot.n_slots} slots"
     batches = {
-        f"batch of {batch}, {scenario.lot.n_slots} slots, full belief, copy=False": _ours(
-            scenario, batch, "full", False
-        ),
-        f"batch of {batch}, {scenario.lot.n_slots} slots, full belief": _ours(scenario, batch, "full", True),
-        f"batch of {batch}, {scenario.lot.n_slots} slots, p_occupied alone": _ours(
-            scenario, batch, "occupancy", True
-        ),
-        f"batch of {batch}, {scenario.lot.n_slots} slots, local k={NEAREST}": _ours(
-            scenario, batch, "local", True
-        ),
-        f"batch of {batch}, {city.lot.n_slots:,} slots, local k={NEAREST}": _ours(city, batch, "local", True),
+        f"{slots}, full belief, copy=False": _ours(scenario, batch, "full", False),
+        f"{slots}, full belief": _ours(scenario, batch, "full"),
+        f"{slots}, p_occupied alone": _ours(scenario, batch, "occupancy"),
+        f"{slots}, local k={NEAREST}": _ours(scenario, batch, "local"),
+        f"batch of {batch}, {city.lot.n_slots:,} slots, local k={NEAREST}": _ours(city, batch, "local"),
     }
     lots = grids(places, seed)
     mean = round(float(np.mean([lot.n_slots for lot in lots])))
-    changing = _ours([make_scenario(lot, day_error=0.8) for lot in lots], batch, "local", True)
-    staying = _ours(make_scenario(grid_lot(8, mean // 8), day_error=0.8), batch, "local", True)
+    changing = _ours([make_scenario(lot, day_error=0.8) for lot in lots], batch, "local")
+    staying = _ours(make_scenario(grid_lot(8, mean // 8), day_error=0.8), batch, "local")
     cart_pole = gym.make_vec("CartPole-v1", batch, vectorization_mode="vector_entry_point")
     steppers = {case: batch_stepper(envs, len(ACTIONS), seed) for case, envs in batches.items()}
     steppers |= {"CartPole batch": batch_stepper(cart_pole, 2, seed)}
@@ -90,8 +86,8 @@ def env_rows(
         "batch without days": batch_stepper(_driving(scenario, batch), PARK, seed),
         "Search-v2": single_stepper(gym.make("parkenv/Search-v2", scenario=scenario), seed),
         "Search-v2 with days": single_stepper(gym.make("parkenv/Search-v2", scenario=days), seed),
+        "CartPole": single_stepper(gym.make("CartPole-v1"), seed),
     }
-    steppers |= {"CartPole": single_stepper(gym.make("CartPole-v1"), seed)}
     others, missing = installed_peers(batch, seed)
     rates = measured(steppers | others, seconds)
     peers = {"gymnasium CartPole-v1 batch": rates["CartPole batch"]}
@@ -129,7 +125,7 @@ def grids(n: int, seed: int) -> list[ParkingLot]:
     return [grid_lot(int(r), int(c)) for r, c in zip(rows, columns, strict=True)]
 
 
-def _ours(scenario: ScenarioSources, batch: int, observation: str, copy: bool) -> ParkSearchVectorEnv:
+def _ours(scenario: ScenarioSources, batch: int, observation: str, copy: bool = True) -> ParkSearchVectorEnv:
     return ParkSearchVectorEnv(batch, scenario, observation=observation, k=NEAREST, copy=copy)
 
 
@@ -195,18 +191,10 @@ def installed_peers(batch: int, seed: int) -> tuple[dict[str, Stepper], list[str
 
 
 def measured(steppers: dict[str, Stepper], seconds: float) -> dict[str, float]:
-    """Return the steps per second of each stepper."""
-    rates: dict[str, list[float]] = {name: [] for name in steppers}
-    spent = dict.fromkeys(steppers, 0.0)
-    for step in steppers.values():
-        step()  # compiles, and ends the initial phase in which all searches have the same age
-    while not all(rates.values()) or min(spent.values()) < seconds:
-        for name, step in steppers.items():
-            if rates[name] and spent[name] >= seconds:
-                continue
-            start = time.process_time()
-            steps = step()
-            took = time.process_time() - start
-            spent[name] += took
-            rates[name].append(steps / took)
-    return {name: float(np.median(values)) for name, values in rates.items()}
+    """Return the steps per second of each stepper, in CPU time."""
+
+    def rate_of(step: Stepper, _: int) -> float:
+        start = time.process_time()
+        return step() / (time.process_time() - start)
+
+    return medians({name: partial(rate_of, step) for name, step in steppers.items()}, seconds, least=1)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, duration, rate
+from parkenv.studies.bench.rows import BenchRow, duration, median_of, rate
 from parkenv.studies.bench.sumo import sumo_rows
 from parkenv.world.demand import Demand, ExponentialTime, Headways, PoissonArrivals
 from parkenv.world.scenario import Scenario
@@ -105,7 +105,7 @@ def _decisions_per_second(fleets: Sequence[Fleet], seed: int, seconds: float) ->
         took = time.process_time() - start
         return sum(fleet.totals["decisions"] for fleet in fleets) / took
 
-    return _median(run, seconds)
+    return median_of(run, seconds)
 
 
 def _seconds_a_day(fleet: Fleet, seed: int, seconds: float) -> float:
@@ -117,7 +117,7 @@ def _seconds_a_day(fleet: Fleet, seed: int, seconds: float) -> float:
         fleet.run()
         return time.process_time() - start
 
-    return _median(run, seconds)
+    return median_of(run, seconds)
 
 
 def _seconds_a_decision(fleet: Fleet, seed: int, seconds: float) -> float:
@@ -133,14 +133,4 @@ def _seconds_a_decision(fleet: Fleet, seed: int, seconds: float) -> float:
             n += 1
         return (time.process_time() - start) / n
 
-    return _median(run, seconds)
-
-
-def _median(measure: Callable[[int], float], seconds: float, least: int = 3) -> float:
-    """Return the median of `measure(episode)`, after a warm-up."""
-    measure(0)
-    found: list[float] = []
-    end = time.perf_counter() + seconds
-    while len(found) < least or time.perf_counter() < end:
-        found.append(measure(1 + len(found)))
-    return float(np.median(found))
+    return median_of(run, seconds)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import TypedDict
 
 import numpy as np
@@ -38,50 +38,64 @@ def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[
         unit: unit, such as `scans/s`.
         peers: values of the peers.
     """
-    if not peers:
-        return [_row(part, case, value, unit, None, None, None)]
-    return [_row(part, case, value, unit, name, other, value / other) for name, other in peers.items()]
+    return _rows(part, case, value, unit, {name: (other, value / other) for name, other in peers.items()})
 
 
 def duration(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
     """Return rows like `rate` for a value where lower is better."""
-    if not peers:
-        return [_row(part, case, value, unit, None, None, None)]
-    return [_row(part, case, value, unit, name, other, other / value) for name, other in peers.items()]
+    return _rows(part, case, value, unit, {name: (other, other / value) for name, other in peers.items()})
 
 
 def absent(part: str, case: str, unit: str) -> list[BenchRow]:
     """Return the row of a value that could not be measured."""
-    return [_row(part, case, None, unit, None, None, None)]
+    return _rows(part, case, None, unit, {})
 
 
-def _row(
-    part: str,
-    case: str,
-    value: float | None,
-    unit: str,
-    peer: str | None,
-    peer_value: float | None,
-    ratio: float | None,
-) -> BenchRow:
-    return BenchRow(
-        part=part, case=case, value=value, unit=unit, peer=peer, peer_value=peer_value, ratio=ratio
-    )
+def _rows(
+    part: str, case: str, value: float | None, unit: str, peers: Mapping[str, tuple[float, float]]
+) -> list[BenchRow]:
+    alone: dict[str | None, tuple[float | None, float | None]] = {None: (None, None)}
+    return [
+        BenchRow(part=part, case=case, value=value, unit=unit, peer=peer, peer_value=other, ratio=ratio)
+        for peer, (other, ratio) in (peers or alone).items()
+    ]
+
+
+Measure = Callable[[int], float]
+"""Measures something once; called with 0, 1, ..."""
+
+
+def medians(measures: Mapping[str, Measure], seconds: float = 0.6, least: int = 3) -> dict[str, float]:
+    """Return the median of what each function measures; they take turns, so that other load affects all equally.
+
+    Args:
+        measures: the functions; the first call of each is a warm-up, which may compile.
+        seconds: minimum time of all calls of each.
+        least: minimum number of calls of each.
+    """
+    found: dict[str, list[float]] = {name: [] for name in measures}
+    spent = dict.fromkeys(measures, 0.0)
+    for measure in measures.values():
+        measure(0)
+    while waiting := [name for name in measures if len(found[name]) < least or spent[name] < seconds]:
+        for name in waiting:
+            start = time.perf_counter()
+            found[name].append(measures[name](1 + len(found[name])))
+            spent[name] += time.perf_counter() - start
+    return {name: float(np.median(values)) for name, values in found.items()}
+
+
+def median_of(measure: Measure, seconds: float = 0.6, least: int = 3) -> float:
+    """Return the median of what a function measures; see `medians`."""
+    return medians({"": measure}, seconds, least)[""]
 
 
 def seconds_each(work: Callable[[int], object], seconds: float = 0.6, least: int = 3) -> float:
-    """Return the median time, s, of `work(i)` for i = 0, 1, ...; the first call is a warm-up.
+    """Return the median time, s, of `work(i)`; see `medians`."""
 
-    Args:
-        work: the timed function.
-        seconds: minimum total duration.
-        least: minimum number of timed calls.
-    """
-    work(0)
-    times: list[float] = []
-    end = time.perf_counter() + seconds
-    while len(times) < least or time.perf_counter() < end:
+    def timed(i: int) -> float:
         start = time.perf_counter()
-        work(len(times))
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+        work(i)
+        return time.perf_counter() - start
+
+    return median_of(timed, seconds, least)
