@@ -6,8 +6,10 @@ parallel form, which advances by ticks. Both need the extra `multi`: `pip instal
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
 
+import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
@@ -21,21 +23,138 @@ except ImportError as error:
         'parkenv.lot_v0 needs pettingzoo, which is not installed: pip install "parkenv[multi]"'
     ) from error
 
-from parkenv.engine.fleet import Fleet
+from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
-from parkenv.envs.fleet_agents import MAX_CYCLES, METADATA, FleetAgents, Observation, car_of
 from parkenv.errors import InputError
-from parkenv.scenarios.build import ScenarioSource
-from parkenv.world.demand import Demand
+from parkenv.scenarios.build import ScenarioSource, make_scenario
+from parkenv.world.demand import MAX_CARS, Demand, Headways
+from parkenv.world.lot import ACTIONS
+
+if TYPE_CHECKING:
+    from parkenv.show.frames.fleet import FleetRenderer
 
 __all__ = ["LotEnv", "LotParallelEnv", "env", "parallel_env", "raw_env"]
 
-
+Observation = Mapping[str, Any]
 _MARGIN = 1e-6  # of a tick
 
 
-class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo has no types
+class _CarsAsAgents:
+    """What both forms have in common: a fleet whose cars are all decided from outside."""
+
+    metadata: dict[str, Any] = {  # noqa: RUF012 - PettingZoo's
+        "name": "lot_v0",
+        "render_modes": ["human", "rgb_array"],
+        "render_fps": 8,
+        "is_parallelizable": False,
+    }
+    _fleet_options: tuple[str, ...] = (
+        "delay_s", "leave_full_lot", "manoeuvre_s", "leaving_soon_s", "sees_cars",
+    )  # fmt: skip
+
+    def __init__(
+        self,
+        scenario: ScenarioSource = "mini",
+        cars: int = 5,
+        demand: Demand | None = None,
+        background: str = "residents",
+        max_cycles: int = MAX_STEPS,
+        render_mode: str | None = None,
+        knows: str = "own",
+        **changes: Any,
+    ) -> None:
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
+        if demand is None:
+            if isinstance(cars, bool) or not isinstance(cars, (int, np.integer)) or not 1 <= cars <= MAX_CARS:
+                raise InputError(f"cars is {cars!r}, want a whole number from 1 to {MAX_CARS:,}")
+            demand = Demand(Headways(int(cars)))
+        if isinstance(max_cycles, bool) or not isinstance(max_cycles, (int, np.integer)) or max_cycles < 1:
+            raise InputError(f"max_cycles is {max_cycles!r}, want a whole number of at least 1")
+        options = {name: value for name, value in changes.items() if name in self._fleet_options}
+        fields = {name: value for name, value in changes.items() if name not in options}
+        # With the hidden occupancy: not for agents.
+        self.fleet = Fleet(
+            make_scenario(scenario, **fields),
+            demand,
+            background=background,
+            drivers=[DriverKind(knows=knows, shares=knows == "shared")],
+            max_steps=max_cycles,
+            **options,
+        )
+        self.scenario = self.fleet.scenario
+        self.render_mode, self.max_cycles = render_mode, max_cycles
+        self.possible_agents = [f"car_{i}" for i in range(demand.arrivals.most)]
+        self.agents: list[str] = []
+        self._observation_space = self.fleet.observation_space
+        self._observation_spaces: dict[str, spaces.Dict] = {}
+        self._action_spaces: dict[str, spaces.Discrete] = {}
+        self._seed: int | None = None
+        self._episode = 0
+        self._renderer: FleetRenderer | None = None
+
+    def observation_space(self, agent: str) -> spaces.Dict:
+        """Return the space of an agent's observations, always the same object; that of `parkenv/Search-v2`."""
+        if agent not in self._observation_spaces:
+            self._observation_spaces[agent] = spaces.Dict(dict(self._observation_space.items()))
+        return self._observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Discrete:
+        """Return the space of an agent's actions, always the same object."""
+        if agent not in self._action_spaces:
+            self._action_spaces[agent] = spaces.Discrete(len(ACTIONS))
+        return self._action_spaces[agent]
+
+    def _begin(self, seed: int | None) -> list[str]:
+        """Begin the next world, and return its agents: the first of a seed, or the next one of the last seed."""
+        if seed is not None:
+            self._seed, self._episode = int(seed), 0
+        elif self._seed is None:
+            self._seed = int(np.random.SeedSequence().generate_state(1)[0])
+        else:
+            self._episode += 1
+        self.fleet.reset(self._seed, self._episode)
+        return self.possible_agents[: len(self.fleet.cars)]
+
+    def _blank_observation(self, car: int) -> dict[str, Any]:
+        """Return the observation of a car that has not arrived: at its entry, nothing known, no action possible."""
+        boxes = {name: one for name, one in self._observation_space.items() if isinstance(one, spaces.Box)}
+        blank: dict[str, Any] = {name: np.zeros(box.shape, box.dtype) for name, box in boxes.items()}
+        blank["vertex"] = np.int64(self.fleet.cars["entry"][car])
+        blank["p_occupied"][:] = 1.0
+        parts = blank["belief"].reshape(4, -1)
+        parts[0], parts[2], parts[3] = 1.0, 1.0, -1.0
+        return blank
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Return a frame from above, (480, 640, 3) uint8 RGB, or show it in a window, depending on `render_mode`."""
+        if self.render_mode is None:
+            gym.logger.warn('render() does nothing without a render_mode, e.g. env(render_mode="rgb_array")')
+            return None
+        if self._renderer is None:
+            from parkenv.show.frames.fleet import FleetRenderer
+
+            self._renderer = FleetRenderer(self.fleet)
+        frame = self._renderer.frame()
+        if self.render_mode == "rgb_array":
+            return frame
+        self._renderer.window.show(frame, self.metadata["render_fps"])
+        return None
+
+    def close(self) -> None:
+        """Close the window, if open."""
+        if self._renderer is not None:
+            self._renderer.window.close()
+            self._renderer = None
+
+
+def _car_of(agent: str) -> int:
+    """Return the index of an agent's car."""
+    return int(agent.rpartition("_")[2])
+
+
+class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo has no types
     """Many cars search one lot for free slots; the car whose decision is next decides (AEC).
 
     ## Description
@@ -126,49 +245,10 @@ class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo 
     - v0: first version.
     """
 
-    metadata = METADATA
-
-    def __init__(
-        self,
-        scenario: ScenarioSource = "mini",
-        cars: int = 5,
-        demand: Demand | None = None,
-        background: str = "residents",
-        max_cycles: int = MAX_CYCLES,
-        render_mode: str | None = None,
-        knows: str = "own",
-        **changes: Any,
-    ) -> None:
-        super().__init__()
-        self._cars = FleetAgents(
-            scenario, cars, demand, background, max_cycles, 0.0, render_mode, knows, changes
-        )
-        self.render_mode = render_mode
-        self.possible_agents = self._cars.possible_agents
-        self.agents: list[str] = []
-
-    @property
-    def fleet(self) -> Fleet:
-        """The fleet, with the hidden occupancy; not for agents."""
-        return self._cars.fleet
-
-    @property
-    def scenario(self) -> Any:
-        """The scenario."""
-        return self.fleet.scenario
-
-    def observation_space(self, agent: str) -> spaces.Dict:
-        """Return the space of an agent's observations."""
-        return self._cars.observation_space(agent)
-
-    def action_space(self, agent: str) -> spaces.Discrete:
-        """Return the space of an agent's actions."""
-        return self._cars.action_space(agent)
-
     def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> None:
         """Begin a world; see the class for seeds."""
         del options
-        self.agents = list(self._cars.begin(seed))
+        self.agents = list(self._begin(seed))
         self.rewards = dict.fromkeys(self.agents, 0.0)
         self._cumulative_rewards = dict.fromkeys(self.agents, 0.0)
         self.terminations = dict.fromkeys(self.agents, False)
@@ -213,21 +293,13 @@ class LotEnv(AECEnv[str, Observation, Any]):  # type: ignore[misc] # PettingZoo 
 
     def observe(self, agent: str) -> Observation | None:
         """Return what an agent's car observed last; nothing is known before it arrives."""
-        car = car_of(agent)
+        car = _car_of(agent)
         if self.fleet.cars["search"][car] == 0:
-            return self._cars.blank_observation(car)
+            return self._blank_observation(car)
         return self.fleet.observation(car)
 
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return a frame, or show it, depending on `render_mode`."""
-        return self._cars.render()
 
-    def close(self) -> None:
-        """Close the window, if open."""
-        self._cars.close()
-
-
-class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
+class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
     """Many cars search one lot for free slots; all cars that have to decide at a tick do so at once (parallel).
 
     World, actions, observations and rewards are those of `LotEnv`, but every duration and every arrival is rounded up
@@ -242,15 +314,10 @@ class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
     (terminated), and all leave them after `max_cycles` ticks (truncated).
 
     Args:
-        scenario: as of `LotEnv`, as are `cars`, `demand`, `background`, `render_mode`, `knows` and further keywords.
+        scenario: as of `LotEnv`.
         cars: number of cars.
         tick_s: length of a tick, s.
-        demand: demand instead of `cars`.
-        background: who else takes slots.
-        max_cycles: number of ticks after which all cars are truncated.
-        render_mode: `rgb_array`, `human` or None.
-        knows: what cars know.
-        changes: further options, and fields of the scenario to replace.
+        options: further options of `LotEnv`; `max_cycles` is the number of ticks after which all cars are truncated.
 
     Examples:
         >>> from parkenv import lot_v0
@@ -260,59 +327,28 @@ class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
         [1, 0, 0, 0, 0]
     """
 
-    metadata = METADATA | {"is_parallelizable": True}
+    metadata = _CarsAsAgents.metadata | {"is_parallelizable": True}
+    _fleet_options = (*_CarsAsAgents._fleet_options, "tick_s")
 
     def __init__(
-        self,
-        scenario: ScenarioSource = "mini",
-        cars: int = 5,
-        tick_s: float = 1.0,
-        demand: Demand | None = None,
-        background: str = "residents",
-        max_cycles: int = MAX_CYCLES,
-        render_mode: str | None = None,
-        knows: str = "own",
-        **changes: Any,
+        self, scenario: ScenarioSource = "mini", cars: int = 5, tick_s: float = 1.0, **options: Any
     ) -> None:
         if not tick_s > 0.0:
             raise InputError(f"tick_s is {tick_s!r}, want a finite number above 0")
-        self._cars = FleetAgents(
-            scenario, cars, demand, background, max_cycles, tick_s, render_mode, knows, changes
-        )
-        self.render_mode = render_mode
-        self.tick_s, self.max_cycles = float(tick_s), max_cycles
-        self.possible_agents = self._cars.possible_agents
-        self.agents: list[str] = []
+        super().__init__(scenario, cars, tick_s=tick_s, **options)
+        self.tick_s = float(tick_s)
         self._observations: dict[str, dict[str, Any]] = {}
         self._infos: dict[str, dict[str, Any]] = {}
         self._deciding: set[str] = set()
         self._tick = 0
-
-    @property
-    def fleet(self) -> Fleet:
-        """The fleet, with the hidden occupancy; not for agents."""
-        return self._cars.fleet
-
-    @property
-    def scenario(self) -> Any:
-        """The scenario."""
-        return self.fleet.scenario
-
-    def observation_space(self, agent: str) -> spaces.Dict:
-        """Return the space of an agent's observations."""
-        return self._cars.observation_space(agent)
-
-    def action_space(self, agent: str) -> spaces.Discrete:
-        """Return the space of an agent's actions."""
-        return self._cars.action_space(agent)
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Observation], dict[str, dict[str, Any]]]:
         """Begin a world; see `LotEnv` for seeds. `options` are ignored."""
         del options
-        self.agents = list(self._cars.begin(seed))
-        self._observations = {agent: self._cars.blank_observation(car_of(agent)) for agent in self.agents}
+        self.agents = list(self._begin(seed))
+        self._observations = {agent: self._blank_observation(_car_of(agent)) for agent in self.agents}
         self._infos = {agent: {"place": self.scenario.name} for agent in self.agents}
         self._tick = 0
         self._advance({}, {})
@@ -390,14 +426,6 @@ class LotParallelEnv(ParallelEnv[str, Observation, Any]):  # type: ignore[misc]
         if outcome.begun:
             rewards[agent], self._infos[agent] = outcome.reward, outcome.info
             over[agent] = int(self.fleet.cars["state"][car]) not in (SEARCHING, TRUNCATED)
-
-    def render(self) -> NDArray[np.uint8] | None:
-        """Return a frame, or show it, depending on `render_mode`."""
-        return self._cars.render()
-
-    def close(self) -> None:
-        """Close the window, if open."""
-        self._cars.close()
 
 
 def raw_env(**options: Any) -> LotEnv:
