@@ -101,7 +101,7 @@ for _name, _entry_point, _vector_entry_point in (
     (
         "parkenv/SearchSensors-v2",
         "parkenv.envs.sensors:SearchSensorsEnv",
-        "parkenv.envs.scan_vector:ScanSearchVectorEnv",
+        "parkenv.envs.search_vector:ScanSearchVectorEnv",
     ),
     ("parkenv/SearchPerception-v2", "parkenv.envs.perception:SearchPerceptionEnv", None),
 ):

@@ -15,7 +15,7 @@ from parkenv import InputError, make_scenario
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.scan_observation import FIXED, PER_SCAN, SCANS, WAVELENGTHS_M, ScanObservation, scans_space
-from parkenv.envs.scan_vector import StackedScanVectorEnv
+from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.fleet.drivers import policy_of
@@ -85,7 +85,7 @@ def test_the_vector_is_as_described_and_forgets_with_each_search():
 
 
 def test_a_batch_observes_what_single_searches_observe_and_continues_from_a_state():
-    batch, env = StackedScanVectorEnv(3, "campus"), ScanObservation(scan_env("campus"))
+    batch, env = ParkSearchVectorEnv(3, "campus", "scan"), ScanObservation(scan_env("campus"))
     observed, one = batch.reset(seed=5)[0], env.reset(seed=7)[0]
     rng, done, seen = np.random.default_rng(0), [], []
     for step in range(12):
@@ -95,7 +95,7 @@ def test_a_batch_observes_what_single_searches_observe_and_continues_from_a_stat
         done.append(np.array([rng.choice(np.flatnonzero(mask[:4])) for mask in observed["action_mask"]]))
         observed, one = batch.step(done[-1])[0], env.step(done[-1][2])[0]
         seen.append(observed["scan"])
-    other = StackedScanVectorEnv(3, "campus")
+    other = ParkSearchVectorEnv(3, "campus", "scan")
     other.set_state(state)
     for actions, wanted in zip(done[6:], seen[6:], strict=True):
         np.testing.assert_array_equal(other.step(actions)[0]["scan"], wanted)

@@ -4,11 +4,13 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
+from test_python_world import scenario as python_scenario
+from test_search_vector import recorded_scenario
 
 import parkenv
 from parkenv import InputError
 from parkenv.compiled import numpy_streams
-from parkenv.envs.scan_vector import ScanSearchVectorEnv
+from parkenv.envs.search_vector import ScanSearchVectorEnv
 from parkenv.scenarios.build import make_scenario
 from parkenv.world.lot_scene import slot_lot
 from sim_sensors.laser.scanner import LaserScanner
@@ -58,7 +60,14 @@ def driven(n, steps, seed, **options):
 
 @pytest.mark.parametrize(
     ("scenario", "options"),
-    [("mini", {"captures": 3, "every": 0.7}), ("street", {"rig": "both_sides"}), ("campus", {})],
+    [
+        ("mini", {"captures": 3, "every": 0.7}),
+        ("street", {"rig": "both_sides"}),
+        ("campus", {}),
+        (recorded_scenario(), {}),
+        (python_scenario(), {}),
+    ],
+    ids=lambda value: getattr(value, "name", None),
 )
 def test_a_batch_measures_what_single_searches_measure(scenario, options):
     parked = several = 0

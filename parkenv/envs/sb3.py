@@ -32,11 +32,9 @@ from parkenv.engine.records import (
     scenario_at,
     search_at,
 )
-from parkenv.envs.scan_observation import SCANS
-from parkenv.envs.scan_vector import StackedScanVectorEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
-from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenario, make_scenarios
+from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenario
 from parkenv.world.cost_terms import METRICS
 from parkenv.world.demand import Demand
 from parkenv.world.lot import PARK
@@ -154,36 +152,6 @@ class MaskedVecEnv(SharedVecEnv):
 # ---- searches
 
 
-_DEFAULT_K = {"scan": SCANS}
-
-
-def search_batch(
-    num_envs: int,
-    scenario: ScenarioSources,
-    observation: str,
-    k: int | None,
-    max_episode_steps: int = 2000,
-    autoreset_mode: AutoresetMode = AutoresetMode.NEXT_STEP,
-) -> ParkSearchVectorEnv:
-    """Return a compiled batch of searches that observe `local`, `full` or `scan`; see `SearchVecEnv`."""
-    k = _DEFAULT_K.get(observation, 5) if k is None else k
-    if observation != "scan":
-        return ParkSearchVectorEnv(
-            num_envs,
-            scenario,
-            observation=observation,
-            max_episode_steps=max_episode_steps,
-            autoreset_mode=autoreset_mode,
-            k=k,
-        )
-    places = make_scenarios(scenario)
-    if len(places) != 1:
-        raise InputError(f"there are {len(places)} scenarios, want one for searches that observe scans")
-    return StackedScanVectorEnv(
-        num_envs, places[0], max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode, k=k
-    )
-
-
 class SearchVecEnv(MaskedVecEnv):
     """`ParkSearchVectorEnv` for stable-baselines3 and sb3-contrib.
 
@@ -222,7 +190,7 @@ class SearchVecEnv(MaskedVecEnv):
     ) -> None:
         if not (np.isfinite(reward_scale) and reward_scale > 0.0):
             raise InputError(f"reward_scale is {reward_scale}, want a number above 0")
-        self.batch = search_batch(
+        self.batch = ParkSearchVectorEnv(
             num_envs, scenario, observation, k, max_episode_steps, AutoresetMode.SAME_STEP
         )
         super().__init__(num_envs, self.batch.single_observation_space, self.batch.single_action_space)

@@ -1,148 +1,48 @@
-"""A compiled batch of searches: the `vector_entry_point` of `parkenv/Search-v2`."""
+"""Compiled batches of searches: the `vector_entry_point` of `parkenv/Search-v2` and `parkenv/SearchSensors-v2`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
-from gymnasium.vector.utils import batch_space, create_empty_array
+from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import seed_state
-from parkenv.compiled.memory import uint8s
-from parkenv.engine.kernel import (
-    arrive,
-    init_prior,
-    refresh_belief,
-    step_cost_s,
-    take_step,
-    write_clock,
+from parkenv.engine.batch import (
+    BeliefObserver,
+    LocalObserver,
+    Observer,
+    Steps,
+    arrive_all,
+    copy_fields,
+    first_wrong,
+    step_all,
 )
-from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
-from parkenv.engine.records import N_ACTIONS, STEP_FIELDS, ScenarioRecords, Searches, scenario_at, search_at
-from parkenv.engine.spaces import space_of
-from parkenv.envs.search_prefetch import prefetch_searches
+from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
 from parkenv.errors import InputError
-from parkenv.scenarios.build import ScenarioSources, make_scenarios
+from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
-from parkenv.world.occupancy.kernel import kernel
 from parkenv.world.occupancy.python_functions import raise_error
 
-OBSERVATIONS = ("full", "occupancy", "local")
+if TYPE_CHECKING:
+    from sim_sensors.rig import SensorRig
+
+OBSERVATIONS = ("full", "occupancy", "local", "scan")
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
 _WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "place"))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
-
-
-class Steps(NamedTuple):
-    """The results of a step, besides observations.
-
-    Attributes:
-        rewards: (n,) float64.
-        terminated, truncated: (n,) bool.
-    """
-
-    rewards: FloatArray
-    terminated: BoolArray
-    truncated: BoolArray
-
-    @classmethod
-    def of(cls, n: int) -> Self:
-        """Return the initial results for n searches."""
-        return cls(np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_))
-
-
-@kernel
-def arrive_all(address: int, which: BoolArray) -> None:
-    """Put cars at the entries of their next worlds."""
-    for e in range(len(which)):
-        if which[e]:
-            search = search_at(address, e)
-            search.episode += 1
-            arrive(search)
-
-
-@kernel
-def step_full(
-    address: int,
-    actions: IntArray,
-    fresh: BoolArray,
-    idle: BoolArray,
-    limit: int,
-    steps: Steps,
-    vertex: IntArray,
-    time: NDArray[np.float32],
-    mask: NDArray[np.int8],
-) -> None:
-    """Step all searches except idle and fresh ones, and observe."""
-    for e in range(len(actions)):
-        if idle[e]:
-            continue
-        search = search_at(address, e)
-        if fresh[e]:
-            init_prior(search)
-        else:
-            take_step(search, actions[e])
-            refresh_belief(search)
-        report_step(search, e, fresh[e], limit, steps, mask)
-        write_clock(search)
-        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
-
-
-@kernel
-def step_local(
-    address: int,
-    around: Surroundings,
-    actions: IntArray,
-    fresh: BoolArray,
-    idle: BoolArray,
-    limit: int,
-    steps: Steps,
-    local: NDArray[np.float32],
-    mask: NDArray[np.int8],
-) -> None:
-    """As `step_full`, with the local observation."""
-    for e in range(len(actions)):
-        prefetch_searches(address, around, actions, e)
-        if idle[e]:
-            continue
-        search = search_at(address, e)
-        if not fresh[e]:
-            take_step(search, actions[e])
-        report_step(search, e, fresh[e], limit, steps, mask)
-        observe_surroundings(search, around, local[e])
-
-
-@kernel
-def first_wrong(actions: IntArray) -> int:
-    """Return the index of the first invalid action, or -1."""
-    for e in range(len(actions)):
-        if not 0 <= actions[e] < N_ACTIONS:
-            return e
-    return -1
-
-
-@kernel
-def report_step(search: Any, e: int, fresh: bool, limit: int, steps: Steps, mask: NDArray[np.int8]) -> None:
-    """Write a search's reward, end of episode and action mask."""
-    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
-    for action in range(N_ACTIONS):
-        mask[e, action] = masks[search.vertex * N_ACTIONS + action]
-    if fresh:
-        steps.rewards[e] = 0.0
-        steps.terminated[e] = steps.truncated[e] = False
-        return
-    steps.rewards[e] = -step_cost_s(search)
-    steps.terminated[e] = search.over
-    steps.truncated[e] = search.n_steps >= limit
+assert SEARCH.fields is not None
+_OFFSETS = np.array([SEARCH.fields[name][1] for name in (*METRICS, *STEP_FIELDS)])
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
@@ -160,6 +60,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     - `observation="occupancy"`: the same without `belief`, which saves copying it.
     - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.engine.local_observation`. Its size and
       cost are the same on every lot.
+    - `observation="scan"`: a `Dict` of `scan` and `action_mask`, in one scenario; see
+      `parkenv.envs.scan_observation`.
 
     ## Rewards
     As in `parkenv/Search-v2`, float64. `reward_terms` holds the last step's terms.
@@ -189,8 +91,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ## Arguments
     - `num_envs`: number of environments.
     - `scenario`: as in `parkenv/Search-v2`: a scenario, its name, a file, a folder of files, or a sequence of these.
-    - `observation`: full, occupancy or local.
-    - `k`: number of slots that `local` describes.
+    - `observation`: full, occupancy, local or scan; or a function of `ScenarioRecords` and `num_envs` that returns a
+      `parkenv.engine.batch.Observer`.
+    - `k`: number of slots that `local` describes, 5 if None; or of scans in `scan`, 4 if None.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
     - `copy`: False returns arrays that the next step overwrites, which saves copying them.
@@ -222,8 +125,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self,
         num_envs: int = 1,
         scenario: ScenarioSources = "campus",
-        observation: str = "full",
-        k: int = 5,
+        observation: str | Callable[[ScenarioRecords, int], Observer] = "full",
+        k: int | None = None,
         max_episode_steps: int | None = 2000,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         copy: bool = True,
@@ -233,8 +136,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         _require_count("num_envs", num_envs, MAX_ENVS)
         if max_episode_steps is not None:
             _require_count("max_episode_steps", max_episode_steps, 2**31 - 1)
-        if observation not in OBSERVATIONS:
-            raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
         if render_mode is not None:
             raise InputError(f"render_mode is {render_mode!r}, want None: a batch draws no pictures")
         try:
@@ -242,35 +143,20 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         except ValueError:
             known = ", ".join(m.value for m in AutoresetMode)
             raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
+        observer = _observer(observation, k) if isinstance(observation, str) else observation
         self.scenarios = tuple(make_scenarios(scenario, **changes))
-        self.num_envs = int(num_envs)
+        self.num_envs = n = int(num_envs)
         self.max_episode_steps = max_episode_steps
         self.metadata = self.metadata | {"autoreset_mode": mode}
-        self.single_action_space = spaces.Discrete(N_ACTIONS)
-        self._full = observation != "local"
-        if self._full:
-            space = space_of(self.scenarios)
-            if observation == "occupancy":
-                space = spaces.Dict({name: one for name, one in space.items() if name != "belief"})
-            self.single_observation_space = space
-            self._surroundings: Surroundings | None = None
-        else:
-            self._surroundings = Surroundings.of(self.scenarios, k)
-            self.single_observation_space = local_space(k)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        n = self.num_envs
         self._tables = ScenarioRecords(self.scenarios)
-        self._searches = Searches(self._tables, n, self._full)
+        self.observer = observer(self._tables, n)
+        self._searches, self._seen = self.observer.searches, self.observer.seen
+        self.single_action_space = spaces.Discrete(N_ACTIONS)
+        self.single_observation_space = self.observer.space
+        self.action_space = batch_space(self.single_action_space, n)
+        self.observation_space = batch_space(self.single_observation_space, n)
         self._names = np.array([one.name for one in self.scenarios])
-        empty: Any = create_empty_array(self.single_observation_space, n)
-        self._seen: dict[str, NDArray[Any]] = empty
-        if self._full:
-            self._seen["p_occupied"] = self._searches.p_occupied
-            self._seen["day_error"] = self._searches.day_error
-        if "belief" in self._seen:
-            self._seen["belief"] = self._searches.belief.reshape(n, -1)
-        self._steps = Steps.of(n)
+        self._steps = Steps.of(n, self._seen["action_mask"])
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
         self._begun = False
@@ -302,14 +188,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     @property
     def bytes_each(self) -> float:
         """Memory of one search, bytes, after observing every slot; without the shared tables of the scenarios."""
-        own = (a for name, a in self._seen.items() if name not in ("p_occupied", "belief", "day_error"))
-        return (self._searches.n_bytes + sum(a.nbytes for a in (*own, *self._steps))) / self.num_envs
+        return self.observer.n_bytes / self.num_envs
 
     @property
     def table_bytes(self) -> int:
         """Memory of the tables of all scenarios, bytes, which all searches share."""
-        around = self._surroundings
-        return self._tables.n_bytes + (0 if around is None else around.n_bytes)
+        return self._tables.n_bytes + self.observer.table_bytes
 
     @property
     def memory_bytes(self) -> int:
@@ -362,11 +246,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
         """Return a copy of the state of all searches, for `set_state`."""
-        return self._searches.save()
+        return self.observer.get_state()
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
         """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over."""
-        self._searches.restore(state)
+        self.observer.set_state(state)
         self._begun, self._done = True, self._nobody
 
     def step(
@@ -413,17 +297,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
         """Begin fresh searches, skip idle ones, step the others."""
-        seen, steps = self._seen, self._steps
-        if self._surroundings is None:
-            step_full(
-                self._searches.address, actions, fresh, idle, self._limit, steps,
-                seen["vertex"], seen["time"], seen["action_mask"],
-            )  # fmt: skip
-        else:
-            step_local(
-                self._searches.address, self._surroundings, actions, fresh, idle, self._limit, steps,
-                seen["local"], seen["action_mask"],
-            )  # fmt: skip
+        step_all(self._searches.address, actions, fresh, idle, self._limit, self._steps)
+        self.observer.observe(fresh, idle)
         if self._searches.needs_python:
             raise_error()
 
@@ -446,13 +321,17 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return final
 
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
-        """Return the `info` of `SearchEnv`, with masks of the searches that have ended."""
-        records = self._searches.records
-        metrics: dict[str, Any] = {name: records[name].copy() for name in METRICS}
-        metrics |= {
-            "reward_terms": self.reward_terms | dict.fromkeys(_WHICH_TERMS, done),
-            "place": self._names[self.place_of],
+        """Return the `info` of `SearchEnv` of the searches that have ended, with masks that say which."""
+        words = np.zeros((len(_OFFSETS), self.num_envs), np.int64)
+        copy_fields(self._searches.address, done, _OFFSETS, words)
+        metrics: dict[str, Any] = {
+            # A shorter field stands at the beginning of its eight bytes.
+            name: row.view(SEARCH[name])[:: 8 // SEARCH[name].itemsize]
+            for name, row in zip(METRICS, words, strict=False)
         }
+        terms = dict(zip(REWARD_TERMS, -words[len(METRICS) :].view(np.float64), strict=True))
+        metrics["reward_terms"] = terms | dict.fromkeys(_WHICH_TERMS, done)
+        metrics["place"] = self._names[self.place_of]
         return metrics | dict.fromkeys(_WHICH, done)
 
     def _chosen(self, options: dict[str, Any] | None) -> BoolArray:
@@ -468,6 +347,77 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         if not self._begun and not mask.all():
             raise InputError("reset_mask leaves out environments that have no episode yet")
         return mask
+
+
+class ScanSearchVectorEnv(ParkSearchVectorEnv):
+    """A batch of `parkenv/SearchSensors-v2` environments with `observation="scan"` in one compiled step.
+
+    ## Description
+    Search i of a batch reset with `seed=s` equals the single environment reset with `seed=s + i`, in this and all later
+    episodes: the same worlds, cars, poses and noise, to the rounding of float32 in the ranges. Rewards, ends and
+    automatic resets are those of `ParkSearchVectorEnv`.
+
+    ## Action space
+    `MultiDiscrete([5, ...])`: up, down, left, right, park.
+
+    ## Observation space
+    The `Dict` of `parkenv/SearchSensors-v2` with `observation="scan"`, with a row for each search.
+
+    ## Arguments
+    - `num_envs`, `max_episode_steps`, `autoreset_mode`, `copy`: as in `ParkSearchVectorEnv`.
+    - `scenario`: one scenario without traffic.
+    - `rig`, `captures`, `every`: as in `parkenv/SearchSensors-v2`; the rig needs one laser.
+    - `observation`: only `scan`, since a batch draws no pictures.
+    - further keywords replace fields of the scenario.
+
+    ```python
+    >>> import gymnasium as gym
+    >>> import parkenv
+    >>> envs = gym.make_vec(
+    ...     "parkenv/SearchSensors-v2", 3, "vector_entry_point", scenario="mini", observation="scan"
+    ... )
+    >>> observations, infos = envs.reset(seed=0)
+    >>> observations["scan.laser"].shape, observations["count"]
+    ((3, 4, 1081), array([1, 1, 1]))
+
+    ```
+
+    Raises:
+        InputError: an argument out of its range; the message names it.
+    """
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        scenario: ScenarioSource = "campus",
+        rig: str | SensorRig | None = None,
+        captures: int = 4,
+        every: float = 1.0,
+        observation: str = "scan",
+        **options: Any,
+    ) -> None:
+        if observation != "scan":
+            raise InputError(f'observation is {observation!r}, want "scan": a batch draws no pictures')
+        from parkenv.envs.scan_observer import LaserObserver
+
+        laser = partial(LaserObserver, rig=rig, captures=captures, every=every)
+        super().__init__(num_envs, scenario, laser, **options)
+
+
+def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int], Observer]:
+    """Return the constructor of an observer by its name."""
+    if observation == "full":
+        return BeliefObserver
+    if observation == "occupancy":
+        return lambda tables, n: BeliefObserver(tables, n, without=("belief",))
+    if observation == "local":
+        return lambda tables, n: LocalObserver(tables, n, 5 if k is None else k)
+    if observation == "scan":
+        from parkenv.envs.scan_observation import SCANS
+        from parkenv.envs.scan_observer import ScansObserver
+
+        return lambda tables, n: ScansObserver(tables, n, SCANS if k is None else k)
+    raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
 
 
 def _require_count(name: str, value: Any, most: int) -> None:

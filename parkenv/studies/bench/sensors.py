@@ -19,7 +19,7 @@ from scipy.ndimage import distance_transform_edt
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.engine.sensor_sampler import PICTURE_WIDTH
-from parkenv.envs.scan_vector import ScanSearchVectorEnv
+from parkenv.envs.search_vector import ScanSearchVectorEnv
 from parkenv.studies.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot import PARK
 from sim_sensors.camera.ground_texture import ground_texture

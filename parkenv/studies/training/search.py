@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
-from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from parkenv.envs.sb3 import SearchVecEnv, search_batch
+from parkenv.envs.sb3 import SearchVecEnv
+from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.scenarios.places import (
@@ -306,7 +306,7 @@ class ScanTraining(SearchTraining):
         # What gives no scans in a batch is refused before training, not at the tests in the end.
         learned = self.sides[0]
         for place in (*learned, *itertools.chain(*self.tests.values())):
-            search_batch(1, learned if place in learned else place, "scan", self.spec.k)
+            ParkSearchVectorEnv(1, learned if place in learned else place, "scan", self.spec.k)
 
 
 def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
@@ -369,7 +369,7 @@ def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequ
     n = len(seeds)
     _, version, k = observation_of(model.observation_space)
     observation = SEARCH_OBSERVATIONS[version][0]
-    batch = search_batch(n, places, observation, k, MAX_STEPS, AutoresetMode.NEXT_STEP)
+    batch = ParkSearchVectorEnv(n, places, observation, k, MAX_STEPS)
     seen, _ = batch.reset(seed=list(seeds))
     give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
     times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)

@@ -7,7 +7,7 @@ kept while compiled code runs, and raised by `raise_error` after it.
 from __future__ import annotations
 
 import ctypes
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -24,28 +24,27 @@ _errors: list[BaseException] = []
 _TYPE = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_int64, ctypes.c_int64, ctypes.c_double)
 
 
-@_TYPE
-def _state(number: int, slot: int, time: float) -> float:
-    try:
-        return float(np.asarray(_worlds[number].occupied(np.array([slot]), time)).item())
-    except BaseException as error:
-        _errors.append(error)
-        return 0.0
+def _function(method: str) -> Any:
+    """Return a function (number of the world, slot, time, s) that calls a method of the world for a slot."""
+
+    def call(number: int, slot: int, time: float) -> float:
+        try:
+            return float(np.asarray(getattr(_worlds[number], method)(np.array([slot]), time)).item())
+        except BaseException as error:
+            _errors.append(error)
+            return time
+
+    return _TYPE(call)
 
 
-@_TYPE
-def _next_free(number: int, slot: int, time: float) -> float:
-    try:
-        return float(np.asarray(_worlds[number].next_free(np.array([slot]), time)).item())
-    except BaseException as error:
-        _errors.append(error)
-        return time
+# In the order of the fields of FUNCTIONS.
+_FUNCTIONS = tuple(_function(method) for method in ("occupied", "next_free", "sojourn"))
 
 
 def functions_of(world: World) -> int:
     """Return the address of a FUNCTIONS record that calls the methods of a world; valid while the world lives."""
     if _worlds.get(id(world)) is not world:
-        addresses = (ctypes.cast(function, ctypes.c_void_p).value for function in (_state, _next_free))
+        addresses = (ctypes.cast(function, ctypes.c_void_p).value for function in _FUNCTIONS)
         _worlds[id(world)] = world
         # Kept in the world itself; a copy of the world is not among `_worlds` yet and gets a record of its own.
         vars(world)["_functions"] = np.array([(id(world), *addresses)], FUNCTIONS)

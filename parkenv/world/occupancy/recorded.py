@@ -30,6 +30,7 @@ from parkenv.world.occupancy.kernel import (
     MIN_PROBABILITY,
     RECORDED_DAY,
     kernel,
+    recorded_changes,
     recorded_day_at,
     recorded_day_level,
     recorded_forecast,
@@ -102,13 +103,8 @@ def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray)
 @kernel
 def _changes(days: int, slots: IntArray, second: float, count: IntArray) -> None:
     """Write how often each slot's state has changed between its first observation and `second`."""
-    day = recorded_day_at(days, 0)
-    taken = uint8s(day.occupied)
     for i in range(slots.size):
-        first = int64s(day.first)[int64s(day.record)[slots[i]]]
-        count[i] = 0
-        for k in range(first + 1, recorded_index(day, slots[i], second) + 1):
-            count[i] += taken[k] != taken[k - 1]
+        count[i] = recorded_changes(recorded_day_at(days, 0), slots[i], second)
 
 
 @kernel

@@ -1,4 +1,4 @@
-"""A compiled batch of searches with laser scans: the `vector_entry_point` of `parkenv/SearchSensors-v2`."""
+"""Laser scans of a batch of searches, compiled."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector import AutoresetMode
-from gymnasium.vector.utils import batch_space, create_empty_array
+from gymnasium.vector.utils import create_empty_array
 from numba import get_num_threads
 from numpy.typing import NDArray
 
@@ -18,35 +17,38 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import address_of
 from parkenv.compiled.threads import in_threads
-from parkenv.engine.kernel import take_step
-from parkenv.engine.records import search_at
+from parkenv.engine.batch import Observer
+from parkenv.engine.records import ScenarioRecords, scenario_at, search_at
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.engine.spaces import LATEST
 from parkenv.envs.car_footprints import CarLibrary, Scratch, draw_car, put_car, remove_car
 from parkenv.envs.scan_observation import SCANS, ScanHistory, goal_of, observe_scans, scans_space
-from parkenv.envs.search_vector import ParkSearchVectorEnv, Steps, report_step
 from parkenv.envs.sensors import FARTHEST
 from parkenv.errors import InputError
-from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.lot_scene import CARS_APART, slot_lot
-from parkenv.world.occupancy.kernel import CURSOR, PROCESS_KIND, cursor_at, kernel, process_at, process_state
+from parkenv.world.occupancy.kernel import CURSOR, cursor_at, find_state, kernel, sojourn_number
 from sim_sensors.laser.kernel import BEAMS_PER_DRAW, scan_all
 from sim_sensors.laser.scanner import NOISE_TABLE_SIZE, LaserScanner, noise_table
 from sim_sensors.rig import SensorRig
 
 _WIDEST_CAR_M = 6.0
 _SENSOR_WORDS = 2  # the rig's word for lasers in the seed of their noise
+_NOTHING = -1  # instead of a sojourn: the slot has not been drawn
 
 
 class Stops(NamedTuple):
     """Where and when each search measures.
 
     Attributes:
-        count: (n,) int64, number of captures of the last step.
+        vertex: (n,) int64, where the last step ended.
+        begun: (n,) float64, s since Monday 00:00, when it ended.
+        count: (n,) int64, number of its captures.
         pose: (n, captures, 3) float64, x, y in m and yaw in rad of the vehicle.
         time: (n, captures) float64, s since Monday 00:00.
     """
 
+    vertex: IntArray
+    begun: FloatArray
     count: IntArray  # type: ignore[assignment]  # hides tuple.count
     pose: FloatArray
     time: FloatArray
@@ -80,7 +82,7 @@ class Planes(NamedTuple):
         corners, x, y, radius: (n, ...), those arrays of each search's other obstacles.
         label, cell_start, frame: as in `Cells`, the same for all searches.
         k: number of corners.
-        shown: (n, n_slots) int32, the sojourn in which each slot is drawn; 0 before the first.
+        shown: (n, n_slots) int32, the sojourn in which each slot is drawn; `_NOTHING` before the first.
     """
 
     quads: Any
@@ -108,39 +110,28 @@ class Laser(NamedTuple):
 
 
 @kernel
-def drive_all(
-    address: int,
-    lanes: Lanes,
-    actions: IntArray,
-    fresh: BoolArray,
-    idle: BoolArray,
-    limit: int,
-    steps: Steps,
-    stops: Stops,
-    vertex: IntArray,
-    time: NDArray[np.float32],
-    mask: NDArray[np.int8],
+def write_stops(
+    address: int, lanes: Lanes, fresh: BoolArray, idle: BoolArray, stops: Stops, time: NDArray[np.float32]
 ) -> None:
-    """Step all searches except idle and fresh ones, and write where they measure."""
-    for e in range(len(actions)):
+    """Write the time of all searches except idle ones, and where they measured in their last step."""
+    for e in range(len(idle)):
         if idle[e]:
             continue
         search = search_at(address, e)
-        before, begun = search.vertex, search.time
-        if not fresh[e]:
-            take_step(search, actions[e])
-        report_step(search, e, fresh[e], limit, steps, mask)
-        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.time, search.time - search.arrival
-        _write_stops(search, lanes, e, before, begun, stops)
+        time[e, 0], time[e, 1] = search.time, search.time - search.arrival
+        if fresh[e]:
+            stops.vertex[e] = search.vertex
+        _write_stops(search, lanes, e, stops)
+        stops.vertex[e], stops.begun[e] = search.vertex, search.time
 
 
 @kernel
-def _write_stops(search: Any, lanes: Lanes, e: int, before: int, begun: float, stops: Stops) -> None:
+def _write_stops(search: Any, lanes: Lanes, e: int, stops: Stops) -> None:
     """Write the captures of a step as `SensorSampler.sample_step` chooses them."""
     stops.count[e] = 0
     if search.parked:
         return
-    here = search.vertex
+    here, before, begun = search.vertex, stops.vertex[e], stops.begun[e]
     x, y = lanes.xy[here, 0], lanes.xy[here, 1]
     n = 1
     if before != here:
@@ -194,6 +185,7 @@ def scan_searches(
         if idle[e]:
             continue
         search = search_at(address, e)
+        scenario = scenario_at(search.scenario, 0)
         corners, x, y, radius = planes.corners[e], planes.x[e], planes.y[e], planes.radius[e]
         if fresh[e]:
             _forget_cars(cursors, library, planes, e)
@@ -207,10 +199,11 @@ def scan_searches(
             for i in range(lanes.near_start[search.vertex], lanes.near_start[search.vertex + 1]):
                 slot = lanes.near[i]
                 cursor = cursor_at(cursors, e * n_slots + slot)
-                if cursor.sojourn != 0 and time < cursor.valid_until:
+                if time < cursor.valid_until:
                     continue
-                taken = process_state(process_at(search.world, 0), search, slot, cursor, time)
-                if cursor.sojourn == planes.shown[e, slot]:
+                taken = find_state(scenario.world_kind, search.world, search, slot, cursor, time)
+                sojourn = sojourn_number(scenario.world_kind, search.world, slot, cursor, time)
+                if sojourn == planes.shown[e, slot]:
                     continue
                 if done < capture:
                     # The captures before saw the plane as it was.
@@ -218,10 +211,10 @@ def scan_searches(
                         planes.quads, others, sensor, nobody, offsets, no_ids, laser, done, capture, scan[e]
                     )
                     done = capture
-                planes.shown[e, slot] = cursor.sojourn
+                planes.shown[e, slot] = sojourn
                 remove_car(library, slot, x, y)
                 if taken:
-                    number = np.int64(search.key % np.uint64(CARS_APART)) + np.int64(cursor.sojourn)
+                    number = np.int64(search.key % np.uint64(CARS_APART)) + sojourn
                     model = draw_car(library, slot, number, work)
                     put_car(library, slot, model, work.car, corners, x, y, radius)
             at_x, at_y, yaw = stops.pose[e, capture, 0], stops.pose[e, capture, 1], stops.pose[e, capture, 2]
@@ -250,7 +243,7 @@ def _forget_cars(cursors: int, library: CarLibrary, planes: Planes, e: int) -> N
     for slot in range(n_slots):
         cursor = cursor_at(cursors, e * n_slots + slot)
         cursor.sojourn, cursor.valid_until = 0, 0.0
-        planes.shown[e, slot] = 0
+        planes.shown[e, slot] = _NOTHING
         remove_car(library, slot, planes.x[e], planes.y[e])
 
 
@@ -284,94 +277,56 @@ def _draw_noise(key: np.uint64, time: float, work: Any, offsets: IntArray) -> No
             offsets[draw, use] = numpy_streams.integer_below(work.state, NOISE_TABLE_SIZE)
 
 
-class ScanSearchVectorEnv(ParkSearchVectorEnv):
-    """A batch of `parkenv/SearchSensors-v2` environments with `observation="scan"` in one compiled step.
+class LaserObserver(Observer):
+    """The observations of `parkenv/SearchSensors-v2` with `observation="scan"`.
 
-    ## Description
-    Search i of a batch reset with `seed=s` equals the single environment reset with `seed=s + i`, in this and all later
-    episodes: the same worlds, cars, poses and noise, to the rounding of float32 in the ranges. Rewards, ends and
-    automatic resets are those of `parkenv.envs.search_vector.ParkSearchVectorEnv`.
-
-    ## Action space
-    `MultiDiscrete([5, ...])`: up, down, left, right, park.
-
-    ## Observation space
-    The `Dict` of `parkenv/SearchSensors-v2` with `observation="scan"`, with a row for each search.
-
-    ## Arguments
-    - `num_envs`, `max_episode_steps`, `autoreset_mode`, `copy`: as in `ParkSearchVectorEnv`.
-    - `scenario`: one scenario without traffic, whose occupancy is generated.
-    - `rig`, `captures`, `every`: as in `parkenv/SearchSensors-v2`; the rig needs one laser.
-    - `observation`: only `scan`, since a batch draws no pictures.
-    - further keywords replace fields of the scenario.
-
-    ```python
-    >>> import gymnasium as gym
-    >>> import parkenv
-    >>> envs = gym.make_vec(
-    ...     "parkenv/SearchSensors-v2", 3, "vector_entry_point", scenario="mini", observation="scan"
-    ... )
-    >>> observations, infos = envs.reset(seed=0)
-    >>> observations["scan.laser"].shape, observations["count"]
-    ((3, 4, 1081), array([1, 1, 1]))
-
-    ```
+    Args:
+        tables: one scenario, without traffic.
+        n: number of searches.
+        rig, captures, every: as in `parkenv/SearchSensors-v2`; the rig needs one laser.
 
     Raises:
-        InputError: an argument out of its range; the message names it.
+        InputError: several scenarios, traffic, or an argument out of its range.
     """
 
     def __init__(
         self,
-        num_envs: int = 1,
-        scenario: ScenarioSource = "campus",
+        tables: ScenarioRecords,
+        n: int,
         rig: str | SensorRig | None = None,
         captures: int = 4,
         every: float = 1.0,
-        observation: str = "scan",
-        max_episode_steps: int | None = 2000,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-        copy: bool = True,
-        render_mode: str | None = None,
-        **changes: Any,
     ) -> None:
-        if observation != "scan":
-            raise InputError(f'observation is {observation!r}, want "scan": a batch draws no pictures')
-        world = make_scenario(scenario, **changes)
+        if len(tables.scenarios) != 1:
+            raise InputError(
+                f"there are {len(tables.scenarios)} scenarios, want one for searches that observe scans"
+            )
+        world = tables.scenarios[0]
         sensors = make_rig(rig, world)
         if len(sensors.lasers) != 1:
             raise InputError(f"the rig has {len(sensors.lasers)} lasers, want one")
         if world.traffic.cars or world.traffic.pedestrians:
             raise InputError(f"traffic is {world.traffic}, want none in a batch of scans")
-        super().__init__(num_envs, world, "local", 1, max_episode_steps, autoreset_mode, copy, render_mode)
-        if self._tables.records["world_kind"][0] != PROCESS_KIND:
-            raise InputError(
-                f"occupancy is a {type(world.occupancy).__name__}, want a generated one in a batch of scans"
-            )
         self.rig = sensors.only_lasers()
         sampler = SensorSampler(world, self.rig, None, captures, every)
         name, laser, mount = self.rig.lasers[0]
-        n, k, lot = self.num_envs, sampler.captures, world.lot
-        self.single_observation_space = spaces.Dict(
-            {
-                "vertex": spaces.Discrete(lot.n_vertices),
-                "time": spaces.Box(0.0, LATEST, (2,), np.float32),
-                "action_mask": spaces.Box(0, 1, (5,), np.int8),
-                "count": spaces.Discrete(k + 1),
-                "pose": spaces.Box(-FARTHEST, FARTHEST, (k, 3), np.float32),
-                "captured_at": spaces.Box(0.0, LATEST, (k,), np.float32),
-                f"scan.{name}": spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32),
-            }
+        k, lot = sampler.captures, world.lot
+        space = {
+            "vertex": spaces.Discrete(lot.n_vertices),
+            "time": spaces.Box(0.0, LATEST, (2,), np.float32),
+            "action_mask": spaces.Box(0, 1, (5,), np.int8),
+            "count": spaces.Discrete(k + 1),
+            "pose": spaces.Box(-FARTHEST, FARTHEST, (k, 3), np.float32),
+            "captured_at": spaces.Box(0.0, LATEST, (k,), np.float32),
+            f"scan.{name}": spaces.Box(0.0, laser.max_range, (k, laser.n_beams), np.float32),
+        }
+        super().__init__(tables, n, spaces.Dict(space))
+        self._measured, self._scan = self.seen, self.seen[f"scan.{name}"]
+        self._stops = Stops(
+            self.seen["vertex"], np.zeros(n), self.seen["count"], np.zeros((n, k, 3)), np.zeros((n, k))
         )
-        self.observation_space = batch_space(self.single_observation_space, n)
-        empty: Any = create_empty_array(self.single_observation_space, n)
-        self._measured: dict[str, NDArray[Any]] = empty
-        self._seen = self._measured
-        self._surroundings = None
-        self._scan = self._measured[f"scan.{name}"]
-        self._stops = Stops(self._measured["count"], np.zeros((n, k, 3)), np.zeros((n, k)))
         self._library, quads, others = CarLibrary.of(slot_lot(lot))
-        self._lanes = _lanes_of(world.lot, k, float(every), laser.max_range)
+        self._lanes = _lanes_of(lot, k, float(every), laser.max_range)
         self._planes = Planes(
             tuple(quads),
             np.repeat(others.corners[None], n, axis=0),
@@ -382,42 +337,21 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
             others.cell_start,
             others.frame,
             int(others.k),
-            np.zeros((n, lot.n_slots), np.int32),
+            np.full((n, lot.n_slots), _NOTHING, np.int32),
         )
-        self._laser = _laser_of(laser, (float(mount.x), float(mount.y), float(mount.yaw)))
         self._cursors = np.zeros(n * lot.n_slots, CURSOR)
+        planes = self._planes
+        own = (planes.corners, planes.x, planes.y, planes.radius, planes.shown, self._cursors, *self._stops)
+        self.n_bytes += sum(array.nbytes for array in own)
+        self._laser = _laser_of(laser, (float(mount.x), float(mount.y), float(mount.yaw)))
         # Each thread has a share of the searches.
         ends: list[int] = np.linspace(0, n, min(get_num_threads(), n) + 1).astype(int).tolist()
         self._shares = list(pairwise(ends))
 
-    @property
-    def bytes_each(self) -> float:
-        """Memory of one search, bytes."""
-        planes = self._planes
-        arrays = (
-            planes.corners,
-            planes.x,
-            planes.y,
-            planes.radius,
-            planes.shown,
-            self._cursors,
-            *self._stops,
-        )
-        return super().bytes_each + sum(array.nbytes for array in arrays) / self.num_envs
-
-    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """Continue from a state that `get_state` returned for the same scenario; no search in it may be over."""
-        super().set_state(state)
-        # Cars follow from the worlds, so they are drawn again rather than kept.
-        forget_all_cars(address_of(self._cursors, CURSOR), self._library, self._planes)
-
-    def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        seen, address = self._measured, self._searches.address
-        drive_all(
-            address, self._lanes, actions, fresh, idle, self._limit, self._steps, self._stops,
-            seen["vertex"], seen["time"], seen["action_mask"],
-        )  # fmt: skip
-        cursors = address_of(self._cursors, CURSOR)
+    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+        """See `Observer`."""
+        seen, address, cursors = self._measured, self.searches.address, address_of(self._cursors, CURSOR)
+        write_stops(address, self._lanes, fresh, idle, self._stops, seen["time"])
 
         def scan_part(part: tuple[int, int]) -> None:
             scan_searches(
@@ -427,68 +361,53 @@ class ScanSearchVectorEnv(ParkSearchVectorEnv):
 
         in_threads(scan_part, self._shares)
 
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """See `Observer`; cars follow from the worlds, so they are drawn again rather than kept."""
+        super().set_state(state)
+        self._stops.vertex[:], self._stops.begun[:] = (
+            self.searches.records[name] for name in ("vertex", "time")
+        )
+        forget_all_cars(address_of(self._cursors, CURSOR), self._library, self._planes)
 
-class StackedScanVectorEnv(ScanSearchVectorEnv):
-    """A batch of searches that observe their last k scans, as `parkenv.envs.scan_observation.ScanObservation` does.
 
-    There is one scan for each decision. `parkenv.envs.sb3.SearchVecEnv` makes it.
+class ScansObserver(LaserObserver):
+    """The last k scans, as `parkenv.envs.scan_observation.ScanObservation` observes them: one for each decision.
 
     Args:
-        num_envs, scenario, max_episode_steps, autoreset_mode: as in `ScanSearchVectorEnv`.
+        tables, n: as of `LaserObserver`.
         k: number of scans.
 
     Raises:
-        InputError: an argument out of its range; the message names it.
-
-    Examples:
-        >>> envs = StackedScanVectorEnv(3, "mini", k=4)
-        >>> observations, infos = envs.reset(seed=0)
-        >>> observations["scan"].shape
-        (3, 338)
+        InputError: as of `LaserObserver`.
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        scenario: ScenarioSource = "campus",
-        k: int = SCANS,
-        max_episode_steps: int | None = 2000,
-        autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
-    ) -> None:
-        super().__init__(
-            num_envs, scenario, captures=1, max_episode_steps=max_episode_steps, autoreset_mode=autoreset_mode
-        )
-        self._history, self._goal = ScanHistory.of(self.num_envs, k), goal_of(self.scenarios[0])
-        self.single_observation_space = scans_space(k)
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        empty: Any = create_empty_array(self.single_observation_space, self.num_envs)
-        self._seen = empty | {"action_mask": self._measured["action_mask"]}
+    def __init__(self, tables: ScenarioRecords, n: int, k: int = SCANS) -> None:
+        super().__init__(tables, n, captures=1)
+        self._history, self._goal = ScanHistory.of(n, k), goal_of(tables.scenarios[0])
+        self.space = scans_space(k)
+        empty: Any = create_empty_array(self.space, n)
+        self.seen = empty | {"action_mask": self._measured["action_mask"]}
+        self.n_bytes += sum(array.nbytes for array in (self.seen["scan"], *self._history))
 
-    @property
-    def bytes_each(self) -> float:
-        """Memory of one search, bytes."""
-        arrays = (*self._measured.values(), *self._history)
-        return super().bytes_each + sum(array.nbytes for array in arrays) / self.num_envs
-
-    def get_state(self) -> tuple[NDArray[Any], ...]:
-        """Return a copy of the state of all searches, for `set_state`."""
-        return (*super().get_state(), *(array.copy() for array in self._history))
-
-    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """Continue from a state that `get_state` returned for the same scenario; no search in it may be over."""
-        searches, history = state[: -len(self._history)], state[-len(self._history) :]
-        super().set_state(searches)
-        own: tuple[NDArray[Any], ...] = self._history
-        for mine, saved in zip(own, history, strict=True):
-            mine[...] = saved
-
-    def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
-        super()._step(actions, fresh, idle)
+    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+        """See `Observer`."""
+        super().observe(fresh, idle)
         seen = self._measured
         observe_scans(
             self._scan, seen["pose"], seen["count"], seen["time"], self._goal, fresh, idle, self._history,
-            self._seen["scan"],
+            self.seen["scan"],
         )  # fmt: skip
+
+    def get_state(self) -> tuple[NDArray[Any], ...]:
+        """See `Observer`."""
+        return (*super().get_state(), *(array.copy() for array in self._history))
+
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """See `Observer`."""
+        own: tuple[NDArray[Any], ...] = self._history
+        super().set_state(state[: -len(own)])
+        for mine, saved in zip(own, state[-len(own) :], strict=True):
+            mine[...] = saved
 
 
 def _laser_of(laser: LaserScanner, mount: tuple[float, float, float]) -> Laser:

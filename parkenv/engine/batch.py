@@ -1,0 +1,296 @@
+"""A batch of searches: one compiled step for all of them, after which an observer writes what each of them observes.
+
+Where the tables of many places do not fit the processor's inner caches, waiting for them would double a step's time.
+So while one search is stepped, the data of the next ones are loaded, in stages: each reads what the one before it has
+loaded.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from gymnasium import spaces
+from gymnasium.vector.utils import create_empty_array
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.memory import int32s, int64s, prefetch, uint8s
+from parkenv.engine.kernel import arrive, init_prior, refresh_belief, step_cost_s, take_step, write_clock
+from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
+from parkenv.engine.records import (
+    N_ACTIONS,
+    SEARCH,
+    SENTINEL,
+    ScenarioRecords,
+    Searches,
+    edge_at,
+    scenario_at,
+    search_at,
+)
+from parkenv.engine.spaces import space_of
+from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, kernel, prefetch_forecast
+from parkenv.world.scenario import EDGE
+
+_LINE = 64  # bytes of a cache line
+_APART = 2  # searches between two stages of loading
+_SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
+
+
+class Observer(ABC):
+    """What the searches of a batch observe.
+
+    Args:
+        tables: scenarios of the searches.
+        n: number of searches.
+        space: of the observations of one search; has an `action_mask`.
+        full_belief: whether the searches keep `p_occupied` and `belief` up to date.
+        kept: names of observations that are arrays of `Searches`.
+
+    Attributes:
+        searches: the searches.
+        space: as above.
+        seen: the observations by name, (n, ...) each.
+        n_bytes: memory of searches and observations, bytes.
+        table_bytes: memory of what all searches share besides `tables`, bytes.
+    """
+
+    table_bytes = 0
+
+    def __init__(
+        self,
+        tables: ScenarioRecords,
+        n: int,
+        space: spaces.Dict,
+        full_belief: bool = False,
+        kept: tuple[str, ...] = (),
+    ) -> None:
+        self.searches, self.space = Searches(tables, n, full_belief), space
+        own: Any = create_empty_array(spaces.Dict({k: v for k, v in space.items() if k not in kept}), n)
+        of_searches = {name: getattr(self.searches, name).reshape(n, -1) for name in kept}
+        self.seen: dict[str, NDArray[Any]] = own | of_searches
+        self.n_bytes: int = self.searches.n_bytes + sum(array.nbytes for array in own.values())
+
+    @abstractmethod
+    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+        """Write the observations of all searches except idle ones; fresh ones, (n,) bool both, have just begun."""
+
+    def get_state(self) -> tuple[NDArray[Any], ...]:
+        """Return a copy of everything that changes, for `set_state`."""
+        return self.searches.save()
+
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """Continue from a state that `get_state` returned for the same scenarios."""
+        self.searches.restore(state)
+
+
+class BeliefObserver(Observer):
+    """The observations of `parkenv/Search-v2`.
+
+    Args:
+        tables, n: as of `Observer`.
+        without: names of observations to leave out.
+    """
+
+    def __init__(self, tables: ScenarioRecords, n: int, without: tuple[str, ...] = ()) -> None:
+        space = {k: v for k, v in space_of(tables.scenarios).items() if k not in without}
+        kept = tuple(name for name in ("p_occupied", "belief", "day_error") if name in space)
+        super().__init__(tables, n, spaces.Dict(space), full_belief=True, kept=kept)
+
+    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+        """See `Observer`."""
+        observe_belief(self.searches.address, fresh, idle, self.seen["vertex"], self.seen["time"])
+
+
+class LocalObserver(Observer):
+    """The observations of `parkenv.engine.local_observation`, of k slots."""
+
+    def __init__(self, tables: ScenarioRecords, n: int, k: int) -> None:
+        self._around = Surroundings.of(tables.scenarios, k)
+        self.table_bytes = self._around.n_bytes
+        super().__init__(tables, n, local_space(k))
+
+    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+        """See `Observer`."""
+        del fresh
+        observe_local(self.searches.address, self._around, idle, self.seen["local"])
+
+
+class Steps(NamedTuple):
+    """The results of a step, besides observations.
+
+    Attributes:
+        rewards: (n,) float64.
+        terminated, truncated: (n,) bool.
+        mask: (n, 5) int8, the actions that are possible now.
+    """
+
+    rewards: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    mask: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, n: int, mask: NDArray[np.int8]) -> Self:
+        """Return the initial results of n searches whose masks are an array of the observations."""
+        return cls(np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), mask)
+
+
+@kernel
+def first_wrong(actions: IntArray) -> int:
+    """Return the index of the first invalid action, or -1."""
+    for e in range(len(actions)):
+        if not 0 <= actions[e] < N_ACTIONS:
+            return e
+    return -1
+
+
+@kernel
+def arrive_all(address: int, which: BoolArray) -> None:
+    """Put cars at the entries of their next worlds."""
+    for e in range(len(which)):
+        if which[e]:
+            search = search_at(address, e)
+            search.episode += 1
+            arrive(search)
+
+
+@kernel
+def step_all(
+    address: int, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps
+) -> None:
+    """Step all searches except idle and fresh ones, and write the results of all except idle ones."""
+    for e in range(len(actions)):
+        _prefetch_step(address, actions, e)
+        if idle[e]:
+            continue
+        search = search_at(address, e)
+        if fresh[e]:
+            steps.rewards[e] = 0.0
+            steps.terminated[e] = steps.truncated[e] = False
+        else:
+            take_step(search, actions[e])
+            steps.rewards[e] = -step_cost_s(search)
+            steps.terminated[e] = search.over
+            steps.truncated[e] = search.n_steps >= limit
+        masks = uint8s(scenario_at(search.scenario, 0).action_masks)
+        for action in range(N_ACTIONS):
+            steps.mask[e, action] = masks[search.vertex * N_ACTIONS + action]
+
+
+@kernel
+def copy_fields(address: int, which: BoolArray, offsets: IntArray, words: IntArray) -> None:
+    """Write 8 bytes from each offset of the SEARCH records of some searches; `words` is (k, n)."""
+    for e in range(len(which)):
+        if which[e]:
+            for i in range(len(offsets)):
+                words[i, e] = int64s(address + e * _SEARCH_BYTES + offsets[i])[0]
+
+
+@kernel
+def observe_belief(
+    address: int, fresh: BoolArray, idle: BoolArray, vertex: IntArray, time: NDArray[np.float32]
+) -> None:
+    """Write vertex and time, and update the full belief."""
+    for e in range(len(idle)):
+        if idle[e]:
+            continue
+        search = search_at(address, e)
+        if fresh[e]:
+            init_prior(search)
+        else:
+            refresh_belief(search)
+        write_clock(search)
+        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
+
+
+@kernel
+def observe_local(address: int, around: Surroundings, idle: BoolArray, local: NDArray[np.float32]) -> None:
+    """Write the local observations."""
+    for e in range(len(idle)):
+        _prefetch_surroundings(address, around, len(idle), e)
+        if not idle[e]:
+            observe_surroundings(search_at(address, e), around, local[e])
+
+
+# ---- loading ahead
+
+
+@inlined
+def _prefetch_step(address: int, actions: IntArray, e: int) -> None:
+    """Load what the steps of the searches after search e will read."""
+    n = len(actions)
+    if e + 4 * _APART < n:
+        _prefetch(address + (e + 4 * _APART) * _SEARCH_BYTES, _SEARCH_BYTES)
+    if e + 3 * _APART < n:
+        search = search_at(address, e + 3 * _APART)
+        edge = search.vertex * N_ACTIONS + actions[e + 3 * _APART]
+        prefetch(scenario_at(search.scenario, 0).edges + edge * _EDGE_BYTES)
+    if e + 2 * _APART < n:
+        search = search_at(address, e + 2 * _APART)
+        scenario, target = scenario_at(search.scenario, 0), _target(search, actions[e + 2 * _APART])
+        prefetch(scenario.action_masks + target * N_ACTIONS)
+        prefetch(scenario.view_starts + 8 * target)
+    if e + _APART < n:
+        search = search_at(address, e + _APART)
+        scenario, target = scenario_at(search.scenario, 0), _target(search, actions[e + _APART])
+        prefetch(scenario.viewed + 8 * int64s(scenario.view_starts)[target])
+
+
+@inlined
+def _target(search: Any, action: int) -> int:
+    """Return the vertex that an action leads to."""
+    edges = scenario_at(search.scenario, 0).edges
+    return int(edge_at(edges, search.vertex * N_ACTIONS + action).target)
+
+
+@inlined
+def _prefetch_surroundings(address: int, around: Surroundings, n: int, e: int) -> None:
+    """Load what the observations of the searches after search e will read."""
+    if e + 3 * _APART < n:
+        _prefetch(address + (e + 3 * _APART) * _SEARCH_BYTES, _SEARCH_BYTES)
+    if e + 2 * _APART < n:
+        search = search_at(address, e + 2 * _APART)
+        row = around.first[search.place] + search.vertex
+        width = 4 * around.numbers.shape[1]
+        _prefetch(around.numbers.ctypes.data + row * width, width)
+        width = 2 * around.indices.shape[1]
+        _prefetch(around.indices.ctypes.data + row * width, width)
+        prefetch(around.targets.ctypes.data + 16 * row)
+        prefetch(around.starts.ctypes.data + 4 * row)
+        prefetch(around.crow_s.ctypes.data + 16 * row)
+    if e + _APART < n:
+        _prefetch_slots(search_at(address, e + _APART), around)
+
+
+@inlined
+def _prefetch_slots(search: Any, around: Surroundings) -> None:
+    """Load what is known of the slots near the car and of the remembered one."""
+    scenario, first, remembered = (
+        scenario_at(search.scenario, 0),
+        around.first[search.place],
+        search.remembered_slot,
+    )
+    row, columns = first + search.vertex, int32s(search.columns)
+    begin, end = around.starts[row], around.starts[row + 1]
+    _prefetch(around.slots.ctypes.data + 4 * begin, _LINE)
+    seen_from = around.first_view[search.place] + int64s(scenario.view_starts)[search.vertex]
+    _prefetch(around.view_s.ctypes.data + 4 * seen_from, _LINE)
+    prefetch(around.crow_s.ctypes.data + 16 * (first + remembered))
+    prefetch(scenario.walk_s + 8 * remembered)
+    prefetch(scenario.parking_cost_s + 8 * remembered)
+    if scenario.prior_kind != PROCESS_KIND:
+        return
+    for i in range(begin, end):
+        slot = np.int64(around.slots[i])
+        if columns[slot] == SENTINEL:
+            prefetch_forecast(scenario.prior, search.hour, slot)
+
+
+@inlined
+def _prefetch(begin: int, size: int) -> None:
+    """Load the bytes from an address on."""
+    for offset in range(0, size, _LINE):
+        prefetch(begin + offset)
+    prefetch(begin + size - 1)
