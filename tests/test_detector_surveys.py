@@ -11,7 +11,6 @@ from parkenv import InputError
 from parkenv.mapping.survey_score import SIGHTING
 from parkenv.studies.sensing.detector_surveys import (
     CAUSES,
-    SurveyedDrive,
     causes_of,
     is_wanted,
     never_found,
@@ -56,9 +55,8 @@ def test_a_car_that_is_never_found_counts_by_its_best_picture():
         sighting(slot=2, boxes=1, placed=1), sighting(slot=2, distance=13.0),
         sighting(slot=4, visible=0.2), sighting(slot=-1),
     ])  # fmt: skip
-    drive = SurveyedDrive(0, {"weather": "rain"}, seen)
     causes = causes_of(seen, "rain", 640, 480)
-    best = never_found(drive, is_wanted(seen), causes)
+    best = never_found(seen, is_wanted(seen), causes)
     assert [list(CAUSES)[i] for i in best] == ["hidden"]
 
 

@@ -215,15 +215,15 @@ def test_a_model_is_trained_on_labels_and_finds_its_cars(tmp_path):
 @pytest.mark.parametrize(
     ("break_it", "message"),
     [
-        (lambda t: t["annotations"][4].update(bbox=[200, 0, 60, 9]), r"annotations\[4\]: box .* is not inside 1\.png"),
-        (lambda t: t["annotations"][0].update(bbox=[2, 0, -60, 9]), r"annotations\[0\]: box .* is not inside"),
-        (lambda t: t["annotations"][3].update(bbox=[2, 0, 9]), r"annotations\[3\]: bbox is \[2, 0, 9\], want \[left"),
-        (lambda t: t["annotations"][2].update(category_id=9), r"annotations\[2\]: category_id is 9, want one of 3, 18"),
-        (lambda t: t["annotations"][2].update(image_id=99), r"annotations\[2\]: image_id is 99, which no entry"),
-        (lambda t: t["images"][2].update(file_name="lost.png"), r"images\[2\]: there is no picture at .*lost\.png"),
-        (lambda t: t["images"][2].update(file_name="../../x.png"), r"images\[2\]: file_name is '../../x.png'"),
+        (lambda t: t["annotations"][4].update(bbox=[200, 0, 60, 9]), r"annotations\.4: box .* is not inside 1\.png"),
+        (lambda t: t["annotations"][0].update(bbox=[2, 0, -60, 9]), r"annotations\.0: box .* is not inside"),
+        (lambda t: t["annotations"][3].update(bbox=[2, 0, 9]), r"annotations\.3\.bbox\.3 is missing"),
+        (lambda t: t["annotations"][2].update(category_id=9), r"annotations\.2\.category_id is 9, want one of 3, 18"),
+        (lambda t: t["annotations"][2].update(image_id=99), r"annotations\.2\.image_id is 99, which no entry"),
+        (lambda t: t["images"][2].update(file_name="lost.png"), r"images\.2: there is no picture at .*lost\.png"),
+        (lambda t: t["images"][2].update(file_name="../../x.png"), r"images\.2\.file_name is '../../x.png', want"),
         (lambda t: t["categories"][0].update(name="cat"), r"of its classes \(cat, dog\) none is known as a car"),
-        (lambda t: t.pop("images"), r"labels\.json: images is None, want a list of tables"),
+        (lambda t: t.pop("images"), r"labels\.json: images is missing"),
         (lambda t: t["annotations"].clear(), "none of its 3 pictures has a label of a car"),
     ],
 )  # fmt: skip

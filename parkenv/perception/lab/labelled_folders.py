@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import AfterValidator, Strict
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError, nearest
 from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
+from parkenv.files.spec_file import Several, Spec
 from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.lab.car_datasets import Crops, LabelledImage
@@ -33,6 +34,35 @@ LEAST_CARS = 20
 _WINDOWS = 3  # windows without cars from each picture
 _TOLERANCE = 2.0  # px that a box may reach outside its picture, by rounding
 _NO_LABELS = re.compile(r"classes|names|readme.*|requirements|train|val|test|license.*", re.IGNORECASE)
+
+
+def _below(name: str) -> str:
+    if PurePosixPath(name).is_absolute() or ".." in PurePosixPath(name).parts:
+        raise ValueError("a file below the folder of the pictures")
+    return name
+
+
+class _Category(Spec, extra="ignore"):
+    id: int | str
+    name: str = ""
+
+
+class _Picture(Spec, extra="ignore"):
+    id: int | str
+    file_name: Annotated[str, AfterValidator(_below)]
+
+
+class _Label(Spec, extra="ignore"):
+    image_id: int | str
+    category_id: int | str
+    bbox: Annotated[Box, Strict(False)]  # px: left, top, width, height
+    iscrowd: int = 0
+
+
+class _Coco(Spec, extra="ignore"):
+    images: Several[_Picture]
+    annotations: Several[_Label]
+    categories: Several[_Category]
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,38 +102,25 @@ def read_coco(path: Path, images: Path, classes: Sequence[str] = ()) -> list[Lab
             box outside its picture.
     """
     content = read_json(path, finite=True)
-    tables = content if isinstance(content, dict) else {}
-    pictures, labels, categories = (
-        _tables(tables.get(name), f"{path}: {name}") for name in ("images", "annotations", "categories")
-    )
-    names = {
-        _key(c, "id", f"{path}: categories[{i}]"): str(c.get("name", "")) for i, c in enumerate(categories)
-    }
-    cars = _cars(names, classes, path)
+    coco = _Coco.parse(content if isinstance(content, dict) else {}, str(path))
+    names = {category.id: category.name for category in coco.categories}
+    cars, known = _cars(names, classes, path), {picture.id for picture in coco.images}
     boxes: dict[Any, list[tuple[str, Box, bool]]] = defaultdict(list)
-    known = {_key(picture, "id", f"{path}: images[{i}]") for i, picture in enumerate(pictures)}
-    for i, label in enumerate(labels):
-        where = f"{path}: annotations[{i}]"
-        category, its_picture = (_key(label, name, where) for name in ("category_id", "image_id"))
-        if category not in names:
-            raise InputError(f"{where}: category_id is {category!r}, want one of {_listed(map(str, names))}")
-        if its_picture not in known:
-            raise InputError(f"{where}: image_id is {its_picture!r}, which no entry of images has")
-        if category in cars:
-            left, top, width, height = _four(label.get("bbox"), where)
-            box = (left, top, left + width, top + height)
-            boxes[its_picture].append((where, box, not label.get("iscrowd")))
-    photos = []
-    for i, picture in enumerate(pictures):
-        name = picture.get("file_name")
-        if (
-            not isinstance(name, str)
-            or PurePosixPath(name).is_absolute()
-            or ".." in PurePosixPath(name).parts
-        ):
-            raise InputError(f"{path}: images[{i}]: file_name is {name!r:.80}, want a file below {images}")
-        photos.append(_photo(images / name, boxes[picture["id"]], f"{path}: images[{i}]"))
-    return photos
+    for i, label in enumerate(coco.annotations):
+        where = f"{path}: annotations.{i}"
+        if label.category_id not in names:
+            raise InputError(
+                f"{where}.category_id is {label.category_id!r}, want one of {_listed(map(str, names))}"
+            )
+        if label.image_id not in known:
+            raise InputError(f"{where}.image_id is {label.image_id!r}, which no entry of images has")
+        if label.category_id in cars:
+            left, top, width, height = label.bbox
+            boxes[label.image_id].append((where, (left, top, left + width, top + height), not label.iscrowd))
+    return [
+        _photo(images / picture.file_name, boxes[picture.id], f"{path}: images.{i}")
+        for i, picture in enumerate(coco.images)
+    ]
 
 
 def read_yolo(folder: Path, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
@@ -222,29 +239,6 @@ def _cars(names: dict[Any, str], classes: Sequence[str], source: Path) -> set[An
 def _listed(names: Any) -> str:
     some = [str(name) for name in names]
     return ", ".join(some[:10]) + (", ..." if len(some) > 10 else "")
-
-
-def _key(table: dict[str, Any], name: str, where: str) -> int | str:
-    value = table.get(name)
-    if isinstance(value, int | str) and not isinstance(value, bool):
-        return value
-    raise InputError(f"{where}: {name} is {value!r:.60}, want a whole number")
-
-
-def _tables(value: Any, where: str) -> list[dict[str, Any]]:
-    if isinstance(value, list) and all(isinstance(table, dict) for table in value):
-        return value
-    raise InputError(f"{where} is {value!r:.60}, want a list of tables as in COCO")
-
-
-def _four(value: Any, where: str) -> list[float]:
-    if (
-        isinstance(value, list)
-        and len(value) == 4
-        and all(isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) for v in value)
-    ):
-        return [float(v) for v in value]
-    raise InputError(f"{where}: bbox is {value!r:.80}, want [left, top, width, height] in px")
 
 
 def _yolo_names(folder: Path) -> dict[Any, str]:

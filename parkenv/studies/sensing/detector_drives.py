@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.mapping.route import survey_route
 from parkenv.perception.detector import Detections, Detector, overlaps
@@ -112,16 +112,23 @@ def score_on_drives(
 
     rows = [row("all", np.ones(len(weather), dtype=np.bool_))]
     rows += [row(preset, weather == preset) for preset in PRESETS]
-    rows += [
-        row(f"{low:g} to {high:g} m", (distance >= low) & (distance < high))
-        for low, high in itertools.pairwise(DISTANCES)
-    ]
-    rows += [
-        row(f"{low:.0%} to {high:.0%} visible", (visible >= low) & (visible < high))
-        for low, high in itertools.pairwise(VISIBLE)
-    ]
+    rows += [row(part, which) for _, part, which in parts_of(distance, visible)]
     clear = whole & (visible >= VISIBLE[-2])
     return [*rows, row("whole and clear", clear), row("cut by the picture's border", ~whole)]
+
+
+def bins(values: FloatArray, limits: Sequence[float]) -> Iterator[tuple[float, float, BoolArray]]:
+    """Yield the ends of each bin between limits, and which of n values it holds, (n,) bool."""
+    for low, high in itertools.pairwise(limits):
+        yield low, high, (values >= low) & (values < high)
+
+
+def parts_of(distance: FloatArray, visible: FloatArray) -> Iterator[tuple[str, str, BoolArray]]:
+    """Yield group, name and members of the bins of n cars by distance, m, and by visible fraction."""
+    for low, high, which in bins(distance, DISTANCES):
+        yield "distance", f"{low:g} to {high:g} m", which
+    for low, high, which in bins(visible, VISIBLE):
+        yield "visible", f"{low:.0%} to {high:.0%} visible", which
 
 
 def _is_whole(picture: DrivePicture) -> NDArray[np.bool_]:

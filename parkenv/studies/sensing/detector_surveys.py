@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import BoolArray
+from parkenv.compiled.arrays import BoolArray, IntArray
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, typed_records, write_csv
 from parkenv.mapping.distance_bins import DISTANCE_ENDS
@@ -19,7 +19,7 @@ from parkenv.mapping.store import MapStore
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.mapping.survey_score import CLEAR, SIDES, SIGHTING
 from parkenv.studies.results import Row
-from parkenv.studies.sensing.detector_drives import DISTANCES, LEAST_HEIGHT, VISIBLE
+from parkenv.studies.sensing.detector_drives import DISTANCES, LEAST_HEIGHT, VISIBLE, bins, parts_of
 from parkenv.studies.sensing.sessions import MAP_FILE
 from parkenv.studies.sensing.surveys import map_error
 from parkenv.studies.statistics import rate_interval
@@ -27,9 +27,6 @@ from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS
 from sim_sensors.ground_truth import View
 from sim_sensors.rig import SensorRig
-
-if TYPE_CHECKING:
-    from parkenv.show.figures.detectors import MissedCar
 
 Sightings = NDArray[np.void]
 
@@ -60,23 +57,45 @@ class DetectorSurvey:
     settings: SurveySettings
     folder: Path
 
-    @property
-    def name(self) -> str:
-        """Rig and detector, for tables and figures."""
-        return f"{self.settings.rig}, {self.settings.detector}"
-
     def sightings_file(self, number: int) -> Path:
         """Return the table of the sightings of a session."""
         return self.folder / "sightings" / f"{number:05d}.csv"
 
 
-@dataclass(frozen=True, eq=False)
-class SurveyedDrive:
+class SurveyedDrive(NamedTuple):
     """What is kept of one session of a detector's survey."""
 
     number: int  # of the session
     row: Row  # of `sessions.csv`
     sightings: Sightings
+
+
+class _Seen(NamedTuple):
+    """The sightings of all drives of a survey, n in all."""
+
+    sightings: Sightings
+    drive: IntArray  # (n,) row of the drive
+    weather: NDArray[np.str_]  # (n,)
+    wanted: BoolArray  # (n,) see `is_wanted`
+    cause: IntArray  # (n,) see `causes_of`
+    n_drives: int
+
+    @classmethod
+    def of(cls, survey: DetectorSurvey, drives: Sequence[SurveyedDrive]) -> Self:
+        lengths = [len(drive.sightings) for drive in drives]
+        every = np.concatenate([drive.sightings for drive in drives])
+        weather = np.repeat([drive.row["weather"] for drive in drives], lengths)
+        height, width = _picture_size(survey.settings.rig)
+        cause = causes_of(every, weather, width, height)
+        return cls(
+            every, np.repeat(np.arange(len(drives)), lengths), weather, is_wanted(every), cause, len(drives)
+        )
+
+    def counts(self, part: BoolArray, weights: NDArray[Any] | None = None) -> list[int]:
+        """Return the number of sightings of a part in each drive, or the sum of their weights."""
+        weights = None if weights is None else weights[part]
+        counted: list[int] = np.bincount(self.drive[part], weights, self.n_drives).astype(int).tolist()
+        return counted
 
 
 def comparison_table(
@@ -90,27 +109,17 @@ def comparison_table(
     Returns:
         Rows with `TABLE_COLUMNS`; a measure that a part does not have is None.
     """
-    height, width = _picture_size(survey.settings.rig)
-    wanted = [is_wanted(d.sightings) for d in drives]
-    causes = [causes_of(d.sightings, d.row["weather"], width, height) for d in drives]
-    everything = [np.ones(len(d.sightings), dtype=np.bool_) for d in drives]
+    seen = _Seen.of(survey, drives)
+    boxes, visible = seen.sightings["boxes"], seen.sightings["visible"]
 
-    def in_pictures(parts: Sequence[BoolArray]) -> Row:
-        cars = [w & p for w, p in zip(wanted, parts, strict=True)]
-        found = [int((d.sightings["boxes"][c] > 0).sum()) for d, c in zip(drives, cars, strict=True)]
-        return _rate("in_pictures", found, [int(c.sum()) for c in cars])
+    def in_pictures(part: BoolArray) -> Row:
+        cars = seen.wanted & part
+        return _rate("in_pictures", seen.counts(cars & (boxes > 0)), seen.counts(cars))
 
-    def boxes(parts: Sequence[BoolArray]) -> Row:
-        counts = [
-            (
-                int(d.sightings["boxes"][p & (d.sightings["visible"] > 0)].sum()),
-                int(d.sightings["boxes"][p].sum()),
-            )
-            for d, p in zip(drives, parts, strict=True)
-        ]
-        return _rate("boxes", *zip(*counts, strict=True))
+    def of_boxes(part: BoolArray) -> Row:
+        return _rate("boxes", seen.counts(part & (visible > 0), boxes), seen.counts(part, boxes))
 
-    def drive_measures(which: Sequence[SurveyedDrive]) -> Row:
+    def of_drives(which: Sequence[SurveyedDrive]) -> Row:
         rows = [d.row for d in which]
         slots = scenario.lot.n_slots
         place = [r["place_error_m"] for r in rows if np.isfinite(r["place_error_m"])]
@@ -122,27 +131,25 @@ def comparison_table(
         )
 
     with MapStore(survey.folder / MAP_FILE, scenario.lot, create=False) as store:
-        log = store.log({d.row["key"] for d in drives})
-    table = [("all", "all", drive_measures(drives) | in_pictures(everything))]
-    table[0][2]["map_error"] = map_error(scenario, survey.settings.windows, log)[0]
-    for weather in PRESETS:
-        which = [d for d in drives if d.row["weather"] == weather]
-        of_it = [np.full(len(d.sightings), d.row["weather"] == weather) for d in drives]
-        if which:
-            table.append(("weather", weather, drive_measures(which) | in_pictures(of_it)))
-    for low, high in itertools.pairwise(DISTANCES):
-        within = [(d.sightings["distance"] >= low) & (d.sightings["distance"] < high) for d in drives]
-        table.append(("distance", f"{low:g} to {high:g} m", in_pictures(within) | boxes(within)))
-    for low, high in itertools.pairwise(VISIBLE):
-        within = [(d.sightings["visible"] >= low) & (d.sightings["visible"] < high) for d in drives]
-        table.append(("visible", f"{low:.0%} to {high:.0%} visible", in_pictures(within)))
-    names = list(CAUSES)
-    never = [never_found(d, w, c) for d, w, c in zip(drives, wanted, causes, strict=True)]
-    for i, name in enumerate(names):
-        row = in_pictures([c == i for c in causes])
-        # `cars`: of those that were never found in a drive, those whose best picture is of this kind.
-        missed = sum(int((best == i).sum()) for best in never)
-        table.append(("cause", name, row | {"cars": missed}))
+        error, _ = map_error(scenario, survey.settings.windows, store.log({d.row["key"] for d in drives}))
+    whole = of_drives(drives) | in_pictures(np.ones(len(boxes), np.bool_)) | {"map_error": error}
+    table = [("all", "all", whole)]
+    table += [
+        ("weather", weather, of_drives(which) | in_pictures(seen.weather == weather))
+        for weather in PRESETS
+        if (which := [d for d in drives if d.row["weather"] == weather])
+    ]
+    table += [
+        (group, name, in_pictures(part) | (of_boxes(part) if group == "distance" else {}))
+        for group, name, part in parts_of(seen.sightings["distance"], visible)
+    ]
+    of_drive = ([column[seen.drive == k] for column in seen[:5]] for k in range(len(drives)))
+    never = [cause for s, _, _, wanted, causes in of_drive for cause in never_found(s, wanted, causes)]
+    # `cars`: of those that were never found in a drive, those whose best picture is of this kind.
+    table += [
+        ("cause", name, in_pictures(seen.cause == i) | {"cars": never.count(i)})
+        for i, name in enumerate(CAUSES)
+    ]
     empty = dict.fromkeys(TABLE_COLUMNS)
     head = {"rig": survey.settings.rig, "detector": survey.settings.detector}
     return [empty | head | {"group": group, "part": part} | row for group, part, row in table]
@@ -156,24 +163,17 @@ def reach_table(survey: DetectorSurvey, drives: Sequence[SurveyedDrive]) -> list
         its 95 % interval (low, high), for every bin with a car.
     """
     height, width = _picture_size(survey.settings.rig)
-    clear = [
-        is_wanted(s) & (s["visible"] >= CLEAR) & (s["left"] > 0) & (s["top"] > 0)
-        & (s["right"] < width) & (s["bottom"] < height)
-        for s in (d.sightings for d in drives)
-    ]  # fmt: skip
+    seen = _Seen.of(survey, drives)
+    s = seen.sightings
+    whole = (s["left"] > 0) & (s["top"] > 0) & (s["right"] < width) & (s["bottom"] < height)
+    clear = seen.wanted & (s["visible"] >= CLEAR) & whole
     head = {"rig": survey.settings.rig, "detector": survey.settings.detector}
     table = []
     for weather in (ALL_WEATHERS, *PRESETS):
-        its = [
-            d.sightings[c]
-            for d, c in zip(drives, clear, strict=True)
-            if weather in (ALL_WEATHERS, d.row["weather"])
-        ]
-        for low, high in itertools.pairwise((0.0, *DISTANCE_ENDS, DISTANCES[-1])):
-            within = [s[(s["distance"] >= low) & (s["distance"] < high)] for s in its]
-            cars = [len(s) for s in within]
+        its = clear & ((weather == ALL_WEATHERS) | (seen.weather == weather))
+        for low, high, part in bins(s["distance"], (0.0, *DISTANCE_ENDS, DISTANCES[-1])):
+            found, cars = seen.counts(its & part & (s["boxes"] > 0)), seen.counts(its & part)
             if sum(cars):
-                found = [int((s["boxes"] > 0).sum()) for s in within]
                 interval = dict(zip(("rate", "low", "high"), rate_interval(found, cars), strict=True))
                 place = {"weather": weather, "distance_m": [low, high], "cars": sum(cars)}
                 table.append(head | place | interval)
@@ -188,32 +188,33 @@ def is_wanted(sightings: Sightings) -> BoolArray:
     return np.asarray(wanted)
 
 
-def causes_of(sightings: Sightings, weather: str, width: int, height: int) -> NDArray[np.int64]:
-    """Return the index in `CAUSES` of each sighting, in pictures of this size, px."""
+def causes_of(
+    sightings: Sightings, weather: str | NDArray[np.str_], width: int, height: int
+) -> NDArray[np.int64]:
+    """Return the index in `CAUSES` of each sighting, in pictures of this size, px, of one weather or of one each."""
     s = sightings
     left, right = s["left"] <= 0, s["right"] >= width
-    holds = [
+    holds = np.broadcast_arrays(
         (s["top"] <= 0) | (s["bottom"] >= height) | (left & right),
         left | right,
         s["visible"] < VISIBLE[-2],
         s["distance"] > FAR,
-        np.full(len(s), weather == "dusk"),
+        np.asarray(weather) == "dusk",
         s["view"] == View.OBLIQUE,
-        np.ones(len(s), dtype=np.bool_),
-    ]
+        True,
+    )
     return np.asarray(np.argmax(holds, axis=0), dtype=np.int64)
 
 
-def never_found(drive: SurveyedDrive, wanted: BoolArray, causes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return, for each car that stood in pictures but was never located in its slot, the cause of its best one."""
-    s = drive.sightings
+def never_found(sightings: Sightings, wanted: BoolArray, causes: IntArray) -> NDArray[np.int64]:
+    """Return, for each car in a drive's pictures that was never located in its slot, the cause of its best one."""
+    s = sightings
     there = np.unique(s["slot"][wanted])
     missed = np.setdiff1d(there, s["slot"][(s["placed"] > 0) & (s["slot"] >= 0)])
     return np.array([causes[wanted & (s["slot"] == slot)].max() for slot in missed], dtype=np.int64)
 
 
-@dataclass(frozen=True, eq=False)
-class Miss:
+class Miss(NamedTuple):
     """A parked car in a picture that a detector missed."""
 
     session: int
@@ -231,52 +232,18 @@ def choose_misses(
     survey: DetectorSurvey, drives: Sequence[SurveyedDrive], number: int, seed: int = 0
 ) -> list[Miss]:
     """Choose missed cars at random, up to `number` of each cause, each car once in a drive."""
-    height, width = _picture_size(survey.settings.rig)
-    rng = np.random.default_rng(seed)
+    seen, rng = _Seen.of(survey, drives), np.random.default_rng(seed)
     chosen = []
     for i, cause in enumerate(CAUSES):
         cars = {}
-        for drive in drives:
-            s, weather = drive.sightings, drive.row["weather"]
-            missed = is_wanted(s) & (s["boxes"] == 0) & (causes_of(s, weather, width, height) == i)
-            for row in rng.permutation(np.flatnonzero(missed)).tolist():
-                cars[drive.number, int(s["slot"][row])] = Miss(drive.number, weather, cause, s[row])
+        missed = seen.wanted & (seen.sightings["boxes"] == 0) & (seen.cause == i)
+        for k, drive in enumerate(drives):
+            for row in rng.permutation(np.flatnonzero(missed & (seen.drive == k))).tolist():
+                car = seen.sightings[row]
+                cars[drive.number, int(car["slot"])] = Miss(drive.number, drive.row["weather"], cause, car)
         misses = list(cars.values())
         chosen += [misses[k] for k in rng.permutation(len(misses))[:number].tolist()]
     return chosen
-
-
-def missed_by_cause(
-    misses: Sequence[Miss],
-    pictures: Mapping[tuple[int, int, int], NDArray[np.uint8]],
-    rows: Sequence[Row],
-) -> dict[str, list[MissedCar]]:
-    """Return missed cars for a contact sheet, by cause; the headings say how many there are in all.
-
-    Args:
-        misses: the cars.
-        pictures: from `pictures_of`.
-        rows: rows of the group `cause` of the comparison.
-    """
-    from parkenv.show.figures.detectors import MissedCar  # loads Matplotlib
-
-    sheet: dict[str, list[MissedCar]] = {}
-    for row in rows:
-        cause = row["part"]
-        missed = round(row["in_pictures"] * (1.0 - row["in_pictures_rate"])) if row["in_pictures"] else 0
-        heading = f"{cause} ({CAUSES[cause]}): {missed:,} of {row['in_pictures']:,} missed"
-        sheet[heading] = [
-            MissedCar(
-                pictures[miss.picture],
-                [float(miss.sighting[side]) for side in SIDES],
-                float(miss.sighting["distance"]),
-                float(miss.sighting["visible"]),
-                miss.weather,
-            )
-            for miss in misses
-            if miss.cause == cause
-        ]
-    return sheet
 
 
 def pictures_of(
@@ -320,20 +287,34 @@ def draw_misses(
         table: rows of `comparison_table`.
         folder: where the sheets go.
     """
-    from parkenv.show.figures.detectors import save_misses
+    from parkenv.show.figures.detectors import MissedCar, save_misses
 
     chosen = [choose_misses(survey, its, number, seed) for survey, its in zip(surveys, drives, strict=True)]
     of_rig = itertools.groupby(zip(surveys, chosen, strict=True), lambda s: s[0].settings.rig)
-    for _, group in of_rig:
+    for rig, group in of_rig:
         sheets = list(group)
         wanted = {miss.picture for _, cars in sheets for miss in cars}
         pictures = pictures_of(scenario, sheets[0][0].settings, wanted)
         for survey, cars in sheets:
-            rig, detector = survey.settings.rig, survey.settings.detector
-            rows = [r for r in table if (r["rig"], r["detector"], r["group"]) == (rig, detector, "cause")]
+            detector, by_cause = survey.settings.detector, dict[str, list[MissedCar]]()
+            for row in table:
+                if (row["rig"], row["detector"], row["group"]) != (rig, detector, "cause"):
+                    continue
+                cause, there = row["part"], row["in_pictures"]
+                missed = round(there * (1.0 - row["in_pictures_rate"])) if there else 0
+                by_cause[f"{cause} ({CAUSES[cause]}): {missed:,} of {there:,} missed"] = [
+                    MissedCar(
+                        pictures[miss.picture],
+                        [float(miss.sighting[side]) for side in SIDES],
+                        float(miss.sighting["distance"]),
+                        float(miss.sighting["visible"]),
+                        miss.weather,
+                    )
+                    for miss in cars
+                    if miss.cause == cause
+                ]
             title = f"Cars that {detector} missed in pictures of {scenario.name}, rig {rig}"
-            missed = missed_by_cause(cars, pictures, rows)
-            save_misses(missed, title, folder / f"misses_{survey.folder.name}.png")
+            save_misses(by_cause, title, folder / f"misses_{survey.folder.name}.png")
 
 
 def _rate(measure: str, right: Sequence[int], total: Sequence[int]) -> Row:

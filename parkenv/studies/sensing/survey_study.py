@@ -189,7 +189,7 @@ class SurveyStudy(Study):
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: pictures of the map; those of the first session only if it was driven in this run."""
-        from parkenv.studies.sensing.survey_figures import draw_survey
+        from parkenv.studies.sensing.surveys import draw_survey
 
         shown, _ = result.results.kept.get(SHOWN, (None, None))
         return [partial(draw_survey, self.built, self.drive_settings, result.rows[0], shown, result.folder)]
