@@ -53,11 +53,8 @@ def publish(
         seed (N >= 0): First seed; episode i uses seed + i.  [default: 3000000, as in the tests of trainings]
     """
     from parkenv.files.atomic_write import make_folder
-    from parkenv.scenarios.build import build
-    from parkenv.studies.publish.fleet import FleetPublication
-    from parkenv.studies.publish.publication import CARD, FILM, MODEL, Publication
+    from parkenv.studies.publication import CARD, FILM, MODEL, kind_of
     from parkenv.studies.results import write_summary
-    from parkenv.studies.training.spec import FleetTrainingSpec
     from parkenv.studies.training.training import FIGURE, TEST_SEED
     from planners.model_file import ModelCard
 
@@ -71,11 +68,7 @@ def publish(
     if scenario is not None:
         tested = args.scenario_specs(scenario)
     named = {_file_of(spec): spec for spec in (tested or _trained_on(model, card.scenarios))}
-    published = (
-        FleetPublication.of_training(spec, model, named, episodes or 16, seed)
-        if isinstance(spec, FleetTrainingSpec)
-        else Publication(model, {name: build(each) for name, each in named.items()}, episodes or 500, seed)
-    )
+    published = kind_of(model, spec)(model, named, seed, **args.not_none(episodes=episodes))
     make_folder(out)
     console = make_console()
     with console.status("Evaluating"), machines.workers() as workers:
@@ -93,7 +86,7 @@ def publish(
         shutil.copyfile(curve, out / FIGURE)
         further += f"\n## Training\n\n![Learning curves]({FIGURE})\n"
     published.write_card(rows, out / CARD, further)
-    results = {"command": published.command, "version": __version__, "seed": seed, "rows": rows}
+    results = {"command": published.command_line, "version": __version__, "seed": seed, "rows": rows}
     write_summary(out, results, "results.json")
     console.print(f"{out} holds {', '.join(sorted(path.name for path in out.iterdir()))}")
     console.print(f"To upload it: hf upload USER/NAME {shlex.quote(str(out))}")

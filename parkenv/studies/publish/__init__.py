@@ -1,1 +1,0 @@
-"""Publishing trained models: their results beside planners, a film, and a model card."""
