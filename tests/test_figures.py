@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -15,7 +17,6 @@ from parkenv.show.figures.rates import save_rates
 from parkenv.show.figures.searches import BELIEF_MAP, draw_search, draw_searches
 from parkenv.show.figures.time_distribution import draw_time_distribution
 from parkenv.show.figures.times import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
-from parkenv.show.search_trace import SearchTrace
 from parkenv.studies.compare import figures as comparison_figures
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.figures import FIGURES, ComparisonResults, draw_figures, remove_figures
@@ -48,7 +49,7 @@ def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, price=0.0, gave_up=0.0, 
 
 def trace(name="mdp", scenario=None, seed=0):
     scenario = scenario or make_scenario("mini")
-    return EpisodeRunner(scenario, name, make_agent(name, scenario)).run(seed).trace
+    return EpisodeRunner(scenario, name, make_agent(name, scenario)).run(seed)
 
 
 def picture(path):
@@ -200,7 +201,9 @@ def test_a_search_that_gave_up_or_never_moved_is_drawn(tmp_path):
         "gave_up_s": 1800.0,
         "parked": False,
     }
-    still = SearchTrace(scenario, "random", [entry], np.ones(n, bool), np.full(n, 0.9), None, metrics)
+    still = replace(
+        trace("random", scenario), path=[entry], occupied=np.ones(n, bool), policy=None, metrics=metrics
+    )
     save_picture(draw_searches([still]), tmp_path / "search.png")
     picture(tmp_path / "search.png")
     ax = axes()
@@ -304,10 +307,9 @@ def test_the_fastest_agent_and_belief_are_among_the_searches_drawn(monkeypatch):
     mini = make_scenario("mini")
     cases = [(Case(mini, name), range(1)) for name in names]
     table = [row(name, scenario="mini", drive=10.0 if name == "mdp-tuned" else 30.0) for name in names]
-    monkeypatch.setattr(Case, "trace", lambda self, seed: self.agent)
-    monkeypatch.setattr(comparison_figures, "draw_searches", lambda traces: traces)
+    monkeypatch.setattr(comparison_figures, "draw_searches", lambda records: [its.agent for its in records])
     drawn = comparison_figures.searches(ComparisonResults(cases, {}, table))
-    assert [traces for *_, traces in drawn] == [["greedy-goal", "mdp-tuned", "belief", "oracle"]]
+    assert [agents for *_, agents in drawn] == [["greedy-goal", "mdp-tuned", "belief", "oracle"]]
 
 
 def test_a_single_search_has_no_band():

@@ -18,7 +18,7 @@ from parkenv.lots import packaged_lot, write_lot
 from parkenv.show.report.page import SCHEMA
 from parkenv.show.report.tables import table_of
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.compare.search_replay import Encounter, choose, record
+from parkenv.studies.compare.search_replay import Encounter, choose, replay
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import EPISODES
 from parkenv.studies.sensing.sessions import SESSIONS
@@ -288,7 +288,7 @@ def test_searches_are_chosen_in_turns_over_settings():
 )
 def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
     scenario = make_scenario("campus")
-    recorded = record(Encounter((Case(scenario, name),), 3), {})
+    recorded = replay(Encounter((Case(scenario, name),), 3), {})
     (search,), neighbors = recorded["world"]["searches"], scenario.lot.neighbors
     assert search["agrees"] is None
     plan, planned = [], 0
@@ -308,7 +308,7 @@ def test_plans_are_ways_that_can_be_driven_and_begin_with_what_is_done(name):
 def test_asking_belief_for_its_plan_changes_nothing():
     scenario = make_scenario("mini")
     case = Case(scenario, "belief")
-    recorded = record(Encounter((case,), 11), {})["world"]["searches"][0]
+    recorded = replay(Encounter((case,), 11), {})["world"]["searches"][0]
     assert recorded["total_s"] == case.run([11])[0]["total_s"]
 
     agent = make_agent("belief", scenario)

@@ -55,7 +55,7 @@ def plan(
     with console.status("Planning"):
         for setting in settings_of(base, grid.failure_s, grid.v_walk_kmh, grid.v_drive_kmh):
             case = Case(setting, named.name, options=named.options)
-            trace = case.trace(seed)
+            trace = case.runner().run(seed)
             planner = make_agent(named.name, setting, **named.options)
             assert isinstance(planner, StaticAgent)
             expected = float(planner.expected_time(trace.forecast)[trace.path[0]])

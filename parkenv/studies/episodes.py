@@ -1,9 +1,8 @@
-"""Run episodes of one agent in one scenario: a table row for each, and traces for pictures."""
+"""Run episodes of one agent in one scenario, and record them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -11,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.engine.state import SearchState
-from parkenv.show.search_trace import SearchTrace
-from parkenv.studies.results import DECISIONS
+from parkenv.show.search_record import Moment, SearchRecord
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
@@ -20,39 +18,46 @@ from planners.bounds.oracle import best_slot
 from planners.routes import DriveRoutes
 
 
-@dataclass
-class Episode:
-    """The outcome of one search."""
+class SearchRecorder(Observer):
+    """Records a search, whose true occupancy no agent sees.
 
-    row: dict[str, Any]  # row of `episodes.csv`, without the columns that identify agent and setting
-    # wall time of each decision, s; not in the row because it differs from run to run
-    decision_s: list[float]
-    trace: SearchTrace  # trace for pictures
-
-    @property
-    def timed_row(self) -> dict[str, Any]:
-        """The row with the wall times of its decisions."""
-        return self.row | {DECISIONS: " ".join(str(round(1e6 * s)) for s in self.decision_s)}
-
-
-class FirstPlan(Observer):
-    """Records the plan of the first decision.
+    Args:
+        agent: the agent, whose plans are recorded if it has `plan_preview`; None to record none.
+        keeps: whether each moment is kept, instead of the first plan alone.
 
     Attributes:
-        policy: (n_vertices,) int64; None for agents without a policy.
+        policy: plan of the first decision, (n_vertices,) int64; None for agents without a policy.
+        moments: the arrival and each step, if they are kept.
     """
 
+    def __init__(self, agent: Agent | None = None, *, keeps: bool = True) -> None:
+        self._preview_of, self._keeps = getattr(agent, "plan_preview", None), keeps
+
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Reset the recorder."""
-        del env, observation
+        """Record the arrival."""
+        del observation
+        self._env: Any = env.unwrapped
         self.policy: NDArray[np.int64] | None = None
+        self.moments: list[Moment] = []
         self._decided = False
+        if self._keeps:
+            self._add()
 
     def on_step(self, step: Step) -> None:
-        """Record the first plan."""
+        """Record the decision, the plan that led to it, and the next state."""
         if not self._decided:
             self.policy = getattr(step.memory, "policy", None)
-            self._decided = True
+        self._decided = True
+        if self._keeps:
+            action = int(step.action)
+            preview = self._preview_of and self._preview_of(step.observation, action, step.memory)
+            self._add(action, tuple(preview.path) if preview else (), step.info)
+
+    def _add(self, *step: Any) -> None:
+        state, perception = self._env.state, getattr(self._env, "perception", None)
+        captures = () if perception is None else perception.results
+        moment = Moment(state.time, state.vertex, state.belief, *step)
+        self.moments.append(moment._replace(captures=captures))
 
 
 class EpisodeRunner:
@@ -89,32 +94,36 @@ class EpisodeRunner:
         self.env.reset(seed=seed)
         return self._bound_s()
 
-    def run(self, seed: int, observers: Sequence[Observer] = ()) -> Episode:
-        """Run one search in the world of `seed`."""
-        scenario, first_plan = self.scenario, FirstPlan()
-        result = simulate(self.env, self.agent, seed, (first_plan, *observers))
+    def run(self, seed: int, observers: Sequence[Observer] = (), *, moments: bool = False) -> SearchRecord:
+        """Run one search in the world of `seed`.
+
+        Args:
+            seed: seed of the world.
+            observers: further observers.
+            moments: whether the record holds each step.
+        """
+        recorder = SearchRecorder(self.agent, keeps=moments)
+        result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
             name: value for name, value in result.info.items() if name not in ("reward_terms", "place")
         }
-        metrics["replans"] = int(getattr(result.memory, "replans", 0))
-        state = self._state
-        occupied = state.world.occupied(np.arange(scenario.lot.n_slots), state.arrival.time)
-        row = {
-            "seed": seed,
-            "day": state.arrival.day,
-            "arrival_s": round(state.arrival.time, 3),
-            "occupancy": float(occupied.mean()),
-            "slot": scenario.lot.slot_ids[state.vertex] if metrics["parked"] else "",
-            **metrics,
-            "steps": result.steps,
-            "truncated": result.truncated,
-            "bound_s": self._bound_s(),
-        }
-        forecast = scenario.forecast(state.arrival).p_occupied
-        trace = SearchTrace(
-            scenario, self.name, list(state.path), occupied, forecast, first_plan.policy, metrics
+        state, scenario = self._state, self.scenario
+        return SearchRecord(
+            scenario=scenario,
+            agent=self.name,
+            seed=seed,
+            arrival=state.arrival,
+            world=state.world,
+            path=list(state.path),
+            occupied=state.world.occupied(np.arange(scenario.lot.n_slots), state.arrival.time),
+            forecast=scenario.forecast(state.arrival).p_occupied,
+            policy=recorder.policy,
+            metrics=metrics | {"replans": int(getattr(result.memory, "replans", 0))},
+            truncated=result.truncated,
+            bound_s=self._bound_s(),
+            decision_s=result.decision_s,
+            moments=recorder.moments,
         )
-        return Episode(row, result.decision_s, trace)
 
     @property
     def _state(self) -> SearchState:

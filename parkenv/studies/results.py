@@ -33,6 +33,7 @@ from parkenv.studies.workers import SERIAL
 from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
+    from parkenv.show.search_record import SearchRecord
     from parkenv.studies.study import Cell, Study
 
 Row = dict[str, Any]
@@ -423,6 +424,11 @@ class Results:
 def decision_s(row: Mapping[str, Any]) -> list[float]:
     """Return the wall times of an episode's decisions, s; empty if a crash lost them."""
     return [int(us) * 1e-6 for us in row[DECISIONS].split()]
+
+
+def timed_row(record: SearchRecord) -> Row:
+    """Return the row of a search with the wall times of its decisions."""
+    return record.row | {DECISIONS: " ".join(str(round(1e6 * s)) for s in record.decision_s)}
 
 
 def _write_text(path: Path, text: str) -> None:

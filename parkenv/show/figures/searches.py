@@ -22,7 +22,7 @@ from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
 from parkenv.show.painters.axes import paint, points_per_m
 from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, posed, poses_on
-from parkenv.show.search_trace import SearchTrace
+from parkenv.show.search_record import SearchRecord
 from parkenv.world.cost_terms import COST_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
@@ -32,7 +32,7 @@ POLICY_SCALE = 2.2
 """Least scale, points per metre, at which arrows at every vertex are legible."""
 
 
-def draw_search(trace: SearchTrace, ax: Axes) -> None:
+def draw_search(record: SearchRecord, ax: Axes) -> None:
     """Draw one search as in T Fig. 4.9 to 4.12.
 
     At each slot, an inner disc shows the true occupancy and an outer ring the forecast. The path (from 1 to 2) and the
@@ -40,23 +40,23 @@ def draw_search(trace: SearchTrace, ax: Axes) -> None:
     axes first: line widths and arrows depend on the scale.
 
     Args:
-        trace: the search.
+        record: the search.
         ax: axes to draw in; sets their limits, aspect and title.
     """
-    lot = trace.scenario.lot
+    lot = record.scenario.lot
     draw_lot(lot, ax)
     scale = points_per_m(ax)
-    draw_discs(lot, ax, trace.forecast, BELIEF_MAP(trace.occupied.astype(np.float64)))
-    if _shows_policy(trace, scale):
-        _draw_policy(trace, ax, scale)
-    _draw_path(trace, ax, scale)
-    title = _title(trace, ax.get_window_extent().width / ax.figure.dpi)
+    draw_discs(lot, ax, record.forecast, BELIEF_MAP(record.occupied.astype(np.float64)))
+    if _shows_policy(record, scale):
+        _draw_policy(record, ax, scale)
+    _draw_path(record, ax, scale)
+    title = _title(record, ax.get_window_extent().width / ax.figure.dpi)
     ax.set_title(title, loc="left", fontsize=mpl.rcParams["font.size"], linespacing=1.35)
 
 
-def _title(trace: SearchTrace, width: float) -> str:
+def _title(record: SearchRecord, width: float) -> str:
     """Describe the search, with lines broken to a width in inches at the current font size."""
-    scenario, metrics = trace.scenario, trace.metrics
+    scenario, metrics = record.scenario, record.metrics
     terms = [
         f"{metrics[term.field]:.0f} {term.label}"
         for term in COST_TERMS
@@ -65,7 +65,7 @@ def _title(trace: SearchTrace, width: float) -> str:
     replans = metrics.get("replans", 0)
     planned = f"; {replans} replan{'s' if replans > 1 else ''}" if replans else ""
     lines = (
-        f"{trace.agent}: failure cost {scenario.failure_s:g} s, walk {scenario.v_walk / KMH:g}, "
+        f"{record.agent}: failure cost {scenario.failure_s:g} s, walk {scenario.v_walk / KMH:g}, "
         f"drive {scenario.v_drive / KMH:g} km/h",
         f"total {metrics['total_s']:.0f} s = {' + '.join(terms)}{planned}",
     )
@@ -73,13 +73,13 @@ def _title(trace: SearchTrace, width: float) -> str:
     return "\n".join(line for text in lines for line in textwrap.wrap(text, max(letters, 10)))
 
 
-def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
-    lot, parked = trace.scenario.lot, bool(trace.metrics["parked"])
-    xy = lot.vertex_xy[trace.path]
+def _draw_path(record: SearchRecord, ax: Axes, scale: float) -> None:
+    lot, parked = record.scenario.lot, bool(record.metrics["parked"])
+    xy = lot.vertex_xy[record.path]
     width = float(np.clip(0.5 * scale, 1.2, 3.0))
     layers: list[Layer] = []
     if parked:
-        end, goal = lot.slot_xy[trace.path[-1]], lot.goals[trace.scenario.goal]
+        end, goal = lot.slot_xy[record.path[-1]], lot.goals[record.scenario.goal]
         xy = np.vstack([xy, end])
         layers.append(Lines([np.stack([end, goal])], WALK, px=(1.8, 1.8), dash=(5.4, 3.6), halo="white"))
     layers.append(Lines([xy], PATH, px=(width, width), halo=INK))
@@ -104,19 +104,19 @@ def _draw_path(trace: SearchTrace, ax: Axes, scale: float) -> None:
         )
 
 
-def _shows_policy(trace: SearchTrace, scale: float) -> bool:
-    return trace.policy is not None and scale >= POLICY_SCALE
+def _shows_policy(record: SearchRecord, scale: float) -> bool:
+    return record.policy is not None and scale >= POLICY_SCALE
 
 
-def _draw_policy(trace: SearchTrace, ax: Axes, scale: float) -> None:
-    lot, policy = trace.scenario.lot, trace.policy
+def _draw_policy(record: SearchRecord, ax: Axes, scale: float) -> None:
+    lot, policy = record.scenario.lot, record.policy
     assert policy is not None
     drives = np.flatnonzero(policy < PARK)
     target = lot.neighbors[drives, policy[drives]]
     drives, target = drives[target >= 0], target[target >= 0]
     ahead = lot.vertex_xy[target] - lot.vertex_xy[drives]
     poses = posed(lot.vertex_xy[drives], np.arctan2(ahead[:, 1], ahead[:, 0]))
-    driven = np.isin(drives, trace.path)
+    driven = np.isin(drives, record.path)
     for there, color in ((driven, INK), (~driven, "white")):
         paint(ax, [Marks(poses[there], LANE_ARROW, color, (1.9, 0.8))], 3.5)
     size = min(2.1 * scale, 14.0)
@@ -138,24 +138,24 @@ def _text_marker(text: str) -> MplPath:
     return path.transformed(Affine2D().translate(*-path.get_extents().get_points().mean(axis=0)))
 
 
-def draw_searches(traces: Sequence[SearchTrace]) -> Figure:
+def draw_searches(records: Sequence[SearchRecord]) -> Figure:
     """Draw searches of several agents or settings in the same world side by side.
 
     Args:
-        traces: at least one search.
+        records: at least one search.
 
     Raises:
-        InputError: there are no traces.
+        InputError: there are no records.
     """
-    if not traces:
+    if not records:
         raise InputError("no search to draw")
-    bounds = np.array([trace.scenario.lot.bounds() for trace in traces])
+    bounds = np.array([record.scenario.lot.bounds() for record in records])
     across, up = (bounds[:, 2:] - bounds[:, :2]).T
     aspect = float(
         np.max((up + 6.0 + 0.1 * np.maximum(across, up)) / (across + 6.0 + 0.04 * np.maximum(across, up)))
     )
-    columns = 1 if len(traces) == 1 or (len(traces) == 2 and aspect < 0.6) else 2
-    lines = -(-len(traces) // columns)
+    columns = 1 if len(records) == 1 or (len(records) == 2 and aspect < 0.6) else 2
+    lines = -(-len(records) // columns)
     # All sizes in inches. Line widths depend on the size of the axes, so the axes get their final place here.
     width = 9.6 if columns == 1 else 7.0
     height = min(width * aspect, 8.0)
@@ -163,17 +163,17 @@ def draw_searches(traces: Sequence[SearchTrace]) -> Figure:
     zoom = 1.0 if columns == 1 else 1.2
     key, gap = 0.66 * zoom, 0.14
     with mpl.rc_context({**STYLE, "font.size": 10.0 * zoom}):
-        title = 0.12 + 0.19 * zoom * max(_title(trace, width).count("\n") + 1 for trace in traces)
+        title = 0.12 + 0.19 * zoom * max(_title(record, width).count("\n") + 1 for record in records)
         total = max(columns * (width + gap) + gap, 7.4 * zoom), lines * (height + title) + key
         figure = Figure(figsize=total)
         side = (total[0] - columns * (width + gap) + gap) / 2
-        for i, trace in enumerate(traces):
+        for i, record in enumerate(records):
             line, column = divmod(i, columns)
             left = side + column * (width + gap)
             bottom = total[1] - (line + 1) * (height + title)
             box = left / total[0], bottom / total[1], width / total[0], height / total[1]
-            draw_search(trace, figure.add_axes(box))
-        policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(traces, figure.axes, strict=True))
+            draw_search(record, figure.add_axes(box))
+        policy = any(_shows_policy(t, points_per_m(ax)) for t, ax in zip(records, figure.axes, strict=True))
         _draw_key(figure, key, zoom, policy=policy)
     return figure
 

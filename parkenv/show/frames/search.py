@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -65,7 +66,7 @@ class SearchRenderer:
         lot, belief = self.scenario.lot, state.belief
         here = lot.vertex_xy[state.vertex]
         image = self.frames.slots(here, belief_colors(belief.p_occupied, belief.observed), occupied)
-        view, pose = self.frames.still(here).view, car_pose(self.scenario, state)
+        view, pose = self.frames.still(here).view, car_pose(self.scenario, state.path, parked=state.parked)
         goal = lot.goals[self.scenario.goal]
         path = lot.vertex_xy[state.path]
         if state.parked:
@@ -141,7 +142,7 @@ class SearchRenderer:
         put(lot.slot_xy[order], glyphs[order])
         put(lot.entries, np.full(len(lot.entries), "E"))
         put(lot.goals[[self.scenario.goal]], np.array(["G"]))
-        pose = car_pose(self.scenario, state)
+        pose = car_pose(self.scenario, state.path, parked=state.parked)
         quarter = round(float(view.yaw(pose[2])) / (np.pi / 2)) % 4
         put(pose[None, :2], np.array([">v<^"[quarter]]))
         return ["".join(row).rstrip() for row in rows]
@@ -157,12 +158,12 @@ def strip_with_key() -> Image:
     return image
 
 
-def car_pose(scenario: Scenario, state: SearchState) -> FloatArray:
-    """Return the car's pose, (3,): x, y, m, and yaw, at its vertex or in its slot."""
-    lot, vertex = scenario.lot, state.vertex
-    if state.parked:
+def car_pose(scenario: Scenario, path: Sequence[int], *, parked: bool) -> FloatArray:
+    """Return the car's pose, (3,): x, y, m, and yaw, at the last vertex of its path or in its slot."""
+    lot, vertex = scenario.lot, path[-1]
+    if parked:
         return np.array([*lot.slot_xy[vertex], lot.slot_yaw[vertex]])
-    ahead = lot.vertex_xy[vertex] - lot.vertex_xy[state.path[-2] if len(state.path) > 1 else vertex]
+    ahead = lot.vertex_xy[vertex] - lot.vertex_xy[path[-2] if len(path) > 1 else vertex]
     if not ahead.any():
         ahead = _way_in(lot, vertex)
     return np.array([*lot.vertex_xy[vertex], np.arctan2(ahead[1], ahead[0])])

@@ -21,7 +21,7 @@ from parkenv.mapping.trips import Trip
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.commute.tables import FIXED, NONE
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import Row
+from parkenv.studies.results import Row, timed_row
 from parkenv.studies.trip_recorder import TripRecorder
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import PriorModel
@@ -142,8 +142,8 @@ class CommuteRun:
             for driver in range(self.fleet):
                 scenario, seed = self._search(day, driver, known)
                 recorder = TripRecorder()
-                episode = EpisodeRunner(scenario, self.label, agent).run(seed, (recorder,))
-                error = episode.trace.forecast - episode.trace.occupied
+                record = EpisodeRunner(scenario, self.label, agent).run(seed, (recorder,))
+                error = record.forecast - record.occupied
                 time = day.count * DAY_S + scenario.arrival.start_s
                 trips.append(recorder.trip(f"{day.number:05}-{driver:04}", time, day.date))
                 rows.append(
@@ -151,7 +151,7 @@ class CommuteRun:
                         **self.columns,
                         "day_number": day.number,
                         "driver": driver,
-                        **episode.timed_row,
+                        **timed_row(record),
                         "forecast_error": None if self.map == NONE else float(np.mean(error**2)),
                         TRIP: trips[-1] if self.learns else None,
                     }

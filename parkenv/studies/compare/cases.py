@@ -14,10 +14,9 @@ import numpy as np
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.scenarios.places import seeds_by_place
-from parkenv.show.search_trace import SearchTrace
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
+from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s, timed_row
 from parkenv.studies.statistics import mean_interval, summarize
 from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -67,11 +66,7 @@ class Case:
     def run(self, seeds: Sequence[int]) -> list[Row]:
         """Run one episode per seed; return their rows of `episodes.csv`, with the wall times of their decisions."""
         runner = self.runner()
-        return [{**self.columns, **runner.run(seed).timed_row} for seed in seeds]
-
-    def trace(self, seed: int) -> SearchTrace:
-        """Run one episode, and return its trace for a picture."""
-        return self.runner().run(seed).trace
+        return [{**self.columns, **timed_row(runner.run(seed))} for seed in seeds]
 
     def runner(self) -> EpisodeRunner:
         """Return a runner of this case's episodes."""

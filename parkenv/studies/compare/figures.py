@@ -179,7 +179,7 @@ def searches(results: ComparisonResults) -> Iterator[Drawn]:
         wanted = [cases[0], fastest, *(c for word in PICTURED for c in cases if c.agent == word)]
         labels = list(dict.fromkeys(case.label for case in wanted))[:MOST_PICTURED]
         drawn = [case for case in cases if case.label in labels]
-        yield name, setting, draw_searches([case.trace(results.seed) for case in drawn])
+        yield name, setting, draw_searches([case.runner().run(results.seed) for case in drawn])
 
 
 def _setting_of(row: Mapping[str, Any]) -> tuple[Any, ...]:

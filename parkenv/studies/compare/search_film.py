@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import cv2
-import gymnasium as gym
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
-from parkenv.envs.perception import SearchPerceptionEnv
 from parkenv.show.colors import PALETTE, belief_colors, rgb
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.figures.survey import draw_detections
@@ -20,12 +17,10 @@ from parkenv.show.frames.lot import PIXELS, LotFrames, clock, draw_belief_key, p
 from parkenv.show.frames.search import car_pose, searching_car, view_range, walk
 from parkenv.show.painters.opencv import paint, write_text
 from parkenv.show.scene import DISC, Lines, Marks, cars, posed
+from parkenv.show.search_record import Moment, SearchRecord
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 from parkenv.world.lot import PARK
-from parkenv.world.scenario import Scenario
-from planners.agent import Agent
 
 FPS = 10.0
 DRIVE_SPEEDUP, WALK_SPEEDUP = 3.0, 12.0
@@ -47,61 +42,59 @@ _PARKING_FRAMES = 5
 _CAMERA = (213, 160)
 
 
-class SearchFilm(Observer):
-    """Films a search in `parkenv/SearchPerception-v2`.
+class SearchFilm:
+    """Film of a search in `parkenv/SearchPerception-v2`.
 
     Args:
-        scenario: the scenario.
-        agent: the agent, whose plans are shown if it has `plan_preview`.
-        name: name of the agent.
+        record: the search, with its moments.
 
     Attributes:
-        frames: the frames so far, (h, w, 3) uint8.
+        frames: the frames, (h, w, 3) uint8.
     """
 
-    def __init__(self, scenario: Scenario, agent: Agent, name: str) -> None:
-        self._scenario, self._name = scenario, name
-        self._preview_of = getattr(agent, "plan_preview", None)
+    def __init__(self, record: SearchRecord) -> None:
+        self._record, self._scenario = record, record.scenario
         self.frames: list[Image] = []
-
-    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Show the lot and the forecast at the arrival."""
-        del observation
-        inner = env.unwrapped
-        assert isinstance(inner, SearchPerceptionEnv)
-        self._env = inner
-        lot = inner.scenario.lot
+        lot = self._scenario.lot
         west, south, east, north = lot.bounds()
         height = int(np.clip(WIDTH * (north - south + 6.0) / (east - west + 6.0), *MAP_HEIGHT))
         self._map = LotFrames(lot, (WIDTH, height))
-        self._slots = self._slots_image()
         self._camera = np.full((_CAMERA[1], _CAMERA[0], 3), PALETTE["ground"], np.uint8)
         self._parts = dict.fromkeys(COST_FIELDS, 0.0)
-        self._pose, self._trail = car_pose(inner.scenario, inner.state), list[FloatArray]()
+        self._moment, self._path = record.moments[0], [record.moments[0].vertex]
+        self._slots = self._slots_image()
+        self._pose, self._trail = car_pose(self._scenario, self._path, parked=False), list[FloatArray]()
         self._take("A car arrives. Its map says how likely each slot is taken.", hold=INTRO_S)
+        for moment in record.moments[1:]:
+            self._step(moment)
+        self._end()
 
-    def on_step(self, step: Step) -> None:
+    def _step(self, moment: Moment) -> None:
         """Show the way to the next vertex, or the parking attempt."""
-        state, lot = self._env.state, self._scenario.lot
-        start, end = self._pose, car_pose(self._scenario, state)
-        info = step.info
-        before = dict(self._parts)
-        self._parts |= {key: float(info[key]) for key in self._parts if key != "walk_s"}
-        if step.action == PARK and not state.parked:
-            name = lot.slot_ids[state.vertex]
+        lot, before = self._scenario.lot, dict(self._parts)
+        self._moment = moment
+        if moment.vertex != self._path[-1]:
+            self._path.append(moment.vertex)
+        start, end = self._pose, car_pose(self._scenario, self._path, parked=self._parked)
+        self._parts |= {key: float(moment.info[key]) for key in self._parts if key != "walk_s"}
+        if moment.action == PARK and not self._parked:
             self._slots = self._slots_image()
-            self._take(f"Slot {name} is taken after all: a failed attempt", hold=FAILED_S)
+            self._take(
+                f"Slot {lot.slot_ids[moment.vertex]} is taken after all: a failed attempt", hold=FAILED_S
+            )
             return
-        plan = self._plan(step)
+        plan = [lot.vertex_xy[v] for v in moment.plan] if moment.action != PARK else []
         seconds = self._parts["drive_s"] - before["drive_s"]
-        count = _PARKING_FRAMES if state.parked else max(1, round(seconds * FPS / DRIVE_SPEEDUP))
-        text = f"Slot {lot.slot_ids[state.vertex]} is free: it parks" if state.parked else self._seen_so_far()
+        count = _PARKING_FRAMES if self._parked else max(1, round(seconds * FPS / DRIVE_SPEEDUP))
+        text = (
+            f"Slot {lot.slot_ids[moment.vertex]} is free: it parks" if self._parked else self._seen_so_far()
+        )
         turn = math.remainder(end[2] - start[2], 2 * math.pi)
         self._trail.append(start[:2])
         for i in range(1, count + 1):
             share = i / count
             # On a lane the car has turned by the first half of an edge.
-            heading = start[2] + turn * (share if state.parked else min(2 * share, 1.0))
+            heading = start[2] + turn * (share if self._parked else min(2 * share, 1.0))
             self._pose = np.array([*(start + share * (end - start))[:2], heading])
             elapsed = {k: before[k] + share * (self._parts[k] - before[k]) for k in before}
             if i == count:
@@ -109,24 +102,24 @@ class SearchFilm(Observer):
             self._take(text, [self._pose[:2], *plan], elapsed)
         self._pose = end
 
-    def on_end(self, result: EpisodeResult) -> None:
+    def _end(self) -> None:
         """Show the driver's walk, and the total."""
-        state, lot, info = self._env.state, self._scenario.lot, result.info
-        if not state.parked:
-            self._parts |= {key: float(info[key]) for key in self._parts}
-            self._take(f"No free slot found: {info['total_s']:.0f} s", hold=LAST_S)
+        lot, metrics = self._scenario.lot, self._record.metrics
+        if not self._parked:
+            self._parts |= {key: float(metrics[key]) for key in self._parts}
+            self._take(f"No free slot found: {metrics['total_s']:.0f} s", hold=LAST_S)
             return
-        slot, goal = lot.slot_xy[state.vertex], lot.goals[self._scenario.goal]
+        slot, goal = lot.slot_xy[self._moment.vertex], lot.goals[self._scenario.goal]
         self._slots = self._slots_image()
-        text = f"The driver walks {info['walked_m']:.0f} m to the goal"
+        text = f"The driver walks {metrics['walked_m']:.0f} m to the goal"
         self._take(text, hold=PARKED_S)
-        count = max(2, round(float(info["walk_s"]) * FPS / WALK_SPEEDUP))
+        count = max(2, round(float(metrics["walk_s"]) * FPS / WALK_SPEEDUP))
         for i in range(1, count + 1):
             share = i / count
-            elapsed = self._parts | {"walk_s": share * float(info["walk_s"])}
+            elapsed = self._parts | {"walk_s": share * float(metrics["walk_s"])}
             self._take(text, elapsed=elapsed, walker=slot + share * (goal - slot))
-        self._parts |= {key: float(info[key]) for key in self._parts}
-        self._take(f"At the goal after {info['total_s']:.0f} s", hold=LAST_S, walker=goal)
+        self._parts |= {key: float(metrics[key]) for key in self._parts}
+        self._take(f"At the goal after {metrics['total_s']:.0f} s", hold=LAST_S, walker=goal)
 
     def save(self, path: Path) -> None:
         """Write the film as a GIF.
@@ -137,23 +130,28 @@ class SearchFilm(Observer):
         step = -(-len(self.frames) // MOST_FRAMES)
         save_film([*self.frames[:-1:step], self.frames[-1]], path, fps=FPS, colors=COLORS)
 
+    @property
+    def _parked(self) -> bool:
+        """Whether the car is in its slot."""
+        return bool(self._moment.info.get("parked"))
+
     def _slots_image(self) -> Image:
-        state = self._env.state
-        occupied = state.world.occupied(np.arange(self._scenario.lot.n_slots), state.time)
-        if state.parked:
-            occupied[state.vertex] = False  # the searching car itself is there
-        belief = state.belief
+        moment = self._moment
+        occupied = self._record.world.occupied(np.arange(self._scenario.lot.n_slots), moment.time)
+        if self._parked:
+            occupied[moment.vertex] = False  # the searching car itself is there
+        belief = moment.belief
         return self._map.slots(self._here, belief_colors(belief.p_occupied, belief.observed), occupied)
 
     @property
     def _here(self) -> FloatArray:
         """Position of the car's vertex, (2,) m, which a window on a large lot shows."""
-        here: FloatArray = self._scenario.lot.vertex_xy[self._env.state.vertex]
+        here: FloatArray = self._scenario.lot.vertex_xy[self._moment.vertex]
         return here
 
     def _map_image(self, plan: Sequence[FloatArray], walker: FloatArray | None) -> Image:
         """Return the map with the plan, the trail, the goal, the car and the walking driver."""
-        state, scenario, here = self._env.state, self._scenario, self._here
+        scenario, here = self._scenario, self._here
         image, view, goal = self._slots.copy(), self._map.still(here).view, scenario.lot.goals[scenario.goal]
         if len(plan) > 1:
             line = np.array(plan)
@@ -164,10 +162,10 @@ class SearchFilm(Observer):
             )
         trail = np.array([*self._trail, self._pose[:2]])
         paint(image, view, [Lines([trail], "car", px=(3.0, 3.0), halo="ink")])
-        if state.parked:
-            paint(image, view, [walk(scenario.lot.slot_xy[state.vertex], goal)])
+        if self._parked:
+            paint(image, view, [walk(scenario.lot.slot_xy[self._moment.vertex], goal)])
         paint_goal(image, view, goal, here)
-        if not state.parked:
+        if not self._parked:
             paint(image, view, [view_range(scenario, self._pose)])
         paint(image, view, searching_car(self._pose))
         if walker is not None:
@@ -175,26 +173,19 @@ class SearchFilm(Observer):
         return image
 
     def _seen_so_far(self) -> str:
-        belief = self._env.state.belief
+        belief = self._moment.belief
         taken = int((belief.p_occupied[belief.observed] > 0.5).sum())
         free = int(belief.observed.sum()) - taken
         return (
             f"Its camera and laser saw {taken} taken and {free} free slots" if taken + free else "It searches"
         )
 
-    def _plan(self, step: Step) -> list[FloatArray]:
-        """Return the vertices that the agent intends to drive along."""
-        if self._preview_of is None or step.action == PARK:
-            return []
-        path = self._preview_of(step.observation, int(step.action), step.memory).path
-        return [self._scenario.lot.vertex_xy[v] for v in path]
-
     def _look(self) -> None:
         """Update the picture of the camera and the colours of the slots."""
         self._slots = self._slots_image()
-        results = self._env.perception.results
-        if results and not self._env.state.parked:
-            view = results[-1].views[0]
+        captures = self._moment.captures
+        if captures and not self._parked:
+            view = captures[-1].views[0]
             drawn = draw_detections(view.image, view.detections, view.cars.detection)
             self._camera = cv2.resize(drawn, _CAMERA, interpolation=cv2.INTER_AREA)
 
@@ -207,12 +198,11 @@ class SearchFilm(Observer):
         hold: float = 0.0,
     ) -> None:
         """Draw a frame, and show it for `hold` seconds."""
-        state = self._env.state
         parts = elapsed or self._parts
         top = strip(CAPTION, WIDTH)
         write_text(top, caption, (16, 32), "white", 22, 600)
         seconds = sum(parts.values())
-        write_text(top, clock(state.arrival.time + seconds)[4:], (WIDTH - 186, 32), "car", 20, 500)
+        write_text(top, clock(self._record.arrival.time + seconds)[4:], (WIDTH - 186, 32), "car", 20, 500)
         write_text(top, f"{seconds:.0f} s", (WIDTH - 76, 32), "car", 22, 700)
         frame = np.vstack([top, self._map_image(plan, walker), self._panel(parts)])
         self.frames += [frame] * max(1, round(hold * FPS))
@@ -225,7 +215,7 @@ class SearchFilm(Observer):
         cv2.rectangle(panel, (6, 6), (6 + 136, 6 + 20), PALETTE["ink"], cv2.FILLED)
         write_text(panel, "camera, detected cars", (11, 20), "white", 12, 500)
         left = width + 28
-        x = write_text(panel, f"agent {self._name}:", (left, 28), "ink", 16, 700) + 12
+        x = write_text(panel, f"agent {self._record.agent}:", (left, 28), "ink", 16, 700) + 12
         for term in COST_TERMS:
             if term.optional and not parts[term.field]:
                 continue
@@ -272,7 +262,4 @@ def film_search(case: Case, seed: int, path: Path) -> None:
     Raises:
         InputError: the file cannot be written.
     """
-    runner = case.runner()
-    film = SearchFilm(case.scenario, runner.agent, case.label)
-    runner.run(seed, (film,))
-    film.save(path)
+    SearchFilm(case.runner().run(seed, moments=True)).save(path)

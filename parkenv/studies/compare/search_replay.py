@@ -7,19 +7,16 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.engine.state import SearchState
 from parkenv.show.scene import LotScene
+from parkenv.show.search_record import SearchRecord
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording, ReportOptions
 from parkenv.studies.results import EPISODES
-from parkenv.studies.simulate import EpisodeResult, Observer, Step
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.occupancy.process import World
-from planners.agent import Agent
 
 STEADY_S = 600.0
 """Time, s, up to which the true occupancy is recorded every second; later it is recorded only at decisions."""
@@ -78,7 +75,7 @@ class SearchReplay(NamedTuple):
         tasks = []
         for encounter in encounters:
             keys = [case.key(encounter.seed) for case in encounter.cases]
-            tasks.append(partial(record, encounter, {key: totals[key] for key in keys if key in totals}))
+            tasks.append(partial(replay, encounter, {key: totals[key] for key in keys if key in totals}))
         return Again(tasks, notes)
 
 
@@ -105,7 +102,7 @@ def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[E
     return chosen
 
 
-def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Recording:
+def replay(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Recording:
     """Repeat the searches of all agents of an encounter, and record them.
 
     Args:
@@ -113,35 +110,31 @@ def record(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
         counted: total time, s, of each search in the original run, by `Case.key`; the totals of missing searches are
             not checked.
     """
+    records = [case.runner().run(encounter.seed, moments=True) for case in encounter.cases]
+    first, one = encounter.cases[0], records[-1]
+    scenario, start = first.scenario, one.arrival.time
     searches, moments = [], {0.0}
-    state: SearchState | None = None
-    for case in encounter.cases:
-        runner = case.runner()
-        recorder = SearchRecorder(case.label, runner.agent)
-        runner.run(encounter.seed, (recorder,))
-        state, search = recorder.state, recorder.recording
+    for case, record in zip(encounter.cases, records, strict=True):
+        search = recorded(record)
         before = counted.get(case.key(encounter.seed))
         search["counted_s"] = before
         search["agrees"] = None if before is None else abs(before - search["total_s"]) <= AGREES_S
         searches.append(search)
         moments |= {centiseconds / 100.0 for centiseconds in search["t"]}
-    assert state is not None
-    first = encounter.cases[0]
-    scenario, start = first.scenario, state.arrival.time
     longest = max(moments)
     moments |= set(np.arange(0.0, min(longest, STEADY_S), 1.0).tolist())
     world = {
         "scenario": scenario.name,
         "setting": {k: v for k, v in first.columns.items() if k != "agent"},
         "seed": encounter.seed,
-        "day": state.arrival.day,
+        "day": one.arrival.day,
         "arrival_s": round(start, 3),
         "goal": scenario.goal,
         "view_range_m": round(float(scenario.sensor_model.view_range), 2),
         "v_walk": round(float(scenario.v_walk), 4),
         "sensors": first.rig,
-        "forecast": _bytes(state.belief.forecast),
-        **_truth(state.world, scenario.lot.n_slots, start, sorted(moments)),
+        "forecast": _bytes(one.forecast),
+        **_truth(one.world, scenario.lot.n_slots, start, sorted(moments)),
         "searches": searches,
     }
     differences = [
@@ -166,77 +159,42 @@ def _truth(world: World, n_slots: int, start: float, moments: Sequence[float]) -
     return {"taken": np.flatnonzero(first).tolist(), "changes": changes}
 
 
-class SearchRecorder(Observer):
-    """Records a search for the report: times in centiseconds since the arrival, beliefs in steps of 1/255.
-
-    Args:
-        name: name of the agent.
-        agent: the agent; its plans are recorded if it has `plan_preview`.
-
-    Attributes:
-        state: state of the environment, including the hidden occupancy.
-        recording: recording of the finished search.
-    """
-
-    state: SearchState
-    recording: Recording
-
-    def __init__(self, name: str, agent: Agent) -> None:
-        self._name = name
-        self._preview_of = getattr(agent, "plan_preview", None)
-
-    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Record the arrival."""
-        del observation
-        self.state = env.unwrapped.state  # type: ignore[attr-defined]
-        belief = self.state.belief
-        self._known = np.array(_bytes(belief.forecast))
-        self._seen = np.zeros(len(self._known), dtype=np.bool_)
-        self._plan = [-1]
-        self._vertex = self.state.vertex
-        self._rows: dict[str, list[Any]] = {
-            name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
-        }
-        self._record_state(failed_s=0.0)
-
-    def on_step(self, step: Step) -> None:
-        """Record the decision, the plan that led to it, and the next state."""
-        plan: list[int] = []
-        if self._preview_of is not None:
-            plan = list(self._preview_of(step.observation, int(step.action), step.memory).path)
-        # Most plans are the remainder of the previous one; those are stored as None.
-        self._rows["plan"].append(None if plan == self._plan[1:] else plan)
-        self._rows["action"].append(int(step.action))
-        self._plan = plan if self.state.vertex != self._vertex else [-1, *plan]
-        self._vertex = self.state.vertex
-        self._record_state(step.info["failed_s"])
-
-    def on_end(self, result: EpisodeResult) -> None:
-        """Add the metrics."""
-        info, parked = result.info, bool(result.info["parked"])
-        self.recording = {
-            "agent": self._name,
-            **self._rows,
-            "parked": parked,
-            "slot": self.state.vertex if parked else None,
-            "truncated": result.truncated,
-            "total_s": info["total_s"],
-            "costs": {name: info[name] for name in COST_FIELDS},
-            "failed_parks": int(info["failed_parks"]),
-            "replans": int(getattr(result.memory, "replans", 0)),
-        }
-
-    def _record_state(self, failed_s: float) -> None:
-        state, rows = self.state, self._rows
-        belief = state.belief
-        now = np.array(_bytes(belief.p_occupied))
-        changed = np.flatnonzero(now != self._known)
-        rows["t"].append(round(100 * (state.time - state.arrival.time)))
-        rows["vertex"].append(state.vertex)
-        rows["failed"].append(round(100 * failed_s))
+def recorded(record: SearchRecord) -> Recording:
+    """Return a search in the data of a page: times in centiseconds since the arrival, beliefs in steps of 1/255."""
+    rows: dict[str, list[Any]] = {
+        name: [] for name in ("t", "vertex", "failed", "belief", "seen", "action", "plan")
+    }
+    known = np.array(_bytes(record.forecast))
+    seen, left = np.zeros(len(known), dtype=np.bool_), [-1]
+    before = record.moments[0].vertex
+    for number, moment in enumerate(record.moments):
+        now = np.array(_bytes(moment.belief.p_occupied))
+        changed = np.flatnonzero(now != known)
+        rows["t"].append(round(100 * (moment.time - record.arrival.time)))
+        rows["vertex"].append(moment.vertex)
+        rows["failed"].append(round(100 * moment.info.get("failed_s", 0.0)))
         rows["belief"].append(np.stack([changed, now[changed]], axis=1).ravel().tolist())
-        rows["seen"].append(np.flatnonzero(belief.observed & ~self._seen).tolist())
-        self._known, self._seen = now, self._seen | belief.observed
+        rows["seen"].append(np.flatnonzero(moment.belief.observed & ~seen).tolist())
+        known, seen = now, seen | moment.belief.observed
+        if number:
+            rows["action"].append(moment.action)
+            plan = list(moment.plan)
+            # Most plans are the remainder of the previous one; those are stored as None.
+            rows["plan"].append(None if plan == left[1:] else plan)
+            left = plan if moment.vertex != before else [-1, *plan]
+        before = moment.vertex
+    metrics, parked = record.metrics, bool(record.metrics["parked"])
+    return {
+        "agent": record.agent,
+        **rows,
+        "parked": parked,
+        "slot": record.path[-1] if parked else None,
+        "truncated": record.truncated,
+        "total_s": metrics["total_s"],
+        "costs": {name: metrics[name] for name in COST_FIELDS},
+        "failed_parks": int(metrics["failed_parks"]),
+        "replans": metrics["replans"],
+    }
 
 
 def _bytes(p: NDArray[np.floating]) -> list[int]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
-import gymnasium as gym
 import numpy as np
 from gymnasium.wrappers import TimeLimit
 from matplotlib import colormaps
@@ -18,16 +17,18 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.studies.simulate import STEP_LIMIT, Observer, Step, simulate
+from parkenv.studies.episodes import SearchRecorder
+from parkenv.studies.simulate import STEP_LIMIT, simulate
 from parkenv.world.lot import ParkingLot
 
 if TYPE_CHECKING:
     import rerun as rr
 
-    from parkenv.envs.perception import OnboardPerception, SearchPerceptionEnv
+    from parkenv.envs.perception import SearchPerceptionEnv
     from parkenv.mapping.grid import OccupancyGrid
     from parkenv.mapping.survey import Survey, SurveyFrame
     from parkenv.perception.pipeline import PerceptionResult
+    from parkenv.show.search_record import Moment
     from parkenv.studies.trips.driven_search import DrivenSearch, Trip
     from planners.agent import Agent
     from sim_sensors.rig import SensorRig
@@ -268,33 +269,6 @@ def record_session(survey: Survey, number: int, log: SensorLog) -> None:
     survey.drive(number, on_frame=keep)
 
 
-class _SearchLogger(Observer):
-    """Record the sensor captures of a search and the belief after every decision.
-
-    Args:
-        log: the log to write to.
-        perception: the environment's perception.
-    """
-
-    def __init__(self, log: SensorLog, perception: OnboardPerception) -> None:
-        self._log, self._perception = log, perception
-
-    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
-        """Begin a drive."""
-        self._log.begin()
-        self._start = env.unwrapped.state.arrival.time  # type: ignore[attr-defined]
-        self._record(observation)
-
-    def on_step(self, step: Step) -> None:
-        """Record the captures of the step."""
-        self._record(step.next_observation)
-
-    def _record(self, observation: Any) -> None:
-        for result in self._perception.results:
-            self._log.capture(result.captured.time - self._start, result)
-        self._log.slots(observation["p_occupied"].astype(np.float64))
-
-
 def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: SensorLog) -> None:
     """Run one search with simulated sensors, and record it.
 
@@ -304,7 +278,9 @@ def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: Sensor
         seed: seed of the world.
         log: a log for the environment's lot and rig.
     """
-    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (_SearchLogger(log, env.perception),))
+    recorder = SearchRecorder()
+    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (recorder,))
+    _log(recorder.moments, log)
 
 
 def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
@@ -318,10 +294,21 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     Raises:
         InputError: the search has no rig.
     """
-    perception = search.env.perception
-    if perception is None:
+    if search.env.perception is None:
         raise InputError("a recorded trip needs sensors: give it a rig")
-    return search.run(seed, (_SearchLogger(log, perception),))
+    recorder = SearchRecorder()
+    trip = search.run(seed, (recorder,))
+    _log(recorder.moments, log)
+    return trip
+
+
+def _log(moments: Sequence[Moment], log: SensorLog) -> None:
+    """Record the sensor captures of a search, and the belief after every decision."""
+    log.begin()
+    for moment in moments:
+        for result in moment.captures:
+            log.capture(result.captured.time - moments[0].time, result)
+        log.slots(moment.belief.p_occupied.astype(np.float64))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:
