@@ -10,18 +10,31 @@ from typing import Any
 from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.spec_file import Spec
-from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.results import Row, read_settings
 
 
-def search_settings(spec: Spec, scenarios: Iterable[ScenarioSpec], agents: Iterable[AgentSpec]) -> Row:
-    """Return the version, the scenarios, and hashes of the files of a specification and of its agents."""
+def search_settings(spec: Any, *fields: str) -> Row:
+    """Return the settings of a study whose agents search.
+
+    Args:
+        spec: the study; has `scenarios` or a `scenario`, `agents` or an `agent`, and may have a `detector`.
+        fields: further fields that a resumed run must share.
+
+    Returns:
+        The version, the scenarios, hashes of the files of the study and of its agents, the fields, and the detector.
+    """
+    from parkenv.perception.detector_registry import detector_version
+
+    scenarios = spec.scenarios if hasattr(spec, "scenarios") else (spec.scenario,)
+    agents = spec.agents if hasattr(spec, "agents") else (spec.agent,)
+    detector = getattr(spec, "detector", None)
     return {
         "version": __version__,
         "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in scenarios},
         "files": fingerprints(spec.files()),
         "agent files": agent_fingerprints(agent.name for agent in agents),
+        **{name: getattr(spec, name) for name in fields},
+        **({} if detector is None else {"detector": detector_version(detector)}),
     }
 
 

@@ -128,6 +128,17 @@ def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, flo
     return float(rate), float(max(middle - half, 0.0)), float(min(middle + half, 1.0))
 
 
+def columns_of(name: str, interval: tuple[float, float, float]) -> dict[str, Any]:
+    """Return a value and the ends of its interval as columns of a row.
+
+    Examples:
+        >>> columns_of("total_s", (2.0, 1.0, 3.0))
+        {'total_s': 2.0, 'total_s_ci95': [1.0, 3.0]}
+    """
+    value, low, high = interval
+    return {name: value, f"{name}_ci95": [low, high]}
+
+
 MEANS = (
     *COST_FIELDS,
     "failed_parks",
@@ -157,24 +168,20 @@ def summarize(
         decision_s: (k,) wall time of single decisions, s.
     """
     total = _column(episodes, "total_s")
-    mean, low, high = mean_interval(total)
     row: dict[str, Any] = {
         **columns,
         "episodes": len(episodes),
         "parked_fraction": float(_column(episodes, "parked").mean()),
-        "total_s": mean,
-        "total_s_ci95": [low, high],
+        **columns_of("total_s", mean_interval(total)),
         "difference_s": 0.0,
         "difference_s_ci95": [0.0, 0.0],
     }
     if first is not None:
         theirs = {e["seed"]: e["total_s"] for e in first}
         paired = [e["total_s"] - theirs[e["seed"]] for e in episodes if e["seed"] in theirs]
-        mean, low, high = mean_interval(paired)
-        row |= {"difference_s": mean, "difference_s_ci95": [low, high]}
+        row |= columns_of("difference_s", mean_interval(paired))
     row |= {name: float(_column(episodes, name).mean()) for name in MEANS}
-    mean, low, high = mean_interval(total - _column(episodes, "bound_s"))
-    row |= {"regret_s": mean, "regret_s_ci95": [low, high]}
+    row |= columns_of("regret_s", mean_interval(total - _column(episodes, "bound_s")))
     milliseconds = 1e3 * np.asarray(decision_s, dtype=np.float64)
     if len(milliseconds):
         row["decision_ms"] = float(np.median(milliseconds))

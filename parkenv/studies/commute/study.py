@@ -147,9 +147,7 @@ class Commute(Study):
         """See `Study`."""
         from parkenv.studies.fingerprints import search_settings
 
-        return {
-            **search_settings(self, self.scenarios, self.agents), "seed": self.seed, "fleet": self.fleet,
-        }  # fmt: skip
+        return search_settings(self, "seed", "fleet")
 
     def cells(self) -> list[Cell]:
         """See `Study`."""

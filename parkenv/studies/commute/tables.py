@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from parkenv.studies.results import Row
-from parkenv.studies.statistics import mean_interval, trimmed_mean_interval
+from parkenv.studies.statistics import columns_of, mean_interval, trimmed_mean_interval
 
 FIXED, NONE = "fixed", "none"
 """Names in the column `map` of the references: a right map that does not learn; an agent that uses no map."""
@@ -86,8 +86,7 @@ def _difference(
     ]
     if not paired:
         return {}
-    mean, low, high = interval(paired)
-    return {name: mean, f"{name}_ci95": [low, high]}
+    return columns_of(name, interval(paired))
 
 
 def _grouped(episodes: Sequence[Row], period: Callable[[Row], int]) -> _Cases:
@@ -109,5 +108,4 @@ def _robust(values: Sequence[float]) -> tuple[float, float, float]:
 def _mean(name: str, courses: Iterable[Sequence[Row]]) -> Row:
     means = [_course_mean(name, its) for its in courses]
     # Agents without a map have no forecast error.
-    mean, low, high = mean_interval(means) if np.isfinite(means).all() else (np.nan,) * 3
-    return {name: mean, f"{name}_ci95": [low, high]}
+    return columns_of(name, mean_interval(means) if np.isfinite(means).all() else (np.nan, np.nan, np.nan))

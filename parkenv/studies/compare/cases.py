@@ -17,7 +17,7 @@ from parkenv.scenarios.places import seeds_by_place
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s, timed_row
-from parkenv.studies.statistics import mean_interval, summarize
+from parkenv.studies.statistics import columns_of, mean_interval, summarize
 from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
@@ -225,15 +225,13 @@ def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float])
             bins[row["agent"], row["failure_cost_s"], number].append(row)
     result = []
     for (agent, failure, _), inside in sorted(bins.items(), key=lambda item: item[0][1:]):
-        mean, low, high = mean_interval([r["total_s"] for r in inside])
         result.append(
             {
                 "agent": agent,
                 "failure_cost_s": failure,
                 "occupancy": float(np.mean([r["occupancy"] for r in inside])),
                 "episodes": len(inside),
-                "total_s": mean,
-                "total_s_ci95": [low, high],
+                **columns_of("total_s", mean_interval([r["total_s"] for r in inside])),
             }
         )
     return result

@@ -263,11 +263,9 @@ class Comparison(CaseStudy):
 
     def settings(self) -> Row:
         """See `Study`."""
-        from parkenv.perception.detector_registry import detector_version
         from parkenv.studies.fingerprints import search_settings
 
-        detector = {} if self.detector is None else {"detector": detector_version(self.detector)}
-        return {**search_settings(self, self.scenarios, self.agents), "rig": self.rig, **detector}
+        return search_settings(self, "rig")
 
     def cells(self) -> list[Cell]:
         """See `Study`."""

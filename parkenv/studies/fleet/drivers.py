@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -13,9 +12,9 @@ from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.tables import day_means
 from parkenv.studies.results import Row
-from parkenv.studies.statistics import mean_interval
-from parkenv.studies.workers import Workers
+from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
@@ -141,23 +140,16 @@ class MixedFleet:
             "others_s": _mean(cars["total_s"][~members]),
         }
 
-    def row(
-        self, member: AgentSpec | CompiledPolicy, seed: int, days: int, workers: Workers | None = None
-    ) -> Row:
+    def row(self, member: AgentSpec | CompiledPolicy, seed: int, days: int, workers: Workers = SERIAL) -> Row:
         """Return means over days, with 95 % intervals; see `run_day`."""
         tasks = [partial(self.run_day, member, seed, day) for day in range(days)]
-        return summary([task() for task in tasks] if workers is None else list(workers.in_order(tasks)))
-
-
-def summary(days: Sequence[Row]) -> Row:
-    """Return the row of some days; days without members, or without others, do not count for their means."""
-    row: Row = {"days": len(days), "cars": sum(day["cars"] for day in days)}
-    for name in ("parked_fraction", "total_s", "search_s", "others_s"):
-        values = [day[name] for day in days if not np.isnan(day[name])]
-        row[name], low, high = mean_interval(values)
-        if name != "parked_fraction":
-            row[f"{name}_ci95"] = [low, high]
-    return row
+        done = list(workers.in_order(tasks))
+        with_interval = ("total_s", "search_s", "others_s")
+        return {
+            "days": days,
+            "cars": sum(day["cars"] for day in done),
+            **day_means(done, ("parked_fraction", *with_interval), with_interval),
+        }
 
 
 def _mean(values: Any) -> float:

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
@@ -287,16 +286,9 @@ class FleetStudy(Study):
 
     def settings(self) -> Row:
         """See `Study`."""
-        from parkenv.studies.fingerprints import agent_fingerprints, fingerprints, flat_tables
+        from parkenv.studies.fingerprints import search_settings
 
-        return {
-            "version": __version__,
-            "scenario": {self.scenario.title: flat_tables(self.scenario.model_dump(mode="json"))},
-            "files": fingerprints(self.files()),
-            "agent files": agent_fingerprints(agent.name for agent in self.agents),
-            "manoeuvre_s": self.blocked_s,
-            **{name: getattr(self, name) for name in (*OPTIONS, "seed")},
-        }
+        return search_settings(self, *OPTIONS, "seed") | {"manoeuvre_s": self.blocked_s}
 
     def cells(self) -> list[Cell]:
         """See `Study`."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
 from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS
 from parkenv.studies.results import Row
-from parkenv.studies.statistics import mean_interval, ratio_interval
+from parkenv.studies.statistics import columns_of, mean_interval, ratio_interval
 
 ASSIGNED = "reserve"
 WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
@@ -46,7 +46,7 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
             **{name: days[0][name] for name in SETTING_COLUMNS},
             "days": len(days),
             "cars": sum(day["cars"] for day in days),
-            **_means(days),
+            **day_means(days, MEASURES, WITH_INTERVAL),
             **_differences(paired(days, OWN, 0.0)),
             **_price(paired(days, ASSIGNED, 1.0)),
             **_ratio("price_over_bound", days, days, "clairvoyant_s"),
@@ -56,24 +56,23 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
 
 
 def _differences(pairs: Pairs) -> Row:
-    row: Row = {}
-    for name, column in DIFFERENCES.items():
-        values = [one[column] - other["total_s"] for one, other in pairs]
-        row[name], low, high = mean_interval([value for value in values if not math.isnan(value)])
-        row[f"{name}_ci95"] = [low, high]
-    return row
+    apart = [
+        {name: one[column] - other["total_s"] for name, column in DIFFERENCES.items()} for one, other in pairs
+    ]
+    return day_means(apart, DIFFERENCES, DIFFERENCES)
 
 
-def _means(days: list[Row]) -> Row:
+def day_means(days: Sequence[Row], measures: Iterable[str], with_interval: Collection[str]) -> Row:
+    """Return the mean of each measure over days, some with a 95 % interval."""
     row: Row = {}
-    for name in MEASURES:
+    for name in measures:
         # On a day without members, or without others, there is no mean of theirs.
         values = [day[name] for day in days if not math.isnan(day[name])]
-        if name in WITH_INTERVAL:
-            row[name], low, high = mean_interval(values)
-            row[f"{name}_ci95"] = [low, high]
-        else:
-            row[name] = float(np.mean(values))
+        row |= (
+            columns_of(name, mean_interval(values))
+            if name in with_interval
+            else {name: float(np.mean(values or [math.nan]))}
+        )
     return row
 
 
@@ -85,8 +84,7 @@ def _price(pairs: Pairs) -> Row:
 def _ratio(name: str, days: Sequence[Row], others: Sequence[Row], column: str) -> Row:
     """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
     if not days:
-        return {name: float("nan"), f"{name}_ci95": [float("nan")] * 2}
+        return columns_of(name, (math.nan, math.nan, math.nan))
     mine = np.array([day["total_s"] * day["cars"] for day in days])
     theirs = np.array([day[column] * day["cars"] for day in others])
-    ratio, low, high = ratio_interval(mine, theirs)
-    return {name: ratio, f"{name}_ci95": [low, high]}
+    return columns_of(name, ratio_interval(mine, theirs))

@@ -22,7 +22,7 @@ from parkenv.errors import InputError
 from parkenv.scenarios.calibration import Calibration
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 from parkenv.studies.results import Row
-from parkenv.studies.statistics import mean_interval
+from parkenv.studies.statistics import columns_of, mean_interval
 from parkenv.studies.trips.driven_search import Trip
 from parkenv.studies.trips.executor import EDGE_KINDS, OBSERVED, UNOBSERVED, Leg, ParkingAttempt
 from parkenv.world.scenario import KMH, Scenario
@@ -92,12 +92,10 @@ def samples(rows: Sequence[Row], speed: float) -> dict[str, FloatArray]:
 
 def summary_of(values: FloatArray) -> Row:
     """Return median, mean with its 95 % interval, and 95th percentile of a sample."""
-    mean, low, high = mean_interval(values)
     return {
         "n": len(values),
         "median": float(np.median(values)),
-        "mean": mean,
-        "mean_ci95": [low, high],
+        **columns_of("mean", mean_interval(values)),
         "p95": float(np.quantile(values, 0.95)),
     }
 

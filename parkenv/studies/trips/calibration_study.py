@@ -135,16 +135,10 @@ class CalibrationStudy(Study):
 
     def settings(self) -> Row:
         """See `Study`."""
-        from parkenv.perception.detector_registry import detector_version
         from parkenv.studies.fingerprints import search_settings
 
-        return {
-            **search_settings(self, [self.scenario], [self.agent]),
-            "agent": self.agent.label,
-            "style": dataclasses.asdict(self.style),
-            "rig": self.rig,
-            **({} if self.detector is None else {"detector": detector_version(self.detector)}),
-        }
+        driving = {"agent": self.agent.label, "style": dataclasses.asdict(self.style)}
+        return search_settings(self, "rig") | driving
 
     def cells(self) -> list[Cell]:
         """See `Study`."""
