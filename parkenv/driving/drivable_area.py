@@ -1,4 +1,4 @@
-"""The paved area of a lot and its kerbs."""
+"""The paved area of a lot, its kerbs and walls."""
 
 from __future__ import annotations
 
@@ -47,6 +47,8 @@ class DrivableArea:
         self._bays = np.asarray(shapely.convex_hull(shapely.multipoints(np.asarray(shapely.points(way_in)))))
         self._tree = shapely.STRtree(self._bays)
         self._whole: shapely.Geometry | None = None
+        self._walls = np.array([leg for wall in lot.walls for leg in pairwise(wall)]).reshape(-1, 2, 2)
+        self._wall_tree = shapely.STRtree(np.asarray(shapely.linestrings(self._walls)))
 
     def around(self, center: FloatArray, reach: float) -> shapely.Geometry:
         """The paved area near a point, (2,) m; exact only within `reach` m along both axes."""
@@ -65,6 +67,11 @@ class DrivableArea:
         joined = shapely.buffer(shapely.buffer(area, JOINT, join_style="mitre"), -JOINT, join_style="mitre")
         # Shrinking with mitred corners removes too much at reflex corners.
         return shapely.union(joined, area).simplify(STRAIGHTENED)
+
+    def walls(self, center: FloatArray, reach: float) -> FloatArray:
+        """Straight pieces of the lot's walls, end points (m, 2, 2) m; arguments as for `kerbs`."""
+        window = shapely.box(*(center - reach), *(center + reach))
+        return self._walls[np.sort(self._wall_tree.query(window))]
 
     def kerbs(self, center: FloatArray, reach: float) -> FloatArray:
         """Straight kerb segments, end points (m, 2, 2) m, within `reach` m of a point, (2,) m, along both axes."""

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from itertools import pairwise
 
 import numpy as np
-import shapely
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import ObstacleKind, Obstacles
@@ -37,8 +35,6 @@ class LotObstacles:
         lot = scenario.lot
         self.slots = slot_lot(lot)
         self._area = DrivableArea(lot)
-        legs = np.array([leg for wall in lot.walls for leg in pairwise(wall)]).reshape(-1, 2, 2)
-        self._walls = shapely.STRtree(np.asarray(shapely.linestrings(legs))), legs
         self._still: dict[tuple[int, int], list[tuple[ObstacleKind, FloatArray]]] = {}
         heading = np.stack([np.cos(lot.slot_yaw), np.sin(lot.slot_yaw)], axis=1)
         out = np.where(lot.slot_mouth == Mouth.REAR, OVERHANG_M, 0.0)[:, None] * heading
@@ -75,11 +71,9 @@ class LotObstacles:
         if (column, row) not in self._still:
             middle = 10.0 * np.array([column, row])
             reach = REACH_M + 5.0
-            tree, legs = self._walls
-            walls = legs[np.sort(tree.query(shapely.box(*(middle - reach), *(middle + reach))))]
             self._still[column, row] = [
                 *((ObstacleKind.KERB, line) for line in self._area.kerbs(middle, reach)),
-                *((ObstacleKind.WALL, line) for line in walls),
+                *((ObstacleKind.WALL, line) for line in self._area.walls(middle, reach)),
             ]
         return self._still[column, row]
 

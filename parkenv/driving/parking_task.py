@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -193,11 +192,6 @@ class ParkingTasks:
             manners=self.manners,
         )
 
-    @cached_property
-    def _walls(self) -> tuple[shapely.STRtree, FloatArray]:
-        legs = np.array([leg for wall in self.lot.walls for leg in pairwise(wall)]).reshape(-1, 2, 2)
-        return shapely.STRtree(np.asarray(shapely.linestrings(legs))), legs
-
     def draw(self, key: int, start: ArrayLike | None = None) -> ParkingTask:
         """Draw the task of a key.
 
@@ -277,11 +271,9 @@ class ParkingTasks:
             close = self.slack > 0.0 and offset[j] < self.slack + 12.0
             if not (close and shapely.distance(box, shapely.Polygon(outline)) < self.slack):
                 outlines.append((ObstacleKind.PARKED_CAR, outline))
-        tree, legs = self._walls
-        walls = legs[np.sort(tree.query(shapely.box(*(center - REACH), *(center + REACH))))]
         for thing, lines in (
             (ObstacleKind.KERB, self._area.kerbs(center, REACH)),
-            (ObstacleKind.WALL, walls),
+            (ObstacleKind.WALL, self._area.walls(center, REACH)),
         ):
             order = np.argsort(
                 shapely.distance(shapely.Point(center), shapely.linestrings(lines)), kind="stable"

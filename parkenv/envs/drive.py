@@ -20,7 +20,7 @@ from parkenv.driving.drive_state import DriveState
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.driving.yielding_traffic import YieldingTraffic
-from parkenv.envs.drive_goals import goal_error, goal_errors
+from parkenv.envs.drive_goals import goal_error, goal_errors, goal_of
 from parkenv.envs.drive_observation import (
     CORNERS,
     FAR,
@@ -386,9 +386,7 @@ length and width over the car's |
             self._space.move(state.movers)
         self._slot = np.array([*task.slot.tolist(), *task.room.tolist()])
         self._kind = np.array([k == task.kind for k in KINDS], dtype=np.float32)
-        turned = float(task.target[2] - task.slot[2])
-        still = [0.0, 0.0, round(math.cos(turned), 9), round(math.sin(turned), 9), 0.0, *task.room.tolist()]
-        self._desired = np.array(still, dtype=np.float32)
+        self._desired = goal_of(task)
         if self.laser is not None:
             self._plane = scan_plane(task, self._n_movers)
         if self._maps:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
+from parkenv.driving.parking_task import ParkingTask
 
 POSITION_TOLERANCE = 0.25  # largest distance, m, of a parked car's centre from the goal
 ANGLE_TOLERANCE = math.radians(5.0)  # largest angle, rad, between a parked car's yaw and the goal's
@@ -30,6 +31,13 @@ def goal_errors(
     """
     errors = np.array([goal_error(a, d, half) for a, d in zip(achieved, desired, strict=True)]).reshape(-1, 3)
     return errors[:, 0], errors[:, 1], errors[:, 2] > 0.5
+
+
+def goal_of(task: ParkingTask) -> NDArray[np.float32]:
+    """Return the desired goal of a task, (7,) float32; see `DriveEnv`."""
+    turned = float(task.target[2] - task.slot[2])
+    still = [0.0, 0.0, round(math.cos(turned), 9), round(math.sin(turned), 9), 0.0, *task.room.tolist()]
+    return np.array(still, dtype=np.float32)
 
 
 @compiled(error_model="numpy")
