@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -133,24 +132,19 @@ class OnnxSettings(Spec):
     )
 
 
-@dataclass(frozen=True)
-class _Plan:
-    """All settings of a network, none left open."""
+class _Plan(OnnxSettings):
+    """Settings of a network, none left open but the cars of a layout without classes."""
 
     layout: Layout
     outputs: tuple[str, ...]
     size: tuple[int, int]
-    letterbox: bool
-    enlarge: float
-    mirror: bool
-    pad: int
-    channels: str
-    mean: Float32Array
-    std: Float32Array
-    corners: bool
-    fractions: bool
+    resize: Literal["letterbox", "stretch"]
+    channels: Literal["rgb", "bgr", "grey"]
+    mean: tuple[float, ...]
+    std: tuple[float, ...]
+    box: Literal["center", "corners"]
+    unit: Literal["pixels", "fractions"]
     scores: Scores
-    cars: tuple[int, ...]
     overlap: float
     grid: bool  # of yolo, whether a candidate is a column
 
@@ -217,7 +211,7 @@ class OnnxDetector:
             centers = decode_centers(outputs[0], plan.size, self.settings.threshold)
             boxes, score = centers.boxes, centers.score
         else:
-            boxes, score = decode(outputs, plan.layout, plan.cars, plan.scores, grid=plan.grid)
+            boxes, score = decode(outputs, plan.layout, plan.cars or (), plan.scores, grid=plan.grid)
         if not (np.isfinite(boxes).all() and np.isfinite(score).all()):
             raise InputError(f"{name}: put out numbers that are not finite, want boxes and scores")
         if len(score) and not (score.min() >= -1e-4 and score.max() <= 1.0 + 1e-4):
@@ -227,10 +221,10 @@ class OnnxDetector:
             )
         rows = np.flatnonzero(score >= self.settings.threshold)
         boxes, score = boxes[rows].astype(np.float64), np.clip(score[rows], 0.0, 1.0)
-        if not plan.corners:
+        if plan.box == "center":
             half = 0.5 * boxes[:, 2:]
             boxes = np.hstack([boxes[:, :2] - half, boxes[:, :2] + half])
-        if plan.fractions:
+        if plan.unit == "fractions":
             boxes = boxes * np.tile(plan.size, 2)
         boxes = ((boxes - np.tile(offset, 2)) / np.tile(scale, 2)).astype(np.float32)
         size = boxes[:, 2:] - boxes[:, :2]
@@ -325,24 +319,23 @@ def _planned(file: OnnxFile, settings: OnnxSettings, run: Any, *, is_known: bool
     scores: Scores = "probabilities"
     if layout == "detr":
         scores = "softmax" if classes in (2, 92) else "logits"
-    return _Plan(
-        layout=layout,
-        outputs=names,
-        size=size,
-        letterbox=(s.resize or rule.resize) == "letterbox",
-        enlarge=s.enlarge,
-        mirror=s.mirror,
-        pad=s.pad,
-        channels=channels,
-        mean=_per_channel("mean", s.mean or usual.mean, count, beside),
-        std=_per_channel("std", s.std or usual.std, count, beside),
-        corners=(s.box or rule.box) == "corners",
-        fractions=(s.unit or rule.unit) == "fractions",
-        scores=s.scores or scores,
-        cars=() if layout == "centers" else _cars(file, s, classes, named, beside),
-        overlap=s.overlap or rule.overlap,
-        grid=grid,
-    )  # fmt: skip
+    means = {name: getattr(s, name) or getattr(usual, name) for name in ("mean", "std")}
+    for name, values in means.items():
+        if len(values) not in (1, count):
+            raise InputError(
+                f"{beside}: {name} has {len(values)} numbers, want 1 or {count}, one per channel"
+            )
+    chosen = {name: getattr(s, name) or getattr(rule, name) for name in ("resize", "box", "unit", "overlap")}
+    cars = None if layout == "centers" else _cars(file, s, classes, named, beside)
+    found = {
+        "layout": layout,
+        "outputs": names,
+        "size": size,
+        "channels": channels,
+        "grid": grid,
+        "cars": cars,
+    }
+    return _Plan(**dict(s) | {"scores": s.scores or scores} | means | chosen | found)
 
 
 def _image_input(file: OnnxFile) -> tuple[OnnxValue, int]:
@@ -413,12 +406,6 @@ def _is_grid(shape: tuple[int, ...], names: int) -> bool:
     return by_name[0] if by_name[0] != by_name[1] else rows <= columns
 
 
-def _per_channel(name: str, values: Sequence[float], channels: int, beside: str) -> Float32Array:
-    if len(values) not in (1, channels):
-        raise InputError(f"{beside}: {name} has {len(values)} numbers, want 1 or {channels}, one per channel")
-    return np.broadcast_to(np.array(values, np.float32), (channels,)).reshape(1, channels, 1, 1)
-
-
 def _fed(image: Image, plan: _Plan) -> tuple[Float32Array, tuple[float, float], tuple[float, float]]:
     """Return the network's input, and scale and offset of the image in it, px."""
     grey = as_grey(image)  # checks the image
@@ -431,7 +418,7 @@ def _fed(image: Image, plan: _Plan) -> tuple[Float32Array, tuple[float, float], 
     (width, height), (rows, columns) = plan.size, grey.shape
     fit = (width, height)
     left = top = 0
-    if plan.letterbox:
+    if plan.resize == "letterbox":
         ratio = min(width / columns, height / rows, plan.enlarge)
         fit = max(1, round(columns * ratio)), max(1, round(rows * ratio))
         left, top = (width - fit[0]) // 2, (height - fit[1]) // 2
@@ -440,7 +427,8 @@ def _fed(image: Image, plan: _Plan) -> tuple[Float32Array, tuple[float, float], 
         resized = np.asarray(cv2.resize(resized, fit, interpolation=cv2.INTER_LINEAR))
     canvas = np.full((height, width, 1 if plan.channels == "grey" else 3), plan.pad, np.uint8)
     canvas[top : top + fit[1], left : left + fit[0]] = resized.reshape(fit[1], fit[0], -1)
-    fed = (canvas.transpose(2, 0, 1)[None].astype(np.float32) - plan.mean) / plan.std
+    mean, std = (np.array(values, np.float32)[:, None, None] for values in (plan.mean, plan.std))
+    fed = (canvas.transpose(2, 0, 1)[None].astype(np.float32) - mean) / std
     return np.ascontiguousarray(fed), (fit[0] / columns, fit[1] / rows), (float(left), float(top))
 
 

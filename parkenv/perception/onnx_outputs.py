@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from parkenv.errors import InputError
 
@@ -190,8 +191,5 @@ def _is_centers(shape: tuple[int, ...]) -> bool:
 
 def _probability(values: Float32Array, scores: Scores) -> Float32Array:
     if scores == "logits":
-        return np.asarray(1.0 / (1.0 + np.exp(-np.clip(values, -80.0, 80.0))), dtype=np.float32)
-    if scores == "softmax":
-        power = np.exp(values - values.max(axis=1, keepdims=True))
-        return np.asarray(power / power.sum(axis=1, keepdims=True), dtype=np.float32)
-    return values
+        return np.asarray(special.expit(values))
+    return np.asarray(special.softmax(values, axis=1)) if scores == "softmax" else values

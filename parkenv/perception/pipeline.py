@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -174,7 +175,7 @@ class PerceptionPipeline:
                 partial(self._detections, capture),
                 partial(self._disparities, capture),
             ]
-            return _Seen(*in_threads(_call, jobs))
+            return _Seen(*in_threads(operator.call, jobs))
         return _Seen(self._detections(capture), self._disparities(capture))
 
     def _detections(self, capture: Capture) -> dict[str, Detections]:
@@ -243,10 +244,6 @@ def localize_as_thesis(view: CameraView, vehicle: FloatArray) -> LocatedCars:
         stereo, disparity_px = view.stereo
         return localize_disparity(view.detections, disparity_px, stereo, view.mount, vehicle)
     return localize_median(view.detections, view.scan, view.camera, view.mount, vehicle)
-
-
-def _call(job: Callable[[], Any]) -> Any:
-    return job()
 
 
 def _confirmed(found: Detections, cars: LocatedCars) -> tuple[Detections, LocatedCars]:

@@ -243,22 +243,21 @@ def cut_out(image: Image, region: NDArray[np.float64], size: tuple[int, int]) ->
     return _cut(image, (left, top), (right, bottom), size)
 
 
+def _shifted(crop: Image, size: tuple[int, int], dx: float, dy: float, grow: float) -> Image:
+    """Return a window that is shifted, and larger on each side, by fractions of the crop's sides."""
+    height, width = crop.shape
+    left_top = (dx - grow) * width, (dy - grow) * height
+    return _cut(crop, left_top, ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height), size)
+
+
 def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator, settings: TrainingSettings) -> Image:
     """Return a slightly shifted and scaled copy."""
-    height, width = crop.shape
     dx, dy = rng.uniform(-settings.shift, settings.shift, 2)
-    grow = rng.uniform(-settings.resize, settings.resize) / 2.0
-    return _cut(
-        crop,
-        ((dx - grow) * width, (dy - grow) * height),
-        ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height),
-        size,
-    )
+    return _shifted(crop, size, dx, dy, rng.uniform(-settings.resize, settings.resize) / 2.0)
 
 
 def _beside(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:
     """Return a window with part of the car, or with the car too large or too small: a negative."""
-    height, width = crop.shape
     kind = rng.integers(3)
     if kind == 0:
         grow, (dx, dy) = 0.0, rng.uniform(0.22, 0.6, 2) * rng.choice([-1.0, 1.0], 2) * [1.0, rng.random()]
@@ -266,9 +265,4 @@ def _beside(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Ima
         grow, (dx, dy) = -rng.uniform(0.25, 0.35), rng.uniform(-0.3, 0.3, 2)
     else:
         grow, (dx, dy) = rng.uniform(0.25, 0.5), rng.uniform(-0.2, 0.2, 2)
-    return _cut(
-        crop,
-        ((dx - grow) * width, (dy - grow) * height),
-        ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height),
-        size,
-    )
+    return _shifted(crop, size, dx, dy, grow)
