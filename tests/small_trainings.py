@@ -15,6 +15,9 @@ from parkenv.studies.training.spec import (
     ScanTrainingSpec,
     SearchTrainingSpec,
 )
+from parkenv.studies.training.training import use_one_thread
+
+use_one_thread()  # as in the workers of a study: tests run side by side
 
 NETWORK = {"policy_kwargs": {"net_arch": [16]}}
 DRIVE = {

@@ -17,7 +17,6 @@ from parkenv.studies.fleet.drivers import MixedFleet
 from parkenv.studies.training.configs import SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.search import episode_times
-from parkenv.studies.training.training import train_one
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.learned import LearnedAgent
 
@@ -62,7 +61,7 @@ def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
 
 def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):
     training = fleet_training(MixedFleet(PLACES[0], DEMAND))
-    whole = train_one(training, 0, tmp_path / "whole")
+    whole = training.train(0, tmp_path / "whole")
     steps, step_wait = iter(range(1_000)), FleetVecEnv.step_wait
 
     def stops(self):
@@ -73,9 +72,10 @@ def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint
     with monkeypatch.context() as patched:
         patched.setattr(FleetVecEnv, "step_wait", stops)
         with pytest.raises(KeyboardInterrupt):
-            train_one(training, 0, tmp_path / "broken")
+            training.train(0, tmp_path / "broken")
     assert len(read_curve(tmp_path / "broken" / "curve.csv")) > 1
-    resumed = train_one(training, 0, tmp_path / "broken")
-    curves = [[row | {"wall_s": 0.0} for row in each.curve] for each in (resumed, whole)]
+    resumed = training.train(0, tmp_path / "broken")
+    curves = [[row | {"wall_s": 0.0} for row in each] for each in (resumed, whole)]
     assert curves[0] == curves[1]
-    assert resumed.model == whole.model
+    models = [(tmp_path / name / "model.safetensors").read_bytes() for name in ("broken", "whole")]
+    assert models[0] == models[1]

@@ -21,7 +21,6 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.fleet.drivers import policy_of
 from parkenv.studies.simulate import make_search, simulate
 from parkenv.studies.training.search import episode_times
-from parkenv.studies.training.training import train_one
 from parkenv.studies.trips.driven_search import DrivenSearch
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
@@ -108,7 +107,7 @@ def test_sizes_are_those_of_model_files():
 
 def test_a_trained_model_searches_in_the_worlds_of_all_agents(tmp_path, monkeypatch):
     make_small(monkeypatch)
-    train_one(scan_training(128, len(SEEDS)), 0, tmp_path)
+    scan_training(128, len(SEEDS)).train(0, tmp_path)
     file = tmp_path / "model.safetensors"
     card = ModelCard.of_file(file)
     assert (card.observation, card.k, card.scenarios) == ("scan-1", SCANS, ("mini",))

@@ -33,9 +33,9 @@ _ON_POLICY: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [128, 128]},
 }
 
+_WITH_MASKS = ("ppo", "maskable-ppo")
 SEARCH_CONFIGS: dict[str, TrainingConfig] = {
-    "ppo": TrainingConfig(256, "MultiInputPolicy", _ON_POLICY, 0.05),
-    "maskable-ppo": TrainingConfig(256, "MultiInputPolicy", _ON_POLICY, 0.05),
+    **dict.fromkeys(_WITH_MASKS, TrainingConfig(256, "MultiInputPolicy", _ON_POLICY, 0.05)),
     "recurrent-ppo": TrainingConfig(
         128,
         "MultiInputLstmPolicy",
@@ -65,18 +65,12 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
 """Config of each algorithm for search."""
 
 _ON_SCANS = {**_ON_POLICY, "n_epochs": 4, "policy_kwargs": {"net_arch": [256, 128]}}
-SCAN_CONFIGS = {
-    "ppo": TrainingConfig(256, "MultiInputPolicy", _ON_SCANS, 0.05),
-    "maskable-ppo": TrainingConfig(256, "MultiInputPolicy", _ON_SCANS, 0.05),
-}
+SCAN_CONFIGS = dict.fromkeys(_WITH_MASKS, TrainingConfig(256, "MultiInputPolicy", _ON_SCANS, 0.05))
 """Config of each algorithm for searches that observe raw scans."""
 
 # Shorter rollouts than for single searches: the other cars follow the network only from rollout to rollout.
 _IN_FLEET = {**_ON_POLICY, "n_steps": 128, "batch_size": 1024}
-FLEET_CONFIGS = {
-    "ppo": TrainingConfig(32, "MultiInputPolicy", _IN_FLEET, 0.05),
-    "maskable-ppo": TrainingConfig(32, "MultiInputPolicy", _IN_FLEET, 0.05),
-}
+FLEET_CONFIGS = dict.fromkeys(_WITH_MASKS, TrainingConfig(32, "MultiInputPolicy", _IN_FLEET, 0.05))
 """Config of each algorithm for a fleet; their networks are compiled for the other cars."""
 
 

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 from pydantic_core import PydanticCustomError
 
 from parkenv import __version__
+from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import WHOLE
 from parkenv.files.known_names import KnowledgeName
 from parkenv.files.limited_reading import read_json
@@ -35,6 +36,10 @@ EvaluateEvery = Annotated[int, Field(ge=1, le=10**12, description="Decisions bet
 Episodes = Annotated[int, Field(ge=2, le=1_000_000)]
 ObservedSlots = Annotated[int, Field(ge=1, le=1_000, description="Slots in an observation.")]
 TensorBoard = Annotated[bool, Field(description="Keep logs for TensorBoard.")]
+
+
+FILES = "files"
+"""Key of the files of a training in its row."""
 
 
 class _Seeds(NamedTuple):
@@ -171,22 +176,28 @@ class TrainingSpec(Study):
 
     def run(self, work: _Seeds, items: Sequence[int]) -> list[Row]:
         """See `Study`; a training goes on from its checkpoint."""
-        from parkenv.studies.training.training import train_one
+        from parkenv.studies.training.training import MODEL, use_one_thread
 
+        use_one_thread()
         self.training.command, self.training.shared = work.command, work.shared
         rows: list[Row] = []
         for seed in items:
-            trained = train_one(self.training, seed, work.folder / f"seed_{seed}")
-            last = trained.curve[-1]
-            row = {"seed": seed, "steps": int(last["steps"]), "wall_s": last["wall_s"], "trained": trained}
-            rows.append(row)
+            folder = work.folder / f"seed_{seed}"
+            last = self.training.train(seed, folder)[-1]
+            # As bytes, so that a worker on another machine can return them.
+            files = {name: (folder / name).read_bytes() for name in (CURVE, MODEL)}
+            rows.append({"seed": seed, "steps": int(last["steps"]), "wall_s": last["wall_s"], FILES: files})
         return rows
 
     def keep(self, work: _Seeds, rows: Sequence[Row], results: Results) -> None:
         """See `Study`: the model and the curve."""
         del work
         for row in rows:
-            row.pop("trained").save(results.path / f"seed_{row['seed']}")
+            folder = results.path / f"seed_{row['seed']}"
+            folder.mkdir(exist_ok=True)
+            for name, content in row.pop(FILES).items():
+                with atomic_write(folder / name) as beside:
+                    beside.write_bytes(content)
 
     def summarise(self, results: Results) -> Row:
         """See `Study`; the models are tested once all are trained."""

@@ -12,8 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
-from parkenv.files.csv_tables import write_csv
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
@@ -296,35 +294,14 @@ class Training(ABC):
         return heading, ["", *(" ".join(column) for column in columns)], rows
 
 
-class TrainedModel(NamedTuple):
-    """Result of a training, as bytes, so that a worker on another machine can return it.
-
-    Attributes:
-        curve: rows of `curve.csv`.
-        model: content of the model file.
-    """
-
-    curve: list[Row]
-    model: bytes
-
-    def save(self, folder: Path) -> None:
-        """Write both files to a folder."""
-        folder.mkdir(parents=True, exist_ok=True)
-        write_csv(folder / CURVE, list(self.curve[0]), self.curve)
-        with atomic_write(folder / MODEL) as beside:
-            beside.write_bytes(self.model)
-
-
-def train_one(training: Training, seed: int, folder: Path) -> TrainedModel:
-    """Train with one seed on a single thread, so that one training per core can run in parallel."""
+def use_one_thread() -> None:
+    """Let this process train on a single thread, so that one training per core can run in parallel."""
     import torch
     from numba import get_num_threads
 
     # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
     get_num_threads()
     torch.set_num_threads(1)
-    curve = training.train(seed, folder)
-    return TrainedModel(curve, (folder / MODEL).read_bytes())
 
 
 def training_of(spec: TrainingSpec, command: tuple[str, ...] = ()) -> Training:

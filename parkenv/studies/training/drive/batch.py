@@ -19,7 +19,7 @@ from parkenv.compiled.jit import compiled
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
 from parkenv.envs.drive import CONTROL_S, SUBSTEPS
-from parkenv.envs.drive_goals import goal_error
+from parkenv.envs.drive_goals import goal_error, goal_of
 from parkenv.envs.drive_observation import MOST_CARS, MOST_LINES, obstacle_map
 from planners.driving import policy_interface as interface
 from planners.driving.policy_interface import Outlines, PolicyInterface
@@ -145,11 +145,7 @@ class PreparedTask:
         self.start = task.start.copy()
         self.start[:2] = task.in_slot_frame(task.start[:2])
         self.start[2] -= self.slot_yaw
-        turned = float(task.target[2]) - self.slot_yaw
-        self.desired = np.array(
-            [0.0, 0.0, round(math.cos(turned), 9), round(math.sin(turned), 9), 0.0, *task.room],
-            dtype=np.float32,
-        )
+        self.desired = goal_of(task)
         self.about = np.array([*task.room, *(float(kind == task.kind) for kind in KINDS)])
 
 
