@@ -125,6 +125,7 @@ class _CarsAsAgents:
         blank["p_occupied"][:] = 1.0
         parts = blank["belief"].reshape(4, -1)
         parts[0], parts[2], parts[3] = 1.0, 1.0, -1.0
+        blank["step_observed"].reshape(4, -1)[0] = -1.0
         return blank
 
     def render(self) -> NDArray[np.uint8] | None:

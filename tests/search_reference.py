@@ -92,6 +92,7 @@ class ReferenceSearch:
         self.p_observed = self.forecast.copy()
         self.observed_at = np.full(len(self.forecast), -1.0)
         self.observed_taken = np.zeros(len(self.forecast), dtype=bool)
+        self.step_observed = []
         self.passed = set()
         self.parked = self.over = False
         self.metrics = dict.fromkeys(
@@ -120,16 +121,19 @@ class ReferenceSearch:
         """Take an action; return the terms of the reward."""
         scenario, lot, slot = self.scenario, self.scenario.lot, self.vertex
         terms = dict.fromkeys(("drive", "failed", "walk", "parking", "gave_up"), 0.0)
+        self.step_observed = []
         if action < PARK and lot.neighbors[self.vertex, action] >= 0:
             length = lot.edge_length[self.vertex, action]
             terms["drive"] = length / scenario.v_drive
             self.metrics["driven_m"] += length
             self.vertex = int(lot.neighbors[self.vertex, action])
         elif action == PARK and slot < lot.n_slots:
-            if self.taken(slot):
+            taken = self.taken(slot)
+            self.set_belief(slot, taken, float(taken))
+            self.step_observed.append((slot, taken, 1.0, 0.0))
+            if taken:
                 terms["failed"] = scenario.failure_s
                 self.failed_parks += 1
-                self.set_belief(slot, True, 1.0)
             else:
                 self.parked = True
                 self.metrics["walked_m"] = lot.walk_m(scenario.goal)[slot]
@@ -168,14 +172,18 @@ class ReferenceSearch:
             if_taken, if_free = (hit, false_alarm) if taken else (1.0 - hit, 1.0 - false_alarm)
             evidence = if_taken * p + if_free * (1.0 - p)
             self.set_belief(slot, taken, if_taken * p / evidence if evidence > 0.0 else float(taken))
+            self.step_observed.append((slot, taken, hit, false_alarm))
 
     def observation(self):
         """What `parkenv/Search-v2` should observe."""
+        most = 1 + max(np.diff(self.scenario.slots_in_view[0]))
+        unused = [(-1, 0, 0, 0)] * (most - len(self.step_observed))
         return {
             "vertex": self.vertex,
             "time": np.array([self.time, self.time - self.arrival.time]),
             "p_occupied": self.p_occupied(),
             "belief": np.concatenate([self.forecast, self.decay_rate, self.p_observed, self.observed_at]),
+            "step_observed": np.array([*self.step_observed, *unused], float).T.ravel(),
             "day_error": self.day_error,
             "action_mask": np.append(
                 self.scenario.lot.neighbors[self.vertex] >= 0, self.vertex < self.scenario.lot.n_slots

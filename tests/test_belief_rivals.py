@@ -98,10 +98,12 @@ def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
     for seen_taken in (False, True):
         belief = belief.update([0], [seen_taken])
         for day in (calm, crowd):
-            day.update(belief)
+            day.update(belief.observations)
         belief = belief.decay(2.0)
-    assert crowd.p_occupied(belief)[5] > calm.p_occupied(belief)[5] + 0.05
-    assert crowd.p_occupied(belief)[5] > crowd.p_occupied(belief)[20], "the best slots are the rivals'"
+    assert crowd.p_occupied(belief.time)[5] > calm.p_occupied(belief.time)[5] + 0.05
+    assert crowd.p_occupied(belief.time)[5] > crowd.p_occupied(belief.time)[20], (
+        "the best slots are the rivals'"
+    )
 
 
 def test_as_many_arrive_as_leave():
@@ -120,7 +122,7 @@ def test_if_the_rate_is_not_known_a_multiple_of_the_usual_one_is_expected():
     for rate in (None, CROWD * usual, 0.5 * usual):
         agent = make_agent("belief-rivals", scenario, arrivals_per_hour=rate)
         _, memory = agent.predict(observation)
-        expected.append(memory.day.p_occupied(belief.take(memory.near.slots)))
+        expected.append(memory.day.p_occupied(belief.time))
     assert np.allclose(expected[0], expected[1])
     assert expected[0].mean() > expected[2].mean() + 0.05
 
@@ -135,7 +137,7 @@ def test_free_slots_near_the_entry_do_not_prove_that_nobody_wants_the_best_ones(
         {**observation, **belief.update(worst, np.zeros(len(worst), bool)).to_observation()}
     )
     known = belief.update(worst, np.zeros(len(worst), bool))
-    assert memory.day.p_occupied(known)[best].min() > 0.8
+    assert memory.day.p_occupied(known.time)[best].min() > 0.8
 
 
 def test_wrong_rates_are_refused():

@@ -27,7 +27,7 @@ def logit(p):
 @pytest.mark.parametrize(("level", "slope"), [(0.0, 0.0), (0.8, 0.0), (0.5, 0.5), (1.5, 0.0)])
 def test_before_any_observation_the_forecast_is_believed(level, slope):
     p, near, belief = forecast_of(60, level=level, slope=slope)
-    np.testing.assert_allclose(DayBelief(belief, near).p_occupied(belief), p, atol=0.01)
+    np.testing.assert_allclose(DayBelief(belief, near).p_occupied(belief.time), p, atol=0.01)
 
 
 def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
@@ -42,9 +42,9 @@ def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
         seen = rng.permutation(300)[:100]
         belief = before.update(seen, rng.random(100) < truth[seen])
         day = DayBelief(before, near)
-        day.update(belief)
+        day.update(belief.observations)
         rest = np.setdiff1d(np.arange(300), seen)
-        found.append((day.p_occupied(belief) - truth)[rest])
+        found.append((day.p_occupied(belief.time) - truth)[rest])
         forecast_errors.append((p - truth)[rest])
     assert abs(np.mean(found)) < 0.015
     assert np.abs(found).mean() < 0.35 * np.abs(forecast_errors).mean()
@@ -56,8 +56,8 @@ def test_an_event_is_told_from_a_fuller_day():
     seen = np.flatnonzero((near > 0.3) | (near < -0.8))
     belief = before.update(seen, np.where(near[seen] > 0.0, True, np.arange(len(seen)) % 3 > 0))
     day = DayBelief(before, near)
-    day.update(belief)
-    found = day.p_occupied(belief)
+    day.update(belief.observations)
+    found = day.p_occupied(belief.time)
     assert found[(near < 0.3) & (near > 0.0)].min() > 0.98
     far = (near < -0.6) & (near > -0.8)
     assert abs((logit(found[far]) - logit(p[far])).mean()) < 0.25
@@ -72,8 +72,8 @@ def test_filling_a_nearly_empty_lot_takes_more_than_two_taken_slots(taken_in_a_r
     seen = np.concatenate([far, beyond])
     belief = before.update(seen, np.concatenate([np.arange(80) % 5 == 0, np.ones(taken_in_a_row, bool)]))
     day = DayBelief(before, near)
-    day.update(belief)
-    found = day.p_occupied(belief)[rest]
+    day.update(belief.observations)
+    found = day.p_occupied(belief.time)[rest]
     assert found.min() > 0.99 if believed else found.max() < 0.25
 
 
@@ -81,8 +81,8 @@ def test_a_certain_forecast_is_believed_whatever_is_observed():
     _, near, before = forecast_of(60)
     belief = before.update(np.arange(15), np.ones(15, dtype=bool))
     day = DayBelief(before, near, certain=True)
-    day.update(belief)
-    np.testing.assert_allclose(day.p_occupied(belief), belief.p_occupied)
+    day.update(belief.observations)
+    np.testing.assert_allclose(day.p_occupied(belief.time), belief.p_occupied)
 
 
 def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
@@ -100,12 +100,12 @@ def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
         ([1], [False], 0.9, 0.2),
     ):
         belief = belief.decay(5.0).update(slots, taken, hit, alarm)
-        day.update(belief)
+        day.update(belief.observations)
         for s, said in zip(slots, taken, strict=True):
             chance = np.where(states[:, s], hit, alarm)
             posterior *= chance if said else 1.0 - chance
     np.testing.assert_allclose(
-        day.p_occupied(belief), posterior.sum(axis=0) @ states / posterior.sum(), rtol=1e-9
+        day.p_occupied(belief.time), posterior.sum(axis=0) @ states / posterior.sum(), rtol=1e-9
     )
 
 
@@ -117,8 +117,8 @@ def test_seen_again_at_once_says_nothing_and_after_long_says_as_much_as_another_
         belief, day = before, DayBelief(before, near)
         for gap in gaps:
             belief = belief.decay(gap).update(np.arange(20), np.ones(20, dtype=bool))
-            day.update(belief)
-        return (logit(day.p_occupied(belief)[unseen]) - logit(p[unseen])).mean()
+            day.update(belief.observations)
+        return (logit(day.p_occupied(belief.time)[unseen]) - logit(p[unseen])).mean()
 
     once = moved(1.0)
     assert moved(1.0, 0.0) == pytest.approx(once, rel=1e-6)
@@ -135,11 +135,11 @@ def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day(monkeypatc
         DayBelief(whole, near),
         *(DayBelief(whole.take(part), near[part]) for part in (first, second)),
     )
-    at_once.update(seen)
-    old.update(seen.take(first))
+    at_once.update(seen.observations)
+    old.update(seen.take(first).observations)
     new.carry_over(old, np.arange(30), np.arange(20, 50))
-    new.update(seen.take(second))
-    np.testing.assert_allclose(new.p_occupied(seen.take(second)), at_once.p_occupied(seen)[second], rtol=1e-9)
+    new.update(seen.take(second).observations)
+    np.testing.assert_allclose(new.p_occupied(seen.time), at_once.p_occupied(seen.time)[second], rtol=1e-9)
 
 
 def test_what_is_observed_last_holds_even_if_it_was_excluded():
@@ -150,5 +150,5 @@ def test_what_is_observed_last_holds_even_if_it_was_excluded():
         before = before.decay(5.0).update(slots, slots != reserved)
         # Bayes' rule cannot turn a certain state round.
         before.p_observed[:] = before.p_occupied[:] = slots != reserved
-        day.update(before)
-        np.testing.assert_allclose(day.p_occupied(before), slots != reserved, atol=1e-9)
+        day.update(before.observations)
+        np.testing.assert_allclose(day.p_occupied(before.time), slots != reserved, atol=1e-9)

@@ -71,6 +71,7 @@ def assert_agrees(observation, wanted):
     np.testing.assert_allclose(observation["time"], wanted["time"], rtol=1e-6)
     np.testing.assert_allclose(observation["p_occupied"], wanted["p_occupied"], atol=2e-7)
     np.testing.assert_allclose(observation["belief"], wanted["belief"], rtol=1e-6, atol=2e-7)
+    np.testing.assert_allclose(observation["step_observed"], wanted["step_observed"], rtol=1e-6)
     np.testing.assert_allclose(observation["day_error"], wanted["day_error"], rtol=1e-6)
 
 

@@ -143,7 +143,7 @@ def test_different_lots_share_one_space():
 
 def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():
     full, lean = (make_batch(3, "mini", observation=name) for name in ("full", "occupancy"))
-    assert set(full.observation_space) - set(lean.observation_space) == {"belief"}
+    assert set(full.observation_space) - set(lean.observation_space) == {"belief", "step_observed"}
     pairs = [(full.reset(seed=2)[0], lean.reset(seed=2)[0])]
     pairs += [tuple(envs.step(np.full(3, action))[0] for envs in (full, lean)) for action in (3, 1, 4, 2)]
     for more, less in pairs:

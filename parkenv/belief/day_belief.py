@@ -15,8 +15,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import SlotBelief, decay_to_prior
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.belief.slot_belief import Observations, SlotBelief, decay_to_prior
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError
@@ -53,8 +53,7 @@ class DayBelief:
     """Belief about the day and the slots of (a part of) a lot: the exact posterior over hypotheses about the day.
 
     Under each hypothesis a slot's state is a two-state Markov chain that is observed now and then: the second of two
-    observations at short intervals says nothing about the day. How much an observation says follows from how far it
-    moved the `SlotBelief`, so the error rates of the sensor count.
+    observations at short intervals says nothing about the day.
 
     Args:
         belief: belief about these slots before any observation.
@@ -70,11 +69,11 @@ class DayBelief:
         >>> belief = SlotBelief.of_forecast(np.full(40, 0.6), np.zeros(40))
         >>> belief.day_error = np.array([0.8, 0.0])
         >>> day = DayBelief(belief, nearness(np.arange(40.0)))
-        >>> round(float(day.p_occupied(belief)[20]), 2)
+        >>> round(float(day.p_occupied(time=0.0)[20]), 2)
         0.6
         >>> seen = belief.update(np.arange(10), np.full(10, True))
-        >>> day.update(seen)
-        >>> bool(day.p_occupied(seen)[20] > 0.7)
+        >>> day.update(seen.observations)
+        >>> bool(day.p_occupied(time=0.0)[20] > 0.7)
         True
     """
 
@@ -103,10 +102,14 @@ class DayBelief:
             gone = np.divide(rival_rates, leaving, out=np.zeros(len(leaving)), where=leaving > 0.0)
             p_taken = 1.0 - 1.0 / (1.0 / (1.0 - p_taken) + gone[:, None])
         self._log_weight, self._p_taken = np.log(weight), p_taken
-        # P(taken) at each slot's last observation under each hypothesis, when that was, and the result
+        self._forecast, self._decay_rate = (
+            belief.forecast.astype(np.float64),
+            belief.decay_rate.astype(np.float64),
+        )
+        # P(taken) right after each slot's last observation: under each hypothesis, and of the slot alone; when that was
         self._p_then = np.empty_like(self._p_taken)
+        self._p_alone = forecast.copy()
         self._observed_at = np.full(len(forecast), -1.0)
-        self._p_observed = forecast.copy()
 
     def carry_over(self, other: DayBelief, ours: IntArray, theirs: IntArray) -> None:
         """Take over what is known about the day, and about the slots `theirs` of another part, here `ours`, (k,).
@@ -121,37 +124,28 @@ class DayBelief:
         share = posterior[:usual] + event * prior[:usual] / prior[:usual].sum()
         self._log_weight[:usual] = np.log(np.maximum(share, 1e-300) * prior[:usual].sum())
         self._p_then[ours] = other._p_then[theirs]
+        self._p_alone[ours] = other._p_alone[theirs]
         self._observed_at[ours] = other._observed_at[theirs]
-        self._p_observed[ours] = other._p_observed[theirs]
 
-    def update(self, belief: SlotBelief) -> None:
-        """Update from the observations in a belief that were made since the last call."""
+    def update(self, observations: Observations) -> None:
+        """Update from new observations, in the order of their times (Bayes' rule)."""
         _update(
-            self._log_weight,
-            self._p_taken,
-            self._p_then,
-            self._observed_at,
-            self._p_observed,
-            belief.parts.astype(np.float64).reshape(4, -1),
-        )
+            self._log_weight, self._p_taken, self._forecast, self._decay_rate,
+            self._p_then, self._p_alone, self._observed_at, *observations,
+        )  # fmt: skip
 
     def mixture(self) -> tuple[FloatArray, FloatArray]:
         """Return the weights, (k,), of the hypotheses that matter, and P(free) under each, (n_slots, k)."""
         weight, p_free = _mixture(self._log_weight, self._p_taken)
         return weight, p_free
 
-    def p_occupied(self, belief: SlotBelief) -> FloatArray:
-        """P(taken) of each slot at the time of the belief, (n_slots,), observed or not."""
-        return np.asarray(
-            _p_occupied(
-                self._log_weight,
-                self._p_taken,
-                self._p_then,
-                self._observed_at,
-                belief.parts.astype(np.float64).reshape(4, -1),
-                belief.time,
-            )
-        )
+    def p_occupied(self, time: float) -> FloatArray:
+        """P(taken) of each slot at a time, s since the search began, (n_slots,), observed or not."""
+        p: FloatArray = _p_occupied(
+            self._log_weight, self._p_taken, self._forecast, self._decay_rate,
+            self._p_then, self._observed_at, time,
+        )  # fmt: skip
+        return p
 
 
 def _hypotheses(
@@ -207,30 +201,38 @@ def _nodes(deviation: float, count: int) -> tuple[FloatArray, FloatArray]:
 def _update(
     log_weight: FloatArray,
     p_taken: FloatArray,
+    forecast: FloatArray,
+    decay_rate: FloatArray,
     p_then: FloatArray,
+    p_alone: FloatArray,
     observed_at: FloatArray,
-    p_observed: FloatArray,
-    parts: FloatArray,
+    slots: IntArray,
+    time: FloatArray,
+    taken: BoolArray,
+    hit_rate: FloatArray,
+    false_alarm_rate: FloatArray,
 ) -> None:
-    for s in range(len(observed_at)):
-        time = parts[3, s]
-        if time < 0.0 or time == observed_at[s]:
-            continue
-        forecast, rate = parts[0, s], parts[1, s]
-        first, gap = observed_at[s] < 0.0, time - observed_at[s]
-        before = forecast if first else decay_to_prior(forecast, rate, p_observed[s], gap)
-        before = min(max(before, _LEAST), _MOST)
-        # The likelihoods of the observation, up to a common factor, if the slot is taken or free
-        if_taken, if_free = parts[2, s] / before, (1.0 - parts[2, s]) / (1.0 - before)
+    for i in range(len(slots)):
+        s = slots[i]
+        first, gap = observed_at[s] < 0.0, time[i] - observed_at[s]
+        if_taken = hit_rate[i] if taken[i] else 1.0 - hit_rate[i]
+        if_free = false_alarm_rate[i] if taken[i] else 1.0 - false_alarm_rate[i]
+        # Relative to what is expected of the slot alone, so that what surprises no hypothesis leaves the weights.
+        p = forecast[s] if first else decay_to_prior(forecast[s], decay_rate[s], p_alone[s], gap)
+        p = min(max(p, _LEAST), _MOST)
+        evidence = if_taken * p + if_free * (1.0 - p)
+        p_alone[s] = if_taken * p / evidence
+        if_taken, if_free = if_taken / evidence, if_free / evidence
         for h in range(len(log_weight)):
             p = p_taken[s, h]
             if not first:
-                p = decay_to_prior(p, rate * (1.0 - forecast) / (1.0 - p), p_then[s, h], gap)
+                leaving = decay_rate[s] * (1.0 - forecast[s])
+                p = decay_to_prior(p, leaving / (1.0 - p), p_then[s, h], gap)
             likelihood = if_taken * p + if_free * (1.0 - p)
             # What a hypothesis excludes has been observed all the same.
-            p_then[s, h] = if_taken * p / likelihood if likelihood > 0.0 else parts[2, s]
+            p_then[s, h] = if_taken * p / likelihood if likelihood > 0.0 else np.float64(taken[i])
             log_weight[h] += math.log(max(likelihood, 1e-300))
-        observed_at[s], p_observed[s] = time, parts[2, s]
+        observed_at[s] = time[i]
 
 
 @compiled(inline="always")
@@ -256,14 +258,15 @@ def _mixture(log_weight: FloatArray, p_taken: FloatArray) -> tuple[FloatArray, F
 def _p_occupied(
     log_weight: FloatArray,
     p_taken: FloatArray,
+    forecast: FloatArray,
+    decay_rate: FloatArray,
     p_then: FloatArray,
     observed_at: FloatArray,
-    parts: FloatArray,
     now: float,
 ) -> FloatArray:
     weight, p_occupied = _weights(log_weight), np.zeros(len(observed_at))
     for s in range(len(observed_at)):
-        leaving, first = parts[1, s] * (1.0 - parts[0, s]), 0.0
+        leaving, first = decay_rate[s] * (1.0 - forecast[s]), 0.0
         for h in range(len(weight)):
             p = p_taken[s, h]
             if observed_at[s] >= 0.0:

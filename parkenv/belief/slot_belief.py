@@ -5,21 +5,45 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.occupancy.decay import decay_factor
 
-_SURE = np.zeros(2)
-_SURE.flags.writeable = False
+_SURE, _NOTHING = np.zeros(2), np.zeros(0)
+_SURE.flags.writeable = _NOTHING.flags.writeable = False
 
 UNOBSERVED, OBSERVED_FREE, OBSERVED_TAKEN = 0, 1, 2  # result of a slot's last observation
 _SURELY_LEFT = 8.0  # decay rate times age up to which something of an observation is left
+
+
+class Observations(NamedTuple):
+    """Observations of some slots, (k,) each.
+
+    Attributes:
+        slots: int64.
+        time: float64, when each was observed, s since the search began.
+        taken: bool, observed states.
+        hit_rate: float64, P(observed taken | taken).
+        false_alarm_rate: float64, P(observed taken | free).
+    """
+
+    slots: IntArray
+    time: FloatArray
+    taken: BoolArray
+    hit_rate: FloatArray
+    false_alarm_rate: FloatArray
+
+    def take(self, slots: NDArray[np.integer]) -> Observations:
+        """Return the observations of some slots, (n,), numbered by their position among these."""
+        which, number = np.nonzero(self.slots[:, None] == slots)
+        _, time, taken, hit_rate, false_alarm_rate = self
+        return Observations(number, time[which], taken[which], hit_rate[which], false_alarm_rate[which])
 
 
 @dataclass(eq=False)
@@ -43,6 +67,8 @@ class SlotBelief:
         time: current time, s since the search began.
         day_error: (2,) float, logits, how far whole days differ from the forecast: standard deviations over days of
             the level and of the slope to the goal; see `parkenv.world.occupancy.day_error`.
+        step_observed: (4 * k,) float, what the last step observed, four consecutive parts: slot, or -1; whether it was
+            observed taken; hit rate; false-alarm rate. See `observations`.
 
     Examples:
         Slot 1 is observed free and stays likely to be free for a while.
@@ -57,6 +83,7 @@ class SlotBelief:
     parts: NDArray[np.floating]
     time: float
     day_error: NDArray[np.floating] = field(default_factory=lambda: _SURE)
+    step_observed: NDArray[np.floating] = field(default_factory=lambda: _NOTHING)
 
     @classmethod
     def of_observation(cls, observation: Mapping[str, Any]) -> Self:
@@ -71,6 +98,7 @@ class SlotBelief:
                 observation["belief"],
                 float(observation["time"][1]),
                 observation["day_error"],
+                observation["step_observed"],
             )
         except KeyError as error:
             raise InputError(
@@ -78,10 +106,11 @@ class SlotBelief:
             ) from None
 
     def to_observation(self) -> dict[str, NDArray[np.float32]]:
-        """Return this belief as entries of an observation: `p_occupied`, `belief` and `day_error`, float32."""
+        """Return this belief as entries of an observation, float32: all of them but vertex, time and action mask."""
         return {
             "p_occupied": self.p_occupied.astype(np.float32),
             "belief": self.parts.astype(np.float32),
+            "step_observed": self.step_observed.astype(np.float32),
             "day_error": self.day_error.astype(np.float32),
         }
 
@@ -129,6 +158,20 @@ class SlotBelief:
         return row
 
     @cached_property
+    def observations(self) -> Observations:
+        """The observations of the last step."""
+        slots, taken, hit_rate, false_alarm_rate = self._step_observed
+        observed = slots.astype(np.int64)
+        time = self.observed_at[observed].astype(np.float64)
+        return Observations(observed, time, taken == 1.0, hit_rate, false_alarm_rate)
+
+    @cached_property
+    def _step_observed(self) -> FloatArray:
+        """(4, k) float64, the used part of `step_observed`."""
+        rows = self.step_observed.reshape(4, -1)
+        return rows[:, : np.count_nonzero(rows[0] >= 0.0)].astype(np.float64)
+
+    @cached_property
     def observed(self) -> BoolArray:
         """(n_slots,) bool, whether the slot was observed in this search."""
         return self.observed_at >= 0.0
@@ -167,7 +210,9 @@ class SlotBelief:
     def take(self, slots: NDArray[np.integer]) -> Self:
         """Return the belief of some of the slots, (k,), in float64."""
         parts = self._rows[:, slots].astype(np.float64)
-        return type(self)(self.p_occupied[slots].astype(np.float64), parts.ravel(), self.time, self.day_error)
+        p_occupied = self.p_occupied[slots].astype(np.float64)
+        slot, _, *rest = self.observations.take(slots)
+        return type(self)(p_occupied, parts.ravel(), self.time, self.day_error, np.concatenate([slot, *rest]))
 
     def update(
         self,
@@ -193,8 +238,13 @@ class SlotBelief:
                 (false_alarm_rate, np.float64),
             )
         )
+        step_observed = np.hstack([self._step_observed, [observed, reports, hits, false_alarms]])
         later = type(self)(
-            self.p_occupied.astype(np.float64), self.parts.astype(np.float64), self.time, self.day_error
+            self.p_occupied.astype(np.float64),
+            self.parts.astype(np.float64),
+            self.time,
+            self.day_error,
+            step_observed.ravel(),
         )
         _update_slots(later.p_occupied, observed, reports, hits, false_alarms)
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time

@@ -551,6 +551,7 @@ class Fleet:
             "time": record["clock"].copy(),
             "p_occupied": searches.p_occupied[row].copy(),
             "belief": searches.belief[row].reshape(-1).copy(),
+            "step_observed": searches.step_observed[row].reshape(-1).copy(),
             "day_error": searches.day_error[row].copy(),
             "action_mask": scenario.action_masks[vertex].copy(),
         }

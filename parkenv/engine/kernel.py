@@ -174,9 +174,17 @@ def apply_observations_at(
 
 @kernel
 def set_taken_at(address: int, slot: int) -> None:
-    """Set P(taken) of a slot to 1, as after a failed attempt."""
+    """Set P(taken) of a slot to 1, as after a failed attempt, whatever else the step has observed of it."""
     search = search_at(address, 0)
     set_belief(search, column_of(search, slot), True, 1.0)
+    # The last observation of the slot counts.
+    n, rows = search.n_step_observed - 1, float32s(search.step_observed)
+    while n >= 0 and rows[n] != slot:
+        n -= 1
+    n = search.n_step_observed if n < 0 else n
+    if n < search.most_observed:
+        write_observed(search, n, slot, 1.0, 1.0, 0.0)
+        search.n_step_observed = max(search.n_step_observed, n + 1)
 
 
 @kernel
@@ -289,9 +297,8 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
         search.costs[term] = search.step_costs[term] = 0.0
     search.total_s = search.driven_m = search.walked_m = 0.0
     search.n_observed_free = search.n_expected_free = 0.0
-    search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = (
-        search.n_last_observed_taken
-    ) = 0
+    search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = 0
+    search.n_last_observed_taken = search.n_step_observed = 0
     search.remembered_slot = -1
     _write_day_error(search)
 
@@ -350,20 +357,21 @@ def drive_or_park(search: Any, action: int) -> None:
         taken = is_taken(search, column, search.time)
         if taken:
             search.failed_parks += 1
-            set_belief(search, column, taken, 1.0)
             search.step_failed_s = scenario.failure_s
         else:
             search.parked = True
             search.step_walk_s = float64s(scenario.walk_s)[vertex]
             search.step_parking_cost_s = float64s(scenario.parking_cost_s)[vertex]
             search.walked_m = float64s(scenario.walk_m)[vertex]
+        observe_attempt(search, column, taken)
     search.time += search.step_drive_s + search.step_failed_s
     search.n_steps += 1
 
 
 @inlined
 def clear_step(search: Any) -> None:
-    """Begin a step: it costs nothing yet."""
+    """Begin a step: it costs nothing yet, and nothing is observed."""
+    search.n_step_observed = 0
     for term in range(N_TERMS):
         search.step_costs[term] = 0.0
 
@@ -422,6 +430,7 @@ def observe_exact(search: Any) -> None:
     observed_at, since_arrival = float32s(search.belief), time - search.arrival
     first = OBSERVED_AT * search.width
     starts = int64s(scenario.view_starts)
+    n = search.n_step_observed
     for i in range(starts[search.vertex], starts[search.vertex + 1]):
         slot = viewed[i]
         column = np.int64(columns[slot])
@@ -430,6 +439,10 @@ def observe_exact(search: Any) -> None:
         block_at(search.blocks, column >> BLOCK_BITS).observed_at[column & (BLOCK_SIZE - 1)] = time
         if search.belief != 0:
             observed_at[first + slot] = since_arrival
+            taken = np.float64(slot_at(search.slots, column).observed_taken)
+            write_observed(search, n, slot, taken, 1.0, 0.0)
+            n += 1
+    search.n_step_observed = n
     mark_passed(search)
 
 
@@ -470,6 +483,31 @@ def apply_observation(
     """Update the belief in a slot from one observation (Bayes' rule)."""
     p = bayes_update(belief_now(search, column), taken, hit_rate, false_alarm_rate)
     set_belief(search, column, taken, p)
+    add_observed(search, slot_at(search.slots, column).slot, taken, hit_rate, false_alarm_rate)
+
+
+@inlined
+def observe_attempt(search: Any, column: int, taken: bool) -> None:
+    """Observe without error whether a slot is taken, by an attempt to park in it."""
+    set_belief(search, column, taken, 1.0 if taken else 0.0)
+    add_observed(search, slot_at(search.slots, column).slot, taken, 1.0, 0.0)
+
+
+@inlined
+def add_observed(search: Any, slot: int, taken: bool, hit_rate: float, false_alarm_rate: float) -> None:
+    """Add a slot to what the step observed, if that is kept."""
+    if search.belief != 0:
+        write_observed(search, search.n_step_observed, slot, taken, hit_rate, false_alarm_rate)
+        search.n_step_observed += 1
+
+
+@inlined
+def write_observed(
+    search: Any, n: int, slot: float, taken: float, hit_rate: float, false_alarm_rate: float
+) -> None:
+    """Write an entry of `step_observed`."""
+    rows, most = float32s(search.step_observed), search.most_observed
+    rows[n], rows[most + n], rows[2 * most + n], rows[3 * most + n] = slot, taken, hit_rate, false_alarm_rate
 
 
 @kernel
@@ -522,6 +560,7 @@ def belief_now(search: Any, column: int) -> float:
 def refresh_belief(search: Any) -> None:
     """Write the current belief into `p_occupied`; only slots with a column can have changed."""
     decay_belief(search)
+    end_observed(search)
     p_occupied, end = float32s(search.p_occupied), search.n_columns + 1
     for first in range(0, end, BLOCK_SIZE):
         block = block_at(search.blocks, first >> BLOCK_BITS)
@@ -529,6 +568,13 @@ def refresh_belief(search: Any) -> None:
         for i in range(BLOCK_SIZE):
             if SENTINEL < first + i < end:
                 p_occupied[slot_at(search.slots, first + i).slot] = block.p_occupied[i]
+
+
+@inlined
+def end_observed(search: Any) -> None:
+    """Mark the rest of `step_observed` as unused."""
+    for n in range(search.n_step_observed, search.most_observed):
+        write_observed(search, n, -1.0, 0.0, 0.0, 0.0)
 
 
 @kernel
@@ -627,6 +673,7 @@ def init_prior(search: Any) -> None:
         p_occupied[slot] = belief[FORECAST * width + slot] = belief[P_OBSERVED * width + slot] = 1.0
         belief[DECAY_RATE * width + slot] = 0.0
         belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
+    end_observed(search)
 
 
 @kernel

@@ -22,7 +22,7 @@ from parkenv.world.occupancy.kernel import (
     WORLD_FIELDS,
 )
 from parkenv.world.occupancy.process import Arrival, CompiledModel, PriorModel, World
-from parkenv.world.scenario import EDGE, Scenario
+from parkenv.world.scenario import EDGE, Scenario, SearchProblem
 
 N_ACTIONS = PARK + 1
 
@@ -109,6 +109,8 @@ _PROGRESS = [
     ("n_observed_free", np.float64),
     ("n_expected_free", np.float64),
     ("n_last_observed_taken", np.int64),
+    # Number of observations of the last step in `step_observed`.
+    ("n_step_observed", np.int64),
     # For the local observation: forecast fraction of free slots in each quarter of the lot; the best slot observed
     # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),
@@ -157,11 +159,13 @@ SEARCH = _with_costs(
         ("external_forecast", ADDRESS),
         ("day_error", ADDRESS),
         ("world", ADDRESS),
-        # Number of slots of the largest lot; (width,) float32 current belief and (4, width) float32 `belief` of the
-        # observation, or 0 if these are not kept.
+        # Number of slots of the largest lot; (width,) float32 current belief, (4, width) float32 `belief` and
+        # (4, most_observed) float32 `step_observed` of the observation, or 0 if these are not kept.
         ("width", np.int64),
         ("p_occupied", ADDRESS),
         ("belief", ADDRESS),
+        ("most_observed", np.int64),
+        ("step_observed", ADDRESS),
     ],
     costs=COST_FIELDS[0],
     step_costs=STEP_FIELDS[0],
@@ -520,7 +524,8 @@ class Searches:
     Args:
         scenarios: scenarios of the searches; if there are several, one is drawn for each episode.
         n: number of searches.
-        full_belief: whether to keep `p_occupied` and `belief` up to date.
+        full_belief: whether to keep `p_occupied`, `belief` and `step_observed` up to date.
+        most_observed: maximum number of slots that a step observes; None: those in view, and one more.
 
     Attributes:
         records: (n,) of the dtype SEARCH.
@@ -533,9 +538,13 @@ class Searches:
         p_occupied: (n, m) float32, current belief in every slot; (0, 0) if not kept.
         belief: (n, 4, m) float32: forecast, decay rate, belief after the last observation, and its time; (0, 4, 0) if
             not kept.
+        step_observed: (n, 4, most_observed) float32, what the last step observed: slot, whether it was observed taken,
+            hit rate, false-alarm rate; slot -1 past the last; (0, 4, 0) if not kept.
     """
 
-    def __init__(self, scenarios: ScenarioRecords, n: int, full_belief: bool) -> None:
+    def __init__(
+        self, scenarios: ScenarioRecords, n: int, full_belief: bool, most_observed: int | None = None
+    ) -> None:
         m = int(scenarios.records["n_slots"].max())
         external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
         self.needs_python = external or bool((scenarios.records["world"] == 0).any())
@@ -553,7 +562,9 @@ class Searches:
         self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
         self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
         self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
-        self.records["width"] = m
+        k = most_observed_in(scenarios.scenarios) if most_observed is None else most_observed
+        self.step_observed = np.zeros((n, 4, k) if full_belief else (0, 4, 0), np.float32)
+        self.records["width"], self.records["most_observed"] = m, k
         self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
         self.records["n_places"] = len(scenarios.records)
         self._find_scenarios()
@@ -601,6 +612,7 @@ class Searches:
             "day_error": self.day_error,
             "p_occupied": self.p_occupied,
             "belief": self.belief,
+            "step_observed": self.step_observed,
         }
 
     @property
@@ -638,6 +650,11 @@ class Searches:
         if self.needs_python:
             for search in range(len(self.records)):
                 self._make_world(search)
+
+
+def most_observed_in(problems: Sequence[SearchProblem]) -> int:
+    """Return the maximum number of slots that a step observes: those in view, and one that the car attempts."""
+    return 1 + max(int(np.diff(problem.slots_in_view[0]).max(initial=0)) for problem in problems)
 
 
 def arrival_of(scenario: Scenario, record: np.void) -> Arrival:

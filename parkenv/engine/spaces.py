@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from parkenv.engine.records import NEVER_OBSERVED
+from parkenv.engine.records import NEVER_OBSERVED, most_observed_in
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.day_error import MAX_LOGITS
@@ -22,26 +22,31 @@ MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 def space_of(scenarios: Sequence[SearchProblem]) -> spaces.Dict:
     """The observation space that fits the lots of all scenarios."""
     lots = [one.lot for one in scenarios]
-    return search_space(max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots))
+    n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
+    return search_space(n_slots, n_vertices, most_observed_in(scenarios))
 
 
-def search_space(n_slots: int, n_vertices: int) -> spaces.Dict:
+def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Dict:
     """The observation space for a lot of the given size; see `parkenv.envs.search.SearchEnv`."""
-    # Bounds of forecast, decay_rate, p_observed, observed_at.
-    low, high = (
-        np.repeat(np.array(bounds, np.float32), n_slots)
-        for bounds in ([0.0, 0.0, 0.0, NEVER_OBSERVED], [1.0, MAX_DECAY_RATE, 1.0, LATEST])
-    )
+    belief = _box_of_parts([(0.0, 1.0), (0.0, MAX_DECAY_RATE), (0.0, 1.0), (NEVER_OBSERVED, LATEST)], n_slots)
+    observed = _box_of_parts([(-1.0, n_slots - 1.0), *[(0.0, 1.0)] * 3], most_observed)
     return spaces.Dict(
         {
             "vertex": spaces.Discrete(n_vertices),
             "time": spaces.Box(0.0, LATEST, (2,), np.float32),
             "p_occupied": spaces.Box(0.0, 1.0, (n_slots,), np.float32),
-            "belief": spaces.Box(low, high, dtype=np.float32),
+            "belief": belief,
+            "step_observed": observed,
             "day_error": spaces.Box(0.0, MAX_LOGITS, (2,), np.float32),
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
         }
     )
+
+
+def _box_of_parts(bounds: Sequence[tuple[float, float]], length: int) -> spaces.Box:
+    """Return the space of consecutive parts of equal length, with the bounds of each."""
+    low, high = np.repeat(np.array(bounds, np.float32), length, axis=0).T
+    return spaces.Box(low, high, dtype=np.float32)
 
 
 def action_number(action: Any) -> int:

@@ -95,7 +95,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     `Discrete(5)`, as in `parkenv/Search-v2`: up, down, left, right, park.
 
     ## Observation space
-    The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `day_error`, `action_mask`.
+    The `Dict` of `parkenv/Search-v2`; `step_observed` holds what perception observed.
 
     ## Rewards
     Minus the seconds of the step, as in `parkenv/Search-v2`.
@@ -135,8 +135,8 @@ class SearchPerceptionEnv(SensingSearchEnv):
     ```
 
     ## Version history
-    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast; pictures are
-      400 px wide unless told otherwise.
+    - v2: observations gain `day_error` and `step_observed`; packaged scenarios have days that differ from their
+      forecast; pictures are 400 px wide unless told otherwise.
     - v1: observations gain `belief`.
     - v0: first version.
     """

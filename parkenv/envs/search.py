@@ -69,6 +69,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
     | `p_occupied` | `Box(0, 1, (n_slots,), float32)` | current P(taken) of each slot |
     | `belief` | `Box((4 * n_slots,), float32)` | the belief state behind `p_occupied`, four parts as below |
+    | `step_observed` | `Box((4 * k,), float32)` | what the last step observed, four parts as below |
     | `day_error` | `Box(0, 5, (2,), float32)` | how far whole days differ from the forecast, logits, as below |
     | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
 
@@ -81,6 +82,17 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | 1 | `decay_rate` | 0, 1e6 | 1/s, rate of decay to the forecast; constant in an episode |
     | 2 | `p_observed` | 0, 1 | P(taken) right after the last observation of the slot; the forecast before the first |
     | 3 | `observed_at` | -1, 1e8 | time of that observation, s since the search began; -1 before the first |
+
+    `step_observed` has four parts of k numbers each, k being the most that a step observes; unpack them as `belief`.
+    Part 0 holds the slots that the last step observed, in order, and -1 past the last of them. A parking attempt comes
+    first, and observes without error; a slot may be observed again when the step ends.
+
+    | Part | Name | Bounds | Meaning |
+    |------|------|--------|---------|
+    | 0 | `slot` | -1, n_slots - 1 | the slot; -1: none |
+    | 1 | `taken` | 0, 1 | 1: observed taken; 0: observed free |
+    | 2 | `hit_rate` | 0, 1 | P(observed taken if it is taken) |
+    | 3 | `false_alarm_rate` | 0, 1 | P(observed taken if it is free) |
 
     `day_error` holds two standard deviations over days, in logits, `(level, slope)`; constant in an episode.
     A day has a level L ~ N(0, level²) and a slope S ~ N(0, slope²), which are not observed. It multiplies
@@ -165,7 +177,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ```
 
     ## Version history
-    - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast.
+    - v2: observations gain `day_error` and `step_observed`; packaged scenarios have days that differ from their
+      forecast.
     - v1: observations gain `belief`.
     - v0: first version.
     """
@@ -199,6 +212,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self.searches.records["clock"][0].copy,
             self.searches.p_occupied[0].copy,
             self.searches.belief[0].reshape(-1).copy,
+            self.searches.step_observed[0].reshape(-1).copy,
             self.searches.day_error[0].copy,
         )
         self._copy_masks = [[mask.copy for mask in one.action_masks] for one in self.scenarios]
@@ -341,12 +355,13 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer = None
 
     def _observation(self, vertex: int) -> dict[str, Any]:
-        time, p_occupied, belief, day_error = self._copies
+        time, p_occupied, belief, step_observed, day_error = self._copies
         return {
             "vertex": self._vertices[vertex],
             "time": time(),
             "p_occupied": p_occupied(),
             "belief": belief(),
+            "step_observed": step_observed(),
             "day_error": day_error(),
             "action_mask": self._copy_mask[vertex](),
         }

@@ -21,7 +21,7 @@ from sim_sensors.rig import SensorRig, TimedCapture
 FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
 
 OBSERVATIONS = ("full", "scan")
-_NOT_SENSED = ("p_occupied", "belief", "day_error")
+_NOT_SENSED = ("p_occupied", "belief", "step_observed", "day_error")
 
 
 class SensingSearchEnv(SearchEnv):

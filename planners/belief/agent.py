@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.day_belief import DayBelief
-from parkenv.belief.slot_belief import UNOBSERVED, SlotBelief
+from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
@@ -54,6 +54,8 @@ class BeliefSearch:
     # (k,) int64, the vertices that the path of the last decision passes first; up to `DEPTH`
     targets: IntArray
     paths: PathBuffers  # buffers of the path search
+    # what was observed before this decision, step by step; empty if the part is the whole lot
+    past: list[Observations]
     entry: int = -1  # vertex to drive to before planning, or -1
     failure_s: float = math.nan  # s, failure cost of the thesis's planner on that path; nan if there was none
     # s, time that was expected to remain on that path by now; inf if something has been observed since
@@ -139,6 +141,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         """Choose the part of the lot to search."""
         vertex = int(observation["vertex"])
         memory = self._search_of(self._neighborhoods.toward(vertex), belief)
+        memory.time = -1.0
         if memory.near.index(vertex) < 0:
             memory.entry = memory.near.entry
         return memory
@@ -155,6 +158,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             news_at=belief.time,
             targets=np.zeros(0, dtype=np.int64),
             paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
+            past=[],
         )
 
     def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:
@@ -164,6 +168,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
         """Update the memory, search for the best path, and take its first step or park."""
         vertex = int(observation["vertex"])
+        if not memory.near.whole:
+            memory.past.append(belief.observations)
         known = self._update(belief, vertex, memory)
         if memory.entry not in (-1, vertex):
             return self._routes.move_toward(vertex, memory.entry)
@@ -189,16 +195,17 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         first = np.flatnonzero((state != UNOBSERVED) & (memory.state == UNOBSERVED))
         if len(first):
             memory.news_at = belief.time
-        memory.day.update(known)
         if (state != memory.state).any():
             memory.remaining_s = math.inf
         memory.state = state
         here = near.index(vertex)
+        if belief.time > memory.time:
+            memory.day.update(known.observations)
         # Nothing is observed at the moment of arrival.
-        if here >= 0 and belief.time > memory.time:
+        if here >= 0 and belief.time > max(memory.time, 0.0):
             views = near.in_view(here)
-            missed = np.where(state[views["slot"]] == UNOBSERVED, views["rate"], 0.0)
-            np.maximum.at(memory.missed_rate, views["slot"], missed)
+            missed = views[~np.isin(views["slot"], known.observations.slots)]
+            np.maximum.at(memory.missed_rate, missed["slot"], missed["rate"])
         memory.time = belief.time
         return known
 
@@ -242,6 +249,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
         new.missed_rate[theirs] = memory.missed_rate[ours]
         new.day.carry_over(memory.day, theirs, ours)
+        new.past = memory.past
+        added = np.where(np.isin(near.slots, old.slots), -1, near.slots)
+        for observations in new.past:
+            new.day.update(observations.take(added))
         new.failure_s, new.replans = memory.failure_s, memory.replans
         # Update in place: the caller keeps `memory`.
         vars(memory).update(vars(new))
@@ -265,8 +276,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             vertex = following
             path.append(vertex)
             shown = problem.in_view(vertex)
-            shown = shown[~belief.observed_free[shown]]
-            belief = belief.update(shown, np.full(len(shown), True))
+            belief = belief.update(shown, ~belief.observed_free[shown])
             action = self.decide({"vertex": vertex}, belief, imagined)
         return PlanPreview(tuple(path))
 
@@ -278,7 +288,7 @@ def snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float)
     slots["missed_rate"], slots["state"] = memory.missed_rate, memory.state
     belief = BeliefSnapshot(slots, weights, p_free_if)
     drive_s = memory.near.table.seconds[here]
-    set_slots(belief, known.parts, memory.day.p_occupied(known), drive_s, explore)
+    set_slots(belief, known.parts, memory.day.p_occupied(known.time), drive_s, explore)
     return belief
 
 

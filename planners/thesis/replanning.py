@@ -197,8 +197,8 @@ class ReplanningAgent(StaticAgent):
         """Repair the plan if the belief has changed; then follow it."""
         labels, p_occupied = memory.labels, belief.p_occupied
         if memory.day is not None:
-            memory.day.update(belief)
-            p_occupied = memory.day.p_occupied(belief)
+            memory.day.update(belief.observations)
+            p_occupied = memory.day.p_occupied(belief.time)
         slots, p_free = _changed_slots(p_occupied, labels.p_free, RELEVANT_CHANGE)
         if len(slots):
             if self.solver == "policy_iteration":
