@@ -83,20 +83,19 @@ class CurriculumLevel:
 
     starts: str  # `way-out`, `lane`, or `way-in` (on the planned path from the lane into the slot)
     distance: tuple[float, float]  # minimum and maximum, m; for `way-in`, of the remaining path length
-    slack: float  # free space around the slot, m
 
 
 CURRICULUM = (
-    CurriculumLevel("way-out", (0.3, 1.5), 0.0),
-    CurriculumLevel("way-out", (1.0, 4.0), 0.0),
-    CurriculumLevel("way-out", (2.0, 8.0), 0.0),
-    CurriculumLevel("way-out", (4.0, 14.0), 0.0),
-    CurriculumLevel(WAY_IN, (2.0, 5.0), 0.0),
-    CurriculumLevel(WAY_IN, (3.0, 7.0), 0.0),
-    CurriculumLevel(WAY_IN, (5.0, 9.0), 0.0),
-    CurriculumLevel(WAY_IN, (6.0, 11.0), 0.0),
-    CurriculumLevel(WAY_IN, (8.0, 14.0), 0.0),
-    CurriculumLevel("lane", (4.0, 14.0), 0.0),
+    CurriculumLevel("way-out", (0.3, 1.5)),
+    CurriculumLevel("way-out", (1.0, 4.0)),
+    CurriculumLevel("way-out", (2.0, 8.0)),
+    CurriculumLevel("way-out", (4.0, 14.0)),
+    CurriculumLevel(WAY_IN, (2.0, 5.0)),
+    CurriculumLevel(WAY_IN, (3.0, 7.0)),
+    CurriculumLevel(WAY_IN, (5.0, 9.0)),
+    CurriculumLevel(WAY_IN, (6.0, 11.0)),
+    CurriculumLevel(WAY_IN, (8.0, 14.0)),
+    CurriculumLevel("lane", (4.0, 14.0)),
 )
 """Levels from a start just outside the slot to the full task of `parkenv/Drive-v1`.
 

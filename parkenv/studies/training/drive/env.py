@@ -50,11 +50,9 @@ class SlotGroup:
     lot: ParkingLot
     kind: str
 
-    def tasks(
-        self, slack: float = 0.0, distance: tuple[float, float] = (4.0, 14.0), starts: str = "lane"
-    ) -> ParkingTasks:
+    def tasks(self, **ends: Any) -> ParkingTasks:
         """Tasks in these slots; by default those of `parkenv/Drive-v1`."""
-        return ParkingTasks(self.lot, kinds=(self.kind,), slack=slack, distance=distance, starts=starts)
+        return ParkingTasks(self.lot, kinds=(self.kind,), **ends)
 
 
 def slot_groups(lots: Sequence[ParkingLot]) -> tuple[SlotGroup, ...]:
@@ -284,8 +282,8 @@ class DriveTrainingEnv(SharedVecEnv):
             stage = self.config.curriculum[level]
             on_path = stage.starts == WAY_IN
             if key not in self._tasks:
-                ends = () if on_path else (stage.distance, stage.starts)
-                self._tasks[key] = group.tasks(stage.slack, *ends)
+                ends = {} if on_path else {"distance": stage.distance, "starts": stage.starts}
+                self._tasks[key] = group.tasks(**ends)
             task = self._tasks[key].draw(seed)
             made[seed] = CurriculumTask(PreparedTask(task), planned_path(task) if on_path else None)
         return made[seed]
