@@ -1,4 +1,4 @@
-"""Runs that a signal stops at some moment, and what they leave.
+"""Runs in processes of their own that a signal stops at some moment, and what they leave.
 
 As a program, trials at random moments: `python tests/stopped_runs.py compare SIGTERM 10` prints a line for each.
 """
@@ -16,20 +16,16 @@ import uuid
 from pathlib import Path
 
 from command_line import parkenv
-from few_searches import few_searches
 
 from parkenv.studies.training.training import MODEL
 
 COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
-    "fleet": "fleet --scenario mini --hours 08:00-09:00 --agents first-free(within_m=100) --knows own "
-    "--arrivals-per-hour 20 -n 40 --no-figures",
     "survey": "survey --scenario mini --sessions 3 --every 12",
-    "calibrate": "calibrate --scenario mini -n 3",
-    "benchmark": "benchmark run v1 --agents first-free",
     "train": "train ppo --scenario mini --steps 16000 --trainings 2 --evaluate-every 4000 --evaluation-episodes 16 "
     "--agents none",
 }
+"""Of all studies, those that keep rows alone, rows and a map, and checkpoints."""
 START_S = 1.5
 """Time that a process takes to import its modules."""
 GONE_S = 5.0
@@ -39,21 +35,11 @@ GONE_S = 5.0
 class Run:
     """A command of `COMMANDS` that runs in processes of its own, as in a terminal."""
 
-    def __init__(self, name, out, *options):
-        program = ["-m", "parkenv"]
-        if name == "benchmark":
-            script = out.with_name("parkenv")
-            script.write_text(
-                "from few_searches import few_searches\nfrom parkenv.__main__ import main\n"
-                "if __name__ == '__main__':\n    with few_searches():\n        main()\n"
-            )
-            program = [str(script)]
-        path = os.pathsep.join(filter(None, [str(Path(__file__).parent), os.environ.get("PYTHONPATH")]))
+    def __init__(self, name, out):
         self.mark = f"PARKENV_STOPPED_RUN={uuid.uuid4()}"
-        self.started = time.monotonic()
         self.process = subprocess.Popen(
-            [sys.executable, *program, *COMMANDS[name].split(), "--jobs", "2", "--out", out, *options],
-            env={**os.environ, "PYTHONPATH": path} | dict([self.mark.split("=")]),
+            [sys.executable, "-m", "parkenv", *COMMANDS[name].split(), "--jobs", "2", "--out", out],
+            env=os.environ | dict([self.mark.split("=")]),
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -92,10 +78,6 @@ class Run:
                     f"{living} at work {GONE_S} s after {number!r}: {self.process.communicate()}"
                 )
             time.sleep(0.05)
-        self.gone_s = time.monotonic() - sent
-        return self.end()
-
-    def end(self):
         output, errors = self.process.communicate()
         return self.process.returncode, output, errors
 
@@ -113,8 +95,7 @@ class Run:
 
 def finished(name, out, *options):
     """Run a command to its end, in this process; other workers, same result."""
-    with few_searches():
-        done = parkenv(*COMMANDS[name].split(), "--jobs", 1, "--out", out, *options)
+    done = parkenv(*COMMANDS[name].split(), "--jobs", 1, "--out", out, *options)
     assert done.returncode == 0, (done.stdout, done.stderr)
 
 
@@ -126,26 +107,16 @@ def resume(name, out):
 
 def result_of(name, out):
     """Return what does not depend on wall time."""
-    summary = json.loads((out / "summary.json").read_text())
-    if name in ("compare", "benchmark"):
-        return (
-            (out / "episodes.csv").read_bytes(),
-            summary["complete"],
-            [r["total_s"] for r in summary["rows"]],
-        )
-    if name == "fleet":
-        return (out / "days.csv").read_bytes(), summary["complete"], summary["rows"]
+    rows = json.loads((out / "summary.json").read_text())["rows"]
+    if name == "compare":
+        return (out / "episodes.csv").read_bytes(), [row["total_s"] for row in rows]
     if name == "survey":
         with (out / "sessions.csv").open(newline="") as file:
-            rows = [{**row, "seconds_per_frame": None} for row in csv.DictReader(file)]
-        return rows, summary["rows"][0]["occupancy_mae"]
-    if name == "calibrate":
-        return (out / "calibrated.json").read_bytes()
+            sessions = [{**row, "seconds_per_frame": None} for row in csv.DictReader(file)]
+        return sessions, rows[0]["occupancy_mae"]
     # Weights come after the header, whose length is in the first 8 bytes, and which names the command line.
     models = [(out / f"seed_{seed}" / MODEL).read_bytes() for seed in (0, 1)]
-    return [m[8 + int.from_bytes(m[:8], "little") :] for m in models], [
-        row["total_s"] for row in summary["rows"]
-    ]
+    return [m[8 + int.from_bytes(m[:8], "little") :] for m in models], [row["total_s"] for row in rows]
 
 
 def trial(name, number, moment, folder, unbroken):
@@ -154,7 +125,7 @@ def trial(name, number, moment, folder, unbroken):
     run = Run(name, out)
     time.sleep(moment)
     if run.process.poll() is not None:
-        run.end()
+        run.process.communicate()
         return "over before"
     code, output, errors = run.stop(number)
     ends = {0, -number} if number == signal.SIGKILL else {0, -number, 128 + number}
@@ -169,7 +140,7 @@ def trial(name, number, moment, folder, unbroken):
     resume(name, out)
     assert not list(out.rglob(".*.part"))
     assert result_of(name, out) == unbroken
-    return f"exit {code}, gone after {run.gone_s:.1f} s, {'something' if kept else 'nothing'} kept, results equal"
+    return f"exit {code}, {'something' if kept else 'nothing'} kept, results equal"
 
 
 def trials(name, number, seeds):
@@ -182,15 +153,12 @@ def trials(name, number, seeds):
         for seed in seeds:
             moment = random.Random(f"{name} {number} {seed}").uniform(0.0, lasts)
             with tempfile.TemporaryDirectory() as its:
-                yield (
-                    f"{moment:5.2f} s of {lasts:.1f}",
-                    trial(name, number, moment, Path(its), result_of(name, whole)),
-                )
+                outcome = trial(name, number, moment, Path(its), result_of(name, whole))
+            yield f"{moment:5.2f} s of {lasts:.1f}", outcome
 
 
 if __name__ == "__main__":
-    command, name_of_signal, count, *first = sys.argv[1:]
-    start = int(first[0]) if first else 0
-    for when, outcome in trials(command, signal.Signals[name_of_signal], range(start, start + int(count))):
+    command, name_of_signal, count = sys.argv[1:]
+    for when, outcome in trials(command, signal.Signals[name_of_signal], range(int(count))):
         sys.stdout.write(f"{command} | {name_of_signal} | {when} | {outcome}\n")
         sys.stdout.flush()

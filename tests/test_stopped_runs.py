@@ -53,14 +53,7 @@ def test_a_stopped_command_leaves_no_process_and_is_resumed_to_the_same_result(t
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    ("name", "number"),
-    list(
-        zip(
-            COMMANDS,
-            [signal.SIGINT, signal.SIGKILL, signal.SIGTERM, signal.SIGINT, signal.SIGKILL, signal.SIGTERM],
-            strict=True,
-        )
-    ),
+    ("name", "number"), list(zip(COMMANDS, (signal.SIGINT, signal.SIGKILL, signal.SIGTERM), strict=True))
 )
 def test_runs_stopped_at_random_moments(name, number):
     assert len(list(trials(name, number, [1]))) == 1
@@ -276,7 +269,7 @@ def test_what_is_no_name_of_a_file_is_refused(name):
 
 @pytest.mark.parametrize(
     "command",
-    [("report", "run"), ("fit-sensor-model", "--scenario", "mini", "-n", "1")],
+    [("report", "run"), ("fit-sensor-model", "--scenario", "mini", "-n", "1"), ("compare",), ("plan",)],
     ids=lambda command: command[0],
 )
 def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
@@ -287,7 +280,9 @@ def test_what_cannot_be_written_is_refused_before_the_work(tmp_path, command):
     (tmp_path / "file").touch()
     refused = parkenv(*command, "--out", "file/made", cwd=tmp_path)
     assert (refused.returncode, refused.stdout) == (2, "")
-    assert refused.stderr == "parkenv: error: --out file: cannot be written (File exists)\n"
+    assert refused.stderr.startswith("parkenv: error: --out file")
+    assert ": cannot be written (" in refused.stderr
+    assert refused.stderr.count("\n") == 1
 
 
 def test_a_full_disk_leaves_files_as_they_were(tmp_path):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,9 @@ TRIMMED = 0.1
 """Share of the courses, at either end, that a robust mean leaves out."""
 
 
+_Runs = dict[int, list[Row]]
+
+
 def day_rows(episodes: Sequence[Row]) -> list[Row]:
     """Return a row per scenario, map, agent and day: mean total time and forecast error, with 95 % intervals.
 
@@ -25,19 +28,9 @@ def day_rows(episodes: Sequence[Row]) -> list[Row]:
     learn, in the same worlds: a 10 % trimmed mean, since a full lot may add the give-up penalty to one of the two.
     Intervals are over courses: a fleet's drivers meet the same day.
     """
-    cases = _grouped(episodes, lambda row: row["day_number"])
     return [
-        {
-            **dict(zip(("scenario", "map", "agent"), case, strict=True)),
-            "day": day,
-            "courses": len(by_course),
-            **_mean("total_s", its),
-            **_mean("forecast_error", its),
-            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(day, {}), _robust),
-        }
-        for case, by_day in cases.items()
-        for day, by_course in sorted(by_day.items())
-        for its in [list(by_course.values())]
+        {**case, "day": day, **row, **excess}
+        for case, day, row, _, excess in _periods(episodes, lambda row: row["day_number"])
     ]
 
 
@@ -46,31 +39,38 @@ def week_rows(episodes: Sequence[Row]) -> list[Row]:
 
     The difference is paired by course: the same driver on the same days.
     """
-    cases = _grouped(episodes, lambda row: (row["day_number"] - 1) // 5 + 1)
     last = max((row["day_number"] for row in episodes), default=0)
     return [
-        {
-            **dict(zip(("scenario", "map", "agent"), case, strict=True)),
-            "days": f"{5 * week - 4}-{min(5 * week, last)}",
-            "courses": len(by_course),
-            **_mean("total_s", its),
-            **_mean("forecast_error", its),
-            **_difference("difference_s", by_course, _reference(cases, case[0], NONE).get(week, {})),
-            **_difference("excess_s", by_course, _reference(cases, case[0], FIXED).get(week, {}), _robust),
-        }
-        for case, by_week in cases.items()
-        for week, by_course in sorted(by_week.items())
-        for its in [list(by_course.values())]
+        {**case, "days": f"{5 * week - 4}-{min(5 * week, last)}", **row, **difference, **excess}
+        for case, week, row, difference, excess in _periods(
+            episodes, lambda row: (row["day_number"] - 1) // 5 + 1
+        )
     ]
 
 
-_Runs = dict[int, list[Row]]
-_Cases = dict[tuple[str, str, str], dict[int, _Runs]]
-
-
-def _reference(cases: _Cases, scenario: str, map: str) -> dict[int, _Runs]:
-    """Return the first agent with a map in a scenario, by period."""
-    return next((its for case, its in cases.items() if case[0] == scenario and case[1] == map), {})
+def _periods(
+    episodes: Sequence[Row], period: Callable[[Row], int]
+) -> Iterator[tuple[Row, int, Row, Row, Row]]:
+    """Yield each scenario, map and agent, a period, its means, difference to no map, and excess over the right map."""
+    cases: dict[Any, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
+    for row in episodes:
+        cases[row["scenario"], row["map"], row["agent"]][period(row)][row["course"]].append(row)
+    for case, by_period in cases.items():
+        # The first agents with these maps.
+        none, fixed = (
+            next((cases[other] for other in cases if other[:2] == (case[0], name)), dict[int, _Runs]())
+            for name in (NONE, FIXED)
+        )
+        columns = dict(zip(("scenario", "map", "agent"), case, strict=True))
+        for number, courses in sorted(by_period.items()):
+            means = {
+                "courses": len(courses),
+                **_mean("total_s", courses.values()),
+                **_mean("forecast_error", courses.values()),
+            }
+            difference = _difference("difference_s", courses, none.get(number, {}))
+            excess = _difference("excess_s", courses, fixed.get(number, {}), _robust)
+            yield columns, number, means, difference, excess
 
 
 def _difference(
@@ -87,14 +87,6 @@ def _difference(
     if not paired:
         return {}
     return columns_of(name, interval(paired))
-
-
-def _grouped(episodes: Sequence[Row], period: Callable[[Row], int]) -> _Cases:
-    """Group episodes by scenario, map and agent; then by period; then by course."""
-    found: dict[Any, Any] = defaultdict(lambda: defaultdict(lambda: defaultdict(list)))
-    for row in episodes:
-        found[row["scenario"], row["map"], row["agent"]][period(row)][row["course"]].append(row)
-    return found
 
 
 def _course_mean(name: str, episodes: Sequence[Mapping[str, Any]]) -> float:
