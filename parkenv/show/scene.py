@@ -121,10 +121,10 @@ def posed(xy: FloatArray, yaw: FloatArray | float = 0.0) -> FloatArray:
 
 def placed_shape(shape: FloatArray, poses: FloatArray, size: FloatArray) -> FloatArray:
     """Return a shape, (k, 2), at poses, (n, 3), with a length and width each, (n, 2): (n, k, 2)."""
-    cos, sin = np.cos(poses[:, 2]), np.sin(poses[:, 2])
-    turn = np.stack([np.stack([cos, sin], axis=1), np.stack([-sin, cos], axis=1)], axis=1)
-    corners: FloatArray = poses[:, None, :2] + (shape * size[:, None]) @ turn
-    return corners
+    cos, sin = np.cos(poses[:, 2, None]), np.sin(poses[:, 2, None])
+    along, across = (shape * size[:, None]).transpose(2, 0, 1)
+    x, y = poses[:, 0, None] + along * cos - across * sin, poses[:, 1, None] + along * sin + across * cos
+    return np.stack([x, y], axis=-1)
 
 
 def arrows_along(lines: Sequence[FloatArray], every: float) -> FloatArray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 from typing import Self
 
 import cv2
@@ -101,18 +102,22 @@ def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
         return
     least, most = (end * view.density for end in layer.px)
     width = min(max(layer.width * view.scale, least), most)
-    ends = np.cumsum([len(points) for points in layer.lines])[:-1]
-    pixels = np.split(view(np.concatenate(layer.lines)), ends)
+    all_pixels = view(np.concatenate(layer.lines))
+    ends = [0, *accumulate(map(len, layer.lines))]
+    # All lines are rounded at once: most have two points only.
+    fixed = fixed_point(all_pixels)
+    lines = [fixed[first:last] for first, last in pairwise(ends)]
 
-    def stroke(lines: Sequence[FloatArray], color: Color, thickness: float) -> None:
-        fixed = [fixed_point(line) for line in lines]
-        cv2.polylines(image, fixed, False, color, max(1, round(thickness)), _line_type(view), SUBPIXEL_BITS)
+    def stroke(lines: Sequence[NDArray[np.int32]], color: Color, thickness: float) -> None:
+        cv2.polylines(image, lines, False, color, max(1, round(thickness)), _line_type(view), SUBPIXEL_BITS)
 
     if layer.halo is not None:
-        stroke(pixels, rgb(layer.halo), width + HALO_PX * view.density)
-    parts = [[line] for line in pixels]
+        stroke(lines, rgb(layer.halo), width + HALO_PX * view.density)
+    parts = [[line] for line in lines]
     if layer.dash is not None:
-        parts = [[*_dashes(line, *(part * view.density for part in layer.dash))] for line in pixels]
+        on, off = (part * view.density for part in layer.dash)
+        pixels = (all_pixels[first:last] for first, last in pairwise(ends))
+        parts = [[*fixed_point(_dashes(line, on, off))] for line in pixels]
     if _is_one(layer.color):
         stroke([piece for pieces in parts for piece in pieces], _only(layer.color), width)
         return
@@ -120,13 +125,13 @@ def _paint_lines(image: Image, view: MapView, layer: Lines) -> None:
         stroke(pieces, color, width)
 
 
-def _dashes(pixels: FloatArray, on: float, off: float) -> Iterator[FloatArray]:
-    """Yield dashes, (2, 2) px, along a line; the last one ends with the line."""
+def _dashes(pixels: FloatArray, on: float, off: float) -> FloatArray:
+    """Return dashes, (n, 2, 2) px, along a line; the last one ends with the line."""
     along = np.r_[0.0, np.cumsum(np.hypot(*np.diff(pixels, axis=0).T))]
     n = max(1, round((along[-1] + off) / (on + off)))
-    for start in (on + off) * np.arange(n) * (along[-1] + off) / (n * (on + off)):
-        ends = np.array([start, min(start + on, along[-1])])
-        yield np.stack([np.interp(ends, along, axis) for axis in pixels.T], axis=1)
+    start = (on + off) * np.arange(n) * (along[-1] + off) / (n * (on + off))
+    ends = np.stack([start, np.minimum(start + on, along[-1])], axis=1)
+    return np.stack([np.interp(ends, along, axis) for axis in pixels.T], axis=-1)
 
 
 def _paint_marks(image: Image, view: MapView, layer: Marks) -> None:
@@ -140,10 +145,10 @@ def _paint_marks(image: Image, view: MapView, layer: Marks) -> None:
     colors = _colors(layer.color, len(at))
     if layer.edge is not None:
         border = rgb(layer.edge)
-        for corners in placed_shape(layer.shape, at, size + 2.0 * layer.edge_px * view.density):
-            cv2.fillPoly(image, [fixed_point(corners)], border, _line_type(view), SUBPIXEL_BITS)
-    for corners, color in zip(placed_shape(layer.shape, at, size), colors, strict=True):
-        cv2.fillPoly(image, [fixed_point(corners)], color, _line_type(view), SUBPIXEL_BITS)
+        for corners in fixed_point(placed_shape(layer.shape, at, size + 2.0 * layer.edge_px * view.density)):
+            cv2.fillPoly(image, [corners], border, _line_type(view), SUBPIXEL_BITS)
+    for corners, color in zip(fixed_point(placed_shape(layer.shape, at, size)), colors, strict=True):
+        cv2.fillPoly(image, [corners], color, _line_type(view), SUBPIXEL_BITS)
 
 
 def _colors(color: Paint, n: int) -> list[Color]:
