@@ -20,8 +20,6 @@ from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_polic
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, policy_of
-from parkenv.studies.training.fleet import FleetTraining
-from parkenv.studies.training.spec import TrainingSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 from planners.heuristics import POLICIES
@@ -213,35 +211,6 @@ def test_members_of_a_mixed_fleet_are_those_asked_for():
     assert day["total_s"] == pytest.approx(fleet.cars["total_s"][members].mean())
     assert day["others_s"] == pytest.approx(fleet.cars["total_s"][~members].mean())
     assert (few.name, MixedFleet(MINI, DEMAND).name) == ("0.25 among greedy-drive", "every car")
-
-
-@pytest.mark.parametrize(
-    ("fields", "wanted"),
-    [
-        ({"env": "search", "knows": "own"}, "knows goes with env fleet"),
-        ({"env": "fleet", "clone": "mdp"}, "clone goes with env search"),
-        ({"env": "fleet", "learners": 0.5}, "learners goes with among"),
-        ({"env": "fleet", "arrivals_per_hour": 0.0}, "arrivals_per_hour"),
-        ({"env": "fleet", "test_on": ["mini"]}, "test_on goes with"),
-    ],
-)
-def test_specifications_that_make_no_sense_are_refused(fields, wanted):
-    with pytest.raises(InputError, match=wanted):
-        TrainingSpec.parse(fields, "file")
-
-
-@pytest.mark.parametrize(
-    ("fields", "wanted"),
-    [
-        ({"scenarios": ["mini", "campus"]}, "want one with --env fleet"),
-        ({"among": "belief"}, "want a compiled policy"),
-        ({"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with env fleet"),
-        ({"agents": ["oracle"]}, "knows the future"),
-    ],
-)
-def test_trainings_that_make_no_sense_are_refused(fields, wanted):
-    with pytest.raises(InputError, match=wanted):
-        FleetTraining(TrainingSpec.parse({"env": "fleet", **fields}, "file")).check()
 
 
 @pytest.mark.slow

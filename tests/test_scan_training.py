@@ -150,32 +150,6 @@ def test_a_model_needs_scans(tmp_path):
     assert 0 <= int(action) < 5
 
 
-@pytest.mark.parametrize(
-    ("arguments", "wanted"),
-    [
-        (["dqn"], "algorithm is 'dqn', want one of ppo, maskable-ppo with observation scan"),
-        (["network"], "observation goes with env search or observation scan, not with algorithm network"),
-        (["--env", "fleet"], "observation goes with env search"),
-        (["--clone", "mdp"], "clone goes with env search, not with observation scan"),
-        (
-            ["--held-out", "0.5"],
-            "held_out goes with env search or algorithm network, not with observation scan",
-        ),
-        (["--scenario", "mini,campus"], "there are 2 scenarios, want one for searches that observe scans"),
-        (["--k", "101"], "k is 101, want a whole number of scans from 1 to 100"),
-        (["--observation", "smell"], "'smell' is not one of"),
-        (["--day-error", "0.5"], "--day-error goes with --scenario or --lot"),
-        (["--scenario", "mini", "--day-error", "x"], "--day-error"),
-    ],
-)
-def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
-    algorithm = arguments.pop(0) if not arguments[0].startswith("-") else "maskable-ppo"
-    done = parkenv("train", algorithm, "--observation", "scan", *arguments, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert wanted in " ".join(done.stderr.split())
-    assert not (tmp_path / "out").exists()
-
-
 def test_the_size_of_the_day_error_is_that_of_all_scenarios(tmp_path, monkeypatch):
     make_small(monkeypatch)
     done = parkenv(

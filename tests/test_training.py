@@ -205,11 +205,6 @@ def test_cloning_takes_the_read_only_arrays_of_a_worker():
     assert not torch.equal(before, model.policy.action_net.weight)
 
 
-def test_algorithms_without_cloning_are_refused():
-    with pytest.raises(InputError, match="dqn has no behaviour cloning"):
-        search_training("dqn", 10, 10, [SCENARIO], clone="mdp").check()
-
-
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
     campus = make_scenario("campus")
     model = LearnedAgent(campus, "maskable-ppo", trained / "model.safetensors").model
@@ -566,20 +561,49 @@ def test_a_file_chooses_the_kind_of_training_and_its_copy_is_the_same(tables, ki
         TrainingSpec.parse({**tables, "step": 3}, "file")
 
 
+OF_FLEET, OF_DRIVES, OF_SCANS = {"env": "fleet"}, {"env": "drive"}, {"observation": "scan"}
+
+
 @pytest.mark.parametrize(
-    ("tables", "message"),
+    ("fields", "message"),
     [
         ({"env": "fly"}, "env is 'fly', want one of search, fleet, drive"),
         ({"observation": "smell"}, "observation is 'smell', want one of local, scan"),
-        (
-            {"env": "drive", "k": 3},
-            "k goes with env search or observation scan or env fleet, not with env drive",
-        ),
+        ({"algorithm": "sarsa"}, "algorithm is 'sarsa', want one of"),
+        ({"algorithm": "sac"}, "algorithm is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn with env search"),
+        ({"agents": ["mdp", "belif"]}, "unknown agent 'belif'"),
+        ({"algorithm": "ppo", "clone": "oracle"}, "oracle cannot be cloned"),
+        ({"algorithm": "dqn", "clone": "mdp"}, "dqn has no behaviour cloning"),
+        ({"demonstrations": 5}, "demonstrations goes with clone"),
+        ({"without": ["day"]}, "without goes with algorithm network"),
+        ({"knows": "own"}, "knows goes with env fleet"),
+        ({"algorithm": "network", "clone": "mdp"}, "clone goes with env search, not with algorithm network"),
+        ({"algorithm": "network", "evaluate_every": 9}, "evaluate_every goes with env search or"),
+        ({"algorithm": "network", "tensorboard": True}, "not with algorithm network"),
+        ({"algorithm": "network", "without": ["legs"]}, "without.0 is 'legs', want 'lookahead'"),
+        (OF_SCANS | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with observation scan"),
+        (OF_SCANS | {"algorithm": "network"}, "observation goes with .* not with algorithm network"),
+        (OF_SCANS | {"clone": "mdp"}, "clone goes with env search, not with observation scan"),
+        (OF_SCANS | {"held_out": 0.5}, "held_out goes with env search or algorithm network, not with observation scan"),
+        (OF_SCANS | {"scenarios": ["mini", "campus"]}, "2 scenarios, want one for searches that observe scans"),
+        (OF_SCANS | {"k": 101}, "k is 101, want a whole number of scans from 1 to 100"),
+        (OF_FLEET | OF_SCANS, "observation goes with env search"),
+        (OF_FLEET | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with env fleet"),
+        (OF_FLEET | {"clone": "mdp"}, "clone goes with env search"),
+        (OF_FLEET | {"learners": 0.5}, "learners goes with among"),
+        (OF_FLEET | {"arrivals_per_hour": 0.0}, "arrivals_per_hour"),
+        (OF_FLEET | {"test_on": ["mini"]}, "test_on goes with"),
+        (OF_FLEET | {"scenarios": ["mini", "campus"]}, "want one with --env fleet"),
+        (OF_FLEET | {"among": "belief"}, "want a compiled policy"),
+        (OF_FLEET | {"agents": ["oracle"]}, "knows the future"),
+        (OF_DRIVES | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, sac, tqc with env drive"),
+        (OF_DRIVES | {"agents": ["mdp"]}, "agents has 'mdp', want planner or none with env drive"),
+        (OF_DRIVES | {"k": 3}, "k goes with env search or observation scan or env fleet, not with env drive"),
     ],
-)
-def test_a_field_of_another_kind_of_training_is_refused(tables, message):
+)  # fmt: skip
+def test_trainings_that_make_no_sense_are_refused(fields, message):
     with pytest.raises(InputError, match=message):
-        TrainingSpec.parse(tables, "file")
+        TrainingSpec.parse(fields, "file").training.check()
 
 
 def torn_settings(folder):
@@ -655,43 +679,19 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        (["sarsa"], "algorithm is 'sarsa', want one of"),
-        (
-            ["sac"],
-            "algorithm is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn with env search",
-        ),
-        (["dqn", "--env", "drive"], "algorithm is 'dqn', want one of ppo, sac, tqc with env drive"),
-        (["ppo", "--env", "fly"], "--env: 'fly' is not one of"),
-        (["ppo", "--env", "drive", "--clone", "mdp"], "clone goes with env search"),
-        (
-            ["sac", "--env", "drive", "--lot", "nowhere"],
-            "--lot is 'nowhere', want a packaged lot (campus, jam",
-        ),
-        (
-            ["sac", "--env", "drive", "--lot", "nowhere.geojson"],
-            "--lot is 'nowhere.geojson', want a file; there is",
-        ),
-        (
-            ["sac", "--env", "drive", "--agents", "mdp"],
-            "agents has 'mdp', want planner or none with env drive",
-        ),
-        (["ppo", "--resume"], "to resume"),
-        (["ppo", "--scenario", "nowhere"], "unknown scenario 'nowhere'"),
-        (["ppo", "--agents", "mdp,belif"], "unknown agent 'belif'"),
-        (["ppo", "--clone", "oracle"], "oracle cannot be cloned"),
-        (["network", "--clone", "mdp"], "clone goes with env search, not with algorithm network"),
-        (["network", "--evaluate-every", "9"], "evaluate_every goes with env search or"),
-        (["network", "--tensorboard"], "not with algorithm network"),
-        (["network", "--without", "legs"], "without.0 is 'legs', want 'lookahead'"),
-        (["ppo", "--without", "day"], "without goes with algorithm network"),
-        (["ppo", "--demonstrations", "5"], "demonstrations goes with clone"),
-        (
-            ["ppo", "--env", "drive", "--demonstrations", "5"],
-            "demonstrations goes with env search, not with env drive",
-        ),
+        ("ppo --env fly", "--env: 'fly' is not one of"),
+        ("ppo --observation smell", "'smell' is not one of"),
+        ("ppo --resume", "to resume"),
+        ("ppo --scenario nowhere", "unknown scenario 'nowhere'"),
+        ("sac --env drive --lot nowhere", "--lot is 'nowhere', want a packaged lot (campus, jam"),
+        ("sac --env drive --lot nowhere.geojson", "--lot is 'nowhere.geojson', want a file; there is"),
+        ("ppo --day-error 0.5", "--day-error goes with --scenario or --lot"),
+        ("ppo --scenario mini --day-error x", "--day-error"),
+        ("ppo --env drive --demonstrations 5", "demonstrations goes with env search, not with env drive"),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):
-    done = parkenv("train", *arguments, "--out", tmp_path / "out")
+    done = parkenv("train", *arguments.split(), "--out", tmp_path / "out")
     assert done.returncode == 2
     assert wanted in " ".join(done.stderr.split())
+    assert not (tmp_path / "out").exists()
