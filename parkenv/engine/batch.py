@@ -1,8 +1,7 @@
-"""A batch of searches: one compiled step for all of them, after which an observer writes what each of them observes.
+"""A batch of searches: one compiled call steps all of them and writes what each of them observes.
 
 Where the tables of many places do not fit the processor's inner caches, waiting for them would double a step's time.
-So while one search is stepped, the data of the next ones are loaded, in stages: each reads what the one before it has
-loaded.
+So while one search is stepped with its local observation, the data of the next ones are loaded.
 """
 
 from __future__ import annotations
@@ -38,6 +37,26 @@ _APART = 2  # searches between two stages of loading
 _SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
 
 
+class Steps(NamedTuple):
+    """The results of a step, besides observations.
+
+    Attributes:
+        rewards: (n,) float64.
+        terminated, truncated: (n,) bool.
+        mask: (n, 5) int8, the actions that are possible now.
+    """
+
+    rewards: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    mask: NDArray[np.int8]
+
+    @classmethod
+    def of(cls, n: int, mask: NDArray[np.int8]) -> Self:
+        """Return the initial results of n searches whose masks are an array of the observations."""
+        return cls(np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), mask)
+
+
 class Observer(ABC):
     """What the searches of a batch observe.
 
@@ -50,6 +69,7 @@ class Observer(ABC):
 
     Attributes:
         searches: the searches.
+        address: of their records.
         space: as above.
         seen: the observations by name, (n, ...) each.
         n_bytes: memory of searches and observations, bytes.
@@ -67,14 +87,23 @@ class Observer(ABC):
         kept: tuple[str, ...] = (),
     ) -> None:
         self.searches, self.space = Searches(tables, n, full_belief), space
+        self.address = self.searches.address
         own: Any = create_empty_array(spaces.Dict({k: v for k, v in space.items() if k not in kept}), n)
         of_searches = {name: getattr(self.searches, name).reshape(n, -1) for name in kept}
         self.seen: dict[str, NDArray[Any]] = own | of_searches
         self.n_bytes: int = self.searches.n_bytes + sum(array.nbytes for array in own.values())
 
     @abstractmethod
-    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
-        """Write the observations of all searches except idle ones; fresh ones, (n,) bool both, have just begun."""
+    def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
+        """Step all searches except idle and fresh ones, and write results and observations of all except idle ones.
+
+        Args:
+            actions: (n,) int64.
+            fresh: (n,) bool, searches that have just begun.
+            idle: (n,) bool, searches to leave as they are.
+            limit: number of steps after which a search is truncated.
+            steps: results to write.
+        """
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
         """Return a copy of everything that changes, for `set_state`."""
@@ -98,9 +127,10 @@ class BeliefObserver(Observer):
         kept = tuple(name for name in ("p_occupied", "belief", "step_observed", "day_error") if name in space)
         super().__init__(tables, n, spaces.Dict(space), full_belief=True, kept=kept)
 
-    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+    def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
         """See `Observer`."""
-        observe_belief(self.searches.address, fresh, idle, self.seen["vertex"], self.seen["time"])
+        vertex, time = self.seen["vertex"], self.seen["time"]
+        step_with_belief(self.address, actions, fresh, idle, limit, steps, vertex, time)
 
 
 class LocalObserver(Observer):
@@ -111,30 +141,11 @@ class LocalObserver(Observer):
         self.table_bytes = self._around.n_bytes
         super().__init__(tables, n, local_space(k))
 
-    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+    def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
         """See `Observer`."""
-        del fresh
-        observe_local(self.searches.address, self._around, idle, self.seen["local"])
-
-
-class Steps(NamedTuple):
-    """The results of a step, besides observations.
-
-    Attributes:
-        rewards: (n,) float64.
-        terminated, truncated: (n,) bool.
-        mask: (n, 5) int8, the actions that are possible now.
-    """
-
-    rewards: FloatArray
-    terminated: BoolArray
-    truncated: BoolArray
-    mask: NDArray[np.int8]
-
-    @classmethod
-    def of(cls, n: int, mask: NDArray[np.int8]) -> Self:
-        """Return the initial results of n searches whose masks are an array of the observations."""
-        return cls(np.zeros(n), np.zeros(n, dtype=np.bool_), np.zeros(n, dtype=np.bool_), mask)
+        step_with_surroundings(
+            self.address, self._around, actions, fresh, idle, limit, steps, self.seen["local"]
+        )
 
 
 @kernel
@@ -156,27 +167,66 @@ def arrive_all(address: int, which: BoolArray) -> None:
             arrive(search)
 
 
+@inlined
+def advance(search: Any, e: int, action: int, fresh: bool, limit: int, steps: Steps) -> None:
+    """Step a search unless it is fresh, and write its results."""
+    if fresh:
+        steps.rewards[e] = 0.0
+        steps.terminated[e] = steps.truncated[e] = False
+    else:
+        take_step(search, action)
+        steps.rewards[e] = -step_cost_s(search)
+        steps.terminated[e] = search.over
+        steps.truncated[e] = search.n_steps >= limit
+    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
+    for move in range(N_ACTIONS):
+        steps.mask[e, move] = masks[search.vertex * N_ACTIONS + move]
+
+
 @kernel
-def step_all(
-    address: int, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps
+def step_with_belief(
+    address: int,
+    actions: IntArray,
+    fresh: BoolArray,
+    idle: BoolArray,
+    limit: int,
+    steps: Steps,
+    vertex: IntArray,
+    time: NDArray[np.float32],
 ) -> None:
-    """Step all searches except idle and fresh ones, and write the results of all except idle ones."""
+    """Step, update the full belief, and write vertex and time."""
     for e in range(len(actions)):
-        _prefetch_step(address, actions, e)
         if idle[e]:
             continue
         search = search_at(address, e)
+        advance(search, e, actions[e], fresh[e], limit, steps)
         if fresh[e]:
-            steps.rewards[e] = 0.0
-            steps.terminated[e] = steps.truncated[e] = False
+            init_prior(search)
         else:
-            take_step(search, actions[e])
-            steps.rewards[e] = -step_cost_s(search)
-            steps.terminated[e] = search.over
-            steps.truncated[e] = search.n_steps >= limit
-        masks = uint8s(scenario_at(search.scenario, 0).action_masks)
-        for action in range(N_ACTIONS):
-            steps.mask[e, action] = masks[search.vertex * N_ACTIONS + action]
+            refresh_belief(search)
+        write_clock(search)
+        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
+
+
+@kernel
+def step_with_surroundings(
+    address: int,
+    around: Surroundings,
+    actions: IntArray,
+    fresh: BoolArray,
+    idle: BoolArray,
+    limit: int,
+    steps: Steps,
+    local: NDArray[np.float32],
+) -> None:
+    """Step, and write the local observation."""
+    for e in range(len(actions)):
+        _prefetch_searches(address, around, actions, e)
+        if idle[e]:
+            continue
+        search = search_at(address, e)
+        advance(search, e, actions[e], fresh[e], limit, steps)
+        observe_surroundings(search, around, local[e])
 
 
 @kernel
@@ -188,54 +238,25 @@ def copy_fields(address: int, which: BoolArray, offsets: IntArray, words: IntArr
                 words[i, e] = int64s(address + e * _SEARCH_BYTES + offsets[i])[0]
 
 
-@kernel
-def observe_belief(
-    address: int, fresh: BoolArray, idle: BoolArray, vertex: IntArray, time: NDArray[np.float32]
-) -> None:
-    """Write vertex and time, and update the full belief."""
-    for e in range(len(idle)):
-        if idle[e]:
-            continue
-        search = search_at(address, e)
-        if fresh[e]:
-            init_prior(search)
-        else:
-            refresh_belief(search)
-        write_clock(search)
-        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
-
-
-@kernel
-def observe_local(address: int, around: Surroundings, idle: BoolArray, local: NDArray[np.float32]) -> None:
-    """Write the local observations."""
-    for e in range(len(idle)):
-        _prefetch_surroundings(address, around, len(idle), e)
-        if not idle[e]:
-            observe_surroundings(search_at(address, e), around, local[e])
-
-
 # ---- loading ahead
 
 
 @inlined
-def _prefetch_step(address: int, actions: IntArray, e: int) -> None:
-    """Load what the steps of the searches after search e will read."""
+def _prefetch_searches(address: int, around: Surroundings, actions: IntArray, e: int) -> None:
+    """Load what the searches after search e will read, in stages: each reads what the one before it has loaded."""
     n = len(actions)
+    if e + 5 * _APART < n:
+        _prefetch(address + (e + 5 * _APART) * _SEARCH_BYTES, _SEARCH_BYTES)
     if e + 4 * _APART < n:
-        _prefetch(address + (e + 4 * _APART) * _SEARCH_BYTES, _SEARCH_BYTES)
-    if e + 3 * _APART < n:
-        search = search_at(address, e + 3 * _APART)
-        edge = search.vertex * N_ACTIONS + actions[e + 3 * _APART]
+        search = search_at(address, e + 4 * _APART)
+        edge = search.vertex * N_ACTIONS + actions[e + 4 * _APART]
         prefetch(scenario_at(search.scenario, 0).edges + edge * _EDGE_BYTES)
+    if e + 3 * _APART < n:
+        _prefetch_vertex(search_at(address, e + 3 * _APART), around, actions[e + 3 * _APART])
     if e + 2 * _APART < n:
-        search = search_at(address, e + 2 * _APART)
-        scenario, target = scenario_at(search.scenario, 0), _target(search, actions[e + 2 * _APART])
-        prefetch(scenario.action_masks + target * N_ACTIONS)
-        prefetch(scenario.view_starts + 8 * target)
+        _prefetch_lists(search_at(address, e + 2 * _APART), around, actions[e + 2 * _APART])
     if e + _APART < n:
-        search = search_at(address, e + _APART)
-        scenario, target = scenario_at(search.scenario, 0), _target(search, actions[e + _APART])
-        prefetch(scenario.viewed + 8 * int64s(scenario.view_starts)[target])
+        _prefetch_slots(search_at(address, e + _APART), around, actions[e + _APART])
 
 
 @inlined
@@ -246,43 +267,46 @@ def _target(search: Any, action: int) -> int:
 
 
 @inlined
-def _prefetch_surroundings(address: int, around: Surroundings, n: int, e: int) -> None:
-    """Load what the observations of the searches after search e will read."""
-    if e + 3 * _APART < n:
-        _prefetch(address + (e + 3 * _APART) * _SEARCH_BYTES, _SEARCH_BYTES)
-    if e + 2 * _APART < n:
-        search = search_at(address, e + 2 * _APART)
-        row = around.first[search.place] + search.vertex
-        width = 4 * around.numbers.shape[1]
-        _prefetch(around.numbers.ctypes.data + row * width, width)
-        width = 2 * around.indices.shape[1]
-        _prefetch(around.indices.ctypes.data + row * width, width)
-        prefetch(around.targets.ctypes.data + 16 * row)
-        prefetch(around.starts.ctypes.data + 4 * row)
-        prefetch(around.crow_s.ctypes.data + 16 * row)
-    if e + _APART < n:
-        _prefetch_slots(search_at(address, e + _APART), around)
+def _prefetch_vertex(search: Any, around: Surroundings, action: int) -> None:
+    """Load the rows of the vertex that an action leads to."""
+    scenario = scenario_at(search.scenario, 0)
+    target = _target(search, action)
+    prefetch(scenario.action_masks + target * N_ACTIONS)
+    prefetch(scenario.view_starts + 8 * target)
+    row = around.first[search.place] + target
+    width = 4 * around.numbers.shape[1]
+    _prefetch(around.numbers.ctypes.data + row * width, width)
+    width = 2 * around.indices.shape[1]
+    _prefetch(around.indices.ctypes.data + row * width, width)
+    prefetch(around.targets.ctypes.data + 16 * row)
+    prefetch(around.starts.ctypes.data + 4 * row)
+    prefetch(around.crow_s.ctypes.data + 16 * row)
 
 
 @inlined
-def _prefetch_slots(search: Any, around: Surroundings) -> None:
-    """Load what is known of the slots near the car and of the remembered one."""
-    scenario, first, remembered = (
-        scenario_at(search.scenario, 0),
-        around.first[search.place],
-        search.remembered_slot,
-    )
-    row, columns = first + search.vertex, int32s(search.columns)
-    begin, end = around.starts[row], around.starts[row + 1]
-    _prefetch(around.slots.ctypes.data + 4 * begin, _LINE)
-    seen_from = around.first_view[search.place] + int64s(scenario.view_starts)[search.vertex]
-    _prefetch(around.view_s.ctypes.data + 4 * seen_from, _LINE)
+def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
+    """Load the lists of slots in view of, and near, that vertex."""
+    scenario = scenario_at(search.scenario, 0)
+    target = _target(search, action)
+    first = int64s(scenario.view_starts)[target]
+    _prefetch(scenario.viewed + 8 * first, _LINE)
+    _prefetch(around.view_s.ctypes.data + 4 * (around.first_view[search.place] + first), _LINE)
+    start = around.starts[around.first[search.place] + target]
+    _prefetch(around.slots.ctypes.data + 4 * start, _LINE)
+
+
+@inlined
+def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
+    """Load what is known of these slots and of the remembered one."""
+    scenario = scenario_at(search.scenario, 0)
+    first, remembered = around.first[search.place], search.remembered_slot
     prefetch(around.crow_s.ctypes.data + 16 * (first + remembered))
     prefetch(scenario.walk_s + 8 * remembered)
     prefetch(scenario.parking_cost_s + 8 * remembered)
     if scenario.prior_kind != PROCESS_KIND:
         return
-    for i in range(begin, end):
+    row, columns = first + _target(search, action), int32s(search.columns)
+    for i in range(around.starts[row], around.starts[row + 1]):
         slot = np.int64(around.slots[i])
         if columns[slot] == SENTINEL:
             prefetch_forecast(scenario.prior, search.hour, slot)

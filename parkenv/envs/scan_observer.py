@@ -17,7 +17,7 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import address_of
 from parkenv.compiled.threads import in_threads
-from parkenv.engine.batch import Observer
+from parkenv.engine.batch import Observer, Steps, advance
 from parkenv.engine.records import ScenarioRecords, scenario_at, search_at
 from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.engine.spaces import LATEST
@@ -40,15 +40,11 @@ class Stops(NamedTuple):
     """Where and when each search measures.
 
     Attributes:
-        vertex: (n,) int64, where the last step ended.
-        begun: (n,) float64, s since Monday 00:00, when it ended.
-        count: (n,) int64, number of its captures.
+        count: (n,) int64, number of captures of the last step.
         pose: (n, captures, 3) float64, x, y in m and yaw in rad of the vehicle.
         time: (n, captures) float64, s since Monday 00:00.
     """
 
-    vertex: IntArray
-    begun: FloatArray
     count: IntArray  # type: ignore[assignment]  # hides tuple.count
     pose: FloatArray
     time: FloatArray
@@ -110,28 +106,36 @@ class Laser(NamedTuple):
 
 
 @kernel
-def write_stops(
-    address: int, lanes: Lanes, fresh: BoolArray, idle: BoolArray, stops: Stops, time: NDArray[np.float32]
+def step_to_stops(
+    address: int,
+    lanes: Lanes,
+    actions: IntArray,
+    fresh: BoolArray,
+    idle: BoolArray,
+    limit: int,
+    steps: Steps,
+    stops: Stops,
+    vertex: IntArray,
+    time: NDArray[np.float32],
 ) -> None:
-    """Write the time of all searches except idle ones, and where they measured in their last step."""
-    for e in range(len(idle)):
+    """Step, and write vertex, time, and where the searches measure."""
+    for e in range(len(actions)):
         if idle[e]:
             continue
         search = search_at(address, e)
-        time[e, 0], time[e, 1] = search.time, search.time - search.arrival
-        if fresh[e]:
-            stops.vertex[e] = search.vertex
-        _write_stops(search, lanes, e, stops)
-        stops.vertex[e], stops.begun[e] = search.vertex, search.time
+        before, begun = search.vertex, search.time
+        advance(search, e, actions[e], fresh[e], limit, steps)
+        vertex[e], time[e, 0], time[e, 1] = search.vertex, search.time, search.time - search.arrival
+        _write_stops(search, lanes, e, before, begun, stops)
 
 
 @kernel
-def _write_stops(search: Any, lanes: Lanes, e: int, stops: Stops) -> None:
+def _write_stops(search: Any, lanes: Lanes, e: int, before: int, begun: float, stops: Stops) -> None:
     """Write the captures of a step as `SensorSampler.sample_step` chooses them."""
     stops.count[e] = 0
     if search.parked:
         return
-    here, before, begun = search.vertex, stops.vertex[e], stops.begun[e]
+    here = search.vertex
     x, y = lanes.xy[here, 0], lanes.xy[here, 1]
     n = 1
     if before != here:
@@ -322,9 +326,7 @@ class LaserObserver(Observer):
         }
         super().__init__(tables, n, spaces.Dict(space))
         self._measured, self._scan = self.seen, self.seen[f"scan.{name}"]
-        self._stops = Stops(
-            self.seen["vertex"], np.zeros(n), self.seen["count"], np.zeros((n, k, 3)), np.zeros((n, k))
-        )
+        self._stops = Stops(self.seen["count"], np.zeros((n, k, 3)), np.zeros((n, k)))
         self._library, quads, others = CarLibrary.of(slot_lot(lot))
         self._lanes = _lanes_of(lot, k, float(every), laser.max_range)
         self._planes = Planes(
@@ -348,14 +350,16 @@ class LaserObserver(Observer):
         ends: list[int] = np.linspace(0, n, min(get_num_threads(), n) + 1).astype(int).tolist()
         self._shares = list(pairwise(ends))
 
-    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+    def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
         """See `Observer`."""
-        seen, address, cursors = self._measured, self.searches.address, address_of(self._cursors, CURSOR)
-        write_stops(address, self._lanes, fresh, idle, self._stops, seen["time"])
+        seen, cursors = self._measured, address_of(self._cursors, CURSOR)
+        step_to_stops(
+            self.address, self._lanes, actions, fresh, idle, limit, steps, self._stops, seen["vertex"], seen["time"]
+        )  # fmt: skip
 
         def scan_part(part: tuple[int, int]) -> None:
             scan_searches(
-                *part, address, cursors, fresh, idle, self._lanes, self._library, self._planes, self._laser,
+                *part, self.address, cursors, fresh, idle, self._lanes, self._library, self._planes, self._laser,
                 self._stops, seen["pose"], seen["captured_at"], self._scan,
             )  # fmt: skip
 
@@ -364,9 +368,6 @@ class LaserObserver(Observer):
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
         """See `Observer`; cars follow from the worlds, so they are drawn again rather than kept."""
         super().set_state(state)
-        self._stops.vertex[:], self._stops.begun[:] = (
-            self.searches.records[name] for name in ("vertex", "time")
-        )
         forget_all_cars(address_of(self._cursors, CURSOR), self._library, self._planes)
 
 
@@ -389,9 +390,9 @@ class ScansObserver(LaserObserver):
         self.seen = empty | {"action_mask": self._measured["action_mask"]}
         self.n_bytes += sum(array.nbytes for array in (self.seen["scan"], *self._history))
 
-    def observe(self, fresh: BoolArray, idle: BoolArray) -> None:
+    def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
         """See `Observer`."""
-        super().observe(fresh, idle)
+        super().step(actions, fresh, idle, limit, steps)
         seen = self._measured
         observe_scans(
             self._scan, seen["pose"], seen["count"], seen["time"], self._goal, fresh, idle, self._history,

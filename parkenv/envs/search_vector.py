@@ -23,7 +23,6 @@ from parkenv.engine.batch import (
     arrive_all,
     copy_fields,
     first_wrong,
-    step_all,
 )
 from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
 from parkenv.errors import InputError
@@ -41,8 +40,9 @@ MAX_ENVS = 1_000_000
 # Gymnasium's names of the masks that say which searches have a metric.
 _WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "place"))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
-assert SEARCH.fields is not None
-_OFFSETS = np.array([SEARCH.fields[name][1] for name in (*METRICS, *STEP_FIELDS)])
+# Types and places of the metrics and the step's terms in a SEARCH record.
+_PLACES = [dict(SEARCH.fields or {})[name][:2] for name in (*METRICS, *STEP_FIELDS)]
+_TYPES, _OFFSETS = [dtype for dtype, _ in _PLACES], np.array([offset for _, offset in _PLACES])
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
@@ -297,15 +297,14 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     def _step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray) -> None:
         """Begin fresh searches, skip idle ones, step the others."""
-        step_all(self._searches.address, actions, fresh, idle, self._limit, self._steps)
-        self.observer.observe(fresh, idle)
+        self.observer.step(actions, fresh, idle, self._limit, self._steps)
         if self._searches.needs_python:
             raise_error()
 
     def _arrive(self, which: BoolArray) -> None:
         """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
-        arrive_all(searches.address, which)
+        arrive_all(self.observer.address, which)
         if not searches.needs_python:
             return
         for i in np.flatnonzero(which):
@@ -323,11 +322,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
         """Return the `info` of `SearchEnv` of the searches that have ended, with masks that say which."""
         words = np.zeros((len(_OFFSETS), self.num_envs), np.int64)
-        copy_fields(self._searches.address, done, _OFFSETS, words)
+        copy_fields(self.observer.address, done, _OFFSETS, words)
+        # A type of fewer bytes stands at the beginning of its eight.
         metrics: dict[str, Any] = {
-            # A shorter field stands at the beginning of its eight bytes.
-            name: row.view(SEARCH[name])[:: 8 // SEARCH[name].itemsize]
-            for name, row in zip(METRICS, words, strict=False)
+            name: row.view(dtype)[:: 8 // dtype.itemsize]
+            for name, row, dtype in zip(METRICS, words, _TYPES, strict=False)
         }
         terms = dict(zip(REWARD_TERMS, -words[len(METRICS) :].view(np.float64), strict=True))
         metrics["reward_terms"] = terms | dict.fromkeys(_WHICH_TERMS, done)
