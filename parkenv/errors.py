@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
+from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any
 
@@ -14,6 +15,17 @@ class InputError(ValueError):
 
     The command line turns it into one line on standard error and exit code 2.
     """
+
+
+@contextmanager
+def naming(source: object) -> Iterator[None]:
+    """Let the messages of InputErrors in the block begin with the source that they are about, such as a file."""
+    try:
+        yield
+    except InputError as error:
+        if str(error).startswith(f"{source}: "):
+            raise
+        raise InputError(f"{source}: {error}") from error
 
 
 def require_number(

@@ -17,7 +17,7 @@ from parkenv.lots.formats.recognition import LotFormat, lot_format
 from parkenv.lots.lot_import import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import node_labels
-from parkenv.world.lot import Lane, ParkingLot, corner_points, mouth_heading, mouth_points
+from parkenv.world.lot import Lane, ParkingLot
 
 LANE_GAP = 1.0
 """Distance, m: a lane that ends closer to another one without a common point was probably meant to join it."""
@@ -88,15 +88,13 @@ def _drawing_warnings(contents: LotContents) -> list[LotProblem]:
         if distance > GOAL_REACH:
             warn(number, f"goal: the nearest lane is {distance:.0f} m away; people walk at least that far")
 
-    mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
-    heading = mouth_heading(slots.yaw, slots.mouth)
+    mouth = slots.mouths()
     to_lane = nearest_on_lanes(contents.lanes, mouth)[0] - mouth
-    away = to_lane[:, 0] * np.cos(heading) + to_lane[:, 1] * np.sin(heading) < 0.0
+    away = (to_lane * slots.outward()).sum(axis=1) < 0.0
     for i in np.flatnonzero(away).tolist():
         warn(numbers["slot"][i], f"slot {contents.slot_ids[i]!r:.40}: its mouth faces away from its lane")
 
-    inner = corner_points(slots.xy, slots.yaw, slots.length - SLOT_OVERLAP, slots.width - SLOT_OVERLAP)
-    boxes = np.asarray(shapely.polygons(inner))
+    boxes = slots.boxes(shrink=SLOT_OVERLAP)
     one, other = shapely.STRtree(boxes).query(boxes, predicate="intersects")
     for i, j in zip(one[one < other], other[one < other], strict=True):
         warn(

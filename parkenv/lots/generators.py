@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import require_number, require_whole
 from parkenv.world.drive_graph import LANE_OFFSET, SLOT_REACH
-from parkenv.world.lot import Lane, Mouth, ParkingLot
+from parkenv.world.lot import Lane, Mouth, ParkingLot, corner_points, mouth_heading, mouth_points
 
 BAY_SIZE = (5.0, 2.5)  # length and width, m, of a perpendicular or angled slot
 KERB_SIZE = (6.0, 2.1)  # length and width, m, of a kerbside slot
@@ -63,6 +63,21 @@ class Slots:
     def columns(self) -> dict[str, Any]:
         """Return the keyword arguments of `ParkingLot`."""
         return {f"slot_{f.name}": getattr(self, f.name) for f in fields(self)}
+
+    def mouths(self) -> FloatArray:
+        """Return the middles of the sides by which the slots are entered, (n, 2) m."""
+        return mouth_points(self.xy, self.yaw, self.length, self.width, self.mouth)
+
+    def outward(self) -> FloatArray:
+        """Return the directions that the mouths face, (n, 2) unit vectors."""
+        heading = mouth_heading(self.yaw, self.mouth)
+        return np.stack([np.cos(heading), np.sin(heading)], axis=1)
+
+    def boxes(self, shrink: float | FloatArray = 0.0) -> NDArray[np.object_]:
+        """Return the rectangles, (n,) polygons, m, narrower and shorter by `shrink` m."""
+        return np.asarray(
+            shapely.polygons(corner_points(self.xy, self.yaw, self.length - shrink, self.width - shrink))
+        )
 
 
 def bay_row(

@@ -182,10 +182,14 @@ def linestrings(parts: Sequence[FloatArray]) -> NDArray[np.object_]:
 
 def node_labels(xy: FloatArray) -> IntArray:
     """Label points, (n, 2) m: those closer than `NODE_TOLERANCE` share a label, (n,) int64, and are one node."""
-    near = cKDTree(xy).query_pairs(NODE_TOLERANCE, output_type="ndarray")
-    graph = coo_array((np.ones(len(near), dtype=bool), (near[:, 0], near[:, 1])), shape=(len(xy), len(xy)))
-    _, label = connected_components(graph, directed=False)
-    return np.asarray(label, dtype=np.int64)
+    return component_labels(cKDTree(xy).query_pairs(NODE_TOLERANCE, output_type="ndarray"), len(xy))
+
+
+def component_labels(links: IntArray, n: int) -> IntArray:
+    """Label n things, (n,) int64: those that links, (m, 2) indices, connect share a label."""
+    links = np.reshape(links, (-1, 2))
+    graph = coo_array((np.ones(len(links), dtype=bool), tuple(links.T)), shape=(n, n))
+    return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
 def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:

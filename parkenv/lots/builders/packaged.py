@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
-from parkenv.world.lot import Lane, ParkingLot, corner_points
+from parkenv.world.lot import Lane, ParkingLot
 
 PITCH = BAY_SIZE[1]
 AISLE = 6.0
@@ -191,8 +191,7 @@ def street() -> ParkingLot:
     walls = [shapely.get_coordinates(house) for house in np.asarray(houses)]
 
     slots = streets.kerb_slots(outer=False)
-    boxes = shapely.polygons(corner_points(slots.xy, slots.yaw, slots.length, slots.width))
-    kept = np.asarray(~shapely.intersects(boxes, shapely.union_all(ways_in)))
+    kept = np.asarray(~shapely.intersects(slots.boxes(), shapely.union_all(ways_in)))
     kept[4::12] = False
     goal = blocks[1].mean(axis=0) + np.array([7.0, 5.0])
     return lot("street", [("S", slots[kept])], lanes, [west, east], [goal], walls, turned=np.radians(-6.0))

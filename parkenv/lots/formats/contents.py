@@ -11,7 +11,7 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
-from parkenv.world.lot import Lane, mouth_points
+from parkenv.world.lot import Lane
 
 KINDS = {
     "slot": ("Polygon",),
@@ -72,9 +72,8 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
     lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
     if not lanes:
         return []
-    slots = contents.slots
-    mouth_xy = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
-    left = {"slot": np.arange(len(slots)), "entry": np.arange(len(contents.entries))}
+    mouth_xy = contents.slots.mouths()
+    left = {"slot": np.arange(len(mouth_xy)), "entry": np.arange(len(contents.entries))}
     entries = np.array(contents.entries).reshape(-1, 2)
     errors = []
     while True:

@@ -16,7 +16,7 @@ from parkenv.files.file_names import is_plain
 from parkenv.lots.formats.contents import LotContents
 from parkenv.lots.generators import Slots
 from parkenv.lots.slot_polygons import slots_from_polygons
-from parkenv.world.lot import FARTHEST, SLOT_SIDE, Mouth, corner_points
+from parkenv.world.lot import FARTHEST, SLOT_SIDE, Mouth
 
 SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
@@ -85,8 +85,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
         table[~bare] = [shape for shape in shapes if shape is not None]
         slots = Slots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5].astype(np.int8))
 
-    boxes = shapely.polygons(corner_points(slots.xy, slots.yaw, slots.length, slots.width))
-    apart = shapely.hausdorff_distance(polygons, boxes)
+    apart = shapely.hausdorff_distance(polygons, slots.boxes())
     disagrees = ~bare & (apart > SLOT_AGREEMENT)
     thin = slots.width < SLOT_SIDE
     for k in np.flatnonzero(disagrees):

@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.infer.openings import WIDEST_SHARED, OpenRow, is_on_road
 from parkenv.lots.infer.spaces import Spaces
+from parkenv.world.drive_graph import component_labels
 
 HALF_WIDTH = 3.0  # distance, m, of the centre line from a row that no other row faces
 NARROW_HALF_WIDTH = 2.2  # the same for oblique and kerbside rows
@@ -78,11 +78,7 @@ def find_aisles(
     ]
     links = {(min(r, q), max(r, q)) for r, facing in enumerate(faced) for q in facing[facing >= 0].tolist()}
     links |= _continuations(rows, stops, tree)
-    edges = np.array(sorted(links), dtype=np.int64).reshape(-1, 2)
-    _, label = connected_components(
-        coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(len(rows), len(rows))),
-        directed=False,
-    )
+    label = component_labels(np.array(sorted(links), dtype=np.int64), len(rows))
     aisles = []
     for group in range(int(label.max()) + 1):
         members = np.flatnonzero(label == group)

@@ -13,14 +13,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE
 from parkenv.lots.infer.spaces import Spaces, without_overlaps
+from parkenv.world.drive_graph import component_labels
 
 SPACING = (1.8, 8.0)  # least and greatest distance, m, from a space to the next in its row
 SAME_SPACING = 1.3
@@ -125,9 +124,7 @@ def _find_rows(xy: FloatArray) -> tuple[list[CenterRow], IntArray]:
     near = reach <= SAME_SPACING * np.minimum(spacing[pairs].max(axis=1), SPACING[1])
     for end in (0, 1):
         near &= np.abs((way[pairs[:, end]] * step).sum(axis=1)) >= np.cos(SAME_WAY) * reach
-    links = pairs[near]
-    graph = coo_array((np.ones(len(links), dtype=bool), tuple(links.T)), shape=(len(xy), len(xy)))
-    _, part = connected_components(graph, directed=False)
+    part = component_labels(pairs[near], len(xy))
     groups = [np.flatnonzero(part == k) for k in range(part.max() + 1)]
     long = [_row(group, xy) for group in groups if len(group) > 2]
     joined: dict[int, list[int]] = {}

@@ -32,7 +32,7 @@ from parkenv.lots.infer.rows import find_rows
 from parkenv.lots.infer.spaces import Spaces
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import SLOT_REACH
-from parkenv.world.lot import Lane, Mouth, corner_points, mouth_heading, mouth_points
+from parkenv.world.lot import Lane, Mouth
 
 LONGEST_CONNECTION = 120.0  # m
 NARROWEST, KERB_LENGTH = 1.95, 4.8
@@ -94,7 +94,7 @@ def infer_lot(
     connections = connect([line.points for line in (*lines, *roads)], FreeSpace(blocked), LONGEST_CONNECTION)
     lines = noded(noded([*lines, *roads, *(Line(connection.points) for connection in connections)]))
     index, slots, widened = _slots(spaces, rows)
-    mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    mouths = slots.mouths()
     main = [lines[k] for k in largest_part(lines)[0]]
     lines = without_stubs(main, lambda some: int(_is_served(slots, some).sum()))
     wanted = {
@@ -163,21 +163,17 @@ def _lane_before(entry: Entry | None, xy: FloatArray, lines: Sequence[Line]) -> 
 
 def _is_served(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
     """Whether the lane nearest to each slot's mouth, (n,), is before it and within reach."""
-    mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    mouth = slots.mouths()
     to_lane = nearest_on_lanes([Lane(line.points) for line in lines], mouth)[0] - mouth
-    heading = mouth_heading(slots.yaw, slots.mouth)
-    ahead = to_lane[:, 0] * np.cos(heading) + to_lane[:, 1] * np.sin(heading)
+    ahead = (to_lane * slots.outward()).sum(axis=1)
     distance = np.hypot(to_lane[:, 0], to_lane[:, 1])
     return np.asarray((ahead >= FACING * distance) & (distance <= SLOT_REACH - 0.05))
 
 
 def _is_clear(slots: Slots, lines: Sequence[Line]) -> NDArray[np.bool_]:
     """Whether no lane, (n,), leads closer past a slot than a car can drive."""
-    corners = corner_points(slots.xy, slots.yaw, slots.length - 0.2, slots.width - 0.2)
     tree = shapely.STRtree([shapely.LineString(line.points) for line in lines])
-    hit = tree.query(
-        np.atleast_1d(np.asarray(shapely.polygons(corners))), predicate="dwithin", distance=CAR_ROOM
-    )[0]
+    hit = tree.query(slots.boxes(shrink=0.2), predicate="dwithin", distance=CAR_ROOM)[0]
     clear = np.ones(len(slots), dtype=bool)
     clear[hit] = False
     return clear

@@ -9,13 +9,11 @@ from itertools import product
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.infer.rows import Row
 from parkenv.lots.infer.spaces import Spaces
-from parkenv.world.drive_graph import SLOT_REACH
+from parkenv.world.drive_graph import SLOT_REACH, component_labels
 
 LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m
 WIDEST_SHARED = 13.0  # widest aisle, m, that two facing rows share
@@ -216,16 +214,9 @@ def _choose(
             unary[r, side] += 0.25 * float((1.0 - like).sum()) - 0.01 * float(
                 np.minimum(view.clear, 8.0).sum()
             )
-    links = np.array(list(pairs), dtype=np.int64).reshape(-1, 2)
-    _, label = (
-        connected_components(
-            coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n)), directed=False
-        )
-        if n
-        else (0, np.empty(0))
-    )
+    label = component_labels(np.array(list(pairs), dtype=np.int64), n) if n else np.empty(0, np.int64)
     sides, sure = np.zeros(n, dtype=int), np.ones(n)
-    for part in range(int(label.max()) + 1 if n else 0):
+    for part in np.unique(label):
         members = np.flatnonzero(label == part)
         inside = {pair: table for pair, table in pairs.items() if label[pair[0]] == part}
         sides[members] = _least_cost(unary[members], members, inside)

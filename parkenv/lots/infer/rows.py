@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.lots.infer.spaces import Spaces
+from parkenv.world.drive_graph import component_labels
 
 TOUCHING = 0.7  # widest gap, m, between neighbours in a row
 SAME_AXIS = np.cos(np.radians(25.0))  # least |cosine| of the angle between the axes of neighbours
@@ -105,11 +104,6 @@ def find_rows(spaces: Spaces) -> list[Row]:
     return rows + [_chain(spaces, np.array([i]), kerbside=False) for i in single.tolist()]
 
 
-def as_kerbside(spaces: Spaces, row: Row) -> Row:
-    """Return a single space as a kerbside row."""
-    return _chain(spaces, row.members, kerbside=True)
-
-
 def _mutual(one: IntArray, other: IntArray, positive: NDArray[np.bool_], cost: FloatArray) -> IntArray:
     """Return pairs, (m, 2), of spaces that are each other's nearest neighbour on that side."""
     if not len(one):
@@ -124,8 +118,7 @@ def _mutual(one: IntArray, other: IntArray, positive: NDArray[np.bool_], cost: F
 
 def _chains(links: IntArray, n: int, used: NDArray[np.bool_]) -> list[IntArray]:
     """Return the spaces of each chain of links in order; a closed chain is cut at its first space."""
-    graph = coo_array((np.ones(len(links)), (links[:, 0], links[:, 1])), shape=(n, n))
-    _, label = connected_components(graph, directed=False)
+    label = component_labels(links, n)
     near: dict[int, list[int]] = {}
     for i, j in links.tolist():
         near.setdefault(i, []).append(j)

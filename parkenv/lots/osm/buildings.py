@@ -1,8 +1,8 @@
-"""Goals and walls from buildings in OpenStreetMap."""
+"""Areas of OpenStreetMap elements, and the goals and walls that buildings give."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,11 +10,11 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.roads import Road
-from parkenv.lots.osm.rows import boxes_of
 
 ENTRANCE_REACH = 100.0  # largest distance, m, from the nearest slot of a building entrance that is a goal
 BUILDING_REACH = 200.0  # the same for the nearest building if there is no entrance
@@ -29,6 +29,70 @@ class Area:
 
     element: OsmElement
     polygon: shapely.Geometry
+
+    @classmethod
+    def of(cls, element: OsmElement, frame: LocalFrame, *, simple: bool) -> Area:
+        """Return the area of a closed element.
+
+        Args:
+            element: the element.
+            frame: the lot's frame.
+            simple: whether outlines that cross themselves are refused; otherwise they are mended.
+
+        Raises:
+            InputError: an outline that is open, or that crosses itself.
+        """
+        if not element.is_closed:
+            raise InputError(f"{element.id}: its outline is open, want its first position again at the end")
+        outer, holes = (
+            [shapely.Polygon(frame.to_xy(line)) for line in lines] for lines in (element.lines, element.holes)
+        )
+        for polygon in (*outer, *holes):
+            if simple and not polygon.is_valid:
+                reason = shapely.is_valid_reason(polygon).split("[")[0]
+                raise InputError(f"{element.id}: its outline is not a simple one: {reason}")
+        if element.tags.get("amenity") == "parking_space" and simple and len(outer) == 1 and not holes:
+            # The rectangle of a space depends on the corner that its outline begins at; a union would move it.
+            return cls(element, outer[0])
+        whole, gaps = (shapely.union_all(shapely.make_valid(part)) for part in (outer, holes))
+        shape = shapely.difference(whole, gaps)
+        parts = shapely.get_parts(shape)
+        areas = [part for part in parts if part.geom_type == "Polygon" and part.area > 0.0]
+        return cls(element, shape if len(areas) == len(parts) else shapely.union_all(areas))
+
+
+def areas_of(
+    elements: Sequence[OsmElement],
+    frame: LocalFrame,
+    wanted: Callable[[OsmElement], bool],
+    *,
+    mended: bool = False,
+) -> list[Area]:
+    """Return the areas of the closed ones among the wanted elements.
+
+    Outlines that cross themselves are mended if they are those of buildings alone, or all with `mended`.
+    """
+    closed = (e for e in elements if wanted(e) and e.lines and e.is_closed and not e.is_node)
+    return [Area.of(e, frame, simple=not mended and "amenity" in e.tags) for e in closed]
+
+
+def is_building(element: OsmElement) -> bool:
+    """Whether an element is a building."""
+    return element.tags.get("building", "no") != "no"
+
+
+def within(areas: Sequence[Area], box: tuple[float, float, float, float] | None) -> list[Area]:
+    """Return the areas in a box (least x and y, greatest x and y, m); all if it is None."""
+    if box is None:
+        return list(areas)
+    bounds = shapely.box(*box)
+    return [a for a in areas if shapely.contains(bounds, shapely.point_on_surface(a.polygon))]
+
+
+def exterior_rings(polygons: Iterable[shapely.Geometry]) -> list[FloatArray]:
+    """Return the outer outlines, (k, 2) m each, of polygons and their parts."""
+    rings = [shapely.get_exterior_ring(part) for whole in polygons for part in shapely.get_parts(whole)]
+    return [shapely.get_coordinates(ring) for ring in rings if ring is not None]
 
 
 def find_goals(
@@ -72,17 +136,11 @@ def split_walls(
         return [], []
     polygons = np.array([a.polygon for a in buildings])
     used = shapely.union_all(
-        [*boxes_of(slots, shrink=0.1), *(shapely.LineString(road.points).buffer(1.0) for road in roads)]
+        [*slots.boxes(shrink=0.1), *(shapely.LineString(road.points).buffer(1.0) for road in roads)]
     )
     over = shapely.intersects(polygons, used)
     near = (_distance_to_slots(slots, polygons) <= ENTRANCE_REACH) & ~over
-    rings = [
-        shapely.get_exterior_ring(part)
-        for k in np.flatnonzero(near)
-        for part in shapely.get_parts(polygons[k])
-    ]
-    walls = [shapely.get_coordinates(ring) for ring in rings if ring is not None]
-    return walls, [buildings[k].element.id for k in np.flatnonzero(over).tolist()]
+    return exterior_rings(polygons[near]), [buildings[k].element.id for k in np.flatnonzero(over).tolist()]
 
 
 def _distance_to_slots(slots: Slots, geometries: NDArray[np.object_]) -> FloatArray:

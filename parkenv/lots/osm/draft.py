@@ -31,25 +31,33 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.infer.spaces import to_rectangle
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm import network as network
-from parkenv.lots.osm.buildings import BUILDING_REACH, ENTRANCE_REACH, Area, find_goals, split_walls
-from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.osm.files import read_map
+from parkenv.lots.osm import network
+from parkenv.lots.osm.buildings import (
+    BUILDING_REACH,
+    ENTRANCE_REACH,
+    Area,
+    areas_of,
+    exterior_rings,
+    find_goals,
+    is_building,
+    split_walls,
+    within,
+)
+from parkenv.lots.osm.elements import OsmElement, read_map
 from parkenv.lots.osm.kerbs import Junctions, kerb_of, kerb_slots
 from parkenv.lots.osm.outline_draft import outline_draft
 from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
 from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
-from parkenv.lots.osm.rows import ARRANGEMENTS, boxes_of, without_overlaps
-from parkenv.lots.osm.spaces import split_space, why_no_slot
+from parkenv.lots.osm.rows import ARRANGEMENTS, without_overlaps
+from parkenv.lots.osm.spaces import is_parking_area, is_space, split_space, usable_spaces
 from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
 from parkenv.world.drive_graph import SLOT_REACH
-from parkenv.world.lot import mouth_points
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
 """Values of `parking` for slots that are not in the open at ground level."""
@@ -71,19 +79,22 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
         InputError: the file is incomplete, has another format or contains no parking, an outline crosses itself, or
             the elements are too far apart.
     """
-    return draft_of_elements(Path(path), read_map(Path(path)), options or ImportOptions())
+    path = Path(path)
+    elements = read_map(path)
+    with naming(path):
+        return draft_of_elements(path.stem, elements, options or ImportOptions())
 
 
-def draft_of_elements(path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> LotDraft:
-    """Draft a lot from elements that were read from a file; see `osm_draft`.
+def draft_of_elements(name: str, elements: Sequence[OsmElement], options: ImportOptions) -> LotDraft:
+    """Draft a lot from the elements of a map; see `osm_draft`.
 
     Without a road for cars among them, the lanes are inferred from the spaces' outlines; the same holds if guesses are
     allowed and the roads do not reach all spaces or lack an entry.
     """
     has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
     if has_spaces and not any(_may_be_lane(e) for e in elements):
-        return outline_draft(path, elements, [], map_frame(path, elements), options)
-    importer = _OsmImporter(path, elements, options)
+        return outline_draft(name, elements, [], map_frame(elements), options)
+    importer = _OsmImporter(name, elements, options)
     importer.read_spaces()
     importer.fill_outlines()
     importer.line_kerbs()
@@ -92,18 +103,18 @@ def draft_of_elements(path: Path, elements: Sequence[OsmElement], options: Impor
     if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
         edge = importer._edge(draft.slots)
         roads = [part for road in importer.roads for part in network.clipped_road(road, edge)]
-        return outline_draft(path, elements, roads, importer.frame, options)
+        return outline_draft(name, elements, roads, importer.frame, options)
     return draft
 
 
-def map_frame(path: Path, elements: Sequence[OsmElement]) -> LocalFrame:
+def map_frame(elements: Sequence[OsmElement]) -> LocalFrame:
     """Return the frame around the parking of a map.
 
     Raises:
         InputError: the elements are too far apart for one plane.
     """
     parking = [e for e in elements if _is_parking(e)]
-    _refuse_far_away(path, parking)
+    _refuse_far_away(parking)
     return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
 
 
@@ -139,18 +150,18 @@ class _Group:
 class _OsmImporter:
     """The state of an import: roads, areas, slots, and elements left out."""
 
-    def __init__(self, path: Path, elements: Sequence[OsmElement], options: ImportOptions) -> None:
-        self.path = path
+    def __init__(self, name: str, elements: Sequence[OsmElement], options: ImportOptions) -> None:
+        self.name = name
         self.options = options
         self.left_out: dict[str, list[str]] = {}
         self.notes: list[str] = []
         parking = [e for e in elements if _is_parking(e)]
         if not parking:
             raise InputError(
-                f"{path}: no parking in it: no amenity=parking_space, no amenity=parking, no street with "
+                "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
                 "parking:left, parking:right or parking:both"
             )
-        _refuse_far_away(path, [e for e in elements if _is_parking(e) or "highway" in e.tags])
+        _refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
         self.frame = LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
         self.box = options.box(self.frame)
         box = None if self.box is None else shapely.box(*self.box)
@@ -158,23 +169,14 @@ class _OsmImporter:
         self.roads = self._roads(elements, box)
 
         def areas(wanted: Callable[[OsmElement], bool]) -> list[Area]:
-            found = [
-                Area(e, self._polygon(e))
-                for e in elements
-                if wanted(e) and e.lines and e.is_closed and not e.is_node
-            ]
+            found = areas_of(elements, self.frame, wanted)
             for flat in (a.element for a in found if not shapely.area(a.polygon)):
                 self._leave_out("outlines without an area", flat.id)
-            return [
-                a
-                for a in found
-                if shapely.area(a.polygon)
-                and (box is None or shapely.contains(box, shapely.point_on_surface(a.polygon)))
-            ]
+            return within([a for a in found if shapely.area(a.polygon)], self.box)
 
-        self.outlines = areas(lambda e: e.tags.get("amenity") == "parking")
-        self.spaces = areas(lambda e: e.tags.get("amenity") == "parking_space")
-        self.buildings = areas(lambda e: e.tags.get("building", "no") != "no")
+        self.outlines = areas(is_parking_area)
+        self.spaces = areas(is_space)
+        self.buildings = areas(is_building)
         for e in parking:
             kind = e.tags.get("amenity", "")
             if kind.startswith("parking") and not (e.lines and e.is_closed):
@@ -199,50 +201,23 @@ class _OsmImporter:
                 roads += [road] if box is None else network.clipped_road(road, box)
         return roads
 
-    def _polygon(self, element: OsmElement) -> shapely.Geometry:
-        outer, inner = (
-            [shapely.Polygon(self.frame.to_xy(line)) for line in lines]
-            for lines in (element.lines, element.holes)
-        )
-        is_building = "building" in element.tags and "amenity" not in element.tags
-        for polygon in outer + inner:
-            if not polygon.is_valid and not is_building:
-                reason = shapely.is_valid_reason(polygon).split("[")[0]
-                raise InputError(f"{self.path}: {element.id}: its outline is not a simple one: {reason}")
-        whole = [shapely.union_all([shapely.make_valid(p) for p in part]) for part in (outer, inner)]
-        return whole[0].difference(whole[1])
-
     # ---- slots ----
 
     def read_spaces(self) -> None:
         """Create slots from mapped spaces."""
-        private = [a.polygon for a in self.outlines if closed_to_cars(a.element.tags)]
-        kept: list[Area] = []
-        for area in self.spaces:
-            reason = why_no_slot(
-                area.element.tags, area.polygon, private, with_disabled=self.options.with_disabled
-            )
-            if reason is None:
-                kept.append(area)
-            else:
-                self._leave_out(reason, area.element.id)
-                self.blocked.append(area.polygon)
+        kept, unused = usable_spaces(self.spaces, self.outlines, with_disabled=self.options.with_disabled)
+        for area, reason in unused:
+            self._leave_out(reason, area.element.id)
+            self.blocked.append(area.polygon)
         if not kept:
             return
-        owners: list[str] = []
-        names: list[str] = []
-        polygons: list[shapely.Geometry] = []
         lanes = network.lanes_of(self.roads)
-        for area in kept:
-            capacity = whole_number(area.element.tags.get("capacity")) or 1
-            parts = split_space(to_rectangle(area.polygon), capacity, lanes)
-            names += (
-                [area.element.id]
-                if capacity == 1
-                else [f"{area.element.id}-{k + 1}" for k in range(capacity)]
-            )
-            polygons += parts
-            owners += [area.element.id] * len(parts)
+        parts = [
+            (area.element.id, *part)
+            for area in kept
+            for part in split_space(area.element, to_rectangle(area.polygon), lanes)
+        ]
+        owners, names, polygons = zip(*parts, strict=True)
         self.blocked += [area.polygon for area in kept]
 
         # Prefer an aisle to another service road, and that to a street, even if these are nearer.
@@ -253,7 +228,7 @@ class _OsmImporter:
             if not len(left) or not near:
                 continue
             slots = slots_from_polygons(array[left], near)
-            mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+            mouth = slots.mouths()
             to_lane = nearest_on_lanes(near, mouth)[0] - mouth
             reached = np.hypot(to_lane[:, 0], to_lane[:, 1]) <= SLOT_REACH
             found = np.flatnonzero(reached)
@@ -306,7 +281,7 @@ class _OsmImporter:
                 self._leave_out("parking areas without a road along which a slot fits", name)
                 continue
             self.filled.add_row(name, name, slots, rank)
-            self.blocked += list(boxes_of(slots, shrink=0.02))
+            self.blocked += list(slots.boxes(shrink=0.02))
             if capacity is not None and len(slots) < capacity:
                 self.notes.append(f"{name}: {len(slots)} of the tagged {capacity} slots fit by the rule")
 
@@ -334,7 +309,7 @@ class _OsmImporter:
                 if kerb is None or isinstance(kerb, str):
                     continue
                 slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
-                clear = np.flatnonzero(~shapely.intersects(corridors, boxes_of(slots, shrink=0.05)))
+                clear = np.flatnonzero(~shapely.intersects(corridors, slots.boxes(shrink=0.05)))
                 slots = slots[clear]
                 self.kerbside.add_row(road.id, f"{road.id}-{tagged}", slots, road.rank)
                 if kerb.capacity is not None and len(slots) < kerb.capacity:
@@ -376,7 +351,7 @@ class _OsmImporter:
 
         lanes = limit_junctions(network.lanes_of(roads))
         draft = LotDraft(
-            name=self.path.stem,
+            name=self.name,
             slot_ids=tuple(names),
             slots=slots,
             slot_source=tuple(sources),
@@ -384,11 +359,7 @@ class _OsmImporter:
             entries=entries,
             goals=goals,
             walls=tuple(walls),
-            outlines=tuple(
-                shapely.get_coordinates(shapely.get_exterior_ring(part))
-                for a in self.outlines
-                for part in shapely.get_parts(a.polygon)
-            ),
+            outlines=tuple(exterior_rings(a.polygon for a in self.outlines)),
             missing=tuple(self._missing(slots, roads, entries, goals)),
             frame=self.frame,
         ).searchable()
@@ -407,8 +378,7 @@ class _OsmImporter:
         ranks = np.array([rank for g in groups for rank in g.ranks], dtype=np.int64)
         is_mapped = np.array([source == self.mapped.source for source in sources])
         shrink = np.where(is_mapped, MAPPED_OVERLAP, RULE_OVERLAP)
-        boxes = boxes_of(replace(slots, length=slots.length - shrink, width=slots.width - shrink))
-        kept = without_overlaps(boxes)
+        kept = without_overlaps(slots.boxes(shrink))
         for i in np.flatnonzero(~kept):
             self._leave_out("slots that overlap others", names[i])
         index = np.flatnonzero(kept)
@@ -474,7 +444,7 @@ def _is_parking(element: OsmElement) -> bool:
     )
 
 
-def _refuse_far_away(path: Path, elements: Sequence[OsmElement]) -> None:
+def _refuse_far_away(elements: Sequence[OsmElement]) -> None:
     """Raise an error for a map of more than one place: a plane cannot preserve distances across a continent."""
     positions = np.concatenate([line for e in elements for line in e.lines])
     order = len(positions) // 2
@@ -486,7 +456,7 @@ def _refuse_far_away(path: Path, elements: Sequence[OsmElement]) -> None:
             if away.max() > FARTHEST:
                 there_lon, there_lat = line[away.argmax()]
                 raise InputError(
-                    f"{path}: {element.id} is at {there_lat:.4f}, {there_lon:.4f} and most of the map "
+                    f"{element.id} is at {there_lat:.4f}, {there_lon:.4f} and most of the map "
                     f"{away.max() / 1e3:,.0f} km away at {lat:.4f}, {lon:.4f}, want a map no larger than "
                     f"{FARTHEST / 1e3:.0f} km around its middle (are latitude and longitude swapped?)"
                 )

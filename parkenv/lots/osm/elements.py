@@ -1,8 +1,8 @@
 """Read OpenStreetMap files: nodes, ways and multipolygons with their tags and positions.
 
-Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
-JSON (`elements`, with node references or `out geom;`), and GeoJSON as overpass-turbo and osmtogeojson write
-it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`); `osm_pbf` reads PBF.
+Four formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
+JSON (`elements`, with node references or `out geom;`), GeoJSON as overpass-turbo and osmtogeojson write
+it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`), and PBF with the package osmium.
 GeoJSON of polygons without any such tag holds outlines of parking spaces.
 
 OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
@@ -22,12 +22,14 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
-from parkenv.files.limited_reading import read_bytes, read_json
+from parkenv.errors import InputError, naming
+from parkenv.files.limited_reading import is_there, read_bytes, read_json
 
 OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 """Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
+KEYS = (*MAPPED_KEYS, "noexit")
+"""Keys of the elements that an import reads."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,19 +54,19 @@ class OsmElement:
         return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
 
 
-def read_elements(path: Path) -> list[OsmElement]:
-    """Read all tagged nodes, ways and multipolygons of a file, in its order.
+def read_map(path: Path) -> list[OsmElement]:
+    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON, in its order.
 
     Raises:
         InputError: the file cannot be read, is incomplete or has another format; a position is not on the globe; a
             tagged way refers to a node that is not in the file; or an element appears twice with different content.
     """
+    if path.suffix.lower() == ".pbf":
+        return read_pbf(path)
     is_xml = path.suffix.lower() in (".osm", ".xml")
     content = read_bytes(path) if is_xml else read_json(path)
-    try:
+    with naming(path):
         return _elements_of_xml(content) if is_xml else elements_of_json(content)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def holds_osm(document: object) -> bool:
@@ -303,7 +305,7 @@ def elements_of_json(document: Any) -> list[OsmElement]:
     """Return the elements of parsed Overpass JSON or GeoJSON.
 
     Raises:
-        InputError: see `read_elements`; the message does not name the file.
+        InputError: see `read_map`; the message does not name the file.
     """
     if not isinstance(document, dict):
         raise InputError(f"holds a {type(document).__name__}, want Overpass JSON or a FeatureCollection")
@@ -423,3 +425,49 @@ def _tags(values: object) -> dict[str, str]:
 
 def _is_object(holder: Mapping[str, Any], key: str) -> bool:
     return isinstance(holder.get(key), dict)
+
+
+# ---- PBF ----
+
+
+def read_pbf(path: Path) -> list[OsmElement]:
+    """Read the parking, roads, buildings and entrances of an extract.
+
+    Raises:
+        InputError: osmium is not installed, or the file cannot be read.
+    """
+    try:
+        import osmium
+    except ImportError as error:
+        raise InputError(
+            f"{path}: .osm.pbf is read with osmium; install it by: pip install 'parkenv[osm]'"
+        ) from error
+    if not is_there(path):
+        raise InputError(f"{path}: No such file or directory")
+    raw = RawElements()
+    needed: set[int] = set()
+    try:
+        for relation in osmium.FileProcessor(str(path), osmium.osm.RELATION):
+            tags = dict(relation.tags)
+            if is_area_relation(tags):
+                members = [(m.ref, m.role) for m in relation.members if m.type == "w"]
+                raw.relations[relation.id] = RawRelation(tags, [(ref, role, None) for ref, role in members])
+                needed.update(ref for ref, _ in members)
+        for element in osmium.FileProcessor(str(path), osmium.osm.NODE | osmium.osm.WAY).with_locations():
+            _add(raw, element, needed)
+    except RuntimeError as error:
+        raise InputError(f"{path}: not an OpenStreetMap extract: {error}") from error
+    with naming(path):
+        return raw.elements()
+
+
+def _add(raw: RawElements, element: Any, needed: set[int]) -> None:
+    wanted = any(key in element.tags for key in KEYS)
+    if element.is_node():
+        if wanted:
+            location = element.location
+            raw.add_node(element.id, (location.lon, location.lat), dict(element.tags))
+    elif wanted or element.id in needed:
+        # Nodes beyond the edge of an extract have no position.
+        line = [(n.location.lon, n.location.lat) for n in element.nodes if n.location.valid()]
+        raw.add_way(element.id, RawWay(dict(element.tags), [], np.array(line).reshape(-1, 2)))

@@ -8,14 +8,12 @@ from dataclasses import replace
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import Slots
 from parkenv.lots.osm.roads import Rank, Road
-from parkenv.world.drive_graph import node_labels
-from parkenv.world.lot import Lane, mouth_points
+from parkenv.world.drive_graph import component_labels, node_labels
+from parkenv.world.lot import Lane
 
 
 def lanes_of(roads: Sequence[Road]) -> list[Lane]:
@@ -100,9 +98,8 @@ def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
     """Return the indices of the roads that are nearest to the mouth of some slot."""
     if not roads or not len(slots):
         return set()
-    mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
     lines = np.array([shapely.LineString(road.points) for road in roads])
-    nearest = shapely.STRtree(lines).nearest(shapely.points(mouth))
+    nearest = shapely.STRtree(lines).nearest(shapely.points(slots.mouths()))
     return set(np.asarray(nearest).tolist())
 
 
@@ -114,8 +111,7 @@ def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road
     road = np.repeat(np.arange(len(roads)), [len(p) for p in along])
     label = np.concatenate(along)
     n = len(roads) + int(label.max()) + 1
-    links = coo_array((np.ones(len(road), dtype=bool), (road, len(roads) + label)), shape=(n, n))
-    part = connected_components(links, directed=False)[1][: len(roads)]
+    part = component_labels(np.column_stack([road, len(roads) + label]), n)[: len(roads)]
     serving = {int(part[k]) for k in _serving_roads(roads, slots)}
     return [[r for r, p in zip(roads, part, strict=True) if p == k] for k in sorted(serving)]
 

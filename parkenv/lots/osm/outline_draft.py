@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 import shapely
@@ -16,23 +15,18 @@ from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.network import STREET, Line
 from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, validate_areas
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.buildings import Area, find_goals
+from parkenv.lots.osm.buildings import Area, areas_of, exterior_rings, find_goals, is_building, within
 from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, whole_number
-from parkenv.lots.osm.spaces import split_space, why_no_slot
+from parkenv.lots.osm.roads import Rank, Road
+from parkenv.lots.osm.spaces import is_parking_area, is_space, split_space, usable_spaces
 
 MOST_SPACES = 20_000
 """Maximum number of spaces of one lot."""
-MOST_LOST = 0.2
-"""Largest fraction of the spaces that an import may leave out because no aisle reaches them."""
 LARGEST_USUAL = 18.0  # area, m², that few parking spaces for cars exceed
-SHARE_UNSURE = 0.35  # certainty below which the open side of a row counts as a guess
-TWO_WAY_WIDTH, ONE_WAY_WIDTH = 4.5, 2.8
-"""Least width, m, of a two-way and of a one-way aisle."""
 
 
 def outline_draft(
-    path: Path,
+    name: str,
     elements: Sequence[OsmElement],
     roads: Sequence[Road],
     frame: LocalFrame,
@@ -41,8 +35,8 @@ def outline_draft(
     """Draft a lot from the outlines of its spaces; `parkenv.lots.infer.layout` has the rules.
 
     Args:
-        path: the file, for messages.
-        elements: all elements of it.
+        name: the lot's name.
+        elements: all elements of the map.
         roads: roads open to cars, in the lot's frame.
         frame: the lot's frame.
         options: goals, entries and bounds given by the user.
@@ -51,50 +45,30 @@ def outline_draft(
         InputError: an outline that is open, crosses itself or lies on another, an area that is no space's, too many
             spaces, spaces of which no lot can be made, or nothing left of them.
     """
-    try:
-        return _draft(path.stem, elements, roads, frame, options)
-    except InputError as error:
-        text = str(error)
-        raise InputError(text if text.startswith(f"{path}: ") else f"{path}: {text}") from error
-
-
-def _draft(
-    name: str,
-    elements: Sequence[OsmElement],
-    roads: Sequence[Road],
-    frame: LocalFrame,
-    options: ImportOptions,
-) -> LotDraft:
-    drawn = [e for e in elements if e.tags.get("amenity") == "parking_space" and not e.is_node]
-    refuse_number(len(drawn))
-    box = options.box(frame)
-    areas = [area for e in drawn if (area := _area(e, frame)) is not None and _is_within(area.polygon, box)]
+    drawn = [e for e in elements if is_space(e)]
+    if len(drawn) > MOST_SPACES:
+        raise InputError(
+            f"{len(drawn):,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds"
+        )
+    areas = within([Area.of(e, frame, simple=True) for e in drawn], options.box(frame))
     _refuse_swapped(areas)
     validate_areas(
         [a.element.id for a in areas], shapely.area(np.array([a.polygon for a in areas], dtype=object))
     )
-    buildings = _shapes(elements, frame, lambda e: e.tags.get("building", "no") != "no")
-    parking = _shapes(elements, frame, lambda e: e.tags.get("amenity") == "parking")
-    private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
-
+    buildings, parking = (
+        [a for a in areas_of(elements, frame, wanted, mended=True) if shapely.area(a.polygon)]
+        for wanted in (is_building, is_parking_area)
+    )
+    kept, unused = usable_spaces(areas, parking, with_disabled=options.with_disabled)
     left_out: dict[str, list[str]] = {}
-    ids: list[str] = []
-    polygons: list[shapely.Geometry] = []
-    unused: list[shapely.Geometry] = []
-    for area in areas:
-        reason = why_no_slot(area.element.tags, area.polygon, private, with_disabled=options.with_disabled)
-        if reason is not None:
-            left_out.setdefault(reason, []).append(area.element.id)
-            unused.append(area.polygon)
-            continue
-        count = whole_number(area.element.tags.get("capacity")) or 1
-        parts = split_space(area.polygon, count, [])
-        ids += [area.element.id] if count == 1 else [f"{area.element.id}-{k + 1}" for k in range(count)]
-        polygons += parts
-    if not polygons:
-        raise InputError(f"no parking space for cars: {_listed(left_out)}")
+    for area, reason in unused:
+        left_out.setdefault(reason, []).append(area.element.id)
+    if not kept:
+        listed = "; ".join(str(LeftOut(reason, tuple(members))) for reason, members in left_out.items())
+        raise InputError(f"no parking space for cars: {listed}")
+    ids, polygons = zip(*(part for a in kept for part in split_space(a.element, a.polygon, [])), strict=True)
     spaces = spaces_from_outlines(ids, np.array(polygons, dtype=object))
-    obstacles = [*(a.polygon for a in buildings), *unused]
+    obstacles = [*(a.polygon for a in buildings), *(a.polygon for a, _ in unused)]
     entries, goals = (points_in_frame(frame, given) for given in (options.entries, options.goals))
     lines = [Line(road.points, road.oneway, STREET if road.rank is Rank.STREET else -1) for road in roads]
     lot = infer_lot(spaces, obstacles, lines, entries)
@@ -112,36 +86,9 @@ def _draft(
         frame=frame,
         goals=goals,
         goal_note=goal_note or "",
-        walls=_exterior_rings(buildings),
-        outlines=_exterior_rings(parking),
+        walls=exterior_rings(a.polygon for a in buildings),
+        outlines=exterior_rings(a.polygon for a in parking),
     )
-
-
-def _exterior_rings(areas: Sequence[Area]) -> list[FloatArray]:
-    return [
-        shapely.get_coordinates(shapely.get_exterior_ring(part))
-        for area in areas
-        for part in shapely.get_parts(area.polygon)
-    ]
-
-
-def refuse_number(count: int) -> None:
-    """Raise an error for more spaces than one lot may have."""
-    if count > MOST_SPACES:
-        raise InputError(
-            f"{count:,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds"
-        )
-
-
-def _area(element: OsmElement, frame: LocalFrame) -> Area | None:
-    """Return an element with its outline; None for a relation without an area."""
-    if not element.is_closed:
-        raise InputError(f"{element.id}: its outline is open, want its first position again at the end")
-    polygon = shapely.Polygon(frame.to_xy(element.lines[0]))
-    if not polygon.is_valid:
-        reason = shapely.is_valid_reason(polygon).split("[")[0]
-        raise InputError(f"{element.id}: its outline is not a simple one: {reason}")
-    return Area(element, polygon)
 
 
 def _refuse_swapped(areas: Sequence[Area]) -> None:
@@ -181,26 +128,3 @@ def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
             one, other = np.diff(corners[:3], axis=0)
             skew.append(abs(float(one @ other)) / float(np.hypot(*one) * np.hypot(*other)))
     return float(np.mean(fits)) if fits else 0.0, float(np.median(skew)) if skew else 0.0
-
-
-def _shapes(elements: Sequence[OsmElement], frame: LocalFrame, wanted: object) -> list[Area]:
-    """Return the areas of elements, mended where they cross themselves."""
-    found = []
-    for element in elements:
-        if element.is_node or not element.is_closed or not wanted(element):  # type: ignore[operator]
-            continue
-        parts = [shapely.make_valid(shapely.Polygon(frame.to_xy(line))) for line in element.lines]
-        holes = [shapely.make_valid(shapely.Polygon(frame.to_xy(line))) for line in element.holes]
-        shape = shapely.union_all(parts).difference(shapely.union_all(holes))
-        polygons = [p for p in shapely.get_parts(shape) if p.geom_type == "Polygon" and p.area > 0.0]
-        if polygons:
-            found.append(Area(element, shapely.union_all(polygons)))
-    return found
-
-
-def _is_within(polygon: shapely.Geometry, box: tuple[float, float, float, float] | None) -> bool:
-    return box is None or bool(shapely.contains(shapely.box(*box), shapely.point_on_surface(polygon)))
-
-
-def _listed(left_out: dict[str, list[str]]) -> str:
-    return "; ".join(str(LeftOut(reason, tuple(members))) for reason, members in left_out.items())

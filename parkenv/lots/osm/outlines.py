@@ -15,13 +15,11 @@ from parkenv.lots.osm.rows import (
     DRAWN,
     Arrangement,
     Side,
-    boxes_of,
     row_anchors,
     row_at,
     without_overlaps,
 )
 from parkenv.world.drive_graph import SLOT_REACH
-from parkenv.world.lot import mouth_heading, mouth_points
 
 OUTLINE_TOLERANCE = 0.4  # largest overhang, m, of a slot beyond the outline: the accuracy of mapped outlines
 PHASES = (0.0, 0.25, 0.5, 0.75)
@@ -80,7 +78,7 @@ def fill_outline(
                 rows.append(max(tries, key=len))
     rows.sort(key=len, reverse=True)
     slots = Slots.joined(rows)
-    slots = slots[without_overlaps(boxes_of(slots, shrink=0.02))]
+    slots = slots[without_overlaps(slots.boxes(shrink=0.02))]
     return slots if capacity is None else slots[:capacity]
 
 
@@ -117,9 +115,9 @@ def _fitting(
     """Return the slots that are inside the outline, clear of everything else, and open to their own road."""
     if not len(slots):
         return slots
-    boxes = boxes_of(slots, shrink=0.02)
+    boxes = slots.boxes(shrink=0.02)
     fits = shapely.covers(roomy, boxes) & ~shapely.intersects(taken, boxes)
-    mouth = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    mouth = slots.mouths()
     distance = shapely.distance(np.asarray(shapely.points(mouth))[:, None], lines[None])
     fits &= distance[:, own] <= np.minimum(distance.min(axis=1) + 1e-6, SLOT_REACH)
     # The nearest point of a road that ends or bends may be behind the mouth.
@@ -128,6 +126,5 @@ def _fitting(
             lines[own], shapely.line_locate_point(lines[own], shapely.points(mouth))
         )
     )
-    heading = mouth_heading(slots.yaw, slots.mouth)
-    ahead = ((on_line - mouth) * np.stack([np.cos(heading), np.sin(heading)], axis=1)).sum(axis=1) > 0.0
+    ahead = ((on_line - mouth) * slots.outward()).sum(axis=1) > 0.0
     return slots[np.flatnonzero(fits & ahead)]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import BAY_SIZE, KERB_SIZE, Slots
-from parkenv.world.lot import Mouth, corner_points
+from parkenv.world.lot import Mouth
 
 Side = Literal["left", "right"]
 
@@ -103,14 +103,6 @@ def bend_factor(points: FloatArray, start: float, end: float, side: Side, reach:
     beside = np.diff(anchors.xy + reach * anchors.outward, axis=0)
     length = float(np.hypot(beside[:, 0], beside[:, 1]).sum())
     return max(1.0, (end - start) * (n - 1) / n / max(length, 0.1))
-
-
-def boxes_of(slots: Slots, shrink: float = 0.0) -> NDArray[np.object_]:
-    """Return the slots' rectangles, (n,) polygons, m, narrower and shorter by `shrink` m."""
-    if not len(slots):
-        return np.empty(0, dtype=np.object_)
-    corners = corner_points(slots.xy, slots.yaw, slots.length - shrink, slots.width - shrink)
-    return np.asarray(shapely.polygons(corners))
 
 
 def without_overlaps(boxes: NDArray[np.object_]) -> NDArray[np.bool_]:

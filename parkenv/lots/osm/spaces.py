@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import shapely
 
+from parkenv.lots.osm.buildings import Area
+from parkenv.lots.osm.elements import OsmElement
 from parkenv.lots.osm.roads import closed_to_cars, off_the_ground, whole_number
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.lot import Lane
@@ -17,21 +19,40 @@ LARGEST_SPACE = 30.0
 """Largest area of a slot, m²; a larger space without a capacity counts as several and is left out."""
 
 
-def why_no_slot(
+def is_space(element: OsmElement) -> bool:
+    """Whether an element is a mapped parking space."""
+    return element.tags.get("amenity") == "parking_space" and not element.is_node
+
+
+def is_parking_area(element: OsmElement) -> bool:
+    """Whether an element is a parking area as a whole."""
+    return element.tags.get("amenity") == "parking"
+
+
+def usable_spaces(
+    spaces: Sequence[Area], parking: Sequence[Area], *, with_disabled: bool
+) -> tuple[list[Area], list[tuple[Area, str]]]:
+    """Return the spaces that are slots, and the others with the reasons.
+
+    Args:
+        spaces: the mapped spaces.
+        parking: the parking areas; spaces in private ones are not slots.
+        with_disabled: whether spaces for disabled drivers are slots.
+    """
+    private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
+    reasons = [_why_no_slot(a.element.tags, a.polygon, private, with_disabled=with_disabled) for a in spaces]
+    judged = list(zip(spaces, reasons, strict=True))
+    return [a for a, why in judged if why is None], [(a, why) for a, why in judged if why is not None]
+
+
+def _why_no_slot(
     tags: Mapping[str, str],
     polygon: shapely.Geometry,
     private: Sequence[shapely.Geometry],
     *,
     with_disabled: bool,
 ) -> str | None:
-    """Return the reason why a mapped space is not a slot; None for a slot.
-
-    Args:
-        tags: tags of the space.
-        polygon: its outline, m.
-        private: outlines of parking areas closed to the public, m.
-        with_disabled: whether spaces for disabled drivers are slots.
-    """
+    """Return the reason why a mapped space is not a slot; None for a slot."""
     kind = tags.get("parking_space", "normal")
     is_disabled = (
         kind == "disabled"
@@ -53,10 +74,16 @@ def why_no_slot(
     return None
 
 
-def split_space(polygon: shapely.Geometry, count: int, lanes: Sequence[Lane]) -> list[shapely.Geometry]:
-    """Split a space into `count` equal ones, side by side along its lane, or along its longer side without lanes."""
+def split_space(
+    element: OsmElement, polygon: shapely.Geometry, lanes: Sequence[Lane]
+) -> list[tuple[str, shapely.Geometry]]:
+    """Split a space into as many equal ones as its capacity, and name them.
+
+    They are side by side along the lane nearest to the space, or along its longer side without lanes.
+    """
+    count = whole_number(element.tags.get("capacity")) or 1
     if count == 1:
-        return [polygon]
+        return [(element.id, polygon)]
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(polygon))[:4]
     one, other = corners[1] - corners[0], corners[3] - corners[0]
     along = nearest_on_lanes(lanes, corners.mean(axis=0)[None])[1][0]
@@ -66,4 +93,7 @@ def split_space(polygon: shapely.Geometry, count: int, lanes: Sequence[Lane]) ->
     if share[1] > share[0]:
         one, other = other, one
     starts = corners[0] + np.arange(count)[:, None] / count * one
-    return [shapely.Polygon([p, p + one / count, p + one / count + other, p + other]) for p in starts]
+    return [
+        (f"{element.id}-{k}", shapely.Polygon([p, p + one / count, p + one / count + other, p + other]))
+        for k, p in enumerate(starts, start=1)
+    ]

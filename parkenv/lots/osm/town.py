@@ -8,15 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 from parkenv.lots.draft import ImportOptions, LotDraft
 from parkenv.lots.osm.draft import draft_of_elements, map_frame
-from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.osm.files import read_map
+from parkenv.lots.osm.elements import OsmElement, read_map
+from parkenv.lots.osm.spaces import is_space
+from parkenv.world.drive_graph import component_labels
 
 SAME_CAR_PARK = 22.0
 """Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles."""
@@ -49,59 +48,55 @@ def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPA
     """
     path = Path(path)
     elements = read_map(path)
-    for name, part in split_town(path, elements, least):
-        count = sum(_is_space(e) for e in part)
+    with naming(path):
+        parts = list(split_town(path.stem, elements, least))
+    for name, part in parts:
+        count = sum(map(is_space, part))
         try:
-            draft = draft_of_elements(Path(name), part, options)
+            draft = draft_of_elements(name, part, options)
             draft.lot()
         except InputError as error:
-            yield CarPark(name, count, None, str(error).removeprefix(f"{name}: "))
+            yield CarPark(name, count, None, str(error))
         else:
             yield CarPark(name, count, draft)
 
 
 def split_town(
-    path: Path, elements: Sequence[OsmElement], least: int
+    name: str, elements: Sequence[OsmElement], least: int
 ) -> Iterator[tuple[str, list[OsmElement]]]:
     """Yield the name and the elements of each group of at least `least` spaces, the largest first.
 
     Raises:
         InputError: no parking spaces, or too many.
     """
-    spaces = [e for e in elements if _is_space(e)]
+    spaces = [e for e in elements if is_space(e)]
     if not spaces:
-        raise InputError(f"{path}: no amenity=parking_space in it, want their outlines to find car parks")
+        raise InputError("no amenity=parking_space in it, want their outlines to find car parks")
     if len(spaces) > MOST_IN_TOWN:
-        raise InputError(f"{path}: {len(spaces):,} parking spaces, want at most {MOST_IN_TOWN:,} in one file")
-    frame = map_frame(path, spaces)
+        raise InputError(f"{len(spaces):,} parking spaces, want at most {MOST_IN_TOWN:,} in one file")
+    frame = map_frame(spaces)
     shapes = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in spaces], dtype=object)
-    one, other = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=SAME_CAR_PARK)
-    _, label = connected_components(
-        coo_array((np.ones(len(one), dtype=bool), (one, other)), shape=(len(spaces),) * 2), directed=False
-    )
+    near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=SAME_CAR_PARK)
+    label = component_labels(near.T, len(spaces))
     size = np.bincount(label)
     first = np.array([int(np.flatnonzero(label == k)[0]) for k in range(len(size))])
     chosen = [k for k in np.lexsort((first, -size)).tolist() if size[k] >= least]
     if not chosen:
         raise InputError(
-            f"{path}: {len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"
+            f"{len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"
         )
-    others = [e for e in elements if not _is_space(e)]
+    others = [e for e in elements if not is_space(e)]
     around = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in others], dtype=object)
     tree = shapely.STRtree(around)
     digits = len(str(len(chosen)))
     for number, k in enumerate(chosen, start=1):
         members = np.flatnonzero(label == k)
         ground = shapely.union_all(shapes[members])
-        near: list[int] = np.sort(tree.query(ground, predicate="dwithin", distance=AROUND)).tolist()
+        around_it: list[int] = np.sort(tree.query(ground, predicate="dwithin", distance=AROUND)).tolist()
         yield (
-            f"{path.stem}-{number:0{digits}d}",
-            [spaces[i] for i in members.tolist()] + [others[i] for i in near],
+            f"{name}-{number:0{digits}d}",
+            [spaces[i] for i in members.tolist()] + [others[i] for i in around_it],
         )
-
-
-def _is_space(element: OsmElement) -> bool:
-    return element.tags.get("amenity") == "parking_space" and not element.is_node
 
 
 def _hull(element: OsmElement, xy: FloatArray) -> shapely.Geometry:
