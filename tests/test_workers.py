@@ -2,6 +2,7 @@
 
 import json
 import os
+import subprocess
 import sys
 import time
 from functools import partial
@@ -62,6 +63,22 @@ def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend
     again = sum(Path(f"{marker}.{k}").read_text().count("run") for k in range(12)) - 12
     # loky breaks up the pool when a worker dies, so that the one beside it starts its task over, too.
     assert again <= (3 if backend == "loky" else 0)
+
+
+@pytest.mark.parametrize("backend", ["loky", pytest.param("dask", marks=pytest.mark.slow)])
+def test_nothing_in_the_working_folder_runs_in_place_of_pythons_own(tmp_path, backend):
+    of(backend)
+    for name in ("pickle", "socket", "cloudpickle", "queue"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})")
+    code = (
+        "from parkenv.studies.workers import Workers\n"
+        "if __name__ == '__main__':\n"
+        f"    with Workers(2, {backend!r}) as workers:\n"
+        "        print(sorted(workers.results([int, float])))"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], cwd=tmp_path, capture_output=True, text=True)
+    assert done.stdout == "[(0, 0), (1, 0.0)]\n", done.stderr
+    assert not (tmp_path / "ran").exists()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")

@@ -77,6 +77,7 @@ class Workers:
 
     def __enter__(self) -> Self:
         with ExitStack() as opened:
+            opened.enter_context(_safe_path())
             if self.address is not None:
                 _require_listener(self.address)
             if self.backend != "loky":
@@ -263,6 +264,23 @@ def _end_with(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(1.0)
     os._exit(1)
+
+
+@contextmanager
+def _safe_path() -> Iterator[None]:
+    """Keep processes that start in the block from taking modules of the working folder in place of Python's own.
+
+    Workers get this process's path once they run, with the folders of users' classes.
+    """
+    before = os.environ.get("PYTHONSAFEPATH")
+    os.environ["PYTHONSAFEPATH"] = "1"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ["PYTHONSAFEPATH"]
+        else:
+            os.environ["PYTHONSAFEPATH"] = before
 
 
 @contextmanager
