@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, Union
+from typing import Any, NamedTuple, Protocol, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from parkenv import __version__
 from parkenv.errors import InputError, nearest
@@ -16,6 +16,7 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.show.report.page import Page, page_data, write_page
 from parkenv.show.report.tables import tables_of
+from parkenv.studies.fingerprints import require_unchanged
 from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL
 from parkenv.studies.study import STUDIES, Progress, Study, read_study, study_class
 from parkenv.studies.workers import SERIAL, Task, Workers
@@ -95,59 +96,13 @@ class Replay(Protocol):
         """
 
 
-Number = float | None
-# A row holds rows. The oldest pydantic wants the name before the class.
-Cell = Union[Number, bool, str, list[Union[Number, "SummaryRow"]], "SummaryRow"]
-
-
-class SummaryRow(Spec, extra="allow"):
-    """A row of a table: numbers, texts, lists of numbers, and rows in rows."""
-
-    __pydantic_extra__: dict[str, Cell]
-
-    scenario: str = ""
-    agent: str = ""
-    seed: int = Field(0, ge=0, le=10**15)
-    total_s: Number = None
-
-    @model_validator(mode="after")
-    def _intervals(self) -> Self:
-        for name, value in (self.model_extra or {}).items():
-            if name.endswith("_ci95"):
-                if not (isinstance(value, list) and len(value) == 2) or any(
-                    isinstance(v, Spec) for v in value
-                ):
-                    raise ValueError(f"{name} to be the two ends of an interval")
-            elif isinstance(value, list) and None in value:
-                raise ValueError(f"{name} to hold no null")
-        return self
-
-
-SummaryRow.model_rebuild()
-
-
-class _CurveRow(SummaryRow):
-    steps: Any
-
-
-_Curves = Several[_CurveRow] | dict[str, Several[_CurveRow]]
-
-
 class Summary(Spec, extra="allow"):
     """Content of `summary.json`, of any kind of run."""
 
     command: Several[str] = Field(min_length=2)
     version: str
-    seed: int | None = None
-    rows: Several[SummaryRow]
-    transfer: Several[SummaryRow] = ()
-    planners: Several[SummaryRow] = ()
-    weeks: Several[SummaryRow] = ()
-    occupancy_rows: Several[SummaryRow] = ()
-    survey: SummaryRow | None = None
-    curve: _Curves = ()
-    evaluated: dict[str, Number] = Field(default_factory=dict)
-    beside: dict[str, _Curves] = Field(default_factory=dict)
+    seed: int | None = Field(None, ge=0, le=10**15)
+    rows: Several[dict[str, Any]]
 
 
 @dataclass(frozen=True)
@@ -195,11 +150,12 @@ class RunFolder:
             )
         spec = path / SPEC_FILE
         kind = str((spec.exists() and read_tables(spec).get("kind")) or summary["command"][1])
-        if kind not in STUDIES:
-            page = Page(f"parkenv {kind}", tables=tables_of(summary, {"rows": "Results"}))
-            return cls(path, summary, kind, page)
         try:
-            return cls(path, summary, kind, study_class(kind).page(summary, path))
+            if kind in STUDIES:
+                page = study_class(kind).page(summary, path)
+            else:
+                page = Page(f"parkenv {kind}", tables=tables_of(summary, {"rows": "Results"}))
+            return cls(path, summary, kind, page)
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
@@ -257,7 +213,9 @@ def write_report(
     make_folder(path.parent)
     said, replays = [*notes], list[Replay]()
     try:
-        replays += study.replays(run.path) if study is not None else ()
+        if study is not None:
+            require_unchanged(study, run.path)
+            replays += study.replays(run.path)
     except (InputError, OSError) as error:
         # The page still has tables and figures.
         said.append(f"There is no replay: {error}")

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -25,7 +25,6 @@ from parkenv.files.csv_tables import (
     csv_text,
     typed_records,
     wholes,
-    write_csv,
 )
 from parkenv.files.limited_reading import parse_json, read_json, read_text
 from parkenv.show.columns import SETTING_AXES
@@ -106,12 +105,18 @@ class Table(ABC):
         """
 
     @abstractmethod
+    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
+        """Yield the name of each file with its text of some rows, below a header if wanted and if it has one."""
+
     def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
         """Append rows to the file in a folder, and flush them to disk; see `append_text`."""
+        for file, text in self.texts(rows):
+            append_text(folder / file, text, sync=sync)
 
-    @abstractmethod
     def write(self, folder: Path, rows: Sequence[Row]) -> None:
         """Replace the rows of the file in a folder, atomically."""
+        for file, text in self.texts(rows, header=True):
+            _write_text(folder / file, text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,33 +154,15 @@ class CsvTable(Table):
 
         return [row for _, row in typed_records(path, kind_of, columns, whole_lines=True)]
 
-    def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
-        """See `Table`."""
-        for file, columns, some in self._files(rows):
-            append_text(folder / file, csv_text(columns, some), sync=sync)
-
-    def write(self, folder: Path, rows: Sequence[Row]) -> None:
-        """See `Table`."""
-        for file, columns, some in self._files(rows):
-            write_csv(folder / file, columns, some)
-
-    def _files(self, rows: Sequence[Row]) -> list[tuple[str, Sequence[str], list[Row]]]:
-        """Return each file with its columns and rows.
-
-        Timings come first: a finished row would not run again for its timing.
-        """
-        files: list[tuple[str, Sequence[str]]] = [(self.file, (*self.keys, *self.columns))]
+    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
+        """See `Table`; timings come first: a finished row would not run again for its timing."""
         if self.timings is not None:
-            files.insert(0, (self.timings, (*self.keys, DECISIONS)))
-        timed = [row for row in rows if row.get(DECISIONS)]
-        return [
-            (
-                file,
-                columns,
-                [{c: row.get(c) for c in columns} for row in (rows if file == self.file else timed)],
-            )
-            for file, columns in files
-        ]
+            timed = [row for row in rows if row.get(DECISIONS)]
+            yield self.timings, self._text((*self.keys, DECISIONS), timed, header)
+        yield self.file, self._text((*self.keys, *self.columns), rows, header)
+
+    def _text(self, columns: Sequence[str], rows: Sequence[Row], header: bool) -> str:
+        return csv_text(columns, [{c: row.get(c) for c in columns} for row in rows], header=header)
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,17 +198,10 @@ class JsonTable(Table):
                 raise InputError(f"{path}: line {number}: {line!r:.40} is not a valid {self.what}") from error
         return rows
 
-    def append(self, folder: Path, rows: Sequence[Row], *, sync: bool = True) -> None:
+    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
         """See `Table`."""
-        append_text(folder / self.file, _json_lines(rows), sync=sync)
-
-    def write(self, folder: Path, rows: Sequence[Row]) -> None:
-        """See `Table`."""
-        _write_text(folder / self.file, _json_lines(rows))
-
-
-def _json_lines(rows: Iterable[Row]) -> str:
-    return "".join(json.dumps(row) + "\n" for row in rows)
+        del header
+        yield self.file, "".join(json.dumps(row) + "\n" for row in rows)
 
 
 EPISODES = CsvTable()

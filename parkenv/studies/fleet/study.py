@@ -359,8 +359,6 @@ class FleetStudy(Study):
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
-        from parkenv.studies.fingerprints import require_unchanged
         from parkenv.studies.fleet.day_replay import FleetReplay
 
-        require_unchanged(self, folder)
         return [FleetReplay(self, folder)]
