@@ -169,3 +169,23 @@ def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[Scena
         repeated = [name for i, name in enumerate(names) if name in names[:i]]
         if repeated:
             raise PydanticCustomError("whole", f"{what} has {{name}} twice", {"name": repr(repeated[0])})
+
+
+def require_at_most(count: int, what: str, unit: str, most: int = MAX_EPISODES) -> None:
+    """Check the size of a study.
+
+    Raises:
+        PydanticCustomError: it is too large.
+    """
+    if count > most:
+        raise PydanticCustomError("whole", f"{what} is {count} {unit}, want at most {most}")
+
+
+def require_rig(rig: str | None, detector: str | None) -> None:
+    """Check that a detector has images.
+
+    Raises:
+        PydanticCustomError: there is a detector and no rig.
+    """
+    if detector is not None and rig is None:
+        raise PydanticCustomError("whole", "detector requires a rig, such as laser")

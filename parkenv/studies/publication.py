@@ -23,10 +23,9 @@ from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.frame_recorder import FrameRecorder
 from parkenv.studies.results import Row
 from parkenv.studies.runner import run
-from parkenv.studies.simulate import make_search, simulate
+from parkenv.studies.simulate import FrameRecorder, make_search, simulate
 from parkenv.studies.training.spec import FleetTrainingSpec, TrainingSpec
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.studies.workers import Workers

@@ -8,7 +8,6 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import BeforeValidator, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
 from parkenv.files.known_names import MapName
@@ -17,12 +16,12 @@ from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import (
-    MAX_EPISODES,
     Agents,
     Figures,
     Scenarios,
     Seed,
     listed,
+    require_at_most,
     require_distinct_names,
 )
 from parkenv.studies.results import OUTCOME_COLUMNS, CsvTable, Key, Results, Row
@@ -92,12 +91,8 @@ class Commute(Study):
     def _bounded(self) -> Self:
         require_distinct_names(self.agents, self.scenarios)
         count = len(self.agents) * len(self.scenarios) * (len(self.maps) + 1)
-        if (count := count * self.days * self.drivers * self.fleet) > MAX_EPISODES:
-            raise PydanticCustomError(
-                "whole",
-                "agents x scenarios x maps x days x drivers is {count} searches, want at most {most}",
-                {"count": count, "most": MAX_EPISODES},
-            )
+        count *= self.days * self.drivers * self.fleet
+        require_at_most(count, "agents x scenarios x maps x days x drivers", "searches")
         return self
 
     @cached_property

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
 from parkenv.files.option import Option, numbers_in
@@ -28,7 +27,9 @@ from parkenv.studies.fields import (
     Scenarios,
     Seed,
     Values,
+    require_at_most,
     require_distinct_names,
+    require_rig,
 )
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell, Study
@@ -161,14 +162,8 @@ class Comparison(CaseStudy):
     @model_validator(mode="after")
     def _bounded(self) -> Self:
         require_distinct_names(self.agents, self.scenarios)
-        if self.detector is not None and self.rig is None:
-            raise PydanticCustomError("whole", "detector requires a rig, such as laser")
-        if (count := self.episode_count) > MAX_EPISODES:
-            raise PydanticCustomError(
-                "whole",
-                "agents x scenarios x grid x episodes is {count} searches, want at most {most}",
-                {"count": count, "most": MAX_EPISODES},
-            )
+        require_rig(self.rig, self.detector)
+        require_at_most(self.episode_count, "agents x scenarios x grid x episodes", "searches")
         return self
 
     @property

@@ -23,7 +23,7 @@ from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog
-    from parkenv.mapping.survey import SessionResult
+    from parkenv.mapping.survey import SessionResult, SurveySettings
     from parkenv.show.report.page import Page
     from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
@@ -38,6 +38,7 @@ QUICK = {"sessions": 2, "episodes": 2, "every": 4.0}
 """Settings of a shorter demo."""
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
+_ONE_CAPTURE_M = 1e6  # between captures, of a short survey
 _APART = 1_000_000  # offset between the seeds of survey and searches, so that their worlds differ
 
 
@@ -99,10 +100,8 @@ class Demo(CaseStudy):
         }
 
     def warm_up(self) -> list[Task[object]]:
-        """See `Study`."""
-        from parkenv.studies.demo.warm_up import warm_up_tasks
-
-        return [*warm_up_tasks(self.survey.drive_settings, AGENTS)]
+        """See `Study`: two tasks that share few functions, a short survey and searches without sensors."""
+        return [partial(_short_survey, self.survey.drive_settings), _short_searches]
 
     def prepare(self, results: Results, *, continues: bool) -> None:
         """See `Study`."""
@@ -187,6 +186,26 @@ class Demo(CaseStudy):
         from parkenv.studies.compare.search_replay import SearchReplay
 
         return [SearchReplay(self.cases_in(folder), folder), *self.survey.replays(folder)]
+
+
+def _short_survey(settings: SurveySettings) -> None:
+    from parkenv.mapping.survey import Survey
+
+    Survey(_small_scenario(), replace(settings, every=_ONE_CAPTURE_M, weather="sunny")).drive(0)
+
+
+def _short_searches() -> None:
+    from parkenv.studies.compare.cases import Case
+
+    for name in AGENTS:
+        Case(_small_scenario(), name).run([0])
+
+
+def _small_scenario() -> Scenario:
+    from parkenv.scenarios.build import make_scenario
+    from parkenv.world.traffic import Traffic
+
+    return make_scenario("mini", traffic=Traffic(cars=2, pedestrians=2))
 
 
 def _draw_map(scenario: Scenario, log: SessionLog, sessions: int, path: Path) -> None:

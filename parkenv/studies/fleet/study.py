@@ -19,7 +19,6 @@ from parkenv.files.spec_file import Axis, FilePath
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
-    MAX_EPISODES,
     Agents,
     ArrivalRate,
     Figures,
@@ -28,6 +27,7 @@ from parkenv.studies.fields import (
     Stay,
     Values,
     listed,
+    require_at_most,
     require_distinct_names,
     seconds_of_minutes,
 )
@@ -160,18 +160,9 @@ class FleetStudy(Study):
                 "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
             )
         settings = len(self.agents) * len(self.knows) * len(self.shares) * len(self.arrivals_per_hour)
-        if settings > MAX_SETTINGS:
-            raise PydanticCustomError(
-                "whole",
-                "agents x knows x shares x arrivals_per_hour is {count} settings, want at most {most}",
-                {"count": settings, "most": MAX_SETTINGS},
-            )
-        if (count := settings * self.days) > MAX_EPISODES:
-            raise PydanticCustomError(
-                "whole",
-                "agents x knows x shares x arrivals_per_hour x days is {count} days, want at most {most}",
-                {"count": count, "most": MAX_EPISODES},
-            )
+        axes = "agents x knows x shares x arrivals_per_hour"
+        require_at_most(settings, axes, "settings", MAX_SETTINGS)
+        require_at_most(settings * self.days, f"{axes} x days", "days")
         return self
 
     @cached_property

@@ -8,14 +8,13 @@ from functools import cached_property, partial
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.files.option import Option
 from parkenv.scenarios.spec import Speed, scenario_spec
 from parkenv.studies.agent_spec import AgentItem, AgentSpec, split_agents
-from parkenv.studies.fields import Detector, OneScenario, Rig, Seed
+from parkenv.studies.fields import Detector, OneScenario, Rig, Seed, require_rig
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
@@ -92,8 +91,7 @@ class CalibrationStudy(Study):
 
     @model_validator(mode="after")
     def _seen(self) -> Self:
-        if self.detector is not None and self.rig is None:
-            raise PydanticCustomError("whole", "detector requires a rig, such as laser")
+        require_rig(self.rig, self.detector)
         return self
 
     @cached_property

@@ -16,8 +16,7 @@ from parkenv.driving.drive_state import DriveState
 from parkenv.driving.vehicle import STEERING, YAW
 from parkenv.envs.drive import DriveEnv
 from parkenv.files.csv_tables import write_csv
-from parkenv.studies.frame_recorder import FrameRecorder
-from parkenv.studies.simulate import Observer, Step, simulate
+from parkenv.studies.simulate import FrameRecorder, Observer, Step, simulate
 from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
