@@ -97,10 +97,6 @@ class SearchTraining(RLTraining):
     @cached_property
     def sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
         """Scenarios to train in, and places to evaluate in and not to train in."""
-        return self.build_sides()
-
-    def build_sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
-        """Build `sides` from the specification."""
         given = [build(scenario) for scenario in self.scenarios]
         if self.spec.held_out is not None:
             sides = split_places(given, self.spec.held_out, suite_lots())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -56,15 +56,9 @@ class Row:
 
     def columns(self) -> dict[str, Any]:
         """Return the row of `summary.json`."""
-        return {
-            "case": self.case,
-            "expected": self.expected,
-            "found": self.found,
-            "found_ci95": list(self.found_ci95),
-            "interval": list(self.interval),
-            "agrees": self.agrees,
-            "source": self.source,
-        }
+        columns = asdict(self) | {"agrees": self.agrees}
+        del columns["tolerance"]
+        return columns
 
 
 Task = Callable[[], list[Row]]

@@ -61,9 +61,10 @@ class NetworkTraining(SearchTraining):
 
     spec: NetworkTrainingSpec  # type: ignore[assignment]  # it is evaluated as a search agent, and learns otherwise
 
-    def build_sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
-        """Build the given places, and made ones to train in."""
-        learned, held_out = super().build_sides() if self.scenarios else ([], [])
+    @cached_property
+    def sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
+        """See `SearchTraining`: the given places, and made ones to train in."""
+        learned, held_out = super().sides if self.scenarios else ([], [])
         return [*learned, *made_places()], held_out
 
     @cached_property
