@@ -20,12 +20,20 @@ from parkenv.driving.vehicle import (
     X,
     Y,
     advance,
-    drive,
     move_along,
 )
 
 CAR = VehicleParameters()
 commands = st.lists(st.tuples(st.floats(-1.0, 1.0), st.floats(-1.0, 1.0)), min_size=1, max_size=60)
+
+
+def drive(car, state, acceleration, steering, steps=1):
+    """The states under a constant command, one a step."""
+    states = [np.array(state, dtype=float)]
+    for _ in range(steps):
+        states.append(states[-1].copy())
+        advance(states[-1], acceleration, steering, car.limits)
+    return np.array(states)
 
 
 def driven(pairs, start=None):

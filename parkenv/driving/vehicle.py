@@ -186,28 +186,3 @@ def advance(state: FloatArray, acceleration: float, steering: float, limits: Flo
     curvature = math.tan(state[STEERING]) / wheelbase
     state[X], state[Y], state[YAW] = move_along(state[X], state[Y], state[YAW], curvature, way)
     return float(way)
-
-
-def drive(
-    vehicle: VehicleParameters, state: FloatArray, acceleration: float, steering: float, steps: int = 1
-) -> FloatArray:
-    """Simulate a car under a constant command; return the states, (steps + 1, 6) float64.
-
-    Args:
-        vehicle: the car.
-        state: (6,) float64, the start; not changed.
-        acceleration: fraction of the limit, -1 to 1.
-        steering: fraction of the largest angle, -1 to 1.
-        steps: number of physics steps.
-
-    Examples:
-        >>> path = drive(VehicleParameters(), np.zeros(6), 1.0, 0.0, steps=40)
-        >>> round(float(path[-1, X]), 1), round(float(path[-1, SPEED]), 1)
-        (3.8, 3.9)
-    """
-    states = np.empty((steps + 1, STATE_SIZE))
-    states[0] = state
-    for k in range(steps):
-        states[k + 1] = states[k]
-        advance(states[k + 1], acceleration, steering, vehicle.limits)
-    return states

@@ -24,6 +24,7 @@ STEREO_RANGE = 12.0
 _NEAREST = 1.0  # m, the shortest depth that the matcher searches
 _BAND = (0.35, 1.1)  # m above ground: bumpers and doors, below the windows
 _LEAST_PIXELS = 6
+_COLUMNS = 2  # of an image that share a direction
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ def scan_from_laser(
 
 
 def scan_from_stereo(
-    stereo: StereoCamera, mount: Mount, vehicle: FloatArray, disparity_px: Float32Array, columns: int = 2
+    stereo: StereoCamera, mount: Mount, vehicle: FloatArray, disparity_px: Float32Array
 ) -> RangeScan:
     """Find the nearest obstacle at bumper height in every few columns of a disparity image.
 
@@ -89,13 +90,12 @@ def scan_from_stereo(
         mount: pose of its left camera on the vehicle; without pitch.
         vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
         disparity_px: (h, w) float32, px, NaN where nothing matches; see `disparity`.
-        columns: number of image columns that share a direction.
     """
     camera = stereo.camera
     x, y, yaw = mount.in_world(vehicle)
     depth = _column_depths(
         disparity_px,
-        columns,
+        _COLUMNS,
         camera.fx * stereo.baseline,
         camera.fy,
         camera.cy,
@@ -103,21 +103,20 @@ def scan_from_stereo(
         *_BAND,
         STEREO_RANGE,
     )
-    middle = columns * (np.arange(len(depth)) + 0.5) - camera.cx
+    middle = _COLUMNS * (np.arange(len(depth)) + 0.5) - camera.cx
     aside = np.arctan2(middle, camera.fx)
     distance = depth / np.cos(aside)
     return RangeScan(x, y, (yaw - aside)[::-1], distance[::-1], STEREO_RANGE)
 
 
-def disparity(pair: StereoFrame, stereo: StereoCamera, nearest: float = _NEAREST) -> Float32Array:
+def disparity(pair: StereoFrame, stereo: StereoCamera) -> Float32Array:
     """Compute the disparity, (h, w) float32 px, by OpenCV's semi-global matching; NaN where it finds no match.
 
     Args:
         pair: rectified images.
         stereo: the camera.
-        nearest: m, shortest depth searched.
     """
-    most = 16 * math.ceil(stereo.camera.fx * stereo.baseline / nearest / 16)
+    most = 16 * math.ceil(stereo.camera.fx * stereo.baseline / _NEAREST / 16)
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=most,

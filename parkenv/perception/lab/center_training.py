@@ -134,7 +134,6 @@ def train_centers(
     scenes: Sequence[SimulatedScene],
     settings: CenterTrainingSettings,
     progress: Progress = lambda _: None,
-    on_network: Callable[[CenterNetwork, int], None] = lambda _network, _step: None,
 ) -> CenterNetwork:
     """Train the network; equal arguments give equal weights on one machine.
 
@@ -142,7 +141,6 @@ def train_centers(
         scenes: the simulated pictures.
         settings: the parameters.
         progress: called with one line now and then.
-        on_network: called with the averaged network and the number of steps, now and then.
     """
     torch.manual_seed(settings.seed)
     maker = ExampleMaker(scenes, np.random.default_rng([settings.seed, 1]), settings.textures)
@@ -175,9 +173,6 @@ def train_centers(
             progress(
                 f"step {step + 1} of {settings.steps}, {time.monotonic() - begun:.0f} s: losses {loss_text}"
             )
-        if (step + 1) % 500 == 0:
-            averaged.eval()
-            on_network(averaged, step + 1)
     averaged.eval()
     return averaged
 

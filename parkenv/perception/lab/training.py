@@ -22,6 +22,7 @@ Progress = Callable[[str], None]
 
 CAR_OVERLAP = 0.25
 _LEAST = 20
+_PER_IMAGE = 5  # largest number of hard negatives from one image per round
 _FOLDS = 5
 _NO_CARS = np.empty((0, 4))
 
@@ -36,17 +37,14 @@ class TrainingSettings:
     shift: float = 0.015  # largest shift of a copy, as a fraction of the window
     resize: float = 0.025  # largest change of a copy's size, as a fraction
     misaligned: int = 2  # number of misaligned crops of each positive that become negatives
-    per_image: int = 5  # largest number of hard negatives from one image per round
     enlarged: float = (
         2.0  # without photographs, crops enlarged so much take their place in the mining; 0: none do
     )
-    positives_weight: float = 1.0  # weight of a positive relative to a negative
     seed: int = 0  # seed of the jitter and the solver
 
     def __post_init__(self) -> None:
-        for name in ("penalty", "positives_weight"):
-            require_number(name, getattr(self, name), above=0.0)
-        for name in ("rounds", "jitter", "misaligned", "per_image", "seed"):
+        require_number("penalty", self.penalty, above=0.0)
+        for name in ("rounds", "jitter", "misaligned", "seed"):
             require_whole(name, getattr(self, name))
         if not (self.enlarged == 0.0 or 1.0 <= self.enlarged <= 8.0):
             raise InputError(f"enlarged is {self.enlarged}, want 0 or 1 to 8")
@@ -121,7 +119,7 @@ def train(
         model = _fitted(model, yes, no, settings)
         if round_number == settings.rounds:
             break
-        hard = mined(model, images[round_number :: settings.rounds], settings.per_image)
+        hard = mined(model, images[round_number :: settings.rounds])
         if not len(hard):
             progress(f"round {round_number}: no false positives are left")
             break
@@ -152,7 +150,7 @@ def _enlarged(
     return others
 
 
-def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> Float32Array:
+def mined(model: CarModel, images: Sequence[LabelledImage]) -> Float32Array:
     """Mine hard negatives: descriptors, (n, size), of the false positives with the highest scores in each image.
 
     Windows that overlap a labelled car by more than `CAR_OVERLAP` are skipped.
@@ -167,10 +165,10 @@ def mined(model: CarModel, images: Sequence[LabelledImage], per_image: int) -> F
             (model,), least_height=max(8.0, 0.8 * least), scale_step=1.15, threshold=0.4, margin=0.1
         )
         seen = scan.scan(model, image)
-        seen = seen.select(np.argsort(-seen.score, kind="stable")[: 40 * per_image])
+        seen = seen.select(np.argsort(-seen.score, kind="stable")[: 40 * _PER_IMAGE])
         for car in labelled.boxes:
             seen = seen.select(overlaps(car, seen.boxes) <= CAR_OVERLAP)
-        seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:per_image])
+        seen = seen.select(best_boxes(seen.regions, seen.score, 0.6)[:_PER_IMAGE])
         cuts = [_cut(image, (r[0], r[1]), (r[2], r[3]), size) for r in seen.regions.tolist()]
         found += [window.describe(cut)[None] for cut in cuts]
     return np.concatenate(found)
@@ -188,7 +186,6 @@ def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tup
     machine = LinearSVC(
         C=settings.penalty,
         loss="hinge",
-        class_weight={1: settings.positives_weight, 0: 1.0},
         random_state=settings.seed,
         max_iter=3_000,
         tol=1e-3,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from importlib import import_module
 from importlib.util import find_spec
@@ -42,21 +42,18 @@ LONG_S = 2.0  # solvers that take longer are timed only once, s
 EPSILON = 0.01  # tolerance of the values of iterative peers, s
 
 
-def planning_rows(
-    seed: int = 0, seconds: float = 0.6, *, lot: ParkingLot | None = None, largest: int = SIZES[-1]
-) -> list[BenchRow]:
+def planning_rows(seed: int = 0, seconds: float = 0.6, *, largest: int = SIZES[-1]) -> list[BenchRow]:
     """Return the rows of `parkenv bench planning`, on one core.
 
     Args:
         seed: seed of the cities and of the observations.
         seconds: duration of each measurement.
-        lot: lot for replanning; None for the packaged campus.
         largest: number of slots of the largest city.
     """
     sizes = [n for n in SIZES if n <= largest]
     return [
         *solving_rows(sizes, seed, seconds),
-        *repair_rows(lot or packaged_lot("campus"), seed, seconds),
+        *repair_rows(packaged_lot("campus"), seed, seconds),
         *city_rows_apart(min(CITY, largest), seed),
     ]
 
@@ -136,20 +133,17 @@ def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
             raise
 
 
-def city_rows(
-    n_slots: int, seed: int, agents: Sequence[str] = ("mdp", "mdp-tuned", "belief")
-) -> list[BenchRow]:
+def city_rows(n_slots: int, seed: int) -> list[BenchRow]:
     """Measure searches in a city: an agent's time for the first and for later decisions, and peak memory.
 
     Args:
         n_slots: number of slots of the city.
         seed: seed of the city and of the worlds.
-        agents: names of the agents.
     """
     scenario = make_scenario(city_lot(n_slots, seed))
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     rows: list[BenchRow] = []
-    for name in agents:
+    for name in ("mdp", "mdp-tuned", "belief"):
         first, decisions = [], []
         agent = make_agent(name, scenario)
         for episode in range(CITY_SEARCHES):

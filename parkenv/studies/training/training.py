@@ -76,7 +76,6 @@ class Training(ABC):
 
     Args:
         spec: specification of the training.
-        command: command line, for the model's card.
     """
 
     heading: ClassVar[str]
@@ -85,11 +84,13 @@ class Training(ABC):
     """Columns of a test beside its name that have a column each in the table of tests."""
     evaluated_by: ClassVar[tuple[str, ...]]
     """Settings that evaluations depend on: curves are comparable if these are equal."""
+    command: tuple[str, ...] = ()
+    """Command line, for the model's card."""
     shared: Any = None
     """What the trainings with all seeds share; made by `begin`."""
 
-    def __init__(self, spec: TrainingSpec, command: tuple[str, ...] = ()) -> None:
-        self.spec, self.command = spec, command
+    def __init__(self, spec: TrainingSpec) -> None:
+        self.spec = spec
         self.algorithm = spec.algorithm
         self.scenarios = spec.scenarios or ()
         self.evaluation_episodes = spec.evaluation_episodes
@@ -304,10 +305,10 @@ def use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def training_of(spec: TrainingSpec, command: tuple[str, ...] = ()) -> Training:
+def training_of(spec: TrainingSpec) -> Training:
     """Return the training of a specification."""
     module, _, name = spec.trained_by.partition(":")
-    made: Training = getattr(import_module(f"parkenv.studies.training.{module}"), name)(spec, command)
+    made: Training = getattr(import_module(f"parkenv.studies.training.{module}"), name)(spec)
     return made
 
 

@@ -73,7 +73,7 @@ def certain_row(case: str, expected: float, found: float, source: str, tolerance
     return Row(case, float(expected), found, (found, found), interval, tolerance, source)
 
 
-def mean_row(case: str, expected: float, samples: ArrayLike, source: str, tolerance: float = 0.0) -> Row:
+def mean_row(case: str, expected: float, samples: ArrayLike, source: str) -> Row:
     """Return the row of a simulated case from independent samples, (n,) numbers, n >= 2, of the expected mean.
 
     Intervals are Student's t; rows use means of hundreds of numbers, or of runs that are means themselves.
@@ -84,8 +84,7 @@ def mean_row(case: str, expected: float, samples: ArrayLike, source: str, tolera
     for confidence in (0.95, CONFIDENCE):
         half = float(stats.t.ppf(0.5 + confidence / 2.0, len(values) - 1)) * error
         ends.append((mean - half, mean + half))
-    low, high = ends[1]
-    return Row(case, float(expected), mean, ends[0], (low - tolerance, high + tolerance), tolerance, source)
+    return Row(case, float(expected), mean, ends[0], ends[1], 0.0, source)
 
 
 def disagreeing(rows: Sequence[Row]) -> list[Row]:

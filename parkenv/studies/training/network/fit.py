@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -78,7 +76,6 @@ def fit(
     learning_rate: float,
     seed: int,
     pairs_weight: float = 1.0,
-    status: Callable[[float], None] | None = None,
 ) -> dict[str, float]:
     """Fit a network in place.
 
@@ -94,7 +91,6 @@ def fit(
         learning_rate: learning rate at the beginning; it falls to a twentieth along a cosine.
         seed: seed of the batches.
         pairs_weight: weight of the pairs in the loss.
-        status: called with the share that is done.
 
     Returns:
         Mean losses of the last tenth, by name.
@@ -139,8 +135,6 @@ def fit(
         if step >= 0.9 * steps:
             for name, part in parts.items():
                 last[name].append(part)
-        if status is not None:
-            status((step + 1) / steps)
     return {name: float(np.mean(its)) for name, its in last.items() if its}
 
 
