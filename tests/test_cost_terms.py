@@ -11,7 +11,8 @@ from small_lots import features
 from parkenv import ParkingLot, lot_v0, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import CAR, N_TERMS, SEARCH
-from parkenv.envs.sb3 import FleetVecEnv, SearchVecEnv
+from parkenv.envs.fleet_vector import FleetVectorEnv
+from parkenv.envs.sb3 import BatchVecEnv, SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import OUTCOME_COLUMNS
@@ -106,7 +107,8 @@ def test_the_batch(scenario):
 @pytest.mark.parametrize("of_many", [False, True])
 def test_stable_baselines3(scenario, of_many):
     if of_many:
-        venv = FleetVecEnv(4, scenario, Demand(PoissonArrivals(30, 8 * 3600, 9 * 3600)), max_steps=LIMIT)
+        demand = Demand(PoissonArrivals(30, 8 * 3600, 9 * 3600))
+        venv = BatchVecEnv(FleetVectorEnv(4, scenario, demand, max_steps=LIMIT))
     else:
         venv = SearchVecEnv(4, scenario, max_episode_steps=LIMIT)
     venv.seed(0)

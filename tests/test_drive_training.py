@@ -18,6 +18,7 @@ from parkenv.cli import app
 from parkenv.driving.collision_world import CollisionWorld
 from parkenv.driving.vehicle import SPEED, STATE_SIZE, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
+from parkenv.envs.sb3 import BatchVecEnv
 from parkenv.errors import InputError
 from parkenv.lots import packaged_lot
 from parkenv.show.figures.learning_curves import COLORS, save_success_curves
@@ -244,7 +245,7 @@ def test_a_decision_asks_for_a_speed_and_gets_it(asked, reached):
 
 
 def training_env(algorithm, n=4, lots=(MINI, STREET), levels=None):
-    return DriveTrainingEnv(n, slot_groups(lots), DRIVE_CONFIGS[algorithm], levels)
+    return BatchVecEnv(DriveTrainingEnv(n, slot_groups(lots), DRIVE_CONFIGS[algorithm], levels))
 
 
 def test_places_are_the_kinds_of_slots_that_there_are():
@@ -278,15 +279,15 @@ def test_equal_seeds_give_equal_episodes_and_report_their_ends():
 def test_a_level_is_mastered_by_parking_and_by_nothing_else():
     env = training_env("ppo")
     for _ in range(RECENT_DRIVES):
-        env._record_outcome("parallel", 0, True)
-        env._record_outcome("perpendicular", 5, True)  # of another level
-    assert env.levels == {"perpendicular": 0, "parallel": 1}
+        env.batch._record_outcome("parallel", 0, True)
+        env.batch._record_outcome("perpendicular", 5, True)  # of another level
+    assert env.batch.levels == {"perpendicular": 0, "parallel": 1}
     for k in range(3 * RECENT_DRIVES):
-        env._record_outcome("parallel", 1, k % 100 < 100 * MASTERED - 1)
-    assert env.levels["parallel"] == 1
+        env.batch._record_outcome("parallel", 1, k % 100 < 100 * MASTERED - 1)
+    assert env.batch.levels["parallel"] == 1
     for _ in range(RECENT_DRIVES * 20):
-        env._record_outcome("parallel", env.levels["parallel"], True)
-    assert env.levels["parallel"] == len(DRIVE_CONFIGS["ppo"].curriculum) - 1
+        env.batch._record_outcome("parallel", env.batch.levels["parallel"], True)
+    assert env.batch.levels["parallel"] == len(DRIVE_CONFIGS["ppo"].curriculum) - 1
 
 
 def test_levels_make_tasks_harder():
@@ -323,11 +324,11 @@ def test_drives_on_the_way_in_begin_as_far_from_its_end_as_the_level_says():
     env = training_env("ppo", 64, lots=(STREET,), levels={"parallel": level})
     env.seed(1)
     env.reset()
-    ways = [task.path for task in env._made[env._groups["parallel"][0], level].values()]
+    ways = [task.path for task in env.batch._made[env.batch._groups["parallel"][0], level].values()]
     low, high = curriculum[level].distance
     checked = 0
-    for i in np.flatnonzero([at == ("parallel", level) for at in env._at]):
-        pose = env.batch.state[i, :3]
+    for i in np.flatnonzero([at == ("parallel", level) for at in env.batch._at]):
+        pose = env.batch.batch.state[i, :3]
         left = [np.flatnonzero((way == pose).all(axis=1)) for way in ways]
         (index,) = np.concatenate(left)
         assert low - 0.06 <= 0.1 * index <= high + 0.06
@@ -358,7 +359,7 @@ def test_the_kind_that_lags_is_drawn_most():
     env = training_env("ppo", 400, levels={"perpendicular": last, "parallel": last - 3})
     env.seed(0)
     env.reset()
-    parallel = sum(kind == "parallel" for kind, _ in env._at)
+    parallel = sum(kind == "parallel" for kind, _ in env.batch._at)
     assert 0.72 < parallel / 400 < 0.88, "four times as often"
 
 

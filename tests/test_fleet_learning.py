@@ -16,7 +16,8 @@ from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.network import NetworkPolicy
 from parkenv.engine.records import SEARCHING
-from parkenv.envs.sb3 import FleetVecEnv, ShareNetwork, layers_of, network_policy
+from parkenv.envs.fleet_vector import FleetVectorEnv, layers_of, network_policy
+from parkenv.envs.sb3 import BatchVecEnv, ShareNetwork
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import MixedFleet, policy_of
@@ -30,8 +31,9 @@ DEMAND = Demand(PoissonArrivals(60.0, 8 * 3600, 8.5 * 3600), ExponentialTime(480
 LEARNERS = (DriverKind(),)
 
 
-def batch(n=3, drivers=LEARNERS, **options):
-    return FleetVecEnv(n, MINI, DEMAND, drivers, leave_full_lot=False, **options)
+def batch(n=3, drivers=LEARNERS, reward_scale=1.0, **options):
+    worlds = FleetVectorEnv(n, MINI, DEMAND, drivers, leave_full_lot=False, **options)
+    return BatchVecEnv(worlds, reward_scale)
 
 
 def small(algorithm, venv, **options):
@@ -52,8 +54,8 @@ def test_every_episode_is_the_search_of_one_car_from_its_arrival_to_its_end():
     for _ in range(3000):
         assert (observed["local"][fresh, 3] == 0.0).all(), "a search begins at time 0"
         assert (observed["local"][~fresh, 3] > 0.0).all()
-        for i, fleet in enumerate(venv.fleets):
-            car = fleet.cars[venv._cars[i]]
+        for i, fleet in enumerate(venv.batch.fleets):
+            car = fleet.cars[venv.batch._cars[i]]
             assert car["state"] == SEARCHING
             assert car["policy"] == 0
         observed, rewards, done, infos = venv.step(random_actions(venv.action_masks(), rng))
@@ -66,23 +68,25 @@ def test_every_episode_is_the_search_of_one_car_from_its_arrival_to_its_end():
             returns[i], lengths[i] = 0.0, 0
         fresh = done
     assert ends > 100
-    assert (venv._days > 0).all(), "day after day"
+    assert (venv.batch._days > 0).all(), "day after day"
 
 
 def test_the_other_cars_choose_as_the_learning_one_does():
     """A world driven through the batch equals one in which all cars follow the same policy."""
     venv = batch(1)
     model = small(MaskablePPO, venv, n_steps=8, batch_size=8)
-    venv.follow(model.policy)
-    venv.network.sampled = False
-    venv.network.set_layers(*layers_of(model.policy)[:1])
+    venv.batch.follow(model.policy)
+    venv.batch.network.sampled = False
+    venv.batch.network.set_layers(*layers_of(model.policy)[:1])
     venv.seed(1)
     venv.reset()
-    venv._begin_day(0)
-    venv._advance(np.zeros(1, np.int64))
+    venv.batch._begin_day(0)
+    venv.batch._advance(np.zeros(1, np.int64))
     ended = []
-    while venv._days[0] == 0:
-        actions, _ = model.predict(venv._observations(), action_masks=venv.action_masks(), deterministic=True)
+    while venv.batch._days[0] == 0:
+        actions, _ = model.predict(
+            venv.batch._observations(), action_masks=venv.action_masks(), deterministic=True
+        )
         _, _, done, infos = venv.step(actions)
         ended += [info["total_s"] for info in infos if done[0]]
     fleet = Fleet(
@@ -165,9 +169,9 @@ def test_stable_baselines3_learns_with_others_in_the_same_fleet(algorithm):
     kinds = [DriverKind(0.5), DriverKind(0.5, POLICIES["greedy-drive"])]
     venv = batch(4, kinds, reward_scale=0.01)
     model = small(algorithm, venv, n_steps=32, batch_size=64)
-    before = [weights.copy() for weights, _ in venv.network.layers]
+    before = [weights.copy() for weights, _ in venv.batch.network.layers]
     model.learn(256, callback=ShareNetwork())
-    assert [w.shape for w, _ in venv.network.layers] == [(16, 91), (8, 16), (5, 8)]
+    assert [w.shape for w, _ in venv.batch.network.layers] == [(16, 91), (8, 16), (5, 8)]
     assert len(before) == 1, "until then one layer of zeros: all actions alike"
     mean, _ = evaluate_policy(model, venv, n_eval_episodes=8, warn=False)
     assert mean < 0.0

@@ -11,7 +11,7 @@ from small_trainings import (
 )
 
 from parkenv import make_scenario
-from parkenv.envs.sb3 import FleetVecEnv
+from parkenv.envs.fleet_vector import FleetVectorEnv
 from parkenv.lots import grid_lot, packaged_lot
 from parkenv.studies.fleet.drivers import MixedFleet
 from parkenv.studies.training.configs import SEARCH_CONFIGS
@@ -62,15 +62,15 @@ def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
 def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):
     training = fleet_training(MixedFleet(PLACES[0], DEMAND))
     whole = training.train(0, tmp_path / "whole")
-    steps, step_wait = iter(range(1_000)), FleetVecEnv.step_wait
+    steps, step = iter(range(1_000)), FleetVectorEnv.step
 
-    def stops(self):
+    def stops(self, actions):
         if next(steps) == 200:
             raise KeyboardInterrupt
-        return step_wait(self)
+        return step(self, actions)
 
     with monkeypatch.context() as patched:
-        patched.setattr(FleetVecEnv, "step_wait", stops)
+        patched.setattr(FleetVectorEnv, "step", stops)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, tmp_path / "broken")
     assert len(read_curve(tmp_path / "broken" / "curve.csv")) > 1

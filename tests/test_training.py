@@ -381,7 +381,7 @@ AVERAGES = ("parameters", "policy.optimizer", "state", 0)
         (("numbers", "num_timesteps"), "x", "invalid literal"),
         (("curve", 0, "total_s"), None, "has no column 'total_s'"),
         (("env", "lengths"), torch.zeros(3, 3), "environment: lengths is torch.float32"),
-        (("env", "searches"), {}, "environment: searches is a dict, want a tuple"),
+        (("env", "batch"), {}, "environment: batch is a dict, want a tuple"),
         (("last", "_last_obs"), None, "last observation: _last_obs is a NoneType"),
         (("parameters", "policy", "value_net.bias"), torch.tensor([math.nan]), "a weight is no number"),
         ((*AVERAGES, "exp_avg"), torch.zeros(3), "averages are of other weights"),

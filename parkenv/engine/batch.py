@@ -106,8 +106,8 @@ class Observer(ABC):
         """
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
-        """Return a copy of everything that changes, for `set_state`."""
-        return self.searches.save()
+        """Return a copy of everything that changes as arrays of numbers, for `set_state`."""
+        return tuple(array.view(np.uint8) if array.dtype.names else array for array in self.searches.save())
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
         """Continue from a state that `get_state` returned for the same scenarios."""

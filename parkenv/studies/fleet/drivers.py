@@ -53,7 +53,7 @@ def policy_of(
                 f"agent {spec.label!r} observes laser scans, which the cars of a fleet do not have"
             )
         if agent.card.algorithm not in _WITHOUT_NETWORK_POLICY:
-            from parkenv.envs.sb3 import network_policy
+            from parkenv.envs.fleet_vector import network_policy
 
             sampled = agent.card.algorithm != "dqn"
             return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None

@@ -11,7 +11,8 @@ import numpy as np
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.engine.fleet import DriverKind
-from parkenv.envs.sb3 import FleetVecEnv, network_policy
+from parkenv.envs.fleet_vector import FleetVectorEnv, network_policy
+from parkenv.envs.sb3 import BatchVecEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
 from parkenv.show.plurals import plural
@@ -91,24 +92,24 @@ class FleetTraining(RLTraining):
         """Mean total time, s, its 95 % interval over days, fraction of cars that parked, search time, s."""
         return ("total_s", "low_s", "high_s", "parked_fraction", "search_s")
 
-    def make_env(self) -> FleetVecEnv:
+    def make_env(self) -> BatchVecEnv:
         """Make the worlds."""
         fleet = self.fleet
         kinds = [DriverKind(fleet.share, None, fleet.knows, shares=fleet.knows == "shared")]
         if fleet.among is not None:
             kinds.append(DriverKind(1.0 - fleet.share, policy_of(fleet.among, fleet.scenario)[0]))
-        return FleetVecEnv(
-            self.config.n_envs, fleet.scenario, fleet.demand, kinds, REWARD_SCALE, self.spec.k, fleet.max_steps,
-            leave_full_lot=False,
+        worlds = FleetVectorEnv(
+            self.config.n_envs, fleet.scenario, fleet.demand, kinds, self.spec.k, fleet.max_steps, leave_full_lot=False
         )  # fmt: skip
+        return BatchVecEnv(worlds, REWARD_SCALE)
 
     def connect(self, model: Any) -> None:
         """Let the other cars of the worlds follow the model's policy."""
-        model.env.follow(model.policy)
+        model.env.batch.follow(model.policy)
 
     def before_rollout(self, model: Any) -> None:
         """Hand the current weights to the other cars."""
-        model.env.follow(model.policy)
+        model.env.batch.follow(model.policy)
 
     def before_checkpoint(self, model: Any) -> None:
         """Begin all worlds anew: a checkpoint then needs no more than the numbers of their days."""

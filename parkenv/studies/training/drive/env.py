@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import ArrayLike, NDArray
 from stable_baselines3.common.buffers import DictReplayBufferSamples
 from stable_baselines3.her.her_replay_buffer import HerReplayBuffer
@@ -19,7 +20,6 @@ from parkenv.driving.parking_task import KINDS, ParkingTask, ParkingTasks
 from parkenv.driving.vehicle import SPEED, VehicleParameters
 from parkenv.envs.drive import CONTROL_S
 from parkenv.envs.drive_goals import STANDING, goal_errors
-from parkenv.envs.sb3 import SharedVecEnv
 from parkenv.errors import InputError
 from parkenv.studies.training.configs import WAY_IN, DriveTrainingConfig
 from parkenv.studies.training.drive.batch import CONTACT, PARKED, RUNNING, DriveBatch, PreparedTask
@@ -89,7 +89,7 @@ def planned_path(task: ParkingTask) -> FloatArray:
     return way
 
 
-class DriveTrainingEnv(SharedVecEnv):
+class DriveTrainingEnv(VectorEnv[Observations, FloatArray, NDArray[Any]]):
     """A batch of drives with the decisions of `planners.driving.policy_interface` and a curriculum.
 
     Each kind of slot has its own level, which starts at the first. A level is mastered when a fraction `MASTERED` of
@@ -110,6 +110,8 @@ class DriveTrainingEnv(SharedVecEnv):
     Raises:
         InputError: no groups, or an unknown level.
     """
+
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.SAME_STEP}  # noqa: RUF012 - Gymnasium declares it so
 
     def __init__(
         self,
@@ -145,15 +147,11 @@ class DriveTrainingEnv(SharedVecEnv):
             "achieved_goal": goal,
             "desired_goal": goal,
         }
-        super().__init__(num_envs, spaces.Dict(shown), spaces.Box(-1.0, 1.0, (2,), np.float32))
+        self.num_envs, self.single_observation_space = num_envs, spaces.Dict(shown)
+        self.single_action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self._rng = np.random.default_rng(0)
         self._at = [("", 0)] * num_envs
-        self._stood = np.zeros(num_envs, dtype=np.int64)
-
-    def seed(self, seed: int | None = None) -> list[int | None]:
-        """Seed the drawing of tasks."""
-        self._rng = np.random.default_rng(seed)
-        return [seed] * self.num_envs
+        self._stood, self._decisions = np.zeros((2, num_envs), dtype=np.int64)
 
     def get_state(self) -> dict[str, Any]:
         """Return the drives under way, the levels and the drawn tasks as plain values, for `set_state`."""
@@ -164,57 +162,59 @@ class DriveTrainingEnv(SharedVecEnv):
             "seeds": list(self._seeds_of.values()),
             "at": self._at,
             "stood": self._stood,
-            "returns": self._returns,
-            "lengths": self._lengths,
+            "decisions": self._decisions,
             "batch": self.batch.get_state(),
         }
 
     def set_state(self, state: Mapping[str, Any]) -> None:
         """Continue from a state that `get_state` returned for the same groups and config."""
-        self._start_all()
         self._rng.bit_generator.state = state["rng"]
         self.levels = dict(state["levels"])
         for kind, outcomes in self._recent.items():
             outcomes.extend(state["recent"][kind])
         self._seeds_of = dict(zip(self._seeds_of, map(list, state["seeds"]), strict=True))
-        self._at, self._stood = list(state["at"]), state["stood"]
-        self._returns, self._lengths = state["returns"], state["lengths"]
+        self._at, self._stood, self._decisions = list(state["at"]), state["stood"], state["decisions"]
         self.batch.set_state(state["batch"])
 
-    def reset(self) -> Observations:
-        """Start a new episode in every drive; keep the levels."""
+    def reset(
+        self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, Any]]:
+        """Start a new episode in every drive; keep the levels. The first seed is that of the drawing of tasks."""
+        del options
+        if seed is not None:
+            self._rng = np.random.default_rng(seed if isinstance(seed, int) else seed[0])
         for i in range(self.num_envs):
             self._start_episode(i)
-        self._start_all()
-        return self.batch.observation()
+        return self.batch.observation(), {}
 
-    def step_wait(self) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
-        """Step all drives. At the end of a drive, `info` has the keys of `Monitor`, `is_success` and `contact`."""
+    def step(
+        self, actions: FloatArray
+    ) -> tuple[Observations, NDArray[np.float32], NDArray[np.bool_], NDArray[np.bool_], dict[str, Any]]:
+        """Step all drives; `info["final_info"]` has `is_success` and `contact` of those that have ended."""
         batch = self.batch
-        batch.drive(np.asarray(self.actions, dtype=np.float32))
+        batch.drive(np.asarray(actions, dtype=np.float32))
         observations = batch.observation()
         failed = batch.status >= CONTACT
+        parked = batch.status == PARKED
         if self.config.reward == "sparse":
-            rewards = self._sparse(batch.status == PARKED, failed)
+            rewards = self._sparse(parked, failed)
         else:
             rewards = self._scaled(batch.took + batch.approach, failed)
-        self._count(rewards)
+        self._decisions += 1
         self._stood = np.where(np.abs(batch.state[:, SPEED]) <= STANDING, self._stood + 1, 0)
         over = batch.status != RUNNING
-        done = over | (self._lengths >= MOST_DECISIONS) | (self._stood >= STANDSTILL_DECISIONS)
-        parked = batch.status == PARKED
-
-        def final(i: int) -> tuple[dict[str, Any], dict[str, Any]]:
-            last = {name: values[i].copy() for name, values in observations.items()}
-            return last, {"is_success": bool(parked[i]), "contact": bool(failed[i])}
-
-        infos = self._end_episodes(done, ~over, final)
+        truncated = ~over & ((self._decisions >= MOST_DECISIONS) | (self._stood >= STANDSTILL_DECISIONS))
+        done = over | truncated
+        info: dict[str, Any] = {"final_info": {"is_success": parked, "contact": failed}}
+        info["final_info"] |= {"_is_success": done, "_contact": done}
+        info["final_obs"] = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done).tolist():
+            info["final_obs"][i] = {name: values[i].copy() for name, values in observations.items()}
             self._record_outcome(*self._at[i], bool(parked[i]))
             self._start_episode(i)
         for name, values in batch.observation(np.flatnonzero(done)).items():
             observations[name][done] = values
-        return observations, rewards, done, infos
+        return observations, rewards, over, truncated, info
 
     def compute_reward(
         self, achieved_goal: ArrayLike, desired_goal: ArrayLike, info: Any
@@ -263,7 +263,7 @@ class DriveTrainingEnv(SharedVecEnv):
             pose = path[min(round(left / _STEP_M), len(path) - 1)]
         self.batch.start(i, task, pose)
         self._at[i] = kind, level
-        self._stood[i] = 0
+        self._stood[i] = self._decisions[i] = 0
 
     def _draw_task(self, group: SlotGroup, level: int) -> CurriculumTask:
         key, rng = (group, level), self._rng

@@ -15,6 +15,7 @@ from scipy.stats import binomtest
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.compiled.keyed_random import world_key
+from parkenv.envs.sb3 import BatchVecEnv
 from parkenv.scenarios.build import build
 from parkenv.show.figures.learning_curves import save_success_curves
 from parkenv.studies.agent_spec import AgentSpec
@@ -102,9 +103,9 @@ class DriveTraining(RLTraining):
         of_kind = ("success", "low", "high", "contacts", "time_s", "level")
         return ("success", "time_s", *(f"{kind}_{name}" for kind in self.kinds for name in of_kind))
 
-    def make_env(self) -> DriveTrainingEnv:
+    def make_env(self) -> BatchVecEnv:
         """Make a batch of drives, at the first level of the curriculum."""
-        return DriveTrainingEnv(self.config.n_envs, self.groups, self.config)
+        return BatchVecEnv(DriveTrainingEnv(self.config.n_envs, self.groups, self.config))
 
     def evaluate(self, policy: Any, env: VecEnv) -> Row:
         """Evaluate a policy on the held-out tasks.
