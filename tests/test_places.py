@@ -372,27 +372,6 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
             SearchTraining(SearchTrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--held-out", "0"], "held_out is 0.0, want a number above 0"),
-        (["--held-out", "0.5", "--evaluate-on", "mini"], "at most one of held_out, evaluate_on"),
-        (
-            ["--held-out", "0.2", "--env", "drive"],
-            "held_out goes with env search or algorithm network, not",
-        ),
-        (["--curriculum", "age"], "--curriculum: 'age' is not one of"),
-        (["--evaluate-on", "nowhere"], "unknown scenario 'nowhere'"),
-    ],
-)
-def test_bad_options_of_held_out_places_are_one_line(tmp_path, options, message):
-    done = parkenv("train", "ppo", "--scenario", "campus,street,jam", *options, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert message in done.stderr
-    assert done.stderr.count("\n") == 1
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.slow
 def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
     monkeypatch.setattr("parkenv.studies.training.search.clone", partial(clone, updates=50))
