@@ -14,8 +14,8 @@ from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
 from parkenv.mapping.store import VERSION, MapStore
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
+from parkenv.studies.episodes import TripRecorder
 from parkenv.studies.simulate import simulate
-from parkenv.studies.trip_recorder import TripRecorder
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival, Forecast
 from parkenv.world.scenario import SearchProblem

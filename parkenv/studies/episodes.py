@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.engine.state import SearchState
+from parkenv.mapping.trips import Trip
 from parkenv.show.search_record import Moment, SearchRecord
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
 from parkenv.world.scenario import Scenario
@@ -23,41 +25,66 @@ class SearchRecorder(Observer):
 
     Args:
         agent: the agent, whose plans are recorded if it has `plan_preview`; None to record none.
-        keeps: whether each moment is kept, instead of the first plan alone.
+        keep: called with the arrival and each step; None to record the first plan alone.
 
     Attributes:
         policy: plan of the first decision, (n_vertices,) int64; None for agents without a policy.
-        moments: the arrival and each step, if they are kept.
     """
 
-    def __init__(self, agent: Agent | None = None, *, keeps: bool = True) -> None:
-        self._preview_of, self._keeps = getattr(agent, "plan_preview", None), keeps
+    def __init__(self, agent: Agent | None = None, keep: Callable[[Moment], None] | None = None) -> None:
+        self._preview_of, self._keep = getattr(agent, "plan_preview", None), keep
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
         """Record the arrival."""
         del observation
         self._env: Any = env.unwrapped
         self.policy: NDArray[np.int64] | None = None
-        self.moments: list[Moment] = []
         self._decided = False
-        if self._keeps:
-            self._add()
+        self._record()
 
     def on_step(self, step: Step) -> None:
         """Record the decision, the plan that led to it, and the next state."""
         if not self._decided:
             self.policy = getattr(step.memory, "policy", None)
         self._decided = True
-        if self._keeps:
+        self._record(step)
+
+    def _record(self, step: Step | None = None) -> None:
+        if self._keep is None:
+            return
+        state, perception = self._env.state, getattr(self._env, "perception", None)
+        moment = Moment(state.time, state.vertex, state.belief)
+        if perception is not None:
+            moment = moment._replace(captures=perception.results)
+        if step is not None:
             action = int(step.action)
             preview = self._preview_of and self._preview_of(step.observation, action, step.memory)
-            self._add(action, tuple(preview.path) if preview else (), step.info)
+            plan = tuple(preview.path) if preview else ()
+            moment = moment._replace(action=action, plan=plan, info=step.info)
+        self._keep(moment)
 
-    def _add(self, *step: Any) -> None:
-        state, perception = self._env.state, getattr(self._env, "perception", None)
-        captures = () if perception is None else perception.results
-        moment = Moment(state.time, state.vertex, state.belief, *step)
-        self.moments.append(moment._replace(captures=captures))
+
+class TripRecorder(Observer):
+    """Collects the observations of one search, for a map that learns from it.
+
+    Attributes:
+        observations: those of each step.
+    """
+
+    def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:
+        """Begin a trip."""
+        del env, observation
+        self.observations: list[Observations] = []
+
+    def on_step(self, step: Step) -> None:
+        """Add what the step observed."""
+        self.observations.append(SlotBelief.of_observation(step.next_observation).observations)
+
+    def trip(self, key: str, time: float, date: str) -> Trip:
+        """Return the recorded trip; the arguments are those of `Trip`."""
+        return Trip(
+            key, time, date, *(np.concatenate(parts) for parts in zip(*self.observations, strict=True))
+        )
 
 
 class EpisodeRunner:
@@ -65,7 +92,7 @@ class EpisodeRunner:
 
     Args:
         scenario: the scenario, with the costs and speeds of the setting.
-        name: name of the agent, for the trace.
+        name: name of the agent, for the record.
         agent: the agent.
         rig: sensor rig of the car; None for the scenario's sensor model; see `make_search`.
         detector, every: detector and distance between captures, m, for `parkenv/SearchPerception-v2`; None for its own.
@@ -102,7 +129,8 @@ class EpisodeRunner:
             observers: further observers.
             moments: whether the record holds each step.
         """
-        recorder = SearchRecorder(self.agent, keeps=moments)
+        kept: list[Moment] = []
+        recorder = SearchRecorder(self.agent, kept.append if moments else None)
         result = simulate(self.env, self.agent, seed, (recorder, *observers))
         metrics = {
             name: value for name, value in result.info.items() if name not in ("reward_terms", "place")
@@ -122,7 +150,7 @@ class EpisodeRunner:
             truncated=result.truncated,
             bound_s=self._bound_s(),
             decision_s=result.decision_s,
-            moments=recorder.moments,
+            moments=kept,
         )
 
     @property

@@ -20,9 +20,8 @@ from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap,
 from parkenv.mapping.trips import Trip
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.commute.tables import FIXED, NONE
-from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.episodes import EpisodeRunner, TripRecorder
 from parkenv.studies.results import Row, timed_row
-from parkenv.studies.trip_recorder import TripRecorder
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import PriorModel
 from parkenv.world.scenario import Scenario

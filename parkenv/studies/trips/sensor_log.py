@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
@@ -118,6 +118,15 @@ class SensorLog:
             else rr.Clear(recursive=False),
         )
         self._n_captures += 1
+
+    def moment(self, moment: Moment) -> None:
+        """Record the arrival or a step of a search: the captures on the way, and the belief."""
+        if not moment.info:
+            self.begin()
+            self._arrival = moment.time
+        for result in moment.captures:
+            self.capture(result.captured.time - self._arrival, result)
+        self.slots(moment.belief.p_occupied.astype(np.float64))
 
     def slots(self, p_occupied: FloatArray, known: NDArray[np.bool_] | None = None) -> None:
         """Record P(taken) of every slot, (n_slots,); slots that are not `known` are grey."""
@@ -278,9 +287,7 @@ def record_search(env: SearchPerceptionEnv, agent: Agent, seed: int, log: Sensor
         seed: seed of the world.
         log: a log for the environment's lot and rig.
     """
-    recorder = SearchRecorder()
-    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (recorder,))
-    _log(recorder.moments, log)
+    simulate(TimeLimit(env, STEP_LIMIT), agent, seed, (SearchRecorder(keep=log.moment),))
 
 
 def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
@@ -296,19 +303,7 @@ def record_trip(search: DrivenSearch, seed: int, log: SensorLog) -> Trip:
     """
     if search.env.perception is None:
         raise InputError("a recorded trip needs sensors: give it a rig")
-    recorder = SearchRecorder()
-    trip = search.run(seed, (recorder,))
-    _log(recorder.moments, log)
-    return trip
-
-
-def _log(moments: Sequence[Moment], log: SensorLog) -> None:
-    """Record the sensor captures of a search, and the belief after every decision."""
-    log.begin()
-    for moment in moments:
-        for result in moment.captures:
-            log.capture(result.captured.time - moments[0].time, result)
-        log.slots(moment.belief.p_occupied.astype(np.float64))
+    return search.run(seed, (SearchRecorder(keep=log.moment),))
 
 
 def _jpeg(image: NDArray[np.uint8]) -> bytes:
