@@ -146,7 +146,7 @@ def _search(
         if v < len(ends) and ends[v]:
             return int(v)
         for e in range(start[v], start[v + 1]):
-            u = leads_to[e]
+            u = np.int64(leads_to[e])
             if u >= 0 and far + edge_s[e] < seconds[u]:
                 seconds[u] = far + edge_s[e]
                 size = push(keys, vertices, size, seconds[u], u)

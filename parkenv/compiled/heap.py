@@ -1,43 +1,67 @@
-"""A binary heap of vertices by label, for compiled searches over a graph."""
+"""A binary heap of whole numbers by key, for compiled searches over a graph and queues of events."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 
 
 @compiled(error_model="numpy")
-def push(keys: FloatArray, vertices: NDArray[np.int32], size: int, key: float, vertex: int) -> int:
-    """Insert a vertex into a binary heap; return its new size."""
+def push(
+    keys: FloatArray,
+    items: NDArray[np.int32],
+    size: int,
+    key: float,
+    item: int,
+    ranks: IntArray | None = None,
+) -> int:
+    """Insert an item into a binary heap; return its new size.
+
+    Args:
+        keys: (room,) float64, keys of the items in the heap.
+        items: (room,) int32, the items; the first one has the lowest key.
+        size: how many there are.
+        key: key of the new item.
+        item: the new item.
+        ranks: order of items with equal keys: indexed by item, int64; None: any order.
+    """
     i = size
     while i > 0:
         above = (i - 1) >> 1
-        if keys[above] <= key:
+        if not _is_before(key, item, keys[above], items[above], ranks):
             break
-        keys[i], vertices[i] = keys[above], vertices[above]
+        keys[i], items[i] = keys[above], items[above]
         i = above
-    keys[i], vertices[i] = key, vertex
+    keys[i], items[i] = key, item
     return size + 1
 
 
 @compiled(error_model="numpy")
-def pop(keys: FloatArray, vertices: NDArray[np.int32], size: int) -> int:
-    """Remove the first vertex, which the caller has read, from a binary heap; return its new size."""
+def pop(keys: FloatArray, items: NDArray[np.int32], size: int, ranks: IntArray | None = None) -> int:
+    """Remove the first item, which the caller has read, from a binary heap; return its new size."""
     size -= 1
-    key, vertex = keys[size], vertices[size]
+    key, item = keys[size], items[size]
     i = 0
     while True:
         below = 2 * i + 1
         if below >= size:
             break
-        if below + 1 < size and keys[below + 1] < keys[below]:
-            below += 1
-        if keys[below] >= key:
+        after = below + 1
+        if after < size and _is_before(keys[after], items[after], keys[below], items[below], ranks):
+            below = after
+        if not _is_before(keys[below], items[below], key, item, ranks):
             break
-        keys[i], vertices[i] = keys[below], vertices[below]
+        keys[i], items[i] = keys[below], items[below]
         i = below
-    keys[i], vertices[i] = key, vertex
+    keys[i], items[i] = key, item
     return size
+
+
+@compiled(error_model="numpy", forceinline=True)
+def _is_before(key: float, item: int, other_key: float, other: int, ranks: IntArray | None) -> bool:
+    if ranks is not None and key == other_key:
+        return bool(ranks[item] < ranks[other])
+    return key < other_key

@@ -17,16 +17,27 @@ import math
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.heap import pop, push
 from parkenv.compiled.keyed_random import car_key
-from parkenv.compiled.memory import call_at, float64s, int64s
+from parkenv.compiled.memory import (
+    call_at,
+    float64_array,
+    float64s,
+    int32_array,
+    int32s,
+    int64_array,
+    int64s,
+)
 from parkenv.engine.kernel import (
     SCENARIO_BYTES,
     clear_step,
+    complete_step,
     drive_or_park,
     empty_shared_slots,
     enter,
-    finish_step,
     give_up,
     init_prior,
     leaves_soon,
@@ -37,9 +48,7 @@ from parkenv.engine.kernel import (
 )
 from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report_view
 from parkenv.engine.records import (
-    ARRIVAL,
     BALKED,
-    DEPARTURE,
     GAVE_UP,
     LEFT,
     N_ACTIONS,
@@ -47,12 +56,10 @@ from parkenv.engine.records import (
     NO_CAR,
     OWN_KNOWLEDGE,
     PARKED,
-    REACH,
     RESERVE_KNOWLEDGE,
     SEARCHING,
     TRUNCATED,
     car_at,
-    event_at,
     fleet_at,
     scenario_at,
     search_at,
@@ -74,6 +81,7 @@ LEAVE = -1
 TAKE_SLOT = 16
 """Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
 _ON_TICK = 1e-9  # fraction of a tick
+_DEPARTURES_FIRST = 1 << 62
 
 
 # ---- from Python
@@ -156,8 +164,7 @@ def init_forecast_at(address: int) -> None:
     """Initialise the belief of the car `pending` with its external forecast."""
     fleet = fleet_at(address, 0)
     search = search_at(car_at(fleet.cars, fleet.pending).search, 0)
-    if search.belief != 0:
-        init_prior(search)
+    init_prior(search)
     _inform(fleet, fleet.pending)
     fleet.pending = NO_CAR
 
@@ -180,7 +187,7 @@ def inform_reserving_at(address: int) -> None:
 @inlined
 def _is_due(fleet: Any, time: float) -> bool:
     """Return whether the next event is not after a time, s."""
-    if fleet.n_events > 0 and event_at(fleet.events, 0).time <= time:
+    if fleet.n_events > 0 and float64s(fleet.event_times)[0] <= time:
         return True
     return bool(fleet.next_car < fleet.n_cars and car_at(fleet.cars, fleet.next_car).arrival <= time)
 
@@ -191,8 +198,9 @@ def _next_event(fleet: Any) -> int:
     if fleet.next_car < fleet.n_cars:
         arrival = car_at(fleet.cars, fleet.next_car).arrival
         if fleet.n_events > 0:
-            event = event_at(fleet.events, 0)
-            arrives = event.time > arrival or (event.time == arrival and event.kind > ARRIVAL)
+            first_s, first = float64s(fleet.event_times)[0], np.int64(int32s(fleet.event_cars)[0])
+            departs = car_at(fleet.cars, first).state == PARKED
+            arrives = first_s > arrival or (first_s == arrival and not departs)
         else:
             arrives = True
         if arrives:
@@ -200,16 +208,40 @@ def _next_event(fleet: Any) -> int:
                 return NEEDS_SEARCH
             _pass_time(fleet, arrival)
             return int(_arrive(fleet))
-    event = event_at(fleet.events, 0)
-    _pass_time(fleet, event.time)
+    number = np.int64(int32s(fleet.event_cars)[0])
+    _pass_time(fleet, float64s(fleet.event_times)[0])
     fleet.reservations_stale = True
-    kind = event.kind
-    number = pop_event(fleet)
-    if kind == DEPARTURE:
+    times, cars, ranks = _events_of(fleet)
+    fleet.n_events = pop(times, cars, fleet.n_events, ranks)
+    if car_at(fleet.cars, number).state == PARKED:
         _depart(fleet, number)
     else:
         _reach(fleet, number)
     return 0
+
+
+@inlined
+def _push_event(fleet: Any, time: float, number: int) -> None:
+    """Add the end of a car's step, or the departure of a parked car.
+
+    Of events at the same time, departures come first, and then the first one added.
+    """
+    is_parked = car_at(fleet.cars, number).state == PARKED
+    int64s(fleet.event_ranks)[number] = fleet.event_number - (_DEPARTURES_FIRST if is_parked else 0)
+    fleet.event_number += 1
+    times, cars, ranks = _events_of(fleet)
+    fleet.n_events = push(times, cars, fleet.n_events, time, number, ranks)
+
+
+@inlined
+def _events_of(fleet: Any) -> tuple[FloatArray, NDArray[np.int32], IntArray]:
+    """Return the heap of events: times, cars, and the order of equal times by car."""
+    n = fleet.n_cars
+    return (
+        float64_array(fleet.event_times, (n,)),
+        int32_array(fleet.event_cars, (n,)),
+        int64_array(fleet.event_ranks, (n,)),
+    )
 
 
 @inlined
@@ -228,7 +260,6 @@ def _arrive(fleet: Any) -> int:
     car = car_at(fleet.cars, number)
     fleet.n_free -= 1
     car.search = int64s(fleet.free_searches)[fleet.n_free]
-    car.moves = int64s(fleet.free_moves)[fleet.n_free]
     car.target, car.n_moves, car.reserved, car.informed_until = NO_CAR, 0, NO_CAR, -np.inf
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
@@ -243,8 +274,7 @@ def _arrive(fleet: Any) -> int:
     if scenario_at(search.scenario, 0).prior_kind == EXTERNAL_KIND:
         fleet.pending = number
         return NEEDS_FORECAST
-    if search.belief != 0:
-        init_prior(search)
+    init_prior(search)
     _inform(fleet, number)
     return 0
 
@@ -263,7 +293,7 @@ def _reach(fleet: Any, number: int) -> None:
         report_view(fleet, search)
     if car.knows != OWN_KNOWLEDGE and car.knows != RESERVE_KNOWLEDGE:
         inform(fleet, number)
-    _complete_step(search)
+    complete_step(search)
     if search.over:
         _end_search(fleet, number, GAVE_UP)
     elif search.time - search.arrival >= car.patience_s:
@@ -286,15 +316,7 @@ def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None
         _round_up(fleet, search)
     car.queued_s += search.step_drive_s - before
     block_lane(fleet, search.previous_vertex, search.time, number)
-    push_event(fleet, search.time, REACH, number)
-
-
-@inlined
-def _complete_step(search: Any) -> None:
-    finish_step(search)
-    if search.belief != 0:
-        refresh_belief(search)
-    write_clock(search)
+    _push_event(fleet, search.time, number)
 
 
 @inlined
@@ -302,10 +324,8 @@ def _inform(fleet: Any, number: int) -> None:
     """Give a car what it knows beyond its own observations, and refresh its belief."""
     car = car_at(fleet.cars, number)
     if car.knows != OWN_KNOWLEDGE:
-        search = search_at(car.search, 0)
         inform(fleet, number)
-        if search.belief != 0:
-            refresh_belief(search)
+        refresh_belief(search_at(car.search, 0))
 
 
 @inlined
@@ -352,7 +372,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
     drive_or_park(search, action)
     car.stands, car.vertex = search.vertex == car.vertex, search.vertex
     if search.parked:
-        _complete_step(search)
+        complete_step(search)
         shared = shared_slot_at(fleet.slots, search.vertex)
         shared.car, shared.leaves_at = number, fleet.time + car.stay_s
         block_lane(fleet, search.vertex, fleet.time + fleet.manoeuvre_s, number)
@@ -360,7 +380,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         if car.shares:
             report_slot(fleet, car.slot, True, 1.0)
         _end_search(fleet, number, PARKED)
-        push_event(fleet, fleet.time + car.stay_s, DEPARTURE, number)
+        _push_event(fleet, fleet.time + car.stay_s, number)
         return True
     if fleet.tick_s > 0.0:
         _round_up(fleet, search)
@@ -369,7 +389,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         block_lane(fleet, search.vertex, search.time, number)
     else:
         release_slot(fleet, car)
-    push_event(fleet, search.time, REACH, number)
+    _push_event(fleet, search.time, number)
     if fleet.step_capacity > 0:
         _keep_step(fleet, search, number, origin)
     return True
@@ -440,7 +460,6 @@ def _first_ready(fleet: Any) -> Any:
 @inlined
 def _free_search(fleet: Any, car: Any) -> None:
     int64s(fleet.free_searches)[fleet.n_free] = car.search
-    int64s(fleet.free_moves)[fleet.n_free] = car.moves
     fleet.n_free += 1
     car.search = 0
 
@@ -488,65 +507,3 @@ def release_slot(fleet: Any, car: Any) -> None:
     if car.holds != NO_CAR:
         shared_slot_at(fleet.slots, car.holds).held_by = NO_CAR
         car.holds = NO_CAR
-
-
-# ---- the queue of events, a binary heap
-
-
-@inlined
-def is_before(one: Any, other: Any) -> bool:
-    """Return whether an event happens before another one."""
-    if one.time != other.time:
-        return bool(one.time < other.time)
-    if one.kind != other.kind:
-        return bool(one.kind < other.kind)
-    return bool(one.number < other.number)
-
-
-@inlined
-def _copy(to: Any, event: Any) -> None:
-    to.time, to.kind, to.number, to.car = event.time, event.kind, event.number, event.car
-
-
-@kernel
-def push_event(queue: Any, time: float, kind: int, car: int) -> None:
-    """Add an event to the queue of a record with `QUEUE_FIELDS`."""
-    events, at = queue.events, queue.n_events
-    new = event_at(events, at)
-    new.time, new.kind, new.number, new.car = time, kind, queue.event_number, car
-    queue.n_events += 1
-    queue.event_number += 1
-    number = new.number
-    while at > 0:
-        parent = event_at(events, (at - 1) >> 1)
-        here = event_at(events, at)
-        if parent.time < time or (
-            parent.time == time and (parent.kind < kind or (parent.kind == kind and parent.number < number))
-        ):
-            break
-        _copy(here, parent)
-        at = (at - 1) >> 1
-        up = event_at(events, at)
-        up.time, up.kind, up.number, up.car = time, kind, number, car
-
-
-@kernel
-def pop_event(queue: Any) -> int:
-    """Remove the first event, at least one must be there; returns its car."""
-    events = queue.events
-    car: int = event_at(events, 0).car
-    queue.n_events -= 1
-    n, at = queue.n_events, 0
-    last = event_at(events, n)
-    while True:
-        child = 2 * at + 1
-        if child >= n:
-            break
-        if child + 1 < n and is_before(event_at(events, child + 1), event_at(events, child)):
-            child += 1
-        if not is_before(event_at(events, child), last):
-            break
-        _copy(event_at(events, at), event_at(events, child))
-        at = child
-    _copy(event_at(events, at), last)
-    return car

@@ -43,7 +43,6 @@ from parkenv.engine.records import (
     BACKGROUNDS,
     CAR,
     DUE,
-    EVENT,
     FLEET,
     LIVE_SLOT,
     NO_CAR,
@@ -348,21 +347,21 @@ class Fleet:
         self._keep(
             {
                 "cars": cars,
-                "events": np.zeros(n, EVENT),
+                "event_times": np.zeros(n),
+                "event_cars": np.zeros(n, np.int32),
+                "event_ranks": np.zeros(n, np.int64),
                 "ready": np.zeros(n, np.int64),
                 "free_searches": np.zeros(capacity, np.int64),
-                "free_moves": np.zeros(capacity, np.int64),
             }
         )
-        for searches, moves in zip(self._pool, self._moves, strict=True):
-            self._add_free(searches, moves)
+        for searches in self._pool:
+            self._add_free(searches)
 
-    def _add_free(self, searches: Searches, moves: NDArray[np.uint8]) -> None:
+    def _add_free(self, searches: Searches) -> None:
         """Add SEARCH records to those that are free."""
         first, n = int(self._record["n_free"]), len(searches.records)
-        rows = np.arange(n)[::-1]
-        self._kept["free_searches"][first : first + n] = searches.address + rows * SEARCH.itemsize
-        self._kept["free_moves"][first : first + n] = address_of(moves, np.uint8) + rows * moves.shape[1]
+        addresses = searches.address + np.arange(n)[::-1] * SEARCH.itemsize
+        self._kept["free_searches"][first : first + n] = addresses
         self._record["n_free"] = first + n
 
     def _grow_pool(self) -> None:
@@ -371,10 +370,11 @@ class Fleet:
         n = min(max(_FIRST_CHUNK, size), max(len(self._cars) - size, 1))
         searches = Searches(self._tables, n, self.full_belief)
         moves = np.zeros((n, self.scenario.lot.n_vertices), np.uint8)
+        searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
         self._pool.append(searches)
         self._moves.append(moves)
         self._row |= {searches.address + row * SEARCH.itemsize: (searches, row) for row in range(n)}
-        self._add_free(searches, moves)
+        self._add_free(searches)
 
     def keep_steps(self) -> None:
         """From now on, keep the steps of all cars; `steps` returns those of the present world."""

@@ -93,9 +93,9 @@ def begin_search_at(address: int) -> None:
     """Begin the next episode; an external prior must then be queried and `init_prior` called."""
     search = search_at(address, 0)
     arrive(search)
+    write_clock(search)
     if scenario_at(search.scenario, 0).prior_kind != EXTERNAL_KIND:
         init_prior(search)
-    write_clock(search)
 
 
 @kernel
@@ -558,7 +558,9 @@ def belief_now(search: Any, column: int) -> float:
 
 @kernel
 def refresh_belief(search: Any) -> None:
-    """Write the current belief into `p_occupied`; only slots with a column can have changed."""
+    """Write the current belief into `p_occupied`, if it is kept; only slots with a column can have changed."""
+    if search.belief == 0:
+        return
     decay_belief(search)
     end_observed(search)
     p_occupied, end = float32s(search.p_occupied), search.n_columns + 1
@@ -657,7 +659,9 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
 
 @kernel
 def init_prior(search: Any) -> None:
-    """Initialise the full belief with the forecast of every slot."""
+    """Initialise the full belief, if it is kept, with the forecast of every slot."""
+    if search.belief == 0:
+        return
     scenario, width = scenario_at(search.scenario, 0), search.width
     belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
     if scenario.prior_kind == PROCESS_KIND:

@@ -100,15 +100,18 @@ class CompiledPolicy:
 def car_of(address: int, number: int) -> Any:
     """Return the CAR record of a car that decides.
 
-    A policy reads `place`, and may change `target`, `n_moves` and the array at `moves`, its memory of the search: -1,
-    0 and anything at first.
+    A policy reads `place` and `search`, and may change `target` and `n_moves`, its memory of the search: -1 and 0 at
+    first.
     """
     return car_at(fleet_at(address, 0).cars, number)
 
 
 @inlined
 def search_of(address: int) -> Any:
-    """Return the SEARCH record at an address, `search` of a CAR record, of which a policy reads `vertex`."""
+    """Return the SEARCH record at an address, `search` of a CAR record, of which a policy reads `vertex`.
+
+    It may change the array at `moves`, (n_vertices,) uint8, which holds anything at first.
+    """
     return search_at(address, 0)
 
 

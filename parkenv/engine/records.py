@@ -147,8 +147,10 @@ SEARCH = _with_costs(
         # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
         ("scenarios", ADDRESS),
         ("n_places", np.int64),
-        # Number of the car in its fleet, where slots are shared.
+        # Number of the car in its fleet, where slots are shared; (n_vertices,) uint8 moves to the target of its
+        # compiled policy, the last one first.
         ("car", np.int64),
+        ("moves", ADDRESS),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; the
         # record of the world: PROCESS, RECORDED_DAY, FUNCTIONS or SHARED_WORLD.
@@ -246,22 +248,6 @@ the car that waits for it, or `NO_CAR`; cursor of the background."""
 
 shared_world_at, shared_slot_at = record_at(SHARED_WORLD), record_at(SHARED_SLOT)
 
-# ---- events
-
-DEPARTURE, ARRIVAL, REACH = range(3)
-"""Kinds of events, in the order in which they happen at the same time: a parked car leaves; a car arrives at its entry;
-a car's step is over."""
-
-EVENT = np.dtype(
-    [("time", np.float64), ("kind", np.int64), ("number", np.int64), ("car", np.int64)], align=True
-)
-"""An event: s since Monday 00:00; kind; number of the event in its world, which decides between equal ones; the car."""
-
-QUEUE_FIELDS = [("events", ADDRESS), ("n_events", np.int64), ("event_number", np.int64)]
-"""A queue: address of its EVENT records, with room for all; how many there are; number of the next one."""
-
-event_at = record_at(EVENT)
-
 # ---- cars, and their world
 
 STATES = ("due", "searching", "parked", "left", "gave_up", "balked", "truncated")
@@ -307,11 +293,10 @@ CAR = _with_costs(
         ("holds", np.int64),
         # Sums of the search, complete when it has ended.
         *_SUMS,
-        # Its SEARCH record, 0 unless searching. For compiled policies: the target slot, or -1; the moves to it,
-        # (n_vertices,) uint8 from the last to the first, and how many are left.
+        # Its SEARCH record, 0 unless searching. For compiled policies: the target slot, or -1; how many of the moves to
+        # it are left.
         ("search", ADDRESS),
         ("target", np.int64),
-        ("moves", ADDRESS),
         ("n_moves", np.int64),
     ],
     costs=COST_FIELDS[0],
@@ -343,7 +328,14 @@ drives from and to; whether it is a failed attempt. A car that does not act at t
 FLEET = np.dtype(
     [
         *SHARED_WORLD_FIELDS,
-        *QUEUE_FIELDS,
+        # The events to come, at most one of each car: its step is over, or it leaves its slot. A heap of (n_cars,)
+        # float64 times, s, and int32 cars; by car, (n_cars,) int64, the order of events at the same time; how many
+        # there are; number of the next one.
+        ("event_times", ADDRESS),
+        ("event_cars", ADDRESS),
+        ("event_ranks", ADDRESS),
+        ("n_events", np.int64),
+        ("event_number", np.int64),
         # Beginning of the day, s since Monday 00:00; index of the day among the scenario's; the time now.
         ("midnight", np.float64),
         ("day", np.int64),
@@ -357,9 +349,8 @@ FLEET = np.dtype(
         ("ready", ADDRESS),
         ("first_ready", np.int64),
         ("n_ready", np.int64),
-        # Unused SEARCH records and tables of moves: (capacity,) int64 addresses each.
+        # (capacity,) int64 addresses of unused SEARCH records.
         ("free_searches", ADDRESS),
-        ("free_moves", ADDRESS),
         ("n_free", np.int64),
         # The car whose forecast Python must compute before the next event.
         ("pending", np.int64),

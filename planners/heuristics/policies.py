@@ -40,7 +40,7 @@ def decide_by_rule(address: int, number: int) -> int:
     car = car_of(address, number)
     data, search, target = policy_data(address, car), search_of(car.search), car.target
     tables = tables_at(data, 0)
-    moves = uint8_array(car.moves, (tables.n_vertices,))
+    moves = uint8_array(search.moves, (tables.n_vertices,))
     state = UNOBSERVED if target == NO_SLOT else recent_state(search, target)
     if not keeps_target(tables.heuristic, target, state):
         car.target, car.n_moves = choose_route(
