@@ -87,8 +87,8 @@ def test_few_days_make_a_wide_forecast_and_many_a_narrow_one(trained):
 def test_intervals_hold_nine_days_of_ten(trained):
     counts, _, forecast = trained
     late = Scores.of(forecast.from_day(40), counts)
-    assert mean_where(late.day_held) == pytest.approx(0.9, abs=0.05)
-    assert mean_where(late.hour_held) == pytest.approx(0.9, abs=0.06)
+    assert mean_where(late.day_covered) == pytest.approx(0.9, abs=0.05)
+    assert mean_where(late.hour_covered) == pytest.approx(0.9, abs=0.06)
 
 
 def test_the_settings_follow_the_data():
@@ -203,6 +203,6 @@ def test_forecasts_of_german_car_parks():
     losses = [mean_where(c.scores.log_loss) for c in compared]
     assert losses[0] < min(losses[1:])
     ours = compared[0].scores
-    assert 0.87 < mean_where(ours.day_held) < 0.93
+    assert 0.87 < mean_where(ours.day_covered) < 0.93
     for band in ours.coverage_by_band():
         assert band["days"] < 30 or 0.8 < band["coverage_90"] < 0.97

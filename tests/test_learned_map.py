@@ -9,7 +9,8 @@ import pytest
 from parkenv import make_scenario
 from parkenv.compiled.keyed_random import episode_key, seed_state
 from parkenv.errors import InputError
-from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
+from parkenv.forecast.logistic_normal import EVEN
+from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior
 from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
 from parkenv.mapping.store import VERSION, MapStore
@@ -58,7 +59,7 @@ def test_the_error_of_one_slot_has_its_exact_posterior(taken, free):
     density = np.exp(-0.5 * (GRID / 1.5) ** 2) * sigmoid(GRID + 0.3) ** taken * sigmoid(-GRID - 0.3) ** free
     density /= density.sum()
     mean, variance = error.predict(9.0)
-    assert mean_probability(0.3 + mean, variance)[0, 0] == pytest.approx(
+    assert EVEN.expit(0.3 + mean, np.sqrt(variance))[0][0, 0] == pytest.approx(
         density @ sigmoid(GRID + 0.3), abs=0.01
     )
     assert mean[0, 1] == 0.0
@@ -81,7 +82,7 @@ def test_the_level_of_the_day_is_integrated_out():
         likelihood = (sigmoid(level + today) ** (n // days) @ of_day) ** days
         density = np.exp(-0.5 * (GRID / prior) ** 2) * likelihood
         mean, variance = error.predict(9.0)
-        probability[days] = float(mean_probability(mean, variance)[0, 0])
+        probability[days] = float(EVEN.expit(mean, np.sqrt(variance))[0][0, 0])
         assert probability[days] == pytest.approx(density @ sigmoid(GRID) / density.sum(), abs=0.01)
     assert probability[1] < probability[n] - 0.1
 

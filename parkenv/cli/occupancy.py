@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 from parkenv.cli.arguments import iso_date, words
 from parkenv.cli.command import add, group
@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 
     from parkenv.forecast.comparison import Compared
     from parkenv.forecast.counts import Counts
-    from parkenv.forecast.scores import Scores
-    from parkenv.forecast.slot_comparison import SlotScores
-
-    ScoresT = TypeVar("ScoresT", Scores, SlotScores)
+    from parkenv.forecast.slot_comparison import ComparedSlots
 
 Row = dict[str, Any]
 TIMEZONE = "Europe/Berlin"
@@ -224,8 +221,8 @@ def evaluate(
             save_forecast(shown_counts(compared, counts, week), out / f"{compared.model}.png")
             models.append(compared)
             progress.advance(done)
-    for model, _, scores in models:
-        row = _row(model, scores, models[0].scores, seed)
+    for compared in models:
+        row = _row(compared, models[0], seed)
         shown = [f"{row[key]:.1%}" for key in ("coverage_90", "coverage_90_hours")]
         shown += [
             f"{band['coverage_90']:.1%}" if band["days"] else "-" for band in row["coverage_90_by_band"]
@@ -262,13 +259,14 @@ def evaluate(
     console.print(f"Pictures and summary are in {out}")
 
 
-def _row(model: str, scores: ScoresT, ours: ScoresT, seed: int) -> Row:
+def _row(compared: Compared | ComparedSlots, ours: Compared | ComparedSlots, seed: int) -> Row:
     """Return the row of a model in the summary; differences are to `ours`."""
     import numpy as np
 
-    difference = scores.log_loss_beyond(ours, np.random.default_rng(seed))
+    scores = compared.scores
+    difference = scores.log_loss_beyond(ours.scores, np.random.default_rng(seed))
     return {
-        "model": model,
+        "model": compared.model,
         **scores.means(),
         "difference": difference.value,
         "difference_ci95": [difference.low, difference.high],
@@ -309,11 +307,11 @@ def _evaluate_log(log: Path, from_: str | None, seed: int, out: Path, console: C
     if not found:
         raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
     rows, cells = [], []
-    for scores in found:
-        row = _row(scores.model, scores, found[0], seed)
+    for compared in found:
+        row = _row(compared, found[0], seed)
         rows.append(row)
         cells.append(_cells(row, [f"{row['coverage_90']:.0%}"]))
-        save_forecast(shown_slots(scores, log.name), out / f"{scores.model}.png")
+        save_forecast(shown_slots(compared, log.name), out / f"{compared.model}.png")
     save_summary(out, seed, rows, first_day=first)
     headings = ("model", "log-loss", "Brier", "CRPS", "90 %: days", "log-loss more than ours")
     title = f"{plural(len(recorded.slot_ids), 'slot')}, {plural(rows[0]['days'], 'day')} from {first}"

@@ -1,8 +1,8 @@
-"""Spreads of forecasts, calibrated day by day on how often earlier intervals held.
+"""Spreads of forecasts, calibrated day by day on how often earlier intervals covered what was observed.
 
 A forecast's own spread is multiplied by a scale for the level of the whole day, and one for its hours. After each day
-the scale rises where the 90 % interval missed and falls where it held, per car park and per band of forecast fullness
-over all car parks. So the intervals hold 90 % of the days in the long run, whatever is wrong with the model.
+the scale rises where the 90 % interval missed and falls where it did not, per car park and per band of forecast
+fullness over all car parks. So the intervals hold 90 % of the days in the long run, whatever is wrong with the model.
 
 References:
     Gibbs, Candès: Adaptive Conformal Inference Under Distribution Shift. NeurIPS 2021.
@@ -37,7 +37,7 @@ class _Scale:
     def of(self, band: np.ndarray) -> FloatArray:
         return np.asarray(np.exp(self._car_park + self._band[band]))
 
-    def learn(self, rows: np.ndarray, band: np.ndarray, missed: FloatArray) -> None:
+    def update(self, rows: np.ndarray, band: np.ndarray, missed: FloatArray) -> None:
         excess = missed - _MISSES
         self._days[rows] += 1
         self._car_park[rows] += np.maximum(_STEP_CAR_PARK, _FIRST_STEP / np.sqrt(self._days[rows])) * excess
@@ -80,11 +80,11 @@ def calibrated(forecast: DayForecast, counts: Counts, until: int | None = None) 
             y, o, places = occupied[rows], observed[rows], counts.capacity[rows, day]
             days = draw_days(mean[rows], spread[rows])
             low, high = np.quantile(day_means(days, o), INTERVAL, axis=1)
-            held = holds(day_means(y, o), low, high, places)
-            levels.learn(rows, band[rows], (~held).astype(float))
+            covered = holds(day_means(y, o), low, high, places)
+            levels.update(rows, band[rows], (~covered).astype(float))
             low, high = np.quantile(days, INTERVAL, axis=1)
             missed = ~holds(y, low, high, places[:, None]) & o
-            hours.learn(rows, band[rows], missed.sum(axis=1) / o.sum(axis=1))
+            hours.update(rows, band[rows], missed.sum(axis=1) / o.sum(axis=1))
     return replace(forecast, covariance=covariance)
 
 

@@ -20,9 +20,11 @@ from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import require_number
+from parkenv.forecast.logistic_normal import EVEN
 
 HOURS = 24
 N_HOUR_KNOTS = 2 * HOURS
@@ -33,9 +35,6 @@ NEGLIGIBLE = 1e-6
 """Priors with less weight are dropped."""
 SWEEPS = 3  # of expectation propagation; further ones change logits by less than 0.01
 UPDATES = 32  # of a covariance at once
-# A sum over equally spaced points converges faster here than Gauss-Hermite quadrature.
-_NODES = np.arange(-6.0, 6.1, 0.375)
-_NODE_WEIGHTS = np.exp(-0.5 * _NODES**2) / np.exp(-0.5 * _NODES**2).sum()
 
 
 @dataclass(frozen=True)
@@ -73,9 +72,9 @@ class MapErrorPrior:
     def covariance(self, nearness: FloatArray) -> FloatArray:
         """Covariance of f and g, (n + 48, n + 48), for slots of the given nearness, (n,), -1 to 1."""
         n = len(nearness)
-        made = np.zeros((n + N_HOUR_KNOTS, n + N_HOUR_KNOTS))
+        covariance = np.zeros((n + N_HOUR_KNOTS, n + N_HOUR_KNOTS))
         apart = (nearness[:, None] - nearness) / SMOOTH_REACH
-        made[:n, :n] = (
+        covariance[:n, :n] = (
             self.level**2
             + self.slope**2 * np.outer(nearness, nearness)
             + self.smooth**2 * np.exp(-0.5 * apart**2)
@@ -86,8 +85,8 @@ class MapErrorPrior:
         near = np.exp(-0.5 * (np.minimum(apart, HOURS - apart) / HOUR_REACH) ** 2)
         for kind in range(2):
             part = slice(n + kind * HOURS, n + (kind + 1) * HOURS)
-            made[part, part] = self.hour**2 * near
-        return made
+            covariance[part, part] = self.hour**2 * near
+        return covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,12 +230,6 @@ def _summed(parts: Iterable[FloatArray]) -> FloatArray:
     return reduce(np.add, parts)
 
 
-def mean_probability(logits: FloatArray, variance: FloatArray) -> FloatArray:
-    """E[sigmoid(X)] of normal X, elementwise (quadrature)."""
-    points = logits[..., None] + np.sqrt(variance)[..., None] * _NODES
-    return np.asarray(_sigmoid(points) @ _NODE_WEIGHTS)
-
-
 def _approximate(
     mean: FloatArray, covariance: FloatArray, evidence: Evidence
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -270,9 +263,9 @@ def _approximate(
             # The distribution without this observation.
             without = 1.0 / np.maximum(1.0 / variance - precision[:, i], 1e-9)
             center = without * (mean[:, i] / variance - location[:, i])
-            points = center[:, None] + np.sqrt(without)[:, None] * _NODES
-            p = _sigmoid(points)
-            density = (if_taken * p + if_free * (1.0 - p)) ** weight * _NODE_WEIGHTS
+            points = center[:, None] + np.sqrt(without)[:, None] * EVEN.nodes
+            p = expit(points)
+            density = (if_taken * p + if_free * (1.0 - p)) ** weight * EVEN.weights
             total = np.maximum(density.sum(axis=1), 1e-300)
             if sweep == 0:
                 log_evidence += np.log(total)
@@ -290,7 +283,3 @@ def _approximate(
             precision[:, i] += change
             location[:, i] += shift
     return precision, location, log_evidence
-
-
-def _sigmoid(x: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (1.0 + np.tanh(0.5 * x)))

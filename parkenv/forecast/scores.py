@@ -55,64 +55,72 @@ def crps_of_equally_likely(values: FloatArray, observed: FloatArray) -> FloatArr
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """Scores of one model's forecasts; NaN where nothing was observed.
+    """Scores of one model's forecasts of d days with t hours or other periods; NaN where nothing was observed.
+
+    Either of r whole car parks, each of them in a row of its own, or of the r slots of one car park.
 
     Args:
-        log_loss, brier, crps: (c, d, 24), of the occupied fraction.
-        hour_held: (c, d, 24) float64, 1 where the hour's 90 % interval holds the observed fraction.
-        occupancy: (c, d, 24) forecast.
-        observed: (c, d, 24) occupied fraction.
-        day_held: (c, d) float64, 1 where the 90 % interval of the day's mean holds the observed one.
-        day_forecast, day_observed: (c, d) mean over the day's observed hours.
+        log_loss, brier: (r, d, t) of a place that is taken or not.
+        crps: (c, d, t) of the occupied fraction of each of c car parks.
+        occupancy: (r, d, t) forecast.
+        observed: (r, d, t) occupied fraction.
+        weight: (r, d, t) of each of these, 0 where nothing was observed.
+        day_covered: (c, d) float64, 1 where the 90 % interval of the day's mean covers the observed one.
+        day_forecast, day_observed: (c, d) mean over the day's observed periods.
+        block: number of days whose errors the interval of a difference takes for dependent.
+        hour_covered: (c, d, t) float64, 1 where the 90 % interval of a period covers the observed fraction.
     """
 
     log_loss: FloatArray
     brier: FloatArray
     crps: FloatArray
-    hour_held: FloatArray
     occupancy: FloatArray
     observed: FloatArray
-    day_held: FloatArray
+    weight: FloatArray
+    day_covered: FloatArray
     day_forecast: FloatArray
     day_observed: FloatArray
+    block: int
+    hour_covered: FloatArray | None = None
 
     @classmethod
     def of(cls, forecast: DayForecast, counts: Counts) -> Scores:
-        """Score a forecast."""
+        """Score a forecast of car parks."""
         c, d = forecast.mean.shape[:2]
         days = slice(forecast.first, forecast.first + d)
         y, places = counts.occupied[:, days], counts.capacity[:, days]
         observed = np.isfinite(y)
         p, mean, sd = forecast.occupancy, forecast.mean, forecast.sd
         crps = np.empty(y.shape)
-        day_held, day_forecast = np.full((2, c, d), np.nan)
-        hour_held = np.full(y.shape, np.nan)
+        day_covered, day_forecast = np.full((2, c, d), np.nan)
+        hour_covered = np.full(y.shape, np.nan)
         enough = observed.sum(axis=2) >= MIN_HOURS
         values = quantiles_of_t()[:, None, None]
         for day in range(d):
             crps[:, day] = crps_of_equally_likely(expit(mean[:, day] + sd[:, day] * values), y[:, day])
             draws = draw_days(mean[:, day], forecast.covariance[:, day])
             low, high = np.quantile(draws, INTERVAL, axis=1)
-            hour_held[:, day] = holds(y[:, day], low, high, places[:, day, None])
+            hour_covered[:, day] = holds(y[:, day], low, high, places[:, day, None])
             o, rows = observed[:, day], enough[:, day]
             low, high = np.quantile(day_means(draws, o), INTERVAL, axis=1)
-            held = holds(day_means(y[:, day], o), low, high, places[:, day])
-            day_held[rows, day] = held[rows]
+            inside = holds(day_means(y[:, day], o), low, high, places[:, day])
+            day_covered[rows, day] = inside[rows]
             day_forecast[rows, day] = day_means(p[:, day], o)[rows]
+        flat = (c * d, y.shape[2])
         return cls(
-            log_losses(forecast, counts.occupied, counts.capacity),
-            (p - y) ** 2,
-            crps,
-            np.where(observed, hour_held, np.nan),
-            p,
-            y,
-            day_held,
-            day_forecast,
-            np.where(
-                enough,
-                day_means(y.reshape(-1, y.shape[2]), observed.reshape(-1, y.shape[2])).reshape(c, d),
-                np.nan,
+            log_loss=log_losses(forecast, counts.occupied, counts.capacity),
+            brier=(p - y) ** 2,
+            crps=crps,
+            occupancy=p,
+            observed=y,
+            weight=observed.astype(float),
+            day_covered=day_covered,
+            day_forecast=day_forecast,
+            day_observed=np.where(
+                enough, day_means(y.reshape(flat), observed.reshape(flat)).reshape(c, d), np.nan
             ),
+            block=_WEEK,
+            hour_covered=np.where(observed, hour_covered, np.nan),
         )
 
     def coverage_by_band(self, *, observed: bool = False) -> list[Band]:
@@ -122,47 +130,54 @@ class Scores:
             observed: whether the day's observed fullness gives the band. Days of unexpected fullness are missed then by
                 construction; the forecast fullness does not know the day.
         """
-        return coverage_by_band(self.day_observed if observed else self.day_forecast, self.day_held)
+        return coverage_by_band(self.day_observed if observed else self.day_forecast, self.day_covered)
 
     def reliability(self) -> FloatArray:
-        """Return `reliability` of the hours."""
-        return reliability(self.occupancy, self.observed, np.isfinite(self.observed).astype(float))
+        """Return `reliability` of the forecasts."""
+        return reliability(self.occupancy, self.observed, self.weight)
 
     def means(self) -> dict[str, float]:
         """Return each score in the mean, and the numbers of days and car parks with readings."""
-        observed = np.isfinite(self.observed)
+        observed = np.isfinite(self.crps)
+        seen = self.weight > 0
+        log_loss, brier = (
+            float(np.average(values[seen], weights=self.weight[seen]))
+            for values in (self.log_loss, self.brier)
+        )
+        hours = {} if self.hour_covered is None else {"coverage_90_hours": mean_where(self.hour_covered)}
         return {
-            "log_loss": mean_where(self.log_loss),
-            "brier": mean_where(self.brier),
+            "log_loss": log_loss,
+            "brier": brier,
             "crps": mean_where(self.crps),
-            "coverage_90": mean_where(self.day_held),
-            "coverage_90_hours": mean_where(self.hour_held),
+            "coverage_90": mean_where(self.day_covered),
+            **hours,
             "days": int(observed.any(axis=(0, 2)).sum()),
             "car_parks": int(observed.any(axis=(1, 2)).sum()),
         }
 
     def log_loss_beyond(self, ours: Scores, rng: np.random.Generator) -> Estimate:
-        """Return the mean log-loss minus that of `ours`; its interval is over car parks and weeks."""
-        difference = self.log_loss - ours.log_loss
-        both = np.isfinite(difference)
-        weeks = np.arange(0, difference.shape[1], _WEEK)
+        """Return the mean log-loss minus that of `ours`; its interval is over car parks and blocks of days."""
+        difference = self.weight * np.where(self.weight > 0, self.log_loss - ours.log_loss, 0.0)
+        c, d = self.day_covered.shape
         total, n = (
-            np.add.reduceat(values.sum(axis=2), weeks, axis=1, dtype=float)
-            for values in (np.where(both, difference, 0.0), both)
+            np.add.reduceat(
+                values.sum(axis=2).reshape(c, -1, d).sum(axis=1), np.arange(0, d, self.block), axis=1
+            )
+            for values in (difference, self.weight)
         )
         return ratio_of_sums(total, n, rng)
 
 
-def coverage_by_band(fullness: FloatArray, held: FloatArray) -> list[Band]:
-    """Return the number of days in each band of fullness, and the share of them that is held.
+def coverage_by_band(fullness: FloatArray, covered: FloatArray) -> list[Band]:
+    """Return the number of days in each band of fullness, and the share of them in their intervals.
 
     Args:
         fullness: mean occupancy of each day.
-        held: alike, 1 where the day's interval holds what was observed, NaN where nothing was.
+        covered: alike, 1 where the day's interval holds what was observed, NaN where nothing was.
     """
     rows: list[Band] = []
     for low, high in pairwise(BANDS):
-        inside = held[(fullness >= low) & ((fullness < high) | (high == BANDS[-1])) & np.isfinite(held)]
+        inside = covered[(fullness >= low) & ((fullness < high) | (high == BANDS[-1])) & np.isfinite(covered)]
         rows.append(
             {
                 "from": low,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -11,14 +10,7 @@ from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.forecast.day_forecast import INTERVAL
-from parkenv.forecast.scores import (
-    Band,
-    Estimate,
-    coverage_by_band,
-    crps_of_equally_likely,
-    ratio_of_sums,
-    reliability,
-)
+from parkenv.forecast.scores import Scores, crps_of_equally_likely
 from parkenv.forecast.slot_days import Days, SlotDays, fit_slot_days
 
 OURS = "slot-days"
@@ -31,142 +23,33 @@ _LEVEL_SD, _LEVEL_DAYS = (
 _SMOOTH = 1.5  # periods, of the features of gradient boosting
 
 
-class DayForecast(NamedTuple):
-    """Forecast of the slots on one day."""
+class ScoredDay(NamedTuple):
+    """A day's forecast of m slots, and what was recorded in its t periods."""
 
-    p_taken: FloatArray  # (m, p)
-    curve_covariance: FloatArray  # (p, p) of the level's error over the day, logits²
-
-
-@dataclass(frozen=True, eq=False)
-class ScoredDay:
-    """A day's forecast of m slots, and what was recorded, in the t half-hours in which something was.
-
-    Args:
-        number: of the day (`date.toordinal`).
-        p_taken: (m, t) forecast.
-        taken: (m, t) fraction of the observed time in which a slot was taken.
-        seen: (m, t) observed fraction of the half-hour.
-        draws: (k, t) equally likely days of the lot's mean occupancy, over the observed slots.
-    """
-
-    number: int
-    p_taken: FloatArray
-    taken: FloatArray
-    seen: FloatArray
+    number: int  # of the day (`date.toordinal`)
+    p_taken: FloatArray  # (m, t) forecast
+    taken: FloatArray  # (m, t) fraction of the observed time in which a slot was taken
+    seen: FloatArray  # (m, t) observed fraction of the period
+    # (k, u) equally likely days of the mean occupancy over the observed slots, in the u periods that have some
     draws: FloatArray
 
-    @property
-    def log_loss(self) -> float:
-        """Sum over the observed states."""
-        return -float(
-            (
-                self.seen * (self.taken * np.log(self.p_taken) + (1 - self.taken) * np.log1p(-self.p_taken))
-            ).sum()
-        )
-
-    @property
-    def brier(self) -> float:
-        """Sum over the observed states."""
-        taken, p = self.taken, self.p_taken
-        return float((self.seen * (taken * (1 - p) ** 2 + (1 - taken) * p**2)).sum())
-
-    @property
-    def states(self) -> float:
-        """Weight of the observed states."""
-        return float(self.seen.sum())
-
-    @property
-    def forecast(self) -> FloatArray:
-        """Forecast of the lot's mean occupancy, (t,)."""
-        return _lot_means(self.p_taken, self.seen)
-
-    @property
-    def observed(self) -> FloatArray:
-        """Recorded mean occupancy of the lot, (t,)."""
-        return _lot_means(self.taken, self.seen)
-
-    @property
-    def crps(self) -> FloatArray:
-        """Of the lot's mean occupancy, (t,)."""
-        return crps_of_equally_likely(np.sort(self.draws, axis=0), self.observed)
-
-    @property
-    def held(self) -> bool:
-        """Whether the 90 % interval of the day's mean occupancy holds the recorded one."""
-        low, high = np.quantile(self.draws.mean(axis=1), INTERVAL)
-        return bool(low <= self.observed.mean() <= high)
+    def lot_means(self, values: FloatArray) -> FloatArray:
+        """Return the means of values, (m, t), over the observed slots, (u,)."""
+        used = self.seen.sum(axis=0) > 0
+        return np.asarray((values * self.seen)[:, used].sum(axis=0) / self.seen[:, used].sum(axis=0))
 
 
-@dataclass(frozen=True)
-class SlotScores:
-    """Scores of one model.
-
-    Args:
-        model: its name.
-        days: the scored days, in order of time.
-    """
+class ComparedSlots(NamedTuple):
+    """A model's forecasts of slots, in order of time, and their scores."""
 
     model: str
     days: tuple[ScoredDay, ...]
-
-    @property
-    def log_loss(self) -> float:
-        """Of a slot that is taken or not."""
-        return self._per_state([day.log_loss for day in self.days])
-
-    @property
-    def brier(self) -> float:
-        """Of a slot that is taken or not."""
-        return self._per_state([day.brier for day in self.days])
-
-    @property
-    def crps(self) -> float:
-        """Of the lot's occupancy in a half-hour."""
-        return float(np.concatenate([day.crps for day in self.days]).mean())
-
-    @property
-    def coverage_90(self) -> float:
-        """Of the lot's mean occupancy over a day."""
-        return float(np.mean([day.held for day in self.days]))
-
-    def coverage_by_band(self, *, observed: bool = False) -> list[Band]:
-        """Return `parkenv.forecast.scores.coverage_by_band` of the days, by forecast or by recorded fullness."""
-        fullness = [(day.observed if observed else day.forecast).mean() for day in self.days]
-        return coverage_by_band(np.array(fullness), np.array([float(day.held) for day in self.days]))
-
-    def reliability(self) -> FloatArray:
-        """Return `parkenv.forecast.scores.reliability` of the slots' states."""
-        p, taken, seen = (
-            np.concatenate([getattr(day, name).ravel() for day in self.days])
-            for name in ("p_taken", "taken", "seen")
-        )
-        return reliability(p, taken, seen)
-
-    def means(self) -> dict[str, float]:
-        """Return each score, and the numbers of days and car parks."""
-        return {
-            "log_loss": self.log_loss,
-            "brier": self.brier,
-            "crps": self.crps,
-            "coverage_90": self.coverage_90,
-            "days": len(self.days),
-            "car_parks": 1,
-        }
-
-    def log_loss_beyond(self, ours: SlotScores, rng: np.random.Generator) -> Estimate:
-        """Return the log-loss minus that of `ours` on the same days; its interval is over days."""
-        difference = [a.log_loss - b.log_loss for a, b in zip(self.days, ours.days, strict=True)]
-        states = [day.states for day in self.days]
-        return ratio_of_sums(np.array([difference]), np.array([states]), rng)
-
-    def _per_state(self, sums: list[float]) -> float:
-        return sum(sums) / sum(day.states for day in self.days)
+    scores: Scores
 
 
 def compare_slot_days(
     classes: list[SlotDays], first: int, on_day: Callable[[], None] = lambda: None
-) -> list[SlotScores]:
+) -> list[ComparedSlots]:
     """Score forecasts of every day from `first` on.
 
     Baselines are the mean of the half-hour on some earlier days, shrunk to the mean of the lot by a Beta prior worth
@@ -204,15 +87,14 @@ def compare_slot_days(
                 )
                 errors[name].append(_level_error(p, taken, seen))
                 if counts:
-                    scored[name].append(_score(DayForecast(p, np.full((p.shape[1],) * 2, variance)), day))
+                    scored[name].append(_scored(p, np.full((p.shape[1],) * 2, variance), day))
             if counts:
                 found = fit_slot_days(past).forecast(day.days)
                 p = np.clip(found.p_taken[0], _EDGE, 1 - _EDGE)
-                scored[OURS].append(_score(DayForecast(p, found.curve_covariance[0]), day))
+                scored[OURS].append(_scored(p, found.curve_covariance[0], day))
                 on_day()
-    return [
-        SlotScores(name, tuple(sorted(days, key=lambda day: day.number))) for name, days in scored.items()
-    ]
+    in_order = {name: sorted(days, key=lambda day: day.number) for name, days in scored.items()}
+    return [ComparedSlots(name, tuple(days), _scores(days)) for name, days in in_order.items()]
 
 
 def _days(data: SlotDays, which: slice | IntArray) -> SlotDays:
@@ -260,34 +142,51 @@ def _boosted(past: SlotDays) -> FloatArray:
     return np.asarray(model.predict_proba(features(everything))[:, 1].reshape(n.shape[0], -1))
 
 
-def _lot_means(values: FloatArray, seen: FloatArray) -> FloatArray:
-    """Mean over the slots in each period with observations, (t,)."""
-    used = seen.sum(axis=0) > 0
-    return np.asarray((values * seen)[:, used].sum(axis=0) / seen[:, used].sum(axis=0))
-
-
 def _level_error(p: FloatArray, taken: FloatArray, seen: FloatArray) -> float:
-    means = [np.clip(_lot_means(values, seen).mean(), _EDGE, 1 - _EDGE) for values in (taken, p)]
-    return float(logit(means[0]) - logit(means[1]))
+    used = seen.sum(axis=0) > 0
+    total = seen[:, used].sum(axis=0)
+    means = [((values * seen)[:, used].sum(axis=0) / total).mean() for values in (taken, p)]
+    return float(np.subtract(*logit(np.clip(means, _EDGE, 1 - _EDGE))))
 
 
-def _score(forecast: DayForecast, day: SlotDays) -> ScoredDay:
+def _scored(p: FloatArray, covariance: FloatArray, day: SlotDays) -> ScoredDay:
+    """Return a day with its forecast: P(taken), (m, t), and the covariance of the level's error, (t, t), logits²."""
     taken, seen = day.taken[:, 0], day.seen[:, 0]
-    used = np.flatnonzero(seen.sum(axis=0) > 0)
-    return ScoredDay(
-        int(day.days.number[0]),
-        forecast.p_taken[:, used],
-        taken[:, used],
-        seen[:, used],
-        _drawn_occupancy(forecast, seen, used),
+    return ScoredDay(int(day.days.number[0]), p, taken, seen, _drawn_occupancy(p, covariance, seen))
+
+
+def _scores(days: list[ScoredDay]) -> Scores:
+    p, taken, seen = (
+        np.stack([getattr(day, name) for day in days], axis=1) for name in ("p_taken", "taken", "seen")
+    )
+    crps, covered, forecast, observed = np.full((1, *p.shape[1:]), np.nan), [], [], []
+    for d, day in enumerate(days):
+        mean = day.lot_means(day.taken)
+        crps[0, d, day.seen.sum(axis=0) > 0] = crps_of_equally_likely(np.sort(day.draws, axis=0), mean)
+        low, high = np.quantile(day.draws.mean(axis=1), INTERVAL)
+        covered.append(float(low <= mean.mean() <= high))
+        forecast.append(day.lot_means(day.p_taken).mean())
+        observed.append(mean.mean())
+    return Scores(
+        log_loss=-(taken * np.log(p) + (1 - taken) * np.log1p(-p)),
+        brier=taken * (1 - p) ** 2 + (1 - taken) * p**2,
+        crps=crps,
+        occupancy=p,
+        observed=taken,
+        weight=seen,
+        day_covered=np.array([covered]),
+        day_forecast=np.array([forecast]),
+        day_observed=np.array([observed]),
+        block=1,
     )
 
 
-def _drawn_occupancy(forecast: DayForecast, seen: FloatArray, used: IntArray) -> FloatArray:
-    """Draw days of the lot's mean occupancy, (k, t)."""
+def _drawn_occupancy(p: FloatArray, covariance: FloatArray, seen: FloatArray) -> FloatArray:
+    """Draw days of the lot's mean occupancy, (k, u), in the periods with observations."""
+    used = np.flatnonzero(seen.sum(axis=0) > 0)
     rng = np.random.default_rng(0)
-    p, weight = forecast.p_taken[:, used], seen[:, used] / seen[:, used].sum(axis=0)
-    covariance = forecast.curve_covariance[np.ix_(used, used)]
+    p, weight = p[:, used], seen[:, used] / seen[:, used].sum(axis=0)
+    covariance = covariance[np.ix_(used, used)]
     sd = np.sqrt(np.diag(covariance))
     # The centre of which the mean over days is p, nearly (MacKay's probit approximation).
     centre = logit(p) * np.sqrt(1.0 + np.pi / 8.0 * sd**2)

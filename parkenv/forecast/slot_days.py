@@ -29,6 +29,7 @@ from scipy.optimize import minimize
 from scipy.special import expit
 
 from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.forecast.logistic_normal import NormalQuadrature
 
 MAX_DAYS = 60
 """Days to fit a forecast to, those nearest in time: others say little more."""
@@ -74,28 +75,7 @@ class SlotForecast(NamedTuple):
     curve_covariance: FloatArray  # (k, p, p) covariance of the error of each day's level over its periods
 
 
-class _Normal(NamedTuple):
-    """Quadrature for a standard normal variable."""
-
-    nodes: FloatArray
-    weights: FloatArray
-
-    @classmethod
-    def of(cls, n: int) -> _Normal:
-        nodes, weights = np.polynomial.hermite_e.hermegauss(n)
-        return cls(nodes, weights / weights.sum())
-
-    def expit(self, mean: FloatArray, sd: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the means of sigmoid(mean + sd·Z) and of its derivative."""
-        p, slope = np.zeros(mean.shape), np.zeros(mean.shape)
-        for node, weight in zip(self.nodes, self.weights, strict=True):
-            value = expit(mean + node * sd)
-            p += weight * value
-            slope += weight * value * (1.0 - value)
-        return p, slope
-
-
-_COARSE, _FINE = _Normal.of(5), _Normal.of(15)
+_COARSE, _FINE = NormalQuadrature.gauss_hermite(5), NormalQuadrature.gauss_hermite(15)
 
 
 class _Solution(NamedTuple):

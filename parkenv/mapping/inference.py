@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, logit
 from scipy.stats import beta
 
 from parkenv.compiled.arrays import FloatArray
@@ -100,7 +101,7 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
     weight = np.ones(len(log.time)) if time is None else _alike(log.time, time)
     at_hour = (weight @ taken.sum(axis=1) + LOT_WEIGHT * lot_mean) / (weight @ known.sum(axis=1) + LOT_WEIGHT)
     slot_mean = (taken.sum(axis=0) + SLOT_WEIGHT * lot_mean) / (known.sum(axis=0) + SLOT_WEIGHT)
-    prior = slot_mean if time is None else _expit(_logit(slot_mean) + _logit(at_hour) - _logit(lot_mean))
+    prior = slot_mean if time is None else expit(logit(slot_mean) + logit(at_hour) - logit(lot_mean))
     # Over all sessions, the slot's mean already contains its counts: only the lot's prior must be added.
     strength = SLOT_WEIGHT
     base = np.full(log.n_slots, lot_mean) if time is None else prior
@@ -145,11 +146,3 @@ def _alike(then: FloatArray, time: float) -> FloatArray:
     apart = np.abs(then % DAY_S - time % DAY_S) / HOUR_S
     apart = np.minimum(apart, 24.0 - apart)
     return np.asarray(same * np.exp(-0.5 * (apart / _HOUR_WIDTH) ** 2))
-
-
-def _logit(p: FloatArray | float) -> FloatArray:
-    return np.log(np.asarray(p) / (1.0 - np.asarray(p)))
-
-
-def _expit(x: FloatArray) -> FloatArray:
-    return np.asarray(1.0 / (1.0 + np.exp(-x)))

@@ -10,7 +10,8 @@ from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior, mean_probability
+from parkenv.forecast.logistic_normal import EVEN
+from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior
 from parkenv.mapping.inference import RELAXATION_S, MapPrior, SessionLog
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.world.occupancy.centred_logits import centred_logits
@@ -169,9 +170,9 @@ class LearnedMap(PriorModel):
 
     def learn(self, trips: Sequence[Trip]) -> None:
         """Add trips, ordered by time and not before those already added."""
-        for day, its in groupby(trips, key=lambda trip: int(trip.time // DAY_S)):
+        for day, trips_of_day in groupby(trips, key=lambda trip: int(trip.time // DAY_S)):
             self.pass_time(day)
-            self._learn_day(list(its))
+            self._add_day(list(trips_of_day))
 
     def learn_sessions(self, log: SessionLog) -> None:
         """Add survey sessions; each counts as a day of its own, and as older than any trip, since none has a date."""
@@ -190,9 +191,9 @@ class LearnedMap(PriorModel):
         mean, variance = self._error.predict(hour)
         day = base.day_error.deviations(self._nearness)
         parts = (self._error.trust, self._error.prior_sd(), mean, variance)
-        for trust, prior_sd, its_mean, its_variance in zip(*parts, strict=True):
-            logits = trust * centred_logits(base.p_occupied, np.hypot(prior_sd, day)) + its_mean
-            p_taken.append(mean_probability(logits, its_variance + day**2))
+        for trust, prior_sd, error, error_variance in zip(*parts, strict=True):
+            logits = trust * centred_logits(base.p_occupied, np.hypot(prior_sd, day)) + error
+            p_taken.append(EVEN.expit(logits, np.sqrt(error_variance + day**2))[0])
             mean_logits.append(logits)
         weights = self._error.weights
         p = np.clip(weights @ np.array(p_taken), MIN_PROBABILITY, MAX_PROBABILITY)
@@ -200,7 +201,7 @@ class LearnedMap(PriorModel):
             p, base.decay_rate, self._day_error(base.day_error, weights, np.array(mean_logits), hour)
         )
 
-    def _learn_day(self, trips: Sequence[Trip]) -> None:
+    def _add_day(self, trips: Sequence[Trip]) -> None:
         slots, hours, likelihood, weight, p, day_error = [], [], [], [], [], DayError()
         memory = DayMemory(self.n_slots)
         for trip in trips:
@@ -227,10 +228,10 @@ class LearnedMap(PriorModel):
         level_sd, slope_sd = self._error.common_sd(hour)
         rise = self._nearness / max(float(self._nearness @ self._nearness), 1e-12)
         both = []
-        for own, unknown, its in (
+        for own, unknown, of_priors in (
             (day.level, level_sd, logits.mean(axis=1)),
             (day.slope, slope_sd, logits @ rise),
         ):
-            apart = its - weights @ its
+            apart = of_priors - weights @ of_priors
             both.append(min(float(np.sqrt(own**2 + weights @ (unknown**2 + apart**2))), MAX_LOGITS))
         return DayError(*both)

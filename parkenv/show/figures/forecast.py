@@ -19,7 +19,7 @@ from parkenv.forecast.comparison import Compared
 from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import draw_days
 from parkenv.forecast.scores import Band, mean_where
-from parkenv.forecast.slot_comparison import SlotScores
+from parkenv.forecast.slot_comparison import ComparedSlots
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
@@ -58,28 +58,31 @@ def shown_counts(compared: Compared, counts: Counts, week: tuple[int, int]) -> S
     days = slice(monday - forecast.first, monday - forecast.first + _WEEK)
     draws = np.moveaxis(draw_days(forecast.mean[park, days], forecast.covariance[park, days]), 1, 0)
     return ShownForecast(
-        compared.model, mean_where(scores.log_loss), mean_where(scores.crps), mean_where(scores.day_held),
+        compared.model, mean_where(scores.log_loss), mean_where(scores.crps), mean_where(scores.day_covered),
         counts.car_parks[park], [(day, HOURS) for day in dates], draws.reshape(len(draws), -1),
         forecast.occupancy[park, days].ravel(), counts.occupied[park, monday : monday + _WEEK].ravel(),
         scores.reliability(), "hours", scores.coverage_by_band(), scores.coverage_by_band(observed=True),
     )  # fmt: skip
 
 
-def shown_slots(scores: SlotScores, place: str) -> ShownForecast:
+def shown_slots(compared: ComparedSlots, log: str) -> ShownForecast:
     """Return what to show of a model of slots: the last days that were scored, a week at most.
 
     Args:
-        scores: of the model.
-        place: name of the log.
+        compared: its forecasts and scores.
+        log: name of the log.
     """
-    days = scores.days[-_WEEK:]
+    days, scores = compared.days[-_WEEK:], compared.scores
+    means = scores.means()
     draws, forecast, observed = (
-        np.concatenate([getattr(day, name) for day in days], axis=-1)
-        for name in ("draws", "forecast", "observed")
+        np.concatenate(parts, axis=-1)
+        for parts in zip(
+            *((day.draws, day.lot_means(day.p_taken), day.lot_means(day.taken)) for day in days), strict=True
+        )
     )
     return ShownForecast(
-        scores.model, scores.log_loss, float(scores.crps), scores.coverage_90,
-        f"{place}: mean over the slots", [(date.fromordinal(day.number), day.forecast.size) for day in days],
+        compared.model, means["log_loss"], means["crps"], means["coverage_90"],
+        f"{log}: mean over the slots", [(date.fromordinal(day.number), day.draws.shape[1]) for day in days],
         draws, forecast, observed,
         scores.reliability(), "slots' half-hours", scores.coverage_by_band(), scores.coverage_by_band(observed=True),
     )  # fmt: skip

@@ -12,6 +12,7 @@ from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
+from parkenv.forecast.logistic_normal import NormalQuadrature
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY, PROCESS_KIND
@@ -28,7 +29,7 @@ from parkenv.world.week import DAY_HOURS, DAY_S, HOUR_S
 
 LEAST, MOST = 0.002, 0.998
 """Bounds of the mean occupancy of a lot: beyond them, slots would be taken or free for ever."""
-_NODES, _WEIGHTS = np.polynomial.hermite_e.hermegauss(9)
+_QUADRATURE = NormalQuadrature.gauss_hermite(9)
 _PASSES = 3  # over the day; the curve of a process is periodic
 
 
@@ -114,8 +115,7 @@ class CountedOccupancy(OccupancyModel):
         """Return the forecast: the mean over the days that are possible, and by how much their level differs."""
         index, day = self._index(arrival.day), arrival.day
         if day not in self._forecasts:
-            levels = self.level[index][:, None] + self.level_sd[index][:, None] * _NODES
-            curve = expit(levels) @ (_WEIGHTS / _WEIGHTS.sum())
+            curve, _ = _QUADRATURE.expit(self.level[index], self.level_sd[index])
             self._forecasts[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
         process = self._forecasts[day]
         own = process.forecast(arrival)

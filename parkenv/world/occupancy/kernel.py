@@ -97,7 +97,7 @@ RECORDED_DAY = np.dtype(
     align=True,
 )
 """A log day replayed on a lot: its midnight, s since Monday 00:00; fields of `MappedLog`,
-`DayForecast` and `OccupancyLog`."""
+`ReplayForecast` and `OccupancyLog`."""
 
 FUNCTIONS = np.dtype(
     [("data", np.int64), ("state", ADDRESS), ("next_free", ADDRESS), ("sojourn", ADDRESS)], align=True

@@ -173,7 +173,7 @@ class MappedLog(NamedTuple):
     replayed: IntArray  # (n,) day that each slot replays
 
 
-class DayForecast(NamedTuple):
+class ReplayForecast(NamedTuple):
     """Forecast of a replayed day."""
 
     log_odds: FloatArray  # (n, 48) of P(taken), in the middles of the half-hours
@@ -211,7 +211,7 @@ class RecordedOccupancy(OccupancyModel):
     replay_from: date | None = None
     forecast_from: ForecastFrom = "others"
     _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
-    _forecasts: dict[int, DayForecast] = field(init=False, repr=False, default_factory=dict)
+    _forecasts: dict[int, ReplayForecast] = field(init=False, repr=False, default_factory=dict)
     _fitted: dict[tuple[int, ...], FittedSlotDays] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -343,7 +343,7 @@ class RecordedOccupancy(OccupancyModel):
             days,
         )
 
-    def day_forecast(self, day: str) -> DayForecast:
+    def day_forecast(self, day: str) -> ReplayForecast:
         """Return the forecast of the lot for the replay of `day`, a day of the log."""
         index = self.log.days.index(day)
         if index not in self._forecasts:
@@ -365,7 +365,7 @@ class RecordedOccupancy(OccupancyModel):
             )
         return known
 
-    def _forecast_day(self, day: int, mapped: MappedLog) -> DayForecast:
+    def _forecast_day(self, day: int, mapped: MappedLog) -> ReplayForecast:
         log, known = self.log, mapped.known
         rates = self._decay_rates(known)
         days_away = np.abs(log.dates(known).number - log.dates([day]).number)
@@ -378,7 +378,7 @@ class RecordedOccupancy(OccupancyModel):
         share = np.bincount(which) / which.size
         level = np.sqrt(np.einsum("j,pjk,k->p", share, found.level_covariance, share))
         p = np.clip(found.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
-        return DayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
+        return ReplayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
 
     def _decay_rates(self, known: IntArray) -> FloatArray:
         pairs = self.log.intervals(self.log.max_gap_s)
