@@ -104,6 +104,8 @@ class Study(ExecutionSpec):
         goes_on: when a run continues the one in its folder: if `asked` to resume; also if that is `unfinished`,
             otherwise it replaces it; or `always`, whatever the settings, which the keys of rows hold.
         keeps_order: whether rows are stored in the order of the items, instead of as they finish.
+        heading: heading of the report, before the scenarios; the kind if empty.
+        table_titles: titles of the tables of the report, by their entries in the summary.
     """
 
     kind: str
@@ -114,6 +116,8 @@ class Study(ExecutionSpec):
     unit: ClassVar[str] = "episodes"
     goes_on: ClassVar[GoesOn] = "asked"
     keeps_order: ClassVar[bool] = False
+    heading: ClassVar[str] = ""
+    table_titles: ClassVar[Mapping[str, str]] = {"rows": "Results"}
 
     def __getstate__(self) -> dict[Any, Any]:
         """Workers make scenarios themselves, once each."""
@@ -150,6 +154,12 @@ class Study(ExecutionSpec):
         return []
 
     @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """Return the results of a finished run in sentences, for its report; none by default."""
+        del summary
+        return []
+
+    @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """Return what a report says about a finished run.
 
@@ -160,13 +170,14 @@ class Study(ExecutionSpec):
         Raises:
             InputError: a file in the folder is damaged.
         """
-        from parkenv.show.report.page import Page
+        from parkenv.show.report.page import Page, on_scenarios
         from parkenv.show.report.tables import tables_of
 
         del folder
-        return Page(
-            f"parkenv {cls.model_fields['kind'].default}", tables=tables_of(summary, {"rows": "Results"})
-        )
+        title = f"{cls.heading}{on_scenarios(summary['rows'])}"
+        if not cls.heading:
+            title = f"parkenv {cls.model_fields['kind'].default}"
+        return Page(title, cls.findings(summary), tables_of(summary, cls.table_titles))
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """Return what of the run in a folder a report may show again; nothing by default.

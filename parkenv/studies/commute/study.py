@@ -29,10 +29,7 @@ from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from parkenv.mapping.trips import Trip
-    from parkenv.show.report.page import Page
     from parkenv.studies.commute.runs import CommuteRun, Day
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
@@ -58,6 +55,8 @@ class Commute(Study):
     )
     doing: ClassVar = "Driving"
     unit: ClassVar = "searches"
+    heading: ClassVar = "Maps that learn from every trip"
+    table_titles: ClassVar = {"rows": "Results", "weeks": "By five days"}
 
     kind: Literal["commute"] = "commute"
     agents: Agents = Field(
@@ -216,13 +215,3 @@ class Commute(Study):
         from parkenv.show.figures.commute import save_commute_curves
 
         return [partial(save_commute_curves, result.rows, result.folder / PICTURE)]
-
-    @classmethod
-    def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`."""
-        from parkenv.show.report.page import Page, on_scenarios
-        from parkenv.show.report.tables import tables_of
-
-        del folder
-        title = f"Maps that learn from every trip{on_scenarios(summary['rows'])}"
-        return Page(title, tables=tables_of(summary, {"rows": "Results", "weeks": "By five days"}))

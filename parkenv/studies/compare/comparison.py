@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -37,7 +37,6 @@ from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
-    from parkenv.show.report.page import Page
     from parkenv.studies.compare.cases import Case
     from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
@@ -141,6 +140,9 @@ class CaseStudy(Study):
 
 class Comparison(CaseStudy):
     """An experiment file: all agents search in the same worlds, in every scenario and setting."""
+
+    heading: ClassVar = "Agents compared"
+    table_titles: ClassVar = {"rows": "Results", "occupancy_rows": "By occupancy level"}
 
     kind: Literal["compare"] = "compare"
     agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents, default="all but exact")] = (
@@ -352,37 +354,26 @@ class Comparison(CaseStudy):
         return [partial(draw_figures, data, result.folder)]
 
     @classmethod
-    def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`."""
-        from parkenv.show.report.page import Page, on_scenarios
-        from parkenv.show.report.tables import tables_of
-
-        del folder
-        rows = summary["rows"]
-        tables = tables_of(summary, {"rows": "Results", "occupancy_rows": "By occupancy level"})
-        return Page(f"Agents compared{on_scenarios(rows)}", fastest_agents(rows), tables)
-
-
-def fastest_agents(rows: Sequence[Row]) -> list[str]:
-    """Return a sentence on the fastest agent in each setting with several, the oracle apart."""
-    settings: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
-    findings = []
-    speeds = len({key[2:] for key in settings}) > 1
-    for (name, failure, walk, drive), its in settings.items():
-        agents = [row for row in its if row["agent"] != "oracle"]
-        if len(agents) < 2:
-            continue
-        best = min(agents, key=lambda row: float(row["total_s"]))
-        at = f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
-        interval = best["total_s_ci95"]
-        between = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if None not in interval else ""
-        findings.append(
-            f"{name}, failure cost {failure:g} s{at}: {best['agent']} has the lowest mean total time, "
-            f"{best['total_s']:.1f} s{between}; the clairvoyant lower bound is {best['bound_s']:.1f} s."
-        )
-    return findings
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`: the fastest agent in each setting with several, the oracle apart."""
+        settings: dict[tuple[Any, ...], list[Row]] = {}
+        for row in summary["rows"]:
+            settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
+        findings = []
+        speeds = len({key[2:] for key in settings}) > 1
+        for (name, failure, walk, drive), its in settings.items():
+            agents = [row for row in its if row["agent"] != "oracle"]
+            if len(agents) < 2:
+                continue
+            best = min(agents, key=lambda row: float(row["total_s"]))
+            at = f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
+            interval = best["total_s_ci95"]
+            between = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if None not in interval else ""
+            findings.append(
+                f"{name}, failure cost {failure:g} s{at}: {best['agent']} has the lowest mean total time, "
+                f"{best['total_s']:.1f} s{between}; the clairvoyant lower bound is {best['bound_s']:.1f} s."
+            )
+        return findings
 
 
 def _works_blind(agent: AgentSpec) -> bool:

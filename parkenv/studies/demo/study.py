@@ -13,11 +13,11 @@ from pydantic import Field
 from parkenv import __version__
 from parkenv.files.known_names import RigName
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.compare.comparison import CaseStudy, fastest_agents
+from parkenv.studies.compare.comparison import CaseStudy, Comparison
 from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, ScenarioItem, Seed
 from parkenv.studies.results import EPISODES, Results, Row, Table, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
-from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy, survey_finding
+from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
 from parkenv.studies.study import Cell, Stage
 from parkenv.studies.workers import Task
 
@@ -59,6 +59,8 @@ class Demo(CaseStudy):
 
     block: ClassVar = 1
     goes_on: ClassVar = "unfinished"
+    heading: ClassVar = "From a survey to a search"
+    table_titles: ClassVar = {"rows": "Searches with simulated sensors"}
     all_tables: ClassVar[tuple[Table, ...]] = (EPISODES, SESSIONS)
 
     kind: Literal["demo"] = "demo"
@@ -168,18 +170,18 @@ class Demo(CaseStudy):
         return tasks
 
     @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`."""
+        return [*SurveyStudy.findings({"rows": [summary["survey"]]}), *Comparison.findings(summary)]
+
+    @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
-        from parkenv.show.report.page import Page, on_scenarios
-        from parkenv.show.report.tables import survey_tables, tables_of
+        from parkenv.show.report.tables import survey_tables
 
-        rows, surveyed = summary["rows"], summary["survey"]
-        tables = [
-            *tables_of(summary, {"rows": "Searches with simulated sensors"}),
-            *survey_tables(surveyed, without_nan(SESSIONS.read(folder))),
-        ]
-        findings = [survey_finding(surveyed), *fastest_agents(rows)]
-        return Page(f"From a survey to a search{on_scenarios(rows)}", findings, tables)
+        page = super().page(summary, folder)
+        surveyed = survey_tables(summary["survey"], without_nan(SESSIONS.read(folder)))
+        return page._replace(tables=[*page.tables, *surveyed])
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""

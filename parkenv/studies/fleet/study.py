@@ -69,6 +69,7 @@ class FleetStudy(Study):
     block: ClassVar = 1
     doing: ClassVar = "Driving"
     unit: ClassVar = "days"
+    heading: ClassVar = "Many cars"
 
     kind: Literal["fleet"] = "fleet"
     agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents)] = Field(
@@ -324,12 +325,8 @@ class FleetStudy(Study):
         ]
 
     @classmethod
-    def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`: a sentence for each agent and demand says what competition costs."""
-        from parkenv.show.report.page import Page, on_scenarios
-        from parkenv.show.report.tables import OF_FLEETS, tables_of
-
-        del folder
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`: what competition costs, for each agent and demand."""
         rows = summary["rows"]
         shown: dict[tuple[Any, ...], Row] = {}
         for row in sorted(rows, key=lambda row: row["knows"] != OWN):
@@ -345,8 +342,15 @@ class FleetStudy(Study):
             if None not in (row["price_of_anarchy"], low, high) and row["knows"] == OWN:
                 finding += f"; the price of anarchy is {row['price_of_anarchy']:.3f} [{low:.3f}, {high:.3f}]"
             findings.append(f"{finding}.")
-        tables = tables_of(summary, {"rows": "Results"}, OF_FLEETS)
-        return Page(f"Many cars{on_scenarios(rows)}", findings, tables)
+        return findings
+
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
+        """See `Study`; some columns mean something else than in other tables."""
+        from parkenv.show.report.tables import OF_FLEETS, tables_of
+
+        tables = tables_of(summary, cls.table_titles, OF_FLEETS)
+        return super().page(summary, folder)._replace(tables=tables)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""

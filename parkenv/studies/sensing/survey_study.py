@@ -49,6 +49,7 @@ class SurveyStudy(Study):
     unit: ClassVar = "sessions"
     goes_on: ClassVar = "always"
     keeps_order: ClassVar = True
+    heading: ClassVar = "Survey"
 
     kind: Literal["survey"] = "survey"
     scenario: Annotated[OneScenario, AfterValidator(_with_traffic)] = Field(
@@ -195,26 +196,24 @@ class SurveyStudy(Study):
         return [partial(draw_survey, self.built, self.drive_settings, result.rows[0], shown, result.folder)]
 
     @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`."""
+        (row,) = summary["rows"]
+        return [
+            f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: {row['car_detection_rate']:.1%} "
+            f"of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots classified correctly."
+        ]
+
+    @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
-        from parkenv.show.report.page import Page, on_scenarios
         from parkenv.show.report.tables import survey_tables
 
-        (row,) = summary["rows"]
-        tables = survey_tables(row, without_nan(cls.table.read(folder)))
-        return Page(f"Survey{on_scenarios([row])}", [survey_finding(row)], tables)
+        tables = survey_tables(summary["rows"][0], without_nan(cls.table.read(folder)))
+        return super().page(summary, folder)._replace(tables=tables)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
         from parkenv.studies.sensing.drive_replay import DriveReplay
 
         return [DriveReplay(self.built, self.drive_settings, len(self.table.read(folder)))]
-
-
-def survey_finding(row: Row) -> str:
-    """Return the result of a survey in a sentence."""
-    return (
-        f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: "
-        f"{row['car_detection_rate']:.1%} of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots "
-        "classified correctly."
-    )

@@ -73,6 +73,11 @@ class TrainingSpec(Study):
     )
     block: ClassVar = 1
     doing: ClassVar = "Training"
+    table_titles: ClassVar = {
+        "rows": "Trained models",
+        "transfer": "Test in held-out worlds",
+        "planners": "Planners in the same worlds",
+    }
     unit: ClassVar = ""
 
     kind: Literal["train"] = "train"
@@ -214,23 +219,34 @@ class TrainingSpec(Study):
         return {"settings": self.settings(), **summary}
 
     @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`: the test, if the models search."""
+        rows = [row for row in summary["rows"] if isinstance(row.get("total_s"), float)]
+        if not rows:
+            return []
+        times = sorted(row["total_s"] for row in rows)
+        name = rows[0]["scenario"]
+        between = f"{times[0]:.1f} s"
+        if len(times) > 1:
+            between = f"{times[0]:.1f} to {times[-1]:.1f} s over {len(times)} trainings"
+        finding = f"Tested on {name} in held-out worlds, the models take {between}"
+        planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
+        if planners:
+            best = min(planners, key=lambda row: float(row["total_s"]))
+            finding += f"; the best planner there, {best['agent']}, takes {best['total_s']:.1f} s"
+        return [f"{finding}."]
+
+    @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
         from parkenv.show.report.learning import learning_panels
-        from parkenv.show.report.page import Page, listed, on_scenarios
-        from parkenv.show.report.tables import tables_of
+        from parkenv.show.report.page import listed, on_scenarios
 
         rows = summary["rows"]
         agents = list(dict.fromkeys(str(row.get("agent", "agent")) for row in rows))
         curves = [without_nan(read_curve(folder / f"seed_{row['seed']}" / CURVE)) for row in rows]
-        titles = {
-            "rows": "Trained models",
-            "transfer": "Test in held-out worlds",
-            "planners": "Planners in the same worlds",
-        }
-        title = f"{listed(agents)} trained{on_scenarios(rows)}"
-        tables = tables_of(summary, titles)
-        return Page(title, _test_finding(summary), tables, learning_panels(summary, curves))
+        title, panels = f"{listed(agents)} trained{on_scenarios(rows)}", learning_panels(summary, curves)
+        return super().page(summary, folder)._replace(title=title, learning=panels)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
@@ -240,24 +256,6 @@ class TrainingSpec(Study):
     def tested(self) -> Scenarios | None:
         """Scenarios of the tests in the end; None for made ones."""
         return self.scenarios
-
-
-def _test_finding(summary: Row) -> list[str]:
-    """Return the result of the test in a sentence, if the models search."""
-    rows = [row for row in summary["rows"] if isinstance(row.get("total_s"), float)]
-    if not rows:
-        return []
-    times = sorted(row["total_s"] for row in rows)
-    name = rows[0]["scenario"]
-    between = f"{times[0]:.1f} s"
-    if len(times) > 1:
-        between = f"{times[0]:.1f} to {times[-1]:.1f} s over {len(times)} trainings"
-    finding = f"Tested on {name} in held-out worlds, the models take {between}"
-    planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
-    if planners:
-        best = min(planners, key=lambda row: float(row["total_s"]))
-        finding += f"; the best planner there, {best['agent']}, takes {best['total_s']:.1f} s"
-    return [f"{finding}."]
 
 
 class TestedTrainingSpec(TrainingSpec):
