@@ -228,11 +228,6 @@ def read_settings(folder: Path) -> Row | None:
     return settings
 
 
-def write_settings(folder: Path, settings: Mapping[str, Any]) -> None:
-    """Write the settings of a run."""
-    _write_text(folder / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
-
-
 def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) -> Row:
     """Check that a run to resume has the same settings.
 
@@ -362,7 +357,7 @@ class Results:
         A line that a crash has truncated is dropped, and runs again.
         """
         (self.path / SUMMARY).unlink(missing_ok=True)
-        write_settings(self.path, settings)
+        _write_text(self.path / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
         for table in self._tables:
             table.write(self.path, list(self._rows[table.file].values()))
 

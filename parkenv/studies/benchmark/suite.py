@@ -39,11 +39,6 @@ from planners.agent import make_agent
 RESULT_FORMAT = "parkenv-benchmark-result"
 RESULT_VERSION = 1
 SUITES = ("v1", "v2", "v2-places")
-METRICS = (
-    "episodes", "parked_fraction", "total_s", "total_s_ci95", "regret_s", "regret_s_ci95", "failed_parks",
-    "decision_ms", "decision_ms_p99",
-)  # fmt: skip
-"""Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score."""
 RESAMPLES = 2000
 _ROUNDING = 1e-6
 _FOLDER = Path(__file__).parent / "suites"
@@ -147,6 +142,10 @@ class _ResultRow(Spec, extra="allow"):
     decision_ms: float
     decision_ms_p99: float
     score: Share
+
+
+METRICS = tuple(_ResultRow.model_fields)[2:-1]
+"""Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score."""
 
 
 class _Searches(Spec):

@@ -24,7 +24,6 @@ from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
-BLIND = "-blind"  # suffix of the names of scenarios whose slots are not observed before an attempt
 BLOCK = 50  # episodes per task of searches that are not saved
 
 

@@ -48,8 +48,8 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
             "cars": sum(day["cars"] for day in days),
             **day_means(days, MEASURES, WITH_INTERVAL),
             **_differences(paired(days, OWN, 0.0)),
-            **_price(paired(days, ASSIGNED, 1.0)),
-            **_ratio("price_over_bound", days, days, "clairvoyant_s"),
+            **_ratio("price_of_anarchy", paired(days, ASSIGNED, 1.0), "total_s"),
+            **_ratio("price_over_bound", [(day, day) for day in days], "clairvoyant_s"),
         }
         for days in settings
     ]
@@ -76,15 +76,12 @@ def day_means(days: Sequence[Row], measures: Iterable[str], with_interval: Colle
     return row
 
 
-def _price(pairs: Pairs) -> Row:
-    mine, theirs = zip(*pairs, strict=True) if pairs else ((), ())
-    return _ratio("price_of_anarchy", mine, theirs, "total_s")
-
-
-def _ratio(name: str, days: Sequence[Row], others: Sequence[Row], column: str) -> Row:
+def _ratio(name: str, pairs: Pairs, column: str) -> Row:
     """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
-    if not days:
+    if not pairs:
         return columns_of(name, (math.nan, math.nan, math.nan))
-    mine = np.array([day["total_s"] * day["cars"] for day in days])
-    theirs = np.array([day[column] * day["cars"] for day in others])
+    mine, theirs = (
+        [day[name] * day["cars"] for day in days]
+        for name, days in zip(("total_s", column), zip(*pairs, strict=True), strict=True)
+    )
     return columns_of(name, ratio_interval(mine, theirs))
