@@ -112,8 +112,7 @@ def test_unknown_cases_are_named():
 
 
 def test_the_command_writes_rows_and_a_picture(tmp_path, monkeypatch):
-    inspections = line.inspections
-    monkeypatch.setattr(line, "inspections", lambda first, _: inspections(first, 300))
+    monkeypatch.setattr(line, "INSPECTED", 300)
     done = parkenv("verify", "--cases", "inspections", "--jobs", 1, "--out", tmp_path)
     assert (done.returncode, done.stderr) == (0, "")
     assert "5 of 5 rows agree with theory" in done.stdout

@@ -314,6 +314,7 @@ def _line(seed: int) -> list[Task]:
 SLOTS = 10
 TAKEN = 0.6  # probability that a slot is taken: all numbers of free slots from 2 to 6 are frequent
 FREE = (2, 3, 4, 5, 6)
+INSPECTED = 24_000  # searches
 
 
 def inspections(first: int, episodes: int) -> list[tuple[int, int]]:
@@ -328,14 +329,14 @@ def inspections(first: int, episodes: int) -> list[tuple[int, int]]:
     return [(round(SLOTS * (1.0 - row["occupancy"])), row["slots_passed"]) for row in rows]
 
 
-def inspection_rows(seed: int, episodes: int = 24_000) -> list[Row]:
+def inspection_rows(seed: int) -> list[Row]:
     """Return a row for each number of free slots, all from the same searches.
 
     If m of n slots are free, (n + 1)/(m + 1) are inspected until a free one: the m free slots cut the other n - m into
     m + 1 stretches. In a random order all stretches have the same mean length, (n - m)/(m + 1), and the first free slot
     comes right after the first stretch.
     """
-    found = np.array(inspections(seed, episodes))
+    found = np.array(inspections(seed, INSPECTED))
     return [
         mean_row(
             f"inspections, {m} of {SLOTS} slots free: greedy-drive",
