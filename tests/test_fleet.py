@@ -212,6 +212,8 @@ def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(argumen
     np.testing.assert_allclose(cars["left_at"][left], (cars["ended_at"] + cars["stay_s"])[left])
     searched = np.where(cars["n_steps"] > 0, cars["ended_at"] - cars["arrival"], 0.0)
     np.testing.assert_allclose(searched, cars["drive_s"] + cars["failed_s"], atol=1e-6)
+    assert (cars["queued_s"] <= cars["drive_s"] + 1e-9).all()
+    assert (fleet.slots["held_by"] == -1).all()
 
 
 @settings(max_examples=15, deadline=None)

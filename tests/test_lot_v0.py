@@ -32,9 +32,12 @@ pytestmark = [
 
 
 @LOTS
-def test_pettingzoo_s_tests_of_the_interface(scenario):
-    api_test(lot_v0.env(scenario=scenario), num_cycles=100)
-    parallel_api_test(lot_v0.parallel_env(scenario=scenario, tick_s=5.0), num_cycles=300)
+@pytest.mark.parametrize(
+    "options", [{}, {"knows": "full", "sees_cars": True, "leaving_soon_s": 10.0, "manoeuvre_s": 5.0}]
+)
+def test_pettingzoo_s_tests_of_the_interface(scenario, options):
+    api_test(lot_v0.env(scenario=scenario, **options), num_cycles=100)
+    parallel_api_test(lot_v0.parallel_env(scenario=scenario, tick_s=5.0, **options), num_cycles=300)
 
 
 @LOTS
@@ -195,6 +198,8 @@ def test_demand_decides_which_cars_there_are():
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
         ({"scenario": "moon"}, "moon"),
         ({"speed": 3}, "speed"),
+        ({"knows": "all"}, r"DriverKind\.knows is 'all'"),
+        ({"manoeuvre_s": -1}, "manoeuvre_s is -1"),
     ],
 )
 def test_bad_options_are_refused_in_a_line(options, words):

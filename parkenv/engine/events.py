@@ -125,10 +125,10 @@ def advance_at(address: int, until: float) -> int:
         if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
             number = int64s(fleet.ready)[fleet.first_ready]
             car = car_at(fleet.cars, number)
-            if car.policy == 0 or car.state != SEARCHING:
-                return NEEDS_RESERVATIONS if _lacks_reservation(fleet, car) else int(number)
-            if _lacks_reservation(fleet, car):
+            if fleet.reservations_stale and car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING:
                 return NEEDS_RESERVATIONS
+            if car.policy == 0 or car.state != SEARCHING:
+                return int(number)
             if not act(fleet, number, call_at(car.policy, address, number)):
                 return WRONG_ACTION
             continue
@@ -326,12 +326,6 @@ def _inform(fleet: Any, number: int) -> None:
     if car.knows != OWN_KNOWLEDGE:
         inform(fleet, number)
         refresh_belief(search_at(car.search, 0))
-
-
-@inlined
-def _lacks_reservation(fleet: Any, car: Any) -> bool:
-    """Return whether slots must be reserved anew before a car decides."""
-    return bool(fleet.reservations_stale and car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING)
 
 
 @inlined

@@ -449,19 +449,15 @@ class Fleet:
 
     def help(self, status: int) -> None:
         """Do what only Python can do, after `advance_at` returned a negative status; then call that again."""
-        if status == NEEDS_SEARCH:
-            self._grow_pool()
-        elif status == NEEDS_FORECAST:
-            self._compute_forecast()
-        elif status == NEEDS_REPORTS:
-            self._grow_reports()
-        elif status == NEEDS_RESERVATIONS:
-            self._reserve_slots()
-        elif status == NEEDS_STEPS:
-            self._grow_steps()
-        else:
-            assert status == WRONG_ACTION
+        if status == WRONG_ACTION:
             raise InputError("a compiled policy chose an action that does not exist")
+        {
+            NEEDS_SEARCH: self._grow_pool,
+            NEEDS_FORECAST: self._compute_forecast,
+            NEEDS_REPORTS: self._grow_reports,
+            NEEDS_RESERVATIONS: self._reserve_slots,
+            NEEDS_STEPS: self._grow_steps,
+        }[status]()
 
     def ready_cars(self) -> list[int]:
         """Return the cars that are to decide, or whose end Python has not handled yet, now, in their order."""

@@ -11,7 +11,6 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import (
     ADDRESS,
     address_of,
@@ -23,7 +22,6 @@ from parkenv.compiled.memory import (
     int64_array,
     int64s,
     record_at,
-    uint8s,
 )
 from parkenv.engine.local_observation import (
     FIRST_NEAR,
@@ -33,8 +31,16 @@ from parkenv.engine.local_observation import (
     Surroundings,
     observe_surroundings,
 )
-from parkenv.engine.policy import CompiledPolicy, PolicyData
-from parkenv.engine.records import N_ACTIONS, N_REGIONS, car_at, fleet_at, scenario_at, search_at
+from parkenv.engine.policy import (
+    CompiledPolicy,
+    PolicyData,
+    car_of,
+    draw_uniform,
+    is_allowed,
+    policy_data,
+    search_of,
+)
+from parkenv.engine.records import N_ACTIONS, N_REGIONS
 from parkenv.errors import InputError
 from parkenv.world.occupancy.kernel import inlined, kernel
 from parkenv.world.scenario import SearchProblem
@@ -81,10 +87,8 @@ surroundings_at, network_at = record_at(SURROUNDINGS), record_at(NETWORK)
 @kernel
 def decide_by_network(address: int, number: int) -> int:
     """Choose the action of the network of the car's kind."""
-    fleet = fleet_at(address, 0)
-    car = car_at(fleet.cars, number)
-    search = search_at(car.search, 0)
-    network = network_at(int64s(fleet.policy_data)[car.kind], 0)
+    car = car_of(address, number)
+    search, network = search_of(car.search), network_at(policy_data(address, car), 0)
     around = _surroundings_of(network)
     width = FIRST_NEAR + PER_NEAR * surroundings_at(network.surroundings, 0).k
     observe_surroundings(search, around, float32_array(network.local, (width,)))
@@ -94,10 +98,9 @@ def decide_by_network(address: int, number: int) -> int:
 @kernel
 def observe_locally(address: int, number: int, local: NDArray[np.float32]) -> None:
     """Write the `local` observation of a car whose kind is driven by a network; call once at each of its decisions."""
-    fleet = fleet_at(address, 0)
-    car = car_at(fleet.cars, number)
-    network = network_at(int64s(fleet.policy_data)[car.kind], 0)
-    observe_surroundings(search_at(car.search, 0), _surroundings_of(network), local)
+    car = car_of(address, number)
+    network = network_at(policy_data(address, car), 0)
+    observe_surroundings(search_of(car.search), _surroundings_of(network), local)
 
 
 @inlined
@@ -124,11 +127,10 @@ def _surroundings_of(network: Any) -> Surroundings:
 def _logits(network: Any, search: Any) -> int:
     """Compute the network's output for the observation in `local`; returns the address of (5,) float32."""
     widths = int64s(network.widths)
-    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     local, values = float32s(network.local), float32s(network.values)
     # The inputs are in alphabetical order: `action_mask`, then `local`.
     for action in range(N_ACTIONS):
-        values[action] = masks[search.vertex * N_ACTIONS + action]
+        values[action] = is_allowed(search, action)
     for i in range(widths[0] - N_ACTIONS):
         values[N_ACTIONS + i] = local[i]
     at, before = network.weights, network.values
@@ -168,24 +170,21 @@ def _activate(values_at: int, n: int, activation: int) -> None:
 def _choose(network: Any, search: Any, logits_at: int) -> int:
     """Choose the most probable action, or draw one."""
     logits = float32s(logits_at)
-    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
-    best, highest = -1, -np.inf
+    best, highest, total = -1, -np.inf, 0.0
     for action in range(N_ACTIONS):
-        open_to_it = not network.masked or masks[search.vertex * N_ACTIONS + action]
-        if open_to_it and logits[action] > highest:
+        if network.masked and not is_allowed(search, action):
+            logits[action] = -np.inf
+        if logits[action] > highest:
             best, highest = action, logits[action]
     if not network.sampled:
         return best
-    total = 0.0
     for action in range(N_ACTIONS):
-        if not network.masked or masks[search.vertex * N_ACTIONS + action]:
-            total += math.exp(logits[action] - highest)
-    left = keyed_uniform(search.key, POLICY_STREAM, 0, search.n_steps) * total
+        total += math.exp(logits[action] - highest)
+    left = draw_uniform(search) * total
     for action in range(N_ACTIONS):
-        if not network.masked or masks[search.vertex * N_ACTIONS + action]:
-            left -= math.exp(logits[action] - highest)
-            if left < 0.0:
-                return action
+        left -= math.exp(logits[action] - highest)
+        if left < 0.0:
+            return action
     return best
 
 
