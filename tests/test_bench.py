@@ -82,7 +82,7 @@ def test_bench_writes_its_rows(tmp_path):
 def test_an_unknown_part_is_named():
     result = CliRunner().invoke(app, ["bench", "engine"])
     assert isinstance(result.exception, InputError)
-    assert "no part 'engine' to measure; known: sensors, perception, planning, env" in str(result.exception)
+    assert "PARTS is 'engine', want 'sensors', 'perception', " in str(result.exception)
 
 
 def test_days_of_fleets_are_measured(monkeypatch):

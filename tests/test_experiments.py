@@ -9,12 +9,12 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
-from parkenv.cli.schema import schemas
 from parkenv.files.spec_file import read_tables
 from parkenv.studies.agent_spec import AgentSpec, parse_agent, split_agents
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.runner import run
+from parkenv.studies.schemas import schemas
 from parkenv.world.scenario import KMH
 
 ROOT = Path(__file__).parents[1]

@@ -11,12 +11,13 @@ from command_line import parkenv
 from test_report import data_of
 
 from parkenv import make_scenario
-from parkenv.cli.arguments import Machines
-from parkenv.cli.report import Replays, make_report
+from parkenv.cli.report import make_report
 from parkenv.errors import InputError
 from parkenv.show.report.page import SCHEMA
 from parkenv.studies.fleet.day_replay import DRIVE, FAIL, QUEUE, choose_days, record_day
 from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.report_options import ReportOptions
+from parkenv.studies.study import ExecutionSpec
 
 
 @pytest.fixture(scope="module")
@@ -101,16 +102,16 @@ def test_failed_attempts_and_queues_are_on_the_track():
 
 def test_days_and_agents_can_be_chosen(run, tmp_path):
     made = tmp_path / "chosen.html"
-    make_report(run, Machines(jobs=1), Replays(replay="1", agents="greedy-drive"), out=made)
+    make_report(run, ExecutionSpec(jobs=1), ReportOptions(numbers=(1,), agents=("greedy-drive",)), out=made)
     assert [its["day"] for its in data_of(made)["fleets"]] == [1] * 6
-    make_report(run, Machines(jobs=1), Replays(episodes=0), out=made)
+    make_report(run, ExecutionSpec(jobs=1), ReportOptions(episodes=0), out=made)
     assert data_of(made)["fleets"] == []
     for options, message in (
-        ({"replay": "2"}, "--replay has 2; this run's are 0 to 1"),
-        ({"agents": "belief"}, "--agents has 'belief'; known: greedy-drive"),
+        ({"numbers": (2,)}, "--replay has 2; this run's are 0 to 1"),
+        ({"agents": ("belief",)}, "--agents has 'belief'; known: greedy-drive"),
     ):
         with pytest.raises(InputError, match=message):
-            make_report(run, Machines(jobs=1), Replays(**options), out=made)
+            make_report(run, ExecutionSpec(jobs=1), ReportOptions(**options), out=made)
 
 
 def test_a_day_that_differs_from_the_results_is_noted(run, tmp_path):
@@ -147,7 +148,7 @@ def test_a_damaged_folder_is_refused_in_a_line(run, tmp_path, file, old, new, me
 
 def test_days_with_too_many_cars_are_not_replayed(run, tmp_path, monkeypatch):
     monkeypatch.setattr("parkenv.studies.fleet.day_replay.MOST_CARS", 15)
-    make_report(run, Machines(jobs=1), out=tmp_path / "page.html")
+    make_report(run, ExecutionSpec(jobs=1), out=tmp_path / "page.html")
     data = data_of(tmp_path / "page.html")
     assert {its["arrivals_per_hour"] for its in data["fleets"]} == {20.0}
     assert data["run"]["notes"] == [

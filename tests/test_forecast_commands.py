@@ -84,7 +84,7 @@ def test_a_fit_of_half_a_year_has_the_week(tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--from", "May"], "--from is 'May', want a date such as 2024-01-31"),
+        (["--from", "May"], "--from is 'May', want a date such as 2015-11-20"),
         (["--from", "2025-01-01"], "has no usable readings from then on"),
         (["--car-parks", "c"], "has no car park 'c'"),
         (["--timezone", "Mars"], "timezone is 'Mars', want an IANA name"),

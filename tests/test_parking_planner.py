@@ -356,8 +356,8 @@ def test_park_writes_its_table_and_pictures(tmp_path):
     ("options", "message"),
     [
         (["--lot", "nowhere"], "--lot is 'nowhere', want a packaged lot"),
-        (["--kind", "diagonal"], "--kind has 'diagonal'; known: perpendicular, oblique, parallel"),
-        (["--way", "up"], "--way has 'up'; known: nose-in, back-in"),
+        (["--kind", "diagonal"], "--kind is 'diagonal', want 'perpendicular', 'oblique' or 'parallel'"),
+        (["--way", "up"], "--way is 'up', want 'nose-in' or 'back-in'"),
         (["--lot", "mini", "--kind", "parallel"], "'mini' has no slot of the kinds parallel"),
     ],
 )

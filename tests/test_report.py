@@ -12,16 +12,17 @@ from command_line import parkenv
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.cli.arguments import Machines
-from parkenv.cli.report import Replays, make_report
+from parkenv.cli.report import make_report
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.show.report.page import SCHEMA
 from parkenv.show.report.tables import table_of
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.search_replay import Encounter, choose, replay
 from parkenv.studies.report import RunFolder
+from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import EPISODES
 from parkenv.studies.sensing.sessions import SESSIONS
+from parkenv.studies.study import ExecutionSpec
 from parkenv.world.lot import PARK
 from planners import make_agent
 
@@ -108,13 +109,15 @@ def test_a_page_is_one_small_file_that_needs_nothing_else(run):
 
 def test_the_same_folder_gives_the_same_page(run, tmp_path):
     made = tmp_path / "again.html"
-    make_report(run, Machines(jobs=2), out=made)
+    make_report(run, ExecutionSpec(jobs=2), out=made)
     assert made.read_bytes() == (run / "report.html").read_bytes()
 
 
 def test_searches_can_be_chosen(run, tmp_path):
     made = tmp_path / "chosen.html"
-    make_report(run, Machines(jobs=1), Replays(replay="9,8", agents="belief,oracle"), out=made)
+    make_report(
+        run, ExecutionSpec(jobs=1), ReportOptions(numbers=(9, 8), agents=("belief", "oracle")), out=made
+    )
     worlds = data_of(made)["worlds"]
     assert [w["seed"] for w in worlds] == [9, 9, 8, 8]
     assert {s["agent"] for w in worlds for s in w["searches"]} == {"belief", "oracle"}
@@ -123,13 +126,13 @@ def test_searches_can_be_chosen(run, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"replay": "99"}, "--replay has 99; this run's are 7 to 10"),
-        ({"agents": "belief,exact"}, "--agents has 'exact'; known: mdp, belief, mdp-static, oracle"),
+        ({"numbers": (99,)}, "--replay has 99; this run's are 7 to 10"),
+        ({"agents": ("belief", "exact")}, "--agents has 'exact'; known: mdp, belief, mdp-static, oracle"),
     ],
 )
 def test_what_is_not_in_the_run_cannot_be_chosen(run, tmp_path, options, message):
     with pytest.raises(InputError, match=re.escape(message)):
-        make_report(run, Machines(), Replays(**options), out=tmp_path / "x.html")
+        make_report(run, ExecutionSpec(), ReportOptions(**options), out=tmp_path / "x.html")
     assert not list(tmp_path.iterdir())
 
 
@@ -180,7 +183,7 @@ def test_a_total_that_differs_is_told(run, tmp_path, capsys):
     cells = lines[1].split(",")
     cells[column] = "1.0"
     (copy / "episodes.csv").write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
-    make_report(copy, Machines(jobs=1))
+    make_report(copy, ExecutionSpec(jobs=1))
     assert "episodes.csv says 1.00 s" in " ".join(capsys.readouterr().out.split())
     data = data_of(copy / "report.html")
     assert len(data["run"]["notes"]) == 1
@@ -196,10 +199,10 @@ def test_a_world_that_has_changed_since_is_not_replayed_but_told(tmp_path):
         "--jobs", 1, "--out", out,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    make_report(out, Machines(jobs=1))
+    make_report(out, ExecutionSpec(jobs=1))
     assert len(data_of(out / "report.html")["worlds"]) == 2
     lot.write_text(lot.read_text() + "\n")
-    make_report(out, Machines(jobs=1))
+    make_report(out, ExecutionSpec(jobs=1))
     data = data_of(out / "report.html")
     assert data["run"]["notes"] == [f"There is no replay: {lot} has changed since the run"]
     assert data["worlds"] == []
@@ -212,7 +215,7 @@ def test_other_commands_get_tables_and_figures(tmp_path):
         {"part": "env", "case": "resets", "value": None, "unit": "1/s"},
     ]
     summary_in(tmp_path, rows=rows)
-    make_report(tmp_path, Machines(jobs=1))
+    make_report(tmp_path, ExecutionSpec(jobs=1))
     (table,) = data_of(tmp_path / "report.html")["tables"]
     assert [row[2] for row in table["rows"]] == [3.5, None]
 
@@ -220,7 +223,7 @@ def test_other_commands_get_tables_and_figures(tmp_path):
 def test_episodes_of_other_commands_are_not_read_as_searches(tmp_path):
     summary_in(tmp_path, command=["parkenv", "park"], rows=[{"lot": "mini", "success": 1.0}])
     (tmp_path / "episodes.csv").write_text("agent,lot,seed,parked\nplanner,mini,0,True\n")
-    make_report(tmp_path, Machines(jobs=1))
+    make_report(tmp_path, ExecutionSpec(jobs=1))
     assert data_of(tmp_path / "report.html")["tables"][0]["rows"] == [["mini", 1.0]]
 
 
@@ -267,7 +270,7 @@ def test_learning_curves_are_those_of_the_training(tmp_path, drives):
 def test_text_in_the_data_cannot_end_its_element(tmp_path):
     nasty = "</script><script>alert(1)</script>"
     summary_in(tmp_path, rows=[{"case": nasty}, {"case": "b"}], command=["parkenv", "bench", nasty])
-    make_report(tmp_path, Machines(jobs=1))
+    make_report(tmp_path, ExecutionSpec(jobs=1))
     assert nasty not in (tmp_path / "report.html").read_text()
     assert data_of(tmp_path / "report.html")["tables"][0]["rows"] == [[nasty], ["b"]]
 
@@ -360,7 +363,7 @@ def test_a_survey_is_driven_again(tmp_path):
     assert (out / "report.html").stat().st_size < 10e6
 
     made = tmp_path / "short.html"
-    make_report(out, Machines(jobs=1), Replays(frames=6, sessions=2), out=made)
+    make_report(out, ExecutionSpec(jobs=1), ReportOptions(frames=6, sessions=2), out=made)
     assert [len(d["frames"]) <= 4 for d in data_of(made)["drives"]] == [True, True]
 
 

@@ -14,8 +14,8 @@ from selenium.webdriver.common.by import By  # noqa: E402
 from selenium.webdriver.common.keys import Keys  # noqa: E402
 from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
 
-from parkenv.cli.arguments import Machines  # noqa: E402
 from parkenv.cli.report import make_report  # noqa: E402
+from parkenv.studies.study import ExecutionSpec  # noqa: E402
 
 CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
 DRIVER = shutil.which("chromedriver")
@@ -41,7 +41,7 @@ def run(tmp_path_factory):
         "-n", "6", "--occupancy-levels", "none", "--jobs", "1", "--out", str(out),
     ]  # fmt: skip
     assert parkenv(*command).returncode == 0
-    make_report(out, Machines(jobs=1))
+    make_report(out, ExecutionSpec(jobs=1))
     return out
 
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from parkenv import InputError, make_scenario
-from parkenv.cli.arguments import World
+from parkenv.cli.options import made as changed_by
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.learned_map import LearnedMap
@@ -75,13 +75,13 @@ def test_days_of_scenarios_can_be_changed():
         p = [scenario.forecast(TUESDAY_NOON).p_occupied for scenario in (made, as_forecast)]
         np.testing.assert_array_equal(*p)
     spec = scenario_spec("jam")
-    assert World(day_error="0").specs("jam")[0].occupancy.day_error.level == 0.0
-    changed = World(day_error="0.5,0.25").spec("jam")
+    assert changed_by(ScenarioSpec, {"--day-error": "0"}, spec).occupancy.day_error.level == 0.0
+    changed = changed_by(ScenarioSpec, {"--day-error": "0.5,0.25"}, spec)
     assert changed.occupancy.day_error.tables() == {"level": 0.5, "slope": 0.25}
     assert changed.occupancy.event == spec.occupancy.event
     for text in ("x", "1,2,3", "nan", "-1"):
         with pytest.raises(InputError, match=r"^--day-error is "):
-            World(day_error=text).spec("jam")
+            changed_by(ScenarioSpec, {"--day-error": text}, spec)
 
 
 def test_a_file_says_it_all(tmp_path):

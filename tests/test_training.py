@@ -24,7 +24,6 @@ from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
 from parkenv import make_scenario
-from parkenv.cli.schema import schemas
 from parkenv.engine.local_observation import local_space
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.sb3 import SearchVecEnv
@@ -34,6 +33,7 @@ from parkenv.files.spec_file import read_tables
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
 from parkenv.studies.compare.cases import Case
+from parkenv.studies.schemas import schemas
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
@@ -682,15 +682,15 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        ("ppo --env fly", "--env: 'fly' is not one of"),
-        ("ppo --observation smell", "'smell' is not one of"),
-        ("ppo --curriculum age", "--curriculum: 'age' is not one of"),
+        ("ppo --env fly", "env is 'fly', want one of search, fleet, drive"),
+        ("ppo --observation smell", "observation is 'smell', want one of local, scan"),
+        ("ppo --curriculum age", "--curriculum is 'age', want 'size'"),
         ("ppo --evaluate-on nowhere", "unknown scenario 'nowhere'"),
         ("ppo --resume", "to resume"),
         ("ppo --scenario nowhere", "unknown scenario 'nowhere'"),
         ("sac --env drive --lot nowhere", "--lot is 'nowhere', want a packaged lot (campus, jam"),
         ("sac --env drive --lot nowhere.geojson", "--lot is 'nowhere.geojson', want a file; there is"),
-        ("ppo --day-error 0.5", "--day-error goes with --scenario or --lot"),
+        ("network --day-error 0.5", "--day-error goes with --scenario or --lot"),
         ("ppo --scenario mini --day-error x", "--day-error"),
         ("ppo --env drive --demonstrations 5", "demonstrations goes with env search, not with env drive"),
     ],

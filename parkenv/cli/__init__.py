@@ -17,73 +17,89 @@ from typing import Annotated
 import typer
 
 from parkenv import __version__
-from parkenv.cli import (
-    bench,
-    benchmark,
-    calibrate,
-    commute,
-    compare,
-    demo,
-    detect,
-    fleet,
-    lot,
-    occupancy,
-    park,
-    plan,
-    publish,
-    report,
-    run,
-    schema,
-    sensor_model,
-    sensors,
-    survey,
-    train,
-    verify,
-)
-from parkenv.cli.command import add, group
+from parkenv.cli.command import Entry, make_app
 from parkenv.cli.stop_signals import stop_signals
 from parkenv.errors import InputError
 from sim_sensors.errors import SensorError
 
-app = group(
-    "parkenv",
-    """Search for a free parking space: worlds, planners, and comparisons between them.
-
-    Examples:
-      parkenv demo --quick                       the whole story on a small lot
-      parkenv compare --scenario mini -n 20      agents in the same worlds
-      parkenv COMMAND --help                     every command has examples
-    """,
-)
 START, SEARCH, SENSE, DRIVE, DATA = (
     "Start here", "Search and compare", "Sensors and maps", "Drive", "Lots, logs and files",
 )  # fmt: skip
-add(app, "demo", demo.demo, START)
-add(app, "compare", compare.compare, SEARCH)
-add(app, "report", report.report, SEARCH)
-add(app, "commute", commute.commute, SEARCH)
-add(app, "fleet", fleet.fleet, SEARCH)
-add(app, "plan", plan.plan, SEARCH)
-add(app, "train", train.train, SEARCH)
-add(app, "publish", publish.publish, SEARCH)
-add(app, "run", run.run, SEARCH)
-app.add_typer(benchmark.app, rich_help_panel=SEARCH)
-add(app, "survey", survey.survey, SENSE)
-add(app, "map", survey.show_map, SENSE)
-add(app, "map-drive", survey.map_drive, SENSE)
-app.add_typer(sensors.app, rich_help_panel=SENSE)
-add(app, "fit-sensor-model", sensor_model.fit_sensor_model, SENSE)
-add(app, "detect", detect.detect, SENSE)
-add(app, "train-detector", detect.train_detector, SENSE)
-add(app, "evaluate-detector", detect.evaluate_detector, SENSE)
-add(app, "trip", calibrate.trip, DRIVE)
-add(app, "calibrate", calibrate.calibrate, DRIVE)
-add(app, "park", park.park, DRIVE)
-app.add_typer(lot.app, rich_help_panel=DATA)
-app.add_typer(occupancy.app, rich_help_panel=DATA)
-add(app, "schema", schema.schema, DATA)
-add(app, "verify", verify.verify, DATA)
-add(app, "bench", bench.bench, DATA)
+COMMANDS = {
+    "demo": Entry("Survey a lot with simulated sensors, and search there on other days.", "demo:Demo", START),
+    "compare": Entry(
+        "Compare agents over costs and speeds, all in the same worlds.", "compare:Compare", SEARCH
+    ),
+    "report": Entry("Write an HTML page on a run, with replays.", "report:Report", SEARCH),
+    "commute": Entry("Let drivers come day after day, with a map that learns.", "commute:Commute", SEARCH),
+    "fleet": Entry("Let many cars search one lot, and compare what they know.", "fleet:Fleet", SEARCH),
+    "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "plan:Plan", SEARCH),
+    "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),
+    "publish": Entry(
+        "Make a folder for the Hugging Face Hub; nothing is uploaded.", "publish:Publish", SEARCH
+    ),
+    "run": Entry("Run an experiment file.", "run:Run", SEARCH),
+    "benchmark": Entry("Run a fixed benchmark suite, and check the results of others.", heading=SEARCH),
+    "benchmark run": Entry("Run agents through all episodes of a suite.", "benchmark:RunSuite"),
+    "benchmark check": Entry("Check results of a suite, and print them side by side.", "benchmark:Check"),
+    "benchmark page": Entry(
+        "Check results of a suite, and write a page that compares them.", "benchmark:Page"
+    ),
+    "benchmark show": Entry("Show the tasks and settings of a suite.", "benchmark:Show"),
+    "survey": Entry(
+        "Drive past every slot, and write which slots are taken to a map file.", "survey:Survey", SENSE
+    ),
+    "map": Entry("Show the predictions of a map file: how often each slot is taken.", "survey:Map", SENSE),
+    "map-drive": Entry("Map a recorded drive of a car of your own.", "survey:MapDrive", SENSE),
+    "sensors": Entry("Preview the simulated sensors.", heading=SENSE),
+    "sensors preview": Entry("Draw what the sensors measure on the way to the best slot.", "sensors:Preview"),
+    "fit-sensor-model": Entry(
+        "Measure how often slots are observed correctly.", "sensors:FitSensorModel", SENSE
+    ),
+    "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
+    "train-detector": Entry("Train a car model or a network.", "detect:TrainDetector", SENSE),
+    "evaluate-detector": Entry(
+        "Measure a detector on images, or on drives.", "detect:EvaluateDetector", SENSE
+    ),
+    "trip": Entry(
+        "Drive one trip into a slot, and film it from above at five times real speed.", "drive:Trip", DRIVE
+    ),
+    "calibrate": Entry(
+        "Measure the costs of the drive graph on whole driven trips.", "drive:Calibrate", DRIVE
+    ),
+    "park": Entry("Evaluate agents that drive the car into a slot.", "drive:Park", DRIVE),
+    "lot": Entry(
+        "Show, check, import, count and convert lots (files, OpenStreetMap).",
+        heading=DATA,
+    ),
+    "lot show": Entry("Draw a lot and summarise it.", "lot:Show"),
+    "lot check": Entry(
+        "List all errors and warnings of a lot file, by feature number (from 0).", "lot:Check"
+    ),
+    "lot import": Entry(
+        "Import a lot of a real place; report what was found, guessed and left out.", "lot:Import"
+    ),
+    "lot census": Entry(
+        "Count lots: their size, kinds of slots, distances, and how sure they are.", "lot:Census"
+    ),
+    "lot convert": Entry("Write a lot as native GeoJSON.", "lot:Convert"),
+    "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=DATA),
+    "occupancy fit": Entry("Fit a model to recorded occupancy by maximum likelihood.", "occupancy:Fit"),
+    "occupancy evaluate": Entry("Score forecasts of occupancy beside simple ones.", "occupancy:Evaluate"),
+    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "schema:Schema", DATA),
+    "verify": Entry("Compare closed forms of the literature with this package.", "verify:Verify", DATA),
+    "bench": Entry("Measure throughput, and that of other software for the same task.", "bench:Bench", DATA),
+}
+"""Commands and groups of commands, as the help page lists them."""
+app = make_app(
+    "Search for a free parking space: worlds, planners, and comparisons between them.",
+    """
+    parkenv demo --quick                       the whole story on a small lot
+    parkenv compare --scenario mini -n 20      agents in the same worlds
+    parkenv COMMAND --help                     every command has examples
+    """,
+    COMMANDS,
+)
 
 
 def _show_version(wanted: bool) -> None:

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
+from pydantic import Field
+
+from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, make_table, save_summary
-from parkenv.errors import InputError, nearest
+from parkenv.files.option import option
+from parkenv.files.spec_file import Several
+from parkenv.studies.fields import Seed
 
 if TYPE_CHECKING:
     from parkenv.studies.bench.rows import BenchRow
@@ -23,56 +28,51 @@ PARTS = {
 """Modules of `parkenv.studies.bench`, and the function of each that measures."""
 
 
-def bench(
-    parts: list[str] | None = None,
-    /,
-    seconds: float = 0.6,
-    seed: int = 0,
-    out: Path | None = None,
-) -> None:
-    """Measure throughput, and that of other software for the same task, in the same run.
+class Bench(Command):
+    """A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine."""
 
-    A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine.
-
-    Examples:
+    examples = """
         parkenv bench sensors
         parkenv bench --seconds 2 --out results/bench
+        """
 
-    Options:
-        parts (PART): Some of sensors, perception, planning, env, drive, fleet.  [default: all]
-        seconds (0.01 <= X <= 3600): How long each figure is measured.
-        seed (N >= 0): Of the lots and the noise.
-        out, -o (DIR): Folder for summary.json, and a table of each part for a page.  [default: none]
-    """
-    from parkenv.files.atomic_write import make_folder
+    parts: Several[Literal["sensors", "perception", "planning", "env", "drive", "fleet"]] = option(
+        (), f"Some of {', '.join(PARTS)}.", takes="PART", argument=True, default="all"
+    )
+    seconds: float = option(0.6, "How long each figure is measured.", ge=0.01, le=3600)
+    seed: Seed = Field(0, description="Of the lots and the noise.")
+    out: Path | None = option(
+        None, "Folder for summary.json, and a table of each part for a page.", short="-o", default="none"
+    )
 
-    chosen = parts or list(PARTS)
-    for part in chosen:
-        if part not in PARTS:
-            raise InputError(f"there is no part {part!r} to measure; {nearest(part, PARTS)}")
-    if out is not None:
-        make_folder(out)
-    console = make_console()
-    console.print("After an installation each part first compiles what it measures, about 20 s.")
-    rows: list[BenchRow] = []
-    for part in chosen:
-        with console.status(f"Measuring {part}"):
-            measure = getattr(import_module(f"parkenv.studies.bench.{part}"), PARTS[part])
-            measured = measure(seed, seconds)
-        rows += measured
-        if out is not None:
-            (out / f"{part}.md").write_text(_markdown(measured), encoding="utf-8")
-    cells = []
-    before = None
-    for row in rows:
-        ours = [row["part"], row["case"], _figure(row["value"]), row["unit"]]
-        theirs = [row["peer"] or "", _figure(row["peer_value"]), _figure(row["ratio"])]
-        cells.append([*(ours if ours != before else [""] * len(ours)), *theirs])
-        before = ours
-    console.print(make_table(None, ["part", "case", "value", "unit", "peer", "peer's", "ratio"], cells))
-    if out is not None:
-        save_summary(out, seed, rows)
-        console.print(f"Written: {out / 'summary.json'}, and a table of each part, PART.md")
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import make_folder
+
+        chosen = self.parts or PARTS
+        if self.out is not None:
+            make_folder(self.out)
+        console = make_console()
+        console.print("After an installation each part first compiles what it measures, about 20 s.")
+        rows: list[BenchRow] = []
+        for part in chosen:
+            with console.status(f"Measuring {part}"):
+                measure = getattr(import_module(f"parkenv.studies.bench.{part}"), PARTS[part])
+                measured = measure(self.seed, self.seconds)
+            rows += measured
+            if self.out is not None:
+                (self.out / f"{part}.md").write_text(_markdown(measured), encoding="utf-8")
+        cells = []
+        before = None
+        for row in rows:
+            ours = [row["part"], row["case"], _figure(row["value"]), row["unit"]]
+            theirs = [row["peer"] or "", _figure(row["peer_value"]), _figure(row["ratio"])]
+            cells.append([*(ours if ours != before else [""] * len(ours)), *theirs])
+            before = ours
+        console.print(make_table(None, ["part", "case", "value", "unit", "peer", "peer's", "ratio"], cells))
+        if self.out is not None:
+            save_summary(self.out, self.seed, rows)
+            console.print(f"Written: {self.out / 'summary.json'}, and a table of each part, PART.md")
 
 
 def _markdown(rows: list[BenchRow]) -> str:

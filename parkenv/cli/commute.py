@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from parkenv.cli import arguments as args
-from parkenv.cli.command import options_of
-from parkenv.cli.study_run import run_study
+from parkenv.cli.study_command import AgentStudyCommand
 from parkenv.cli.tables import make_table
+from parkenv.files.option import option
 from parkenv.show.plurals import plural
+from parkenv.studies.commute.study import Commute as CommuteStudy
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -18,48 +18,37 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
 
 
-@options_of("parkenv.studies.commute.study:Commute", "--cars", "--pedestrians")
-def commute(
-    given: dict[str, Any],
-    /,
-    out: Path = Path("results/commute"),
-    *,
-    trust: bool = False,
-    trust_model: bool = False,
-    folder: args.ReportedRun,
-) -> None:
-    """Let drivers come day after day, with a map that learns from every trip.
+class Commute(AgentStudyCommand):
+    """Each driver comes at the same time of day, on the next of the scenario's weekdays or recorded days.
 
-    Each driver comes at the same time of day, on the next of the scenario's weekdays or recorded days. What the car
-    observes on a search goes into its map in the evening, with the sensor's error rates; the next day's forecast is
-    corrected by it. Nobody tells the map what else was free.
+    What the car observes on a search goes into its map in the evening, with the sensor's error rates; the next day's
+    forecast is corrected by it. Nobody tells the map what else was free.
 
     The table and the picture show mean total time and forecast error (Brier score of P(taken) at the arrival, over
     all slots) against the day. For comparison, each agent also drives with the right map that does not learn (fixed);
     agents that use no map (first-free, greedy-drive, ...) have one level. All meet the same worlds.
+    """
 
-    Examples:
+    examples = """
         parkenv commute --scenario jam --map wrong
         parkenv commute --scenario campus,jam --map empty,wrong --days 20
         parkenv commute --agents belief,first-free --drivers 100
         parkenv commute --fleet 5 --map empty
         parkenv commute --resume --days 60
+        """
 
-    Options:
-        out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json, commute.png and the maps.
-    """
-    from parkenv.cli.spec_options import given_spec
-    from parkenv.studies.commute.study import Commute
+    study: CommuteStudy = CommuteStudy()
+    out: Path = option(
+        Path("results/commute"),
+        "Folder for experiment.json, episodes.csv, summary.json, commute.png and the maps.",
+        short="-o",
+    )
 
-    _, study = given_spec(Commute(), given, out, folder.resume, trust, trust_model)
-    run_study(study, out, folder, show)
-
-
-def show(console: Console, result: Result) -> None:
-    """Print the tables of a commute."""
-    weeks = result.summary["weeks"]
-    for name in dict.fromkeys(row["scenario"] for row in weeks):
-        console.print(_table(name, [row for row in weeks if row["scenario"] == name]))
+    def show(self, console: Console, result: Result) -> None:
+        """Print the tables of a commute."""
+        weeks = result.summary["weeks"]
+        for name in dict.fromkeys(row["scenario"] for row in weeks):
+            console.print(_table(name, [row for row in weeks if row["scenario"] == name]))
 
 
 def _table(scenario: str, rows: list[dict[str, Any]]) -> Table:

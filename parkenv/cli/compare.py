@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
-from parkenv.cli import arguments as args
-from parkenv.cli.command import options_of
-from parkenv.cli.study_run import run_study
-from parkenv.cli.tables import (
-    WIDE,
-    make_console,
-    make_table,
-    print_recorded,
-)
+from parkenv.cli.options import Given
+from parkenv.cli.study_command import AgentStudyCommand, Rerun
+from parkenv.cli.tables import WIDE, make_console, make_table, print_recorded
 from parkenv.errors import InputError
+from parkenv.files.option import option
 from parkenv.show.plurals import plural
+from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.results import Row
 from parkenv.world.cost_terms import COST_TERMS
 
@@ -25,7 +21,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from parkenv.studies.compare.cases import Case
-    from parkenv.studies.compare.comparison import Comparison
     from parkenv.studies.runner import Result
 
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -34,88 +29,79 @@ MOST_TABLES = 12
 """Maximum number of settings to print; see the figures and files for larger grids."""
 
 
-@options_of("parkenv.studies.compare.comparison:Comparison", "--cars", "--pedestrians")
-def compare(
-    given: dict[str, Any],
-    /,
-    out: Path = Path("results/compare"),
-    *,
-    largest: int | None = None,
-    rerun: Path | None = None,
-    trust: bool = False,
-    trust_model: bool = False,
-    folder: args.ReportedRun,
-) -> None:
-    """Compare agents over failure costs and speeds, all in the same worlds.
+class Compare(AgentStudyCommand):
+    """Episode i has the same seed for every agent, hence the same cars at the same times.
 
-    Episode i has the same seed for every agent, hence the same cars at the same times. The table gives the mean total
-    time (drive + failed attempts + walk) with its 95 % interval, the paired difference to the first agent, and the
-    regret to the clairvoyant bound. Options are shortcuts for an experiment file, which `parkenv run` takes.
+    The table gives the mean total time (drive + failed attempts + walk) with its 95 % interval, the paired difference
+    to the first agent, and the regret to the clairvoyant bound. Options are shortcuts for an experiment file, which
+    `parkenv run` takes.
+    """
 
-    Examples:
+    examples = """
         parkenv compare --scenario campus,jam --failure-cost 10,90 --out results
         parkenv compare --agents "mdp(failure_s=90),belief,oracle" --report
         parkenv compare --agents mdp,mdp-tuned,oracle --failure-cost sweep
         parkenv compare --scenario lots --largest 5 --report
         parkenv compare --lot lot.geojson --occupancy log.csv.gz -n 300
         parkenv compare --resume --episodes 1000
+        """
 
-    Options:
-        out, -o (DIR): Folder for experiment.json, episodes.csv, summary.json and the figures.
+    study: Comparison = Comparison().changed(grid={"occupancy_levels": LEVELS})
+    largest: int | None = option(
+        None, "Of the scenarios, only those with the N largest lots.", panel="World", default="all", ge=1
+    )
+    rerun: Rerun = None
+    out: Path = option(
+        Path("results/compare"),
+        "Folder for experiment.json, episodes.csv, summary.json and the figures.",
+        short="-o",
+    )
 
-    World:
-        largest (N >= 1): Of the scenarios, only those with the N largest lots.  [default: all]
-    """
-    from parkenv.cli.spec_options import given_spec
-    from parkenv.scenarios.build import largest_lots
-    from parkenv.studies.compare.comparison import FAILURE_COST_SWEEP, Comparison
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        """See `StudyCommand`; a sweep of failure costs has no occupancy levels, and also blind searches."""
+        command = super().of(given)
+        study, sweep = command.study, given.get("--failure-cost") == "sweep"
+        if sweep and "--occupancy-levels" not in given and not command.resume:
+            study = study.changed(grid=study.grid.changed(occupancy_levels=()))
+        if sweep or ("--failure-cost" in given and study.grid.blind):
+            study = study.changed(grid=study.grid.changed(blind=sweep))
+        if command.largest is not None:
+            from parkenv.scenarios.build import largest_lots
 
-    sweep = given.get("--failure-cost") == "sweep"
-    first = Comparison().changed(grid={"occupancy_levels": () if sweep else LEVELS})
-    base, spec = given_spec(first, given, out, folder.resume, trust, trust_model)
-    if sweep or base.grid.failure_s == FAILURE_COST_SWEEP != spec.grid.failure_s:
-        spec = spec.changed(grid=spec.grid.changed(blind=sweep))
-    if largest is not None:
-        spec = spec.changed(scenarios=tuple(largest_lots(spec.scenarios, largest)))
-    run_comparison(spec, out, folder, rerun)
+            study = study.changed(scenarios=tuple(largest_lots(study.scenarios, command.largest)))
+        return command.changed(study=study)
 
+    def run(self) -> None:
+        """See `Command`; also record the first episode on request."""
+        if self.rerun is not None:
+            from parkenv.studies.trips.sensor_log import require_viewer
 
-def run_comparison(study: Comparison, out: Path, folder: args.ReportedRun, rerun: Path | None = None) -> None:
-    """Run a comparison, print its tables, and record its first episode on request.
+            if self.study.rig is None:
+                raise InputError("--rerun records what sensors measure: add --rig laser")
+            require_viewer()
+        super().run()
+        if self.rerun is not None:
+            console = make_console()
+            with console.status(f"Running the first episode once more for {self.rerun}"):
+                _record(*self.study.cases[0], self.rerun)
+            print_recorded(console, self.rerun)
 
-    Raises:
-        InputError: the comparison cannot be run, or the folder cannot be used.
-        KeyboardInterrupt: the run was interrupted; the results of finished episodes are printed and in the folder.
-    """
-    if rerun is not None:
-        from parkenv.studies.trips.sensor_log import require_viewer
+    def show(self, console: Console, result: Result) -> None:
+        """Print the tables of a comparison."""
+        from parkenv.world.scenario import KMH
 
-        if study.rig is None:
-            raise InputError("--rerun records what sensors measure: add --rig laser")
-        require_viewer()
-    run_study(study, out, folder, show)
-    if rerun is not None:
-        console = make_console()
-        with console.status(f"Running the first episode once more for {rerun}"):
-            _record(*study.cases[0], rerun)
-        print_recorded(console, rerun)
-
-
-def show(console: Console, result: Result) -> None:
-    """Print the tables of a comparison."""
-    from parkenv.world.scenario import KMH
-
-    count = setting_count(result.rows)
-    for printed in result_tables(result.rows, console.width) if count <= MOST_TABLES else []:
-        console.print(printed)
-    if count > MOST_TABLES:
-        console.print(f"{count} settings: their tables are in summary.json")
-    if (measured := result.summary.get("calibrated")) is not None:
-        console.print(
-            f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, drive "
-            f"{measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for the "
-            "manoeuvre into the slot, under either cost; the tables leave that out."
-        )
+        count = setting_count(result.rows)
+        for printed in result_tables(result.rows, console.width) if count <= MOST_TABLES else []:
+            console.print(printed)
+        if count > MOST_TABLES:
+            console.print(f"{count} settings: their tables are in summary.json")
+        if (measured := result.summary.get("calibrated")) is not None:
+            console.print(
+                f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, "
+                f"drive {measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for "
+                "the manoeuvre into the slot, under either cost; the tables leave that out."
+            )
 
 
 def setting_count(rows: list[Row]) -> int:

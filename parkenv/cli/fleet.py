@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from parkenv.cli import arguments as args
-from parkenv.cli.command import options_of
-from parkenv.cli.study_run import run_study
+from parkenv.cli.study_command import AgentStudyCommand
 from parkenv.cli.tables import make_table
+from parkenv.files.option import option
+from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.results import Row
 
 if TYPE_CHECKING:
@@ -17,50 +17,36 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
 
 
-@options_of("parkenv.studies.fleet.study:FleetStudy", "--cars", "--pedestrians")
-def fleet(
-    given: dict[str, Any],
-    /,
-    out: Path = Path("results/fleet"),
-    *,
-    trust: bool = False,
-    trust_model: bool = False,
-    folder: args.ReportedRun,
-) -> None:
-    """Let many cars arrive in one lot, search, park, stay and leave, and compare what they know.
+class Fleet(AgentStudyCommand):
+    """On a day, residents are parked when the hours of arrival begin, and leave after the rest of their stay.
 
-    On a day, residents are parked when the hours of arrival begin, and leave after the rest of their stay; cars arrive
-    as a Poisson process. All settings have the same days: arrivals, stays, patience and residents. The table gives
-    the mean over cars and days with 95 % intervals over days. The price of anarchy is the total time over that of a
-    guidance system that reserves slots for all cars; it needs reserve among --knows, and 1 among --share.
+    Cars arrive as a Poisson process. All settings have the same days: arrivals, stays, patience and residents. The
+    table gives the mean over cars and days with 95 % intervals over days. The price of anarchy is the total time over
+    that of a guidance system that reserves slots for all cars; it needs reserve among --knows, and 1 among --share.
+    """
 
-    Examples:
+    examples = """
         parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
         parkenv fleet --manoeuvre 15 --leaving-soon 10
         parkenv fleet --resume --episodes 20
+        """
 
-    Options:
-        out, -o (DIR): Folder for experiment.json, days.csv, summary.json and fleet.png.
-    """
-    from parkenv.cli.spec_options import given_spec
-    from parkenv.studies.fleet.study import FleetStudy
+    study: FleetStudy = FleetStudy()
+    out: Path = option(
+        Path("results/fleet"), "Folder for experiment.json, days.csv, summary.json and fleet.png.", short="-o"
+    )
 
-    _, study = given_spec(FleetStudy(), given, out, folder.resume, trust, trust_model)
-    run_study(study, out, folder, show)
-
-
-def show(console: Console, result: Result) -> None:
-    """Print the table of a study of many cars."""
-    study: Any = result.study
-    if not result.rows:
-        return
-    headings = (
-        "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
-        "cruising", "occupancy", "price of anarchy", "over bound",
-    )  # fmt: skip
-    console.print(make_table(study.title, headings, map(_cells, result.rows)))
+    def show(self, console: Console, result: Result) -> None:
+        """Print the table of a study of many cars."""
+        if not result.rows:
+            return
+        headings = (
+            "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
+            "cruising", "occupancy", "price of anarchy", "over bound",
+        )  # fmt: skip
+        console.print(make_table(self.study.title, headings, map(_cells, result.rows)))
 
 
 def _cells(row: Row) -> tuple[str, ...]:

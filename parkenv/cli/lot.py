@@ -2,369 +2,364 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
+from pydantic import Field, model_validator
+from pydantic_core import PydanticCustomError
 from typer import Exit
 
-from parkenv.cli import arguments as args
-from parkenv.cli.command import add, group
-from parkenv.cli.single_writer import writing_into
-from parkenv.cli.tables import make_console, make_table, progress_bar, save_summary
+from parkenv.cli.options import Command
+from parkenv.cli.tables import make_console, make_table, save_summary, stages, writing_into
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
+from parkenv.files.known_names import SCENARIO_NAMES
+from parkenv.files.option import Option, numbers_in, option
+from parkenv.files.spec_file import Several
 from parkenv.show.plurals import plural
-
-AUTO = "auto"
-"""Value of `--entry` and `--goal` that allows a guess."""
+from parkenv.studies.results import Row
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from parkenv.lots.draft import ImportOptions
     from parkenv.lots.quality import Provenance
     from parkenv.world.lot import ParkingLot
 
+AUTO = "auto"
+"""Value of `--entry` and `--goal` that allows a guess."""
+LotName = Annotated[
+    str,
+    Field(description=f"{', '.join(SCENARIO_NAMES)}, or a lot file."),
+    Option("LOT", takes="NAME|FILE", argument=True),
+]
+Place = Annotated[
+    Path,
+    Field(
+        description="OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a "
+        "Dragon Lake map (.yml) or a lot."
+    ),
+    Option(takes="FILE", argument=True),
+]
 
-def show(lot: str, /, graph: bool = False, out: Path | None = None) -> None:
-    """Draw a lot and summarise it; slots with a parking cost are coloured by it. Guesses of an import are listed.
 
-    Examples:
+class Show(Command):
+    """Slots with a parking cost are coloured by it. Guesses of an import are listed."""
+
+    examples = """
         parkenv lot show campus --graph --out campus.png
         parkenv lot show mine.geojson
+        """
 
-    Options:
-        lot (NAME|FILE): {scenarios}, or a lot file.
-        graph: Also draw the drive graph.
-        out, -o (FILE): Picture: .png, .pdf or .svg.  [default: NAME.png]
-    """
-    from parkenv.lots import load_lot
-    from parkenv.show.figures.lot import save_lot_picture
+    lot: LotName
+    graph: bool = option(False, "Also draw the drive graph.")
+    out: Path | None = option(
+        None, "Picture: .png, .pdf or .svg.", short="-o", takes="FILE", default="NAME.png"
+    )
 
-    its_lot = load_lot(lot)
-    picture = out or Path(file_name(its_lot.name, ".png"))
-    origin = _provenance(Path(lot))
-    guesses = origin.guesses if origin is not None else ()
-    save_lot_picture(its_lot, picture, show_graph=graph, guesses=guesses)
-    console = make_console(soft_wrap=True)
-    for guess in guesses:
-        console.print(f"guessed: {guess}", style="cyan", markup=False)
-    console.print(f"{_summary(its_lot)}. Picture: {picture}")
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.lots import load_lot
+        from parkenv.show.figures.lot import save_lot_picture
+
+        its_lot = load_lot(self.lot)
+        picture = self.out or Path(file_name(its_lot.name, ".png"))
+        origin = _provenance(Path(self.lot))
+        guesses = origin.guesses if origin is not None else ()
+        save_lot_picture(its_lot, picture, show_graph=self.graph, guesses=guesses)
+        console = make_console(soft_wrap=True)
+        for guess in guesses:
+            console.print(f"guessed: {guess}", style="cyan", markup=False)
+        console.print(f"{_summary(its_lot)}. Picture: {picture}")
 
 
-def check(place: Path, /, drive: bool | None = None) -> None:
-    """List all errors and warnings of a lot file, by feature number (from 0), and summarise a valid lot.
+class Check(Command):
+    """The drivability of a lot is checked: can a car reach every slot, drive into it and get back, and are lanes clear?
 
-    The drivability of a lot is checked: can a car reach every slot, drive into it and get back, and are the lanes
-    clear? The error probability, 0 to 1, sums up the reasons why an imported lot may differ from the place.
+    The error probability, 0 to 1, sums up the reasons why an imported lot may differ from the place. A valid lot is
+    summarised.
 
     The exit code is 2 if there are errors, else 0. Of a file to import it lists what an import would lack.
+    """
 
-    Examples:
+    examples = """
         parkenv lot check mine.geojson
         parkenv lot check map.osm
+        """
 
-    Options:
-        place (FILE): OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a
-            Dragon Lake map (.yml) or a lot.
-        drive: Plan how the car drives into each kind of slot.  [default: drive]
-    """
-    from parkenv.lots import check_lot, read_lot
-    from parkenv.lots.formats.recognition import lot_format
-    from parkenv.studies.drivability import check_drivability
+    place: Place
+    drive: bool = option(True, "Plan how the car drives into each kind of slot.")
 
-    console = make_console(soft_wrap=True)
-    problems = check_lot(place)
-    form = lot_format(place)
-    drivability = None
-    if form is not None and form.is_complete and not any(p.severity == "error" for p in problems):
-        origin = _provenance(place)
-        drivability = check_drivability(
-            read_lot(place), origin.issues if origin is not None else (), drive=drive is not False
-        )
-        problems += drivability.problems
-    for problem in problems:
-        feature = "" if problem.feature is None else f"feature {problem.feature}: "
-        console.print(
-            f"{problem.severity}: {feature}{problem.message}",
-            style="red" if problem.severity == "error" else "yellow",
-            markup=False,
-        )
-    errors = sum(p.severity == "error" for p in problems)
-    if not problems:
-        console.print(f"{place}: no errors, no warnings")
-    else:
-        counts = (errors, "error"), (len(problems) - errors, "warning")
-        console.print(f"{place}: " + ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts))
-    if errors:
-        raise Exit(2)
-    if drivability is not None:
-        console.print(_summary(read_lot(place)))
-        if drive is not False:
-            console.print(f"{drivability.planned} of {drivability.kinds} kinds of manoeuvres planned")
-        reasons = "; ".join(map(str, drivability.issues))
-        console.print(
-            f"error probability {drivability.error_probability:.2f}" + (f": {reasons}" if reasons else ""),
-            markup=False,
-        )
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.lots import check_lot, read_lot
+        from parkenv.lots.formats.recognition import lot_format
+        from parkenv.studies.drivability import check_drivability
+
+        console = make_console(soft_wrap=True)
+        problems = check_lot(self.place)
+        form = lot_format(self.place)
+        drivability = None
+        if form is not None and form.is_complete and not any(p.severity == "error" for p in problems):
+            origin = _provenance(self.place)
+            drivability = check_drivability(
+                read_lot(self.place), origin.issues if origin is not None else (), drive=self.drive
+            )
+            problems += drivability.problems
+        for problem in problems:
+            feature = "" if problem.feature is None else f"feature {problem.feature}: "
+            console.print(
+                f"{problem.severity}: {feature}{problem.message}",
+                style="red" if problem.severity == "error" else "yellow",
+                markup=False,
+            )
+        errors = sum(p.severity == "error" for p in problems)
+        if not problems:
+            console.print(f"{self.place}: no errors, no warnings")
+        else:
+            counts = (errors, "error"), (len(problems) - errors, "warning")
+            console.print(f"{self.place}: " + ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts))
+        if errors:
+            raise Exit(2)
+        if drivability is not None:
+            console.print(_summary(read_lot(self.place)))
+            if self.drive:
+                console.print(f"{drivability.planned} of {drivability.kinds} kinds of manoeuvres planned")
+            reasons = "; ".join(map(str, drivability.issues))
+            console.print(
+                f"error probability {drivability.error_probability:.2f}"
+                + (f": {reasons}" if reasons else ""),
+                markup=False,
+            )
 
 
-def import_place(
-    place: Path,
-    /,
-    out: Path,
-    picture: Path | None = None,
-    goal: list[str] | None = None,
-    entry: list[str] | None = None,
-    bounds: str | None = None,
-    disabled: bool = False,
-    split: bool = False,
-    least: int = 10,
-) -> None:
-    """Import a lot of a real place; report what was found, guessed, left out and is missing.
+def _points(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
+    """Return the points of an option; `auto` stands for none."""
+    numbers = (numbers_in(text, 2) for text in texts if text != AUTO)
+    return tuple((p[0], p[1]) for p in numbers)
 
-    Outlines of parking spaces are enough: without roads in the file, the rows, the aisles before them and the ways
-    between these are inferred. With --split, every car park of a town becomes a lot in a folder, with a table
-    (`summary.json`) and a contact sheet.
+
+def _point(text: str) -> str:
+    if text != AUTO:
+        numbers_in(text, 2)
+    return text
+
+
+class Import(Command):
+    """Outlines of parking spaces are enough: without roads in the file, rows, aisles and ways between are inferred.
+
+    With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`) and a contact sheet.
 
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
+    """
 
-    Examples:
+    examples = """
         parkenv lot import map.osm --out lot.geojson --picture lot.png
         parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25
         parkenv lot import spaces.geojson --entry auto --goal auto --out lot.geojson
         parkenv lot import town.geojson --split --out lots
+        """
 
-    Options:
-        place (FILE): OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a
-            Dragon Lake map (.yml) or a lot.
-        out, -o (FILE.geojson|DIR): Lot file to write, or folder with --split.
-        picture (FILE.png): Picture to check the import by.
-        goal (POINT): Place that people walk to: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.  [default:
-            building entrances, else the nearest building]
-        entry (POINT): Place where cars enter: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.  [default:
-            where service roads meet a public street, or where streets leave the map]
-        bounds (BOX): Import only this: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres.
-        disabled: Also import spaces for disabled drivers.
-        split: Find the car parks of a town and write a lot of each; entries and goals are guessed.
-        least (N >= 2): Number of spaces of the smallest car park, with --split.
-    """
-    from parkenv.files.atomic_write import check_writable
-    from parkenv.lots import import_lot, write_lot
-    from parkenv.lots.draft import ImportOptions
-    from parkenv.lots.formats.geojson import check_lot_output
-    from parkenv.lots.quality import Provenance
-
-    corners = None if bounds is None else args.numbers("--bounds", bounds, 4)
-    options = ImportOptions(
-        goals=_points("--goal", goal),
-        entries=_points("--entry", entry),
-        guess_entry=split or AUTO in (entry or ()),
-        guess_goal=split or AUTO in (goal or ()),
-        bounds=None if corners is None else ((corners[0], corners[1]), (corners[2], corners[3])),
-        with_disabled=disabled,
+    place: Place
+    picture: Path | None = option(None, "Picture to check the import by.", takes="FILE.png")
+    goal: Several[str] = option(
+        (),
+        "Place that people walk to: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.",
+        takes="POINT",
+        repeat=True,
+        parse=_point,
+        default="building entrances, else the nearest building",
     )
-    console = make_console(soft_wrap=True)
-    if split:
-        if options.goals or options.entries or options.bounds or picture:
-            raise InputError(
-                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture"
+    entry: Several[str] = option(
+        (),
+        "Place where cars enter: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.",
+        takes="POINT",
+        repeat=True,
+        parse=_point,
+        default="where service roads meet a public street, or where streets leave the map",
+    )
+    bounds: Several[float] | None = option(
+        None,
+        "Import only this: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres.",
+        takes="BOX",
+        parse=lambda text: tuple(numbers_in(text, 4)),
+    )
+    disabled: bool = option(False, "Also import spaces for disabled drivers.")
+    split: bool = option(
+        False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
+    )
+    least: int = option(10, "Number of spaces of the smallest car park, with --split.", ge=2)
+    out: Path = option(
+        ..., "Lot file to write, or folder with --split.", short="-o", takes="FILE.geojson|DIR"
+    )
+
+    @model_validator(mode="after")
+    def _split_alone(self) -> Self:
+        points = [point for point in (*self.goal, *self.entry) if point != AUTO]
+        if self.split and (points or self.bounds or self.picture):
+            raise PydanticCustomError(
+                "whole",
+                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture",
             )
-        with writing_into(out):
-            _import_town(place, out, options, least)
-        return
-    check_lot_output(out)
-    if picture is not None:
-        if picture.suffix.lower() != ".png":
-            raise InputError(f"--picture {picture}: want a name that ends in .png")
-        check_writable(picture)
-    draft = import_lot(place, options)
-    for line in draft.found:
-        console.print(line)
-    for guess in draft.guesses:
-        console.print(f"guessed: {guess}", style="cyan", markup=False)
-    for left in draft.left_out:
-        console.print(f"left out: {left}", style="yellow")
-    if picture is not None:
-        from parkenv.show.figures.lot_import import save_import_picture
+        return self
 
-        save_import_picture(draft, picture)
-        console.print(f"Picture: {picture}")
-    try:
-        lot = draft.lot()
-    except InputError as error:
-        raise InputError(f"{place}: {error}") from error
-    provenance = Provenance(place.name, draft.guesses, draft.issues) if draft.guesses else None
-    write_lot(lot, out, provenance)
-    console.print(f"Wrote {out}. {_summary(lot)}")
+    @property
+    def _options(self) -> ImportOptions:
+        from parkenv.lots.draft import ImportOptions
+
+        box = self.bounds
+        return ImportOptions(
+            goals=_points(self.goal),
+            entries=_points(self.entry),
+            guess_entry=self.split or AUTO in self.entry,
+            guess_goal=self.split or AUTO in self.goal,
+            bounds=None if box is None else ((box[0], box[1]), (box[2], box[3])),
+            with_disabled=self.disabled,
+        )
+
+    def run(self) -> None:
+        """See `Command`."""
+        if self.split:
+            with writing_into(self.out):
+                self._import_town()
+            return
+        from parkenv.files.atomic_write import check_writable
+        from parkenv.lots import import_lot, write_lot
+        from parkenv.lots.formats.geojson import check_lot_output
+        from parkenv.lots.quality import Provenance
+
+        check_lot_output(self.out)
+        if self.picture is not None:
+            if self.picture.suffix.lower() != ".png":
+                raise InputError(f"--picture {self.picture}: want a name that ends in .png")
+            check_writable(self.picture)
+        console = make_console(soft_wrap=True)
+        draft = import_lot(self.place, self._options)
+        for line in draft.found:
+            console.print(line)
+        for guess in draft.guesses:
+            console.print(f"guessed: {guess}", style="cyan", markup=False)
+        for left in draft.left_out:
+            console.print(f"left out: {left}", style="yellow")
+        if self.picture is not None:
+            from parkenv.show.figures.lot_import import save_import_picture
+
+            save_import_picture(draft, self.picture)
+            console.print(f"Picture: {self.picture}")
+        try:
+            lot = draft.lot()
+        except InputError as error:
+            raise InputError(f"{self.place}: {error}") from error
+        provenance = Provenance(self.place.name, draft.guesses, draft.issues) if draft.guesses else None
+        write_lot(lot, self.out, provenance)
+        console.print(f"Wrote {self.out}. {_summary(lot)}")
+
+    def _import_town(self) -> None:
+        from parkenv.studies.town_import import import_town_lots
+
+        console = make_console(soft_wrap=True)
+        with stages(console) as progress:
+            town = import_town_lots(self.place, self.out, self._options, self.least, progress)
+        save_summary(self.out, None, town.rows)
+        headings = ("car park", "spaces", "slots", "lanes", "p(error)", "result", "reason")
+        cells = (
+            (
+                row["lot"], row["spaces"], row["slots"], row["lanes"],
+                "" if row["error_probability"] is None else f"{row['error_probability']:.2f}", row["result"],
+                row["reason"],
+            )
+            for row in town.rows
+        )  # fmt: skip
+        make_console().print(_table_of_lots(headings, cells))
+        results = Counter(row["result"] for row in town.rows)
+        listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
+        lots = plural(len(town.rows) - results["refused"], "lot")
+        pictures = f" Pictures: {', '.join(map(str, town.pictures))}" if town.pictures else ""
+        console.print(
+            f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}.{pictures}"
+        )
 
 
-def _import_town(place: Path, out: Path, options: ImportOptions, least: int) -> None:
-    """Write every car park of a town, a table of what became of each, and contact sheets."""
-    from parkenv.lots import write_lot
-    from parkenv.lots.osm.town import import_town
-    from parkenv.lots.quality import Provenance
-    from parkenv.show.figures.contact_sheet import save_contact_sheets
-    from parkenv.studies.drivability import check_drivability
-
-    rows: list[dict[str, object]] = []
-    lots = []
-    console = make_console(soft_wrap=True)
-    parks = import_town(place, options, least)
-    with progress_bar(console) as bar:
-        task = bar.add_task("car parks", total=None)
-        for park in parks:
-            bar.advance(task)
-            row: dict[str, object] = {"lot": park.name, "spaces": park.spaces, "slots": 0, "lanes": 0}
-            if park.draft is None:
-                row |= {"result": "refused", "error_probability": None, "reason": park.reason}
-            else:
-                lot = park.draft.lot()
-                drivability = check_drivability(lot, park.draft.issues)
-                left = "; ".join(map(str, park.draft.left_out))
-                problems = "; ".join(problem.message for problem in drivability.problems)
-                row |= {
-                    "slots": lot.n_slots,
-                    "lanes": len(lot.lanes),
-                    "result": "warnings" if drivability.problems else "clean",
-                    "error_probability": round(drivability.error_probability, 3),
-                    "reason": problems or (f"left out: {left}" if left else ""),
-                }
-                lots.append(
-                    (
-                        lot,
-                        Provenance(place.name, park.draft.guesses, drivability.issues),
-                        drivability.error_probability,
-                    )
-                )
-            rows.append(row)
-    for lot, provenance, _ in lots:
-        write_lot(lot, out / f"{lot.name}.geojson", provenance)
-    drawn = [(f"{lot.name}\n{lot.n_slots} slots, error probability {p:.2f}", lot) for lot, _, p in lots]
-    sheets = save_contact_sheets(drawn, out)
-    save_summary(out, None, rows)
-    headings = ("car park", "spaces", "slots", "lanes", "p(error)", "result", "reason")
-    table = make_table(None, headings)
+def _table_of_lots(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table:
+    """Make a table whose last two columns are text: result and reason."""
+    table = make_table(None, headings, ([str(cell) for cell in row] for row in rows))
     for column in table.columns[-2:]:
         column.justify, column.no_wrap = "left", False
-    for row in rows:
-        p = "" if row["error_probability"] is None else f"{row['error_probability']:.2f}"
-        cells = (row["lot"], row["spaces"], row["slots"], row["lanes"], p, row["result"], row["reason"])
-        table.add_row(*map(str, cells))
-    make_console().print(table)
-    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "warnings", "refused")}
-    listed = ", ".join(f"{count} {name}" for name, count in became.items())
-    pictures = f" Pictures: {', '.join(map(str, sheets))}" if sheets else ""
-    console.print(
-        f"{plural(len(rows), 'car park')} in {place}: {listed}. Wrote {plural(len(lots), 'lot')} to {out}.{pictures}"
-    )
+    return table
 
 
-def _points(option: str, texts: list[str] | None) -> tuple[tuple[float, float], ...]:
-    """Return the points of an option; `auto` stands for none."""
-    numbers = (args.numbers(option, text, 2) for text in texts or () if text != AUTO)
-    return tuple((p[0], p[1]) for p in numbers)
+class Census(Command):
+    """A slot is perpendicular, oblique or kerbside by the angle between its lane and the parked car.
 
-
-def census(places: list[Path], /, drive: bool | None = None, out: Path = Path("results/census")) -> None:
-    """Count lots: how large each is, of what kinds its slots are, how far it is to drive, and how sure it is.
-
-    A slot is perpendicular, oblique or kerbside by the angle between its lane and the parked car; a lot is of the kind
-    of nine in ten of its slots, else mixed. It is small below 80 slots, large from 200 on. The drive time is that from
-    an entry to the slot farthest from it, at 10 km/h. The error probability is that of `parkenv lot check`.
+    A lot is of the kind of nine in ten of its slots, else mixed. It is small below 80 slots, large from 200 on. The
+    drive time is that from an entry to the slot farthest from it, at 10 km/h. The error probability is that of
+    `parkenv lot check`.
 
     The exit code is 2 if a file holds no lot; the others are counted all the same.
+    """
 
-    Examples:
+    examples = """
         parkenv lot import town.geojson --split --out lots
         parkenv lot census lots
         parkenv lot census campus.geojson lots --no-drive --out results/all
+        """
 
-    Options:
-        places (FILE|DIR): Lots (.geojson, .yml), and folders of lots (.geojson).
-        drive: Plan how the car drives into each kind of slot, as `parkenv lot check` does.  [default: drive]
-        out, -o (DIR): Folder for census.csv, summary.json, census.png and contact sheets.
-    """
-    from parkenv.files.atomic_write import make_folder
-    from parkenv.files.csv_tables import write_csv
-    from parkenv.show.figures.census import save_census
-    from parkenv.show.figures.contact_sheet import save_contact_sheets
-    from parkenv.studies.lot_census import COLUMNS, count_lot, lot_files
-
-    files = lot_files(places)
-    make_folder(out)
-    console = make_console(soft_wrap=True)
-    counted = []
-    with progress_bar(console, "lots") as bar:
-        task = bar.add_task("Checking", total=len(files))
-        for file in files:
-            counted.append(count_lot(file, drive=drive is not False))
-            bar.advance(task)
-    counted.sort(key=lambda one: -one[0].get("slots", 0))
-    rows = [row for row, _ in counted]
-    lots = [(row, lot) for row, lot in counted if lot is not None]
-    write_csv(out / "census.csv", COLUMNS, rows)
-    save_summary(out, None, rows)
-    pictures = []
-    if lots:
-        pictures = [out / "census.png"]
-        save_census([row for row, _ in lots], pictures[0])
-        drawn = [
-            (f"{row['lot']}\n{row['slots']} slots, error probability {row['error_probability']:.2f}", lot)
-            for row, lot in lots
-        ]
-        pictures += save_contact_sheets(drawn, out)
-    headings = (
-        "lot",
-        "slots",
-        "kind",
-        "perp.",
-        "obl.",
-        "kerb",
-        "m",
-        "drive s",
-        "p(error)",
-        "result",
-        "reason",
+    places: Several[Path] = option(
+        ..., "Lots (.geojson, .yml), and folders of lots (.geojson).", takes="FILE|DIR", argument=True
     )
-    table = make_table(None, headings)
-    for column in table.columns[-2:]:
-        column.justify, column.no_wrap = "left", False
-    for row in rows:
-        extent = f"{row['extent_x_m']:.0f} × {row['extent_y_m']:.0f}" if "slots" in row else ""
-        values = [
-            row.get(name, "") for name in ("lot", "slots", "kind", "perpendicular", "oblique", "kerbside")
-        ]
-        shown = (
-            *values,
-            extent,
-            row.get("drive_s", ""),
-            row.get("error_probability", ""),
-            row["result"],
-            row["reason"],
+    drive: bool = option(True, "Plan how the car drives into each kind of slot, as `parkenv lot check` does.")
+    out: Path = option(
+        Path("results/census"),
+        "Folder for census.csv, summary.json, census.png and contact sheets.",
+        short="-o",
+    )
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.studies.lot_census import take_census
+
+        with stages(make_console(soft_wrap=True), "lots") as progress:
+            rows = take_census(self.places, self.out, drive=self.drive, progress=progress)
+        save_summary(self.out, None, rows)
+        headings = (
+            "lot", "slots", "kind", "perp.", "obl.", "kerb", "m", "drive s", "p(error)", "result", "reason",
+        )  # fmt: skip
+        make_console().print(_table_of_lots(headings, map(_census_cells, rows)))
+        results = Counter(row["result"] for row in rows)
+        listed = ", ".join(
+            f"{results[name]} {name}" for name in ("clean", "warnings", "invalid") if results[name]
         )
-        table.add_row(*map(str, shown))
-    make_console().print(table)
-    became = {name: sum(row["result"] == name for row in rows) for name in ("clean", "warnings", "invalid")}
-    listed = ", ".join(f"{count} {name}" for name, count in became.items() if count)
-    slots = sum(row["slots"] for row, _ in lots)
-    console.print(f"{len(rows)} lots, {slots:,} slots: {listed}. Table and pictures are in {out}")
-    if became["invalid"]:
-        raise Exit(2)
+        slots = sum(row.get("slots", 0) for row in rows)
+        make_console(soft_wrap=True).print(
+            f"{len(rows)} lots, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
+        )
+        if results["invalid"]:
+            raise Exit(2)
 
 
-def convert(lot: str, /, out: Path) -> None:
-    """Write a lot as native GeoJSON, e.g. to edit it in a GIS.
+def _census_cells(row: Row) -> list[Any]:
+    extent = f"{row['extent_x_m']:.0f} × {row['extent_y_m']:.0f}" if "slots" in row else ""
+    counts = [row.get(name, "") for name in ("lot", "slots", "kind", "perpendicular", "oblique", "kerbside")]
+    rest = [row.get(name, "") for name in ("drive_s", "error_probability", "result", "reason")]
+    return [*counts, extent, *rest]
 
-    Examples:
-        parkenv lot convert campus --out mine.geojson
 
-    Options:
-        lot (NAME|FILE): {scenarios}, or a lot file.
-        out, -o (FILE.geojson): Lot file to write.
-    """
-    from parkenv.lots import load_lot, write_lot
+class Convert(Command):
+    """The file can be edited in a GIS."""
 
-    write_lot(load_lot(lot), out)
-    make_console().print(f"Wrote {out}")
+    examples = "parkenv lot convert campus --out mine.geojson"
+
+    lot: LotName
+    out: Path = option(..., "Lot file to write.", short="-o", takes="FILE.geojson")
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.lots import load_lot, write_lot
+
+        write_lot(load_lot(self.lot), self.out)
+        make_console().print(f"Wrote {self.out}")
 
 
 def _provenance(path: Path) -> Provenance | None:
@@ -392,11 +387,3 @@ def _summary(lot: ParkingLot) -> str:
             f"parking costs {cost.min():g} to {cost.max():g} s ({int((cost != 0).sum())} slots above 0)"
         )
     return ", ".join(parts)
-
-
-app = group("lot", "Show, check, import, count and convert lots (lot files, OpenStreetMap, lists of slots).")
-add(app, "show", show)
-add(app, "check", check)
-add(app, "import", import_place)
-add(app, "census", census)
-add(app, "convert", convert)

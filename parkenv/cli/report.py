@@ -2,89 +2,68 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-from parkenv.cli import arguments as args
+from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, stages
-from parkenv.cli.trust import require_trust
+from parkenv.cli.trust import Trust, require_trust
 from parkenv.errors import InputError
+from parkenv.files.option import option
+from parkenv.studies.report_options import ReportOptions
+from parkenv.studies.study import ExecutionSpec
 
-if TYPE_CHECKING:
-    from parkenv.studies.study import ExecutionSpec
 
+class Report(Command, ExecutionSpec, ReportOptions):
+    """The page needs no network and no other file. Searches and drives are repeated with their seeds.
 
-@dataclass(frozen=True)
-class Replays:
-    """What a page replays.
-
-    Options:
-        episodes, -n (N >= 0): About how many episodes to replay, all agents together.  [default: 20; through simulated
-            sensors 4; 8 days of a fleet]
-        replay (SEED[,...]): Replay the episodes with these seeds, or these days of a fleet.
-        agents (NAME[,...]): Replay only these agents.
-        sessions (N >= 0): Survey drives to replay.
-        frames (2 <= N <= 250): Captures of them to keep, all drives together.
+    If the total time of a search differs from that in the results, the page says so.
     """
 
-    episodes: int | None = None
-    replay: str | None = None
-    agents: str | None = None
-    sessions: int = 1
-    frames: int = 120
-
-
-REPLAYS = Replays()
-
-
-def report(
-    run: Path,
-    /,
-    replays: Replays,
-    out: Path | None = None,
-    *,
-    trust: bool = False,
-    machines: args.Machines,
-) -> None:
-    """Write an HTML page on a run: its settings, sortable tables, figures, and replays of its searches and drives.
-
-    The page needs no network and no other file. Searches and drives are repeated with their seeds. If the total time of
-    a search differs from that in the results, the page says so.
-
-    Examples:
+    examples = """
         parkenv report results/compare
         parkenv report results/compare --replay 3,17 --agents mdp --out two.html
         parkenv report results/survey --sessions 2
+        """
 
-    Options:
-        run (DIR): Folder of compare, survey, demo, train, fleet or another command.
-        out, -o (FILE.html): The page.  [default: DIR/report.html]
-    """
-    make_report(run, machines, replays, out=out, trust=trust)
+    folder: Path = option(
+        ...,
+        "Folder of compare, survey, demo, train, fleet or another command.",
+        name="RUN",
+        takes="DIR",
+        argument=True,
+    )
+    out: Path | None = option(None, "The page.", short="-o", takes="FILE.html", default="DIR/report.html")
+    trust: Trust = False
+
+    def run(self) -> None:
+        """See `Command`."""
+        make_report(self.folder, self, self, out=self.out, trust=self.trust)
 
 
 def make_report(
     folder: Path,
-    machines: args.Machines | ExecutionSpec,
-    replays: Replays = REPLAYS,
+    machines: ExecutionSpec,
+    options: ReportOptions | None = None,
     *,
     out: Path | None = None,
-    drives: Sequence[dict[str, Any]] | None = None,
     stage: str = "Running again",
     trust: bool = True,
 ) -> Path:
-    """Write the page with a progress bar, and return its path.
+    """Write the page on a run with a progress bar, and return its path.
 
-    The arguments are those of `report`; see `ReportOptions` for `drives`, and `stage` describes the progress bar.
+    Args:
+        folder: the run.
+        machines: where searches run again.
+        options: what to replay.
+        out: the page; None for `report.html` in the folder.
+        stage: what the progress bar says.
+        trust: run the classes that the run names, without asking.
 
     Raises:
         InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
             are not trusted.
     """
-    from parkenv.studies.agent_spec import split_agents
-    from parkenv.studies.report import ReportOptions, RunFolder, write_report
+    from parkenv.studies.report import RunFolder, write_report
 
     run = RunFolder.read(folder)
     notes: list[str] = []
@@ -96,16 +75,8 @@ def make_report(
     if spec is not None:
         # The page is made on the machines of this command, not of the run.
         require_trust(spec.changed(address=None), folder, trust)
-    options = ReportOptions(
-        replays.episodes,
-        None if replays.replay is None else args.numbers("--replay", replays.replay),
-        None if replays.agents is None else split_agents(replays.agents),
-        replays.sessions,
-        replays.frames,
-        drives,
-    )
     console = make_console()
-    with args.workers_of(machines) as workers, stages(console) as progress:
+    with machines.workers() as workers, stages(console) as progress:
         path, notes = write_report(
             run, spec, options, out=out, notes=notes, workers=workers, progress=progress, doing=stage
         )

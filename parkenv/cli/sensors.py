@@ -1,109 +1,133 @@
-"""`parkenv sensors`: preview the simulated sensors."""
+"""`parkenv sensors` and `parkenv fit-sensor-model`: what the simulated sensors measure, and how well."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Annotated, get_args
 
-from parkenv.cli import arguments as args
-from parkenv.cli.command import add, group
-from parkenv.cli.tables import make_console
-from parkenv.errors import InputError, nearest
-from parkenv.files.file_names import file_name
-from parkenv.files.known_names import WEATHERS
+from pydantic import AfterValidator, Field
+
+from parkenv.cli.options import Command
+from parkenv.cli.tables import make_console, make_table, stages
+from parkenv.files.known_names import WEATHERS, RigName, WeatherName
+from parkenv.files.option import Inside, option, words_in
+from parkenv.files.spec_file import Axis
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.fields import TRAFFIC, Detector, OneScenario, Scenarios, Seed, with_traffic
+from parkenv.studies.study import ExecutionSpec, counted
+
+_OBSERVATIONS = ("--sensor-model", "--view-range")
 
 
-def preview(
-    scenario: str | None = None,
-    weather: str = "all",
-    drive: float = 20.0,
-    every: float = 0.5,
-    seed: int = 0,
-    out: Path = Path("results/sensors"),
-    *,
-    world: args.Searches,
-    traffic: args.Traffic,
-) -> None:
-    """Draw what the sensors measure on the way from the entry to the slot nearest to the goal.
+class Preview(Command):
+    """Writes one figure per weather, at the place with the most parked cars: what each sensor measures there.
 
-    Writes one figure per weather, at the place with the most parked cars: the side camera's image with the true boxes,
-    its depth, the stereo camera's disparity, and the laser scan from above. Also writes a short video of the side
-    camera.
+    It shows the side camera's image with the true boxes, its depth, the stereo camera's disparity, and the laser scan
+    from above. Also writes a short video of the side camera.
+    """
 
-    Examples:
+    examples = """
         parkenv sensors preview
         parkenv sensors preview --scenario street --weather dusk --drive 40
+        """
 
-    Options:
-        weather (NAME[,...]|all): Some of {weathers}.
-        drive (0 <= M <= 10000): Length of the video, m; 0 for none.
-        every (M >= 0.05): Metres between its frames.
-        out, -o (DIR): Folder for the pictures and drive.gif.
-    """
-    import dataclasses
+    scenario: Annotated[OneScenario, AfterValidator(with_traffic), Inside(without=_OBSERVATIONS)] = Field(
+        scenario_spec("campus"), validate_default=True
+    )
+    weather: Axis[WeatherName] = option(
+        get_args(WeatherName),
+        f"Some of {', '.join(WEATHERS)}.",
+        takes="NAME[,...]|all",
+        default="all",
+        parse=lambda t: WEATHERS if t == "all" else words_in(t),
+    )
+    drive: float = option(
+        20.0, "Length of the video, m; 0 for none.", takes="0 <= M <= 10000", ge=0, le=10_000
+    )
+    every: float = option(0.5, "Metres between its frames.", takes="M", ge=0.05)
+    seed: Seed = 0
+    out: Path = option(Path("results/sensors"), "Folder for the pictures and drive.gif.", short="-o")
 
-    import numpy as np
-    from rich.progress import track
-    from scipy.spatial import cKDTree
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.scenarios.build import build
+        from parkenv.studies.sensing.sensor_preview import preview_sensors
 
-    from parkenv.compiled.keyed_random import world_key
-    from parkenv.files.atomic_write import make_folder
-    from parkenv.scenarios.build import build
-    from parkenv.show.figures.picture_files import save_film
-    from parkenv.show.figures.sensors import save_sensor_preview, with_boxes
-    from parkenv.studies.fields import BUSY
-    from parkenv.world.lot_scene import LotScenes, slot_lot
-    from planners.routes import DriveRoutes
-    from sim_sensors.camera.weather import Weather
-    from sim_sensors.ground_truth import vehicle_boxes
-    from sim_sensors.rig import SensorRig, poses_along
-
-    names = args.words("--weather", ",".join(WEATHERS) if weather == "all" else weather)
-    for name in names:
-        if name not in WEATHERS:
-            raise InputError(f"--weather has {name!r}; {nearest(name, ('all', *WEATHERS))}")
-    its = build(traffic.on(world.spec(scenario), BUSY))
-    make_folder(out)
-    console = make_console()
-
-    key = world_key(seed, 0)
-    arrival = its.occupancy.draw_arrival(its.arrival, key)
-    scenes = LotScenes(slot_lot(its.lot), its, key, its.occupancy.world(key, arrival))
-
-    entry, target = int(its.lot.entry_vertices[0]), int(its.lot.walk_m().argmin())
-    path = [entry, *DriveRoutes(its).path(entry, target)]
-    poses = poses_along(its.lot.vertex_xy[path], every)
-    parked = scenes.at(arrival.time)
-    beside = poses[:, :2] + 4.0 * np.column_stack([np.sin(poses[:, 2]), -np.cos(poses[:, 2])])
-    standing = cKDTree(parked.vehicle_pose[parked.present, :2])
-    middle = int(standing.query_ball_point(beside, 6.0, return_length=True).argmax())
-
-    ((_, stereo, stereo_mount),) = SensorRig.stereo().stereo_cameras
-    rig = dataclasses.replace(SensorRig.thesis(), stereo_cameras=(("pair", stereo, stereo_mount),))
-    name, camera, mount = rig.cameras[0]
-    eye = mount.camera_pose(poses[middle])
-    console.print("The first image after an installation waits about 20 s for the renderer to be compiled.")
-    for preset in track(names, "Rendering", console=console, disable=not console.is_terminal):
-        light = Weather.draw(preset, seed)
-        scene = scenes.at(arrival.time, poses[middle])
-        capture = rig.capture(scene, poses[middle], light, seed)
-        boxes = vehicle_boxes(camera, scene, eye, capture.images[name])
-        title = f"{its.name}, {preset.replace('_', ' ')}"
-        save_sensor_preview(
-            its.lot, rig, capture, boxes, title, out / file_name(f"sensors_{its.name}_{preset}", ".png")
+        console = make_console()
+        console.print(
+            "The first image after an installation waits about 20 s for the renderer to be compiled."
         )
-    n = int(drive / every)
-    if n:
-        frames = []
-        past = poses[max(0, middle - n // 2) :][:n]
-        light = Weather.draw(names[0], seed)
-        for k, pose in enumerate(track(past, "Driving", console=console, disable=not console.is_terminal)):
-            eye = mount.camera_pose(pose)
-            scene = scenes.at(arrival.time + k * every / its.v_drive, pose)
-            frame = camera.render(scene, eye, light, seed + k)
-            frames.append(with_boxes(frame.image, vehicle_boxes(camera, scene, eye, frame)))
-        save_film(frames, out / "drive.gif", fps=8.0)
-    console.print(f"Images are in {out}")
+        with stages(console) as progress:
+            preview_sensors(
+                build(self.scenario), self.out, self.weather, drive=self.drive, every=self.every, seed=self.seed,
+                progress=progress,
+            )  # fmt: skip
+        console.print(f"Images are in {self.out}")
 
 
-app = group("sensors", "Preview the simulated sensors.")
-add(app, "preview", preview)
+class FitSensorModel(Command, ExecutionSpec):
+    """The rates define a sensor model for `parkenv compare --sensor-model FILE`.
+
+    It makes the same errors as the perception pipeline, a thousand times as fast.
+    """
+
+    examples = """
+        parkenv fit-sensor-model --rig stereo --out stereo.json
+        parkenv compare --sensor-model stereo.json
+        """
+
+    scenarios: Annotated[Scenarios, Inside(without=(*_OBSERVATIONS, *TRAFFIC))] = (
+        scenario_spec("campus"),
+        scenario_spec("street"),
+    )
+    episodes: int = option(
+        20, "Episodes of each of three agents in each scenario.", short="-n", ge=1, le=1_000_000
+    )
+    rig: RigName | None = option(
+        None, "Whose errors to measure.", panel="Sensors", default="the scenario's, laser"
+    )
+    detector: Detector = None
+    weather: WeatherName | None = option(
+        None, f"{', '.join(WEATHERS)}.", takes="NAME", panel="Sensors", default="drawn each time"
+    )
+    seed: Seed = 500_000
+    out: Path = option(Path("sensor_model.json"), "The file to write.", short="-o", takes="FILE.json")
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import make_folder
+        from parkenv.scenarios.build import build
+        from parkenv.studies.sensing.sensor_model_fit import AGENTS, measure_sensors
+
+        specs = [with_traffic(spec) for spec in self.scenarios]
+        scenarios, rig = [build(spec) for spec in specs], self.rig or specs[0].rig
+        make_folder(self.out.parent)
+        console = make_console()
+        with self.workers() as workers, stages(console, "episodes") as progress:
+            total = self.episodes * len(AGENTS) * len(scenarios)
+            counts = measure_sensors(
+                scenarios,
+                rig,
+                self.episodes,
+                seed=self.seed,
+                weather=self.weather,
+                detector=self.detector,
+                workers=workers,
+                on_progress=counted(progress, "Searching with simulated sensors", total),
+            )
+        model = counts.fitted()
+        model.to_file(self.out)
+        cells = (
+            (
+                f"{band.up_to:g} m",
+                "right" if band.beside else "elsewhere",
+                str(in_band.sum()),
+                f"{band.seen_rate:.0%}",
+                f"{band.hit_rate:.3f}",
+                f"{band.false_alarm_rate:.3f}",
+            )
+            for band, in_band in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True)
+        )
+        headings = ["slots up to", "side", "slots in range", "observed", "hit rate", "false-alarm rate"]
+        console.print(make_table(f"Observations of slots, rig {rig}", headings, cells))
+        console.print(f"Written: {self.out}")

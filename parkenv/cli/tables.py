@@ -95,10 +95,27 @@ def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int
 
         def advance(doing: str, done: int, total: int) -> None:
             if doing not in bars:
-                bars[doing] = progress.add_task(doing, total=total)
-            progress.update(bars[doing], completed=done)
+                bars[doing] = progress.add_task(doing, total=total or None)
+            progress.update(bars[doing], completed=done, total=total or None)
 
         yield advance
+
+
+@contextmanager
+def writing_into(out: Path) -> Iterator[None]:
+    """Be the only writer of a folder; say so after an interruption.
+
+    Raises:
+        InputError: the folder cannot be made or written, or another process writes into it.
+    """
+    from parkenv.files.folder_lock import only_writer
+
+    try:
+        with only_writer(out):
+            yield
+    except KeyboardInterrupt:
+        make_console().print("Interrupted.")
+        raise
 
 
 def command_line() -> list[str]:

@@ -4,16 +4,35 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+from pydantic import Field
 
 from parkenv.errors import InputError
+from parkenv.files.option import Option
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from parkenv.files.spec_file import Spec
+
+
+Trust = Annotated[
+    bool,
+    Option(panel="Code of others"),
+    Field(
+        description="Run the classes (MODULE:CLASS), and use the cluster, that the file or the folder of the run names."
+    ),
+]
+TrustModel = Annotated[
+    bool,
+    Option(panel="Code of others"),
+    Field(
+        description="Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in "
+        "them."
+    ),
+]
 
 
 def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] = ()) -> None:
@@ -44,12 +63,11 @@ def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] 
     raise InputError(f"{source}: would run {shown}; read that code, then add --trust")
 
 
-def readable_models(agents: Sequence[str], trust_model: bool) -> list[str]:
-    """Return the agents, with archives of stable-baselines3 converted to model files if the user trusts them.
+def readable_models(agents: Sequence[str]) -> list[str]:
+    """Return the agents, with archives of stable-baselines3 converted to model files; this runs the code in them.
 
     Args:
         agents: names or `ALGORITHM:FILE`.
-        trust_model: the value of `--trust-model`; without it, archives are refused where models are loaded.
 
     Raises:
         InputError: an archive cannot be converted.
@@ -57,7 +75,7 @@ def readable_models(agents: Sequence[str], trust_model: bool) -> list[str]:
     from planners.names import ALGORITHMS
 
     readable = list(agents)
-    for i, agent in enumerate(agents if trust_model else ()):
+    for i, agent in enumerate(agents):
         algorithm, _, file = agent.partition(":")
         if algorithm in ALGORITHMS and file.endswith(".zip"):
             from planners.model_file import convert_archive

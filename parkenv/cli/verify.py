@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
-from parkenv.cli import arguments as args
-from parkenv.cli.command import options_of
-from parkenv.cli.study_run import run_study
+from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_table
+from parkenv.files.option import option
+from parkenv.studies.verify.study import Verification
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -19,50 +19,49 @@ if TYPE_CHECKING:
     from parkenv.studies.verify.rows import Row
 
 
-@options_of("parkenv.studies.verify.study:Verification")
-def verify(given: dict[str, Any], /, out: Path | None = None) -> None:
-    """Compare closed forms of the literature with what planners and worlds of this package do.
+class Verify(StudyCommand):
+    """A case without chance has to be found exactly. A simulated one agrees if theory is in an interval of the mean.
 
-    A case without chance has to be found exactly. A simulated one agrees if theory is in the 99.99 % interval of the
-    mean: right rows then all agree with a probability of 0.995 and more. The exit code is 1 if any row disagrees.
+    It is the 99.99 % interval: right rows then all agree with a probability of 0.995 and more. The exit code is 1 if
+    any row disagrees.
+    """
 
-    Examples:
+    examples = """
         parkenv verify --out results/verify
         parkenv verify --cases line,inspections --seed 7
+        """
 
-    Options:
-        out, -o (DIR): Folder for summary.json and verify.png.  [default: none]
-    """
-    from parkenv.cli.spec_options import changed_by
-    from parkenv.studies.verify.rows import disagreeing
-    from parkenv.studies.verify.study import Verification
+    study: Verification = Verification()
+    out: Path | None = option(None, "Folder for summary.json and verify.png.", short="-o", default="none")
 
-    study = changed_by(Verification(), given)
-    result = run_study(study, out, args.ReportedRun(), show)
-    if disagreeing(study.statements(result.results)):
-        raise typer.Exit(1)
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.studies.verify.rows import disagreeing
 
+        if disagreeing(self.study.statements(self.run_study().results)):
+            raise typer.Exit(1)
 
-def show(console: Console, result: Result) -> None:
-    """Print what theory expects and what is found."""
-    from parkenv.show.plurals import plural
-    from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
+    def show(self, console: Console, result: Result) -> None:
+        """Print what theory expects and what is found."""
+        from parkenv.show.plurals import plural
+        from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
 
-    study: Any = result.study
-    rows = study.statements(result.results)
-    cells = (
-        (
-            row.case,
-            _figure(row.expected),
-            _figure(row.found),
-            _interval(row),
-            "" if row.agrees else "DISAGREES",
+        rows = self.study.statements(result.results)
+        cells = (
+            (
+                row.case,
+                _figure(row.expected),
+                _figure(row.found),
+                _interval(row),
+                "" if row.agrees else "DISAGREES",
+            )
+            for row in rows
         )
-        for row in rows
-    )
-    console.print(make_table(None, ("case", "expected", "found", f"{CONFIDENCE:.2%} interval", ""), cells))
-    agree = len(rows) - len(disagreeing(rows))
-    console.print(f"{agree} of {plural(len(rows), 'row')} agree with theory.")
+        console.print(
+            make_table(None, ("case", "expected", "found", f"{CONFIDENCE:.2%} interval", ""), cells)
+        )
+        agree = len(rows) - len(disagreeing(rows))
+        console.print(f"{agree} of {plural(len(rows), 'row')} agree with theory.")
 
 
 def _interval(row: Row) -> str:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
+
+from pydantic import Field
 
 from parkenv.errors import InputError
 
@@ -26,6 +28,8 @@ class Option:
         parse: Convert text to the field's value.  [default: split lists at commas, and convert numbers]
         sets: Other fields of the same table that the option sets.
         description: Instead of the field's.
+        argument: Given by its place, without a name.
+        repeat: Given once for each value of a list; arguments are anyway.
     """
 
     name: str = ""
@@ -36,6 +40,42 @@ class Option:
     parse: Callable[[str], Any] | None = None
     sets: Mapping[str, Any] = field(default_factory=dict, hash=False)
     description: str = ""
+    argument: bool = False
+    repeat: bool = False
+
+
+_MARKS = {mark.name for mark in fields(Option)} - {"description"}
+
+
+def option(value: Any, description: str, **more: Any) -> Any:
+    """Return a field of a specification that is an option.
+
+    Args:
+        value: its default; `...` if there is none.
+        description: what it says.
+        more: arguments of `Option`, and of pydantic's `Field`, such as bounds.
+    """
+    marks = {name: more.pop(name) for name in _MARKS & more.keys()}
+    field = Field(value, description=description, **more)
+    field.metadata.append(Option(**marks))
+    return field
+
+
+@dataclass(frozen=True)
+class Inside:
+    """Choose the fields of a table, at any depth, that are options: an annotation of the field with the table.
+
+    Args:
+        without: Options to leave out.
+        only: The options to have.  [default: all]
+    """
+
+    without: tuple[str, ...] = ()
+    only: tuple[str, ...] | None = None
+
+    def has(self, name: str) -> bool:
+        """Return whether the option is one of the command's."""
+        return name not in self.without and (self.only is None or name in self.only)
 
 
 def words_in(text: str) -> list[str]:

@@ -138,6 +138,11 @@ class Spec(BaseModel):
         path = Path(path)
         return cls.parse(read_tables(path), str(path), path.parent).of_file(path)
 
+    @classmethod
+    def variants(cls) -> tuple[type[Spec], ...]:
+        """Return the classes that `parse` chooses from by the content; none if it is this one."""
+        return ()
+
     def of_file(self, path: str | Path) -> Self:
         """Remember the file that the specification was read from, for messages."""
         self._file = str(path)
@@ -217,7 +222,8 @@ def _message(model: type[BaseModel], error: ValidationError, source: str | Mappi
     first = min(details, key=lambda d: d["type"] != "extra_forbidden")
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if not isinstance(source, str):
-        source = source.get(str(first["loc"][0]) if first["loc"] else "", ", ".join(source.values()))
+        name = str(first["loc"][0]) if first["loc"] else ""
+        return _fault(model, first, source.get(name, ", ".join(source.values()) or name))
     if source.startswith("--"):
         # The source is an option, which names the field itself.
         return _fault(model, first, source)

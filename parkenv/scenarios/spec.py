@@ -27,7 +27,7 @@ from parkenv.files.known_names import (
     SensorModelName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.option import Option, numbers_in
+from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
@@ -240,34 +240,35 @@ class OccupancySpec(Spec):
         )
     )
     counts: CountsSpec | None = None
-    replay_from: Annotated[
-        Date | None, Option(takes="DATE", panel="World", default="the scenario's, all")
-    ] = Field(None, description="First day of the log or the counts that is replayed.")
-    forecast_from: Annotated[
-        ForecastFrom | None,
-        Option(panel="World", default="the scenario's; others, with counts rolling"),
-    ] = Field(
+    replay_from: Date | None = option(
         None,
-        description="Days that the forecast is made from. past: those before the first replayed day; rolling: those "
-        "before the earliest that a world replays; others: all that it does not replay.",
+        "First day of the log or the counts that is replayed.",
+        takes="DATE",
+        panel="World",
+        default="the scenario's, all",
     )
-    mapping: Annotated[
-        FilePath | None,
-        Option(panel="World", default="the log's fullest slots are nearest to the goal"),
-    ] = Field(None, description="CSV slot_id,log_slot_id that assigns the log's slots to the lot's.")
-    event: Event | None = None
-    day_error: Annotated[
-        Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None,
-        Option(
-            takes="X[,Y]",
-            panel="World",
-            parse=_day_error_text,
-            default="the scenario's, 0.8 in the packaged ones, 0.7 for a lot alone",
-        ),
-    ] = Field(
+    forecast_from: ForecastFrom | None = option(
         None,
-        description="How far whole days differ from the forecast: standard deviations, logits, of their level and of "
+        "Days that the forecast is made from. past: those before the first replayed day; rolling: those "
+        "before the earliest that a world replays; others: all that it does not replay.",
+        panel="World",
+        default="the scenario's; others, with counts rolling",
+    )
+    mapping: FilePath | None = option(
+        None,
+        "CSV slot_id,log_slot_id that assigns the log's slots to the lot's.",
+        panel="World",
+        default="the log's fullest slots are nearest to the goal",
+    )
+    event: Event | None = None
+    day_error: Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None = option(
+        None,
+        "How far whole days differ from the forecast: standard deviations, logits, of their level and of "
         "their slope to the goal; 0 for days that are as forecast.",
+        takes="X[,Y]",
+        panel="World",
+        parse=_day_error_text,
+        default="the scenario's, 0.8 in the packaged ones, 0.7 for a lot alone",
     )
 
     @model_validator(mode="after")
@@ -342,14 +343,20 @@ def _days(value: object) -> object:
 class Arrivals(Spec):
     """When searches begin."""
 
-    days: Annotated[
-        str,
-        BeforeValidator(_days),
-        Option(takes="DAYS", panel="World", default="the scenario's, weekdays"),
-    ] = Field("weekdays", description="weekdays, weekend, all, or names such as mon,tue.")
-    hours: Annotated[
-        Hours, Option(takes="HH:MM-HH:MM", panel="World", default="the scenario's, 08:00-13:00")
-    ] = Field("08:00-13:00", description="Searches begin between these hours.")
+    days: Annotated[str, BeforeValidator(_days)] = option(
+        "weekdays",
+        "weekdays, weekend, all, or names such as mon,tue.",
+        takes="DAYS",
+        panel="World",
+        default="the scenario's, weekdays",
+    )
+    hours: Hours = option(
+        "08:00-13:00",
+        "Searches begin between these hours.",
+        takes="HH:MM-HH:MM",
+        panel="World",
+        default="the scenario's, 08:00-13:00",
+    )
 
     def window(self) -> ArrivalWindow:
         """The arrival window."""
@@ -392,8 +399,14 @@ class SensorModelSpec(Spec):
     file: FilePath | None = Field(None, description="A sensor model that `parkenv fit-sensor-model` wrote.")
     hit_rate: Probability | None = Field(None, description="P(observed taken | taken).")
     false_alarm_rate: Probability | None = Field(None, description="P(observed taken | free).")
-    view_range: Annotated[float | None, Option(takes="M", panel="Sensors", default="the sensor model's")] = (
-        Field(None, ge=0.0, le=10_000.0, description="How far slots are observed from the car, m.")
+    view_range: float | None = option(
+        None,
+        "How far slots are observed from the car, m.",
+        takes="M",
+        panel="Sensors",
+        default="the sensor model's",
+        ge=0.0,
+        le=10_000.0,
     )
 
     @model_validator(mode="after")
@@ -409,12 +422,8 @@ class SensorModelSpec(Spec):
 class TrafficSpec(Spec):
     """Other road users."""
 
-    cars: Annotated[Count, Option(panel="World", default="the scenario's")] = Field(
-        0, description="Other cars that drive about."
-    )
-    pedestrians: Annotated[Count, Option(panel="World", default="the scenario's")] = Field(
-        0, description="Pedestrians."
-    )
+    cars: Count = option(0, "Other cars that drive about.", panel="World", default="the scenario's")
+    pedestrians: Count = option(0, "Pedestrians.", panel="World", default="the scenario's")
 
 
 def _goal(value: object) -> object:
@@ -442,35 +451,35 @@ class ScenarioSpec(Spec):
 
     name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
     lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
-    goal: Annotated[
-        int | tuple[float, float],
-        BeforeValidator(_goal),
-        Option(takes="X,Y", panel="World", parse=_goal_text, default="the scenario's"),
-    ] = Field(0, description="Walk to this point, m, or to the lot's goal of this index.")
+    goal: Annotated[int | tuple[float, float], BeforeValidator(_goal)] = option(
+        0,
+        "Walk to this point, m, or to the lot's goal of this index.",
+        takes="X,Y",
+        panel="World",
+        parse=_goal_text,
+        default="the scenario's",
+    )
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
-    occupancy: Annotated[
-        OccupancySpec,
-        BeforeValidator(_occupancy_tables),
-        OrText(),
-        Option(takes="FILE[,FILE...]", panel="World", default="the scenario's", sets={"forecast": "own"}),
-    ] = Field(
+    occupancy: Annotated[OccupancySpec, BeforeValidator(_occupancy_tables), OrText()] = option(
         OccupancySpec(),
-        description="Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, replayed day by day, "
+        "Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, replayed day by day, "
         "or a process that `parkenv occupancy fit` wrote (.json).",
+        takes="FILE[,FILE...]",
+        panel="World",
+        default="the scenario's",
+        sets={"forecast": "own"},
     )
     forecast: Annotated[ForecastSpec, BeforeValidator(_forecast_tables), OrText()] = ForecastSpec()
     arrivals: Arrivals = Arrivals()
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
-    sensor_model: Annotated[
-        SensorModelSpec,
-        BeforeValidator(_sensor_tables),
-        OrText(),
-        Option(takes="NAME|FILE", panel="Sensors", default="the scenario's; with --rig, the rig's"),
-    ] = Field(
+    sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = option(
         SensorModelSpec(name="perfect"),
-        description="How slots are observed. perfect: without error; blind: by attempts alone; laser, stereo: as "
+        "How slots are observed. perfect: without error; blind: by attempts alone; laser, stereo: as "
         "measured with that rig; a file of `parkenv fit-sensor-model`.",
+        takes="NAME|FILE",
+        panel="Sensors",
+        default="the scenario's; with --rig, the rig's",
     )
     rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
     detector: PackagedDetector = Field(

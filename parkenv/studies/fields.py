@@ -14,7 +14,7 @@ from parkenv.files.known_names import (
     RigName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.option import Option, numbers_in, words_in
+from parkenv.files.option import Inside, Option, numbers_in, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several
 from parkenv.scenarios.spec import (
     ScenarioSpec,
@@ -70,19 +70,24 @@ _LOT_ALONE = (
     "Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON, or a Dragon Lake "
     "map (.yml)."
 )
+TRAFFIC = ("--cars", "--pedestrians")
+"""Options of other road users, whom only simulated sensors and driven cars meet."""
 _NAMES = ", ".join(SCENARIO_NAMES)
-Scenarios = Annotated[
+SCENARIOS_HELP = f"{_NAMES}; scenario files (.toml), lots (.geojson), or folders."
+ScenarioList = Annotated[
     Several[ScenarioItem],
     BeforeValidator(_with_folders),
-    Field(
-        min_length=1,
-        max_length=1_000,
-        description=f"{_NAMES}; scenario files (.toml), lots (.geojson), or folders.",
-    ),
-    Option("--scenario", takes="NAME|FILE|DIR[,...]", parse=words_in),
-    Option("--lot", takes="NAME|FILE[,...]", panel="World", parse=_lots, description=_LOT_ALONE),
+    Field(min_length=1, max_length=1_000, description=SCENARIOS_HELP),
 ]
 """Scenarios in a file: names, files, folders of scenario and lot files, or inline tables."""
+SCENARIOS_TAKE = "NAME|FILE|DIR[,...]"
+Scenarios = Annotated[
+    ScenarioList,
+    Option("--scenario", takes=SCENARIOS_TAKE, parse=words_in),
+    Option("--lot", takes="NAME|FILE[,...]", panel="World", parse=_lots, description=_LOT_ALONE),
+    Inside(without=TRAFFIC),
+]
+"""The scenarios of a study."""
 OneScenario = Annotated[
     ScenarioItem,
     Field(description=f"{_NAMES}, a scenario file (.toml), or a lot (.geojson)."),
@@ -106,9 +111,22 @@ Agents = Annotated[
     Option(takes="NAME[,...]", parse=split_agents),
 ]
 """Agents in a file: names, or tables with a name and options."""
-Seed = Annotated[
-    int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option(takes="N >= 0")
+
+
+def _one_agent(text: str) -> str:
+    names = split_agents(text)
+    if len(names) != 1:
+        raise InputError(f"names {len(names)} agents, want one")
+    return names[0]
+
+
+OneAgent = Annotated[
+    AgentItem,
+    Field(description="The agent that searches, with any options in brackets: mdp(failure_s=90)."),
+    Option("--agents", takes="NAME", parse=_one_agent),
 ]
+"""The one agent of a file."""
+Seed = Annotated[int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option()]
 
 
 def listed(value: object) -> object:
@@ -149,9 +167,40 @@ def seconds_of_minutes(text: str) -> float:
 
 
 ArrivalRate = Annotated[float, Field(gt=0.0, le=1e6)]
-Stay = Annotated[float, Field(ge=1.0, le=1e7)]  # s
+_Stay = Annotated[float, Field(ge=1.0, le=1e7)]  # s
+MeanStay = Annotated[
+    _Stay,
+    Field(description="Mean of the exponentially distributed stays, s."),
+    Option(
+        "--stay-min",
+        takes="MINUTES",
+        default="60",
+        panel="Demand",
+        parse=seconds_of_minutes,
+        description="Mean of the exponentially distributed stays, minutes.",
+    ),
+]
+Patience = Annotated[
+    _Stay,
+    Field(description="Search time after which a car goes elsewhere, s."),
+    Option(
+        "--patience-min",
+        takes="MINUTES",
+        default="10",
+        panel="Demand",
+        parse=seconds_of_minutes,
+        description="Minutes after which a searching car goes elsewhere, at the give-up penalty.",
+    ),
+]
 BUSY = TrafficSpec(cars=3, pedestrians=5)
 """Default traffic of runs with simulated sensors."""
+
+
+def with_traffic(scenario: ScenarioSpec) -> ScenarioSpec:
+    """Return the scenario with some traffic if it has none of its own, not even zero."""
+    return scenario if scenario.traffic else scenario.changed(traffic=BUSY)
+
+
 CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
 """Distance between captures, m."""
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.errors import InputError
+from parkenv.files.atomic_write import make_folder
+from parkenv.files.csv_tables import write_csv
 from parkenv.lots import read_lot
 from parkenv.lots.quality import QualityIssue, read_provenance
 from parkenv.studies.drivability import check_drivability, manoeuvre_kinds
 from parkenv.studies.results import Row
+from parkenv.studies.study import Progress, counted
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import KMH
 
@@ -31,7 +35,7 @@ COLUMNS = (
 """Columns of a census."""
 
 
-def lot_files(places: list[Path]) -> list[Path]:
+def lot_files(places: Sequence[Path]) -> list[Path]:
     """Return the lot files that paths stand for: files, and the .geojson files in folders, in order of their names.
 
     Raises:
@@ -51,6 +55,46 @@ def lot_files(places: list[Path]) -> list[Path]:
             raise InputError(f"{place}: holds no lot (.geojson)")
         files += found
     return files
+
+
+def take_census(
+    places: Sequence[Path], folder: Path, *, drive: bool = True, progress: Progress = lambda *_: None
+) -> list[Row]:
+    """Count lots; write census.csv, census.png and contact sheets into a folder.
+
+    Args:
+        places: lots, and folders of lots.
+        folder: where the files go.
+        drive: plan manoeuvres, as `parkenv lot check` does.
+        progress: called as lots are finished.
+
+    Returns:
+        A row for each lot, the largest first; those of files that hold no lot say why.
+
+    Raises:
+        InputError: see `lot_files`.
+    """
+    from parkenv.show.figures.census import save_census
+    from parkenv.show.figures.contact_sheet import save_contact_sheets
+
+    files = lot_files(places)
+    make_folder(folder)
+    done = counted(progress, "Checking", len(files))
+    found = []
+    for file in files:
+        found.append(count_lot(file, drive=drive))
+        done()
+    found.sort(key=lambda one: -one[0].get("slots", 0))
+    rows = [row for row, _ in found]
+    write_csv(folder / "census.csv", COLUMNS, rows)
+    if lots := [(row, lot) for row, lot in found if lot is not None]:
+        save_census([row for row, _ in lots], folder / "census.png")
+        drawn = [
+            (f"{row['lot']}\n{row['slots']} slots, error probability {row['error_probability']:.2f}", lot)
+            for row, lot in lots
+        ]
+        save_contact_sheets(drawn, folder)
+    return rows
 
 
 def count_lot(path: Path, *, drive: bool = True) -> tuple[Row, ParkingLot | None]:

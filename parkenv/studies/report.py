@@ -10,13 +10,14 @@ from typing import Any, NamedTuple, Protocol, Self
 from pydantic import Field
 
 from parkenv import __version__
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.show.report.page import Page, page_data, write_page
 from parkenv.show.report.tables import tables_of
 from parkenv.studies.fingerprints import require_unchanged
+from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL
 from parkenv.studies.study import STUDIES, Progress, Study, read_study, study_class
 from parkenv.studies.workers import SERIAL, Task, Workers
@@ -27,50 +28,6 @@ AGREES_S = 1e-6
 """Total times of a search or a day that differ by less agree, s."""
 Recording = dict[str, Any]
 """Searches in a world, a drive or a day in the data of a page; its `differences` from the run are notes."""
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """What a page replays.
-
-    Args:
-        episodes: about how many searches or days, all agents together; None for the default of their kind.
-        numbers: seeds of the searches, or numbers of the days; None to choose them.
-        agents: agents of the searches or days; None for all.
-        sessions: number of survey drives.
-        frames: captures of them to keep, all drives together.
-        drives: survey drives that are already recorded, instead of driving them again.
-    """
-
-    episodes: int | None = None
-    numbers: Sequence[float] | None = None
-    agents: Sequence[str] | None = None
-    sessions: int = 1
-    frames: int = 120
-    drives: Sequence[Recording] | None = None
-
-    def chosen_agents(self, known: Sequence[str]) -> Sequence[str]:
-        """Return which of the agents of a run are replayed.
-
-        Raises:
-            InputError: the run has no such agent.
-        """
-        for name in self.agents or ():
-            if name not in known:
-                raise InputError(f"--agents has {name!r}; {nearest(name, list(dict.fromkeys(known)))}")
-        return known if self.agents is None else self.agents
-
-    def chosen_numbers(self, known: Sequence[int]) -> list[int] | None:
-        """Return which seeds or days of a run are replayed; None to choose them.
-
-        Raises:
-            InputError: the run has no such seed or day.
-        """
-        for number in self.numbers or ():
-            if number not in known:
-                theirs = f"{known[0]} to {known[-1]}" if known else "none"
-                raise InputError(f"--replay has {number:g}; this run's are {theirs}")
-        return None if self.numbers is None else [int(number) for number in self.numbers]
 
 
 class Again(NamedTuple):

@@ -7,17 +7,16 @@ option, so methods import what they run.
 
 from __future__ import annotations
 
+import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, NamedTuple
-
-from pydantic import Field
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import BackendName
-from parkenv.files.option import Option
+from parkenv.files.option import option
 from parkenv.files.spec_file import Spec, read_tables
 from parkenv.studies.results import (
     EPISODES,
@@ -50,24 +49,39 @@ STUDIES: Mapping[str, str] = {
 
 
 Progress = Callable[[str, int, int], None]
-"""Called with what is going on, how much of it is finished, and of how much."""
+"""Called with what is going on, how much of it is finished, and of how much; 0 where that is not known yet."""
+
+
+def counted(progress: Progress, doing: str, total: int = 0) -> Callable[[], None]:
+    """Return a function to call each time that a part of `total` is finished."""
+    done = itertools.count(1)
+    progress(doing, 0, total)
+    return lambda: progress(doing, next(done), total)
 
 
 class ExecutionSpec(Spec):
     """Where tasks run; the results do not depend on it."""
 
-    jobs: Annotated[int, Option(short="-j", takes="N >= 0", panel="Machines", default="0, all cores")] = (
-        Field(0, ge=0, le=10_000, description="Worker processes, at most one per core and per task.")
+    jobs: int = option(
+        0,
+        "Worker processes, at most one per core and per task.",
+        short="-j",
+        panel="Machines",
+        default="0, all cores",
+        ge=0,
+        le=10_000,
     )
-    backend: Annotated[BackendName, Option(panel="Machines")] = Field(
+    backend: BackendName = option(
         "loky",
-        description="Run workers on this machine (loky), or on a Ray or Dask cluster (extras ray, dask).",
+        "Run workers on this machine (loky), or on a Ray or Dask cluster (extras ray, dask).",
+        panel="Machines",
     )
-    address: Annotated[
-        str | None, Option(takes="HOST:PORT", panel="Machines", default="a cluster on this machine")
-    ] = Field(
+    address: str | None = option(
         None,
-        description="Of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, tcp://HOST:8786.",
+        "Of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, tcp://HOST:8786.",
+        takes="HOST:PORT",
+        panel="Machines",
+        default="a cluster on this machine",
     )
 
     def workers(self) -> Workers:

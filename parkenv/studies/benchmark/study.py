@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Literal
 from pydantic import Field
 
 from parkenv import __version__
-from parkenv.files.spec_file import Several
-from parkenv.studies.agent_spec import AgentItem, AgentSpec
+from parkenv.files.option import option
+from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
+from parkenv.studies.fields import Agents
 from parkenv.studies.results import Results, Row, write_summary
 from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task
@@ -28,13 +29,10 @@ class Benchmark(CaseStudy):
 
     kind: Literal["benchmark"] = "benchmark"
     suite: str = Field("v2", description="The suite.")
-    by: str = Field("", max_length=200, description="Who submits the result: a name, an address of the code.")
-    agents: Several[AgentItem] = Field(
-        tuple(AgentSpec(name=name) for name in AGENTS),
-        min_length=1,
-        max_length=1_000,
-        description="Agents to run.",
+    by: str = option(
+        "", "Who submits the result: a name, an address of the code.", default="nobody", max_length=200
     )
+    agents: Agents = tuple(AgentSpec(name=name) for name in AGENTS)
 
     @cached_property
     def made_suite(self) -> Suite:

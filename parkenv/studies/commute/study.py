@@ -11,7 +11,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.known_names import MapName
-from parkenv.files.option import Option
+from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
@@ -65,24 +65,23 @@ class Commute(Study):
         "that uses no map.",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
-    maps: Annotated[Axis[MapName], BeforeValidator(listed), Option("--map")] = Field(
+    maps: Annotated[Axis[MapName], BeforeValidator(listed)] = option(
         ("empty",),
-        description="The map on the first day. empty: 50 % for every slot. right: the forecast of the scenario's "
+        "The map on the first day. empty: 50 % for every slot. right: the forecast of the scenario's "
         "occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right one with near "
         "and far slots exchanged.",
+        name="--map",
     )
-    days: Annotated[int, Option(takes="N >= 1")] = Field(
-        30, ge=1, le=MAX_DAYS, description="Days on which each driver comes, at most those of a recorded log."
+    days: int = option(
+        30, "Days on which each driver comes, at most those of a recorded log.", ge=1, le=MAX_DAYS
     )
-    drivers: Annotated[int, Option(takes="N >= 1")] = Field(
+    drivers: int = option(
         40,
+        "Drivers (or fleets), each with a map of their own: the more, the narrower the intervals.",
         ge=1,
         le=100_000,
-        description="Drivers (or fleets), each with a map of their own: the more, the narrower the intervals.",
     )
-    fleet: Annotated[int, Option(takes="N >= 1")] = Field(
-        1, ge=1, le=1_000, description="Drivers who share a map, and come every day."
-    )
+    fleet: int = option(1, "Drivers who share a map, and come every day.", ge=1, le=1_000)
     seed: Seed = Field(0, description="Seed of days and drivers.")
     figures: Figures = True
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from parkenv.errors import InputError
-from parkenv.files.option import Option, numbers_in
+from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
 from parkenv.show.columns import SETTING_AXES
@@ -63,60 +63,53 @@ _COSTS = "Costs and speeds"
 class Grid(Spec):
     """Settings to vary; every combination is run. Scenarios keep their own values for missing axes."""
 
-    failure_s: Annotated[
-        Values[Cost] | None,
-        Option(
-            "--failure-cost",
-            takes="S[,S...]|sweep",
-            default="the scenario's, 10",
-            panel=_COSTS,
-            parse=_failure_costs,
-        ),
-    ] = Field(
+    failure_s: Values[Cost] | None = option(
         None,
-        description="Seconds that the world charges for a failed attempt, and that planners expect unless their own "
+        "Seconds that the world charges for a failed attempt, and that planners expect unless their own "
         "options say otherwise. sweep: 0 to 120 s.",
+        name="--failure-cost",
+        takes="S[,S...]|sweep",
+        default="the scenario's, 10",
+        panel=_COSTS,
+        parse=_failure_costs,
     )
-    v_walk_kmh: Annotated[
-        Values[Speed] | None, Option(takes="V[,V...]", default="the scenario's, 4", panel=_COSTS)
-    ] = Field(None, description="Walking speed, km/h.")
-    v_drive_kmh: Annotated[
-        Values[Speed] | None, Option(takes="V[,V...]", default="the scenario's, 10", panel=_COSTS)
-    ] = Field(None, description="Driving speed, km/h.")
-    occupancy_levels: Annotated[
-        tuple[Level, ...],
-        AfterValidator(lambda v: tuple(sorted(set(v)))),
-        Option(
-            takes="P[,...]|none",
-            default="0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep",
-            panel="World",
-        ),
-    ] = Field(
+    v_walk_kmh: Values[Speed] | None = option(
+        None, "Walking speed, km/h.", takes="V[,V...]", default="the scenario's, 4", panel=_COSTS
+    )
+    v_drive_kmh: Values[Speed] | None = option(
+        None, "Driving speed, km/h.", takes="V[,V...]", default="the scenario's, 10", panel=_COSTS
+    )
+    occupancy_levels: Annotated[tuple[Level, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = option(
         (),
-        strict=False,
-        max_length=100,
-        description="Also set the lot's mean occupancy to these values, with a third of the episodes each, for the "
+        "Also set the lot's mean occupancy to these values, with a third of the episodes each, for the "
         "figure of time against occupancy. Searches in a recorded log are binned instead.",
-    )
-    constant_forecast: Annotated[
-        tuple[Probability, ...],
-        AfterValidator(lambda v: tuple(sorted(set(v)))),
-        Option(takes="P[,...]", panel="World", default="none"),
-    ] = Field(
-        (),
+        takes="P[,...]|none",
+        default="0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep",
+        panel="World",
         strict=False,
         max_length=100,
-        description="Also with wrong forecasts that give every slot this probability of being taken; draws total "
-        "time against it.",
+    )
+    constant_forecast: Annotated[tuple[Probability, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = (
+        option(
+            (),
+            "Also with wrong forecasts that give every slot this probability of being taken; draws total "
+            "time against it.",
+            takes="P[,...]",
+            panel="World",
+            default="none",
+            strict=False,
+            max_length=100,
+        )
     )
     blind: bool = Field(
         False,
         description="Also without observations of slots before an attempt, for agents that can do without.",
     )
-    calibrated: Annotated[FilePath | None, Option(panel=_COSTS)] = Field(
+    calibrated: FilePath | None = option(
         None,
-        description="Also compare at the failure cost and driving speed in a calibrated.json of `parkenv calibrate`, "
+        "Also compare at the failure cost and driving speed in a calibrated.json of `parkenv calibrate`, "
         "in the same worlds.",
+        panel=_COSTS,
     )
 
 
@@ -153,9 +146,7 @@ class Comparison(CaseStudy):
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
     grid: Grid = Grid()
-    episodes: Annotated[int, Option(short="-n", takes="N >= 1")] = Field(
-        200, ge=1, le=MAX_EPISODES, description="Episodes of each agent in each setting."
-    )
+    episodes: int = option(200, "Episodes of each agent in each setting.", short="-n", ge=1, le=MAX_EPISODES)
     seed: Seed = 0
     rig: Rig = None
     detector: Detector = None

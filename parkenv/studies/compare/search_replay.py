@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from parkenv.show.scene import LotScene
 from parkenv.show.search_record import SearchRecord
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording, ReportOptions
+from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
+from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import EPISODES
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.occupancy.process import World

@@ -6,15 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
 from parkenv import __version__
 from parkenv.files.known_names import RigName
+from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.comparison import CaseStudy, Comparison
-from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, ScenarioItem, Seed
+from parkenv.studies.fields import MAX_EPISODES, CaptureDistance, Detector, OneScenario, Seed
 from parkenv.studies.results import EPISODES, Results, Row, Table, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
@@ -64,10 +65,12 @@ class Demo(CaseStudy):
     all_tables: ClassVar[tuple[Table, ...]] = (EPISODES, SESSIONS)
 
     kind: Literal["demo"] = "demo"
-    scenario: ScenarioItem = scenario_spec("campus")
-    sessions: int = Field(4, ge=1, le=100_000, description="Survey drives.")
-    episodes: int = Field(6, ge=2, le=MAX_EPISODES, description="Searches of each agent.")
-    every: CaptureDistance = Field(2.5, description="Between captures, m, in the survey and in the searches.")
+    scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
+    sessions: int = option(4, "Survey drives.", ge=1, le=100_000)
+    episodes: int = option(6, "Searches of each agent.", short="-n", ge=2, le=MAX_EPISODES)
+    every: CaptureDistance = option(
+        2.5, "Metres between captures, in the survey and in the searches.", takes="M", panel="Sensors"
+    )
     detector: Detector = None
     seed: Seed = Field(0, description="Seed of drives and searches.")
 

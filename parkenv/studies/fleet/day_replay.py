@@ -15,7 +15,8 @@ from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
 from parkenv.studies.fleet.setting import Setting
-from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording, ReportOptions
+from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
+from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Key
 from parkenv.world.scenario import Scenario
 

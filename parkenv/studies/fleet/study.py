@@ -14,22 +14,23 @@ from pydantic_core import PydanticCustomError
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
-from parkenv.files.option import Option
+from parkenv.files.option import Inside, Option, option
 from parkenv.files.spec_file import Axis, FilePath
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
+    TRAFFIC,
     Agents,
     ArrivalRate,
     Figures,
+    MeanStay,
     OneScenario,
+    Patience,
     Seed,
-    Stay,
     Values,
     listed,
     require_at_most,
     require_distinct_names,
-    seconds_of_minutes,
 )
 from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS, Setting
 from parkenv.studies.results import CsvTable, Results, Row
@@ -77,78 +78,64 @@ class FleetStudy(Study):
         description="Agents, each of which drives all cars in turn, with any options in brackets. greedy-drive, "
         "first-free and random are compiled; any other agent decides in Python.",
     )
-    scenario: OneScenario = scenario_spec("campus")
-    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed), Option(panel="Knowledge")] = Field(
+    scenario: Annotated[OneScenario, Inside(without=TRAFFIC)] = scenario_spec("campus")
+    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = option(
         KNOWLEDGE,
-        description="What members know. own: what they observe; shared: also a live map of what members observe; "
+        "What members know. own: what they observe; shared: also a live map of what members observe; "
         "reserve: the slot that a guidance system has reserved; full: the state of every slot.",
+        panel="Knowledge",
     )
-    shares: Annotated[Values[Probability], Option("--share", panel="Knowledge")] = Field(
+    shares: Values[Probability] = option(
         (1.0,),
-        description="Shares of the cars that are members, from 0 to 1; the others know what they observe.",
+        "Shares of the cars that are members, from 0 to 1; the others know what they observe.",
+        name="--share",
+        panel="Knowledge",
     )
-    arrivals_per_hour: Annotated[Values[ArrivalRate], Option(panel="Demand")] = Field(
-        (60.0, 120.0, 240.0), description="Cars an hour that arrive."
+    arrivals_per_hour: Values[ArrivalRate] = option(
+        (60.0, 120.0, 240.0), "Cars an hour that arrive.", panel="Demand"
     )
-    days: Annotated[int, Option("--episodes", short="-n", takes="N >= 1")] = Field(
-        10, ge=1, le=100_000, description="Days of each setting."
-    )
-    stay_s: Annotated[
-        Stay,
-        Option(
-            "--stay-min",
-            takes="X",
-            default="60",
-            panel="Demand",
-            parse=seconds_of_minutes,
-            description="Mean of the exponentially distributed stays, minutes.",
-        ),
-    ] = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
-    patience_s: Annotated[
-        Stay,
-        Option(
-            "--patience-min",
-            takes="X",
-            default="10",
-            panel="Demand",
-            parse=seconds_of_minutes,
-            description="Minutes after which a searching car goes elsewhere, at the give-up penalty.",
-        ),
-    ] = Field(600.0, description="Search time after which a car goes elsewhere, s.")
-    delay_s: Annotated[float, Option("--delay", panel="Knowledge")] = Field(
-        0.0, ge=0.0, le=1e5, description="Age of the live map, s."
-    )
-    manoeuvre_s: Annotated[
-        float | None,
-        Option(
-            "--manoeuvre", panel="Interactions",
-            default="as in --calibrated; else 0, cars pass through each other",
-        ),
-    ] = Field(
-        None, ge=0.0, le=3600.0,
-        description="Seconds for which a car that parks or leaves blocks its lane; queues form behind it, and behind a "
+    days: int = option(10, "Days of each setting.", name="--episodes", short="-n", ge=1, le=100_000)
+    stay_s: MeanStay = 3600.0
+    patience_s: Patience = 600.0
+    delay_s: float = option(0.0, "Age of the live map, s.", name="--delay", panel="Knowledge", ge=0.0, le=1e5)
+    manoeuvre_s: float | None = option(
+        None,
+        "Seconds for which a car that parks or leaves blocks its lane; queues form behind it, and behind a "
         "car that stands.",
-    )  # fmt: skip
-    leaving_soon_s: Annotated[float, Option("--leaving-soon", panel="Interactions")] = Field(
-        0.0,
+        name="--manoeuvre",
+        panel="Interactions",
+        default="as in --calibrated; else 0, cars pass through each other",
         ge=0.0,
         le=3600.0,
-        description="Seconds for which cars show that they leave; a car that stands before such a slot holds it.",
     )
-    sees_cars: Annotated[bool, Option(panel="Interactions")] = Field(
-        False, description="Let agents observe other cars in view, in a further key of the observation."
+    leaving_soon_s: float = option(
+        0.0,
+        "Seconds for which cars show that they leave; a car that stands before such a slot holds it.",
+        name="--leaving-soon",
+        panel="Interactions",
+        ge=0.0,
+        le=3600.0,
     )
-    calibrated: Annotated[FilePath | None, Option(panel="Interactions")] = Field(
+    sees_cars: bool = option(
+        False,
+        "Let agents observe other cars in view, in a further key of the observation.",
+        panel="Interactions",
+    )
+    calibrated: FilePath | None = option(
         None,
-        description="Take driving speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`.",
+        "Take driving speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`.",
+        panel="Interactions",
     )
-    decision_limit_s: Annotated[
-        float | None, Option("--decision-limit", panel="Agents", default="none")
-    ] = Field(
-        None, ge=0.01, le=1e5,
-        description="Stop the run if an agent in Python takes longer for a decision, in seconds of wall time, "
+    decision_limit_s: float | None = option(
+        None,
+        "Stop the run if an agent in Python takes longer for a decision, in seconds of wall time, "
         "compiling included.",
-    )  # fmt: skip
+        name="--decision-limit",
+        panel="Agents",
+        default="none",
+        ge=0.01,
+        le=1e5,
+    )
     seed: Seed = 0
     figures: Figures = True
 

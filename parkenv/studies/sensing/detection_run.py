@@ -11,7 +11,9 @@ from typing import NamedTuple
 import cv2
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import atomic_write, make_folder
+from parkenv.files.csv_tables import write_csv
+from parkenv.files.file_names import distinct_names, file_name
 from parkenv.files.images import SUFFIXES as IMAGE_SUFFIXES
 from parkenv.files.images import files_in, images_in, read_image
 from parkenv.files.recordings import SUFFIXES as RECORDING_SUFFIXES
@@ -20,6 +22,7 @@ from parkenv.files.videos import VIDEO_SUFFIXES, Video, film
 from parkenv.perception.detector import Detections, Detector
 from parkenv.show.figures.survey import draw_detections
 from parkenv.studies.results import Row
+from parkenv.studies.study import Progress, counted
 from sim_sensors.ground_truth import View
 
 Film = Video | Footage
@@ -36,6 +39,74 @@ class VideoCars(NamedTuple):
 
     row: Row  # of the video: file, frames, seconds, fps, boxes, most_cars
     boxes: list[Row]  # rows of `boxes.csv`
+
+
+class FoundCars(NamedTuple):
+    """The cars in images and videos.
+
+    Attributes:
+        images: number of images.
+        videos: a row for each video: file, frames, seconds, fps, boxes, most_cars.
+        boxes: rows of `boxes.csv`.
+    """
+
+    images: int
+    videos: list[Row]
+    boxes: list[Row]
+
+
+def find_cars(
+    paths: Sequence[Path],
+    detector: Detector,
+    threshold: float,
+    step: int = 1,
+    folder: Path | None = None,
+    progress: Progress = lambda *_: None,
+) -> FoundCars:
+    """Find cars in images, videos and recorded drives, and draw them on request.
+
+    Args:
+        paths: files, or folders of them.
+        detector: what looks at them.
+        threshold: least probability of a reported car.
+        step: of a video, every `step`-th frame is looked at.
+        folder: where pictures, films and boxes.csv go; None to draw nothing.
+        progress: called as frames are finished.
+
+    Raises:
+        InputError: a file cannot be read, or a drawing would replace a file that is searched.
+    """
+    chosen = require_readable(paths)  # a damaged one is refused before any work
+    files = [one if isinstance(one, Path) else one.file for one in chosen]
+    suffixes = [".png" if isinstance(one, Path) else ".mp4" for one in chosen]
+    drawings = [
+        file_name(f"{name}_cars", suffix)
+        for name, suffix in zip(distinct_names(files), suffixes, strict=True)
+    ]
+    if folder is not None:
+        originals = {(one if isinstance(one, Path) else one.path).resolve() for one in chosen}
+        for drawing in drawings:
+            if (folder / drawing).resolve() in originals:
+                kind = "a video" if drawing.endswith(".mp4") else "an image"
+                raise InputError(f"--out {folder}: {drawing} would replace {kind} that is searched")
+        make_folder(folder)
+    counts = [1 if isinstance(one, Path) else one.frames and -(-one.frames // step) for one in chosen]
+    total = 0 if None in counts else sum(count or 0 for count in counts)  # 0 where it is not known
+    advance = counted(progress, "Detecting", total)
+    boxes: list[Row] = []
+    videos: list[Row] = []
+    for one, drawing in zip(chosen, drawings, strict=True):
+        drawn = None if folder is None else folder / drawing
+        if isinstance(one, Path):
+            boxes += detect_in_image(one, detector, threshold, drawn)
+            advance()
+        else:
+            found = detect_in_video(one, detector, threshold, step, drawn, advance)
+            videos.append(found.row)
+            boxes += found.boxes
+    if folder is not None:
+        write_csv(folder / "boxes.csv", BOX_COLUMNS, boxes)
+    return FoundCars(len(chosen) - len(videos), videos, boxes)
 
 
 def require_readable(paths: Sequence[Path]) -> list[Path | Film]:

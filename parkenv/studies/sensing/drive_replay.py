@@ -7,7 +7,8 @@ from typing import NamedTuple
 
 from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.show.report.drive_recording import record_drive
-from parkenv.studies.report import Again, Recording, ReportOptions
+from parkenv.studies.report import Again, Recording
+from parkenv.studies.report_options import ReportOptions
 from parkenv.world.scenario import Scenario
 
 

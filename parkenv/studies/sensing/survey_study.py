@@ -11,11 +11,11 @@ from pydantic import AfterValidator, Field
 
 from parkenv import __version__
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
-from parkenv.files.option import Option
+from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
-from parkenv.scenarios.spec import Hours, ScenarioSpec, scenario_spec
+from parkenv.scenarios.spec import Hours, scenario_spec
 from parkenv.show.plurals import plural
-from parkenv.studies.fields import BUSY, CaptureDistance, Detector, OneScenario, Seed
+from parkenv.studies.fields import CaptureDistance, Detector, OneScenario, Seed, with_traffic
 from parkenv.studies.results import Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.study import Cell, Study
@@ -36,10 +36,6 @@ SHOWN = "shown"
 """Key of the first session in `Results.kept`: its result, with perception results for figures, and its recording."""
 
 
-def _with_traffic(scenario: ScenarioSpec) -> ScenarioSpec:
-    return scenario if scenario.traffic else scenario.changed(traffic=BUSY)
-
-
 class SurveyStudy(Study):
     """A survey: drives past every slot with simulated sensors, recorded in a map file."""
 
@@ -52,45 +48,51 @@ class SurveyStudy(Study):
     heading: ClassVar = "Survey"
 
     kind: Literal["survey"] = "survey"
-    scenario: Annotated[OneScenario, AfterValidator(_with_traffic)] = Field(
-        scenario_spec("campus"), validate_default=True
-    )
-    sessions: Annotated[int, Option(takes="N >= 1")] = Field(
-        6, ge=1, le=100_000, description="Survey drives; the thesis made 21."
-    )
-    rig: Annotated[RigName | None, Option(panel="Sensors", default="the scenario's, laser")] = Field(
+    scenario: Annotated[
+        OneScenario, AfterValidator(with_traffic), Inside(without=("--sensor-model", "--view-range"))
+    ] = Field(scenario_spec("campus"), validate_default=True)
+    sessions: int = option(6, "Survey drives; the thesis made 21.", ge=1, le=100_000)
+    rig: RigName | None = option(
         None,
-        description="laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a laser and a camera "
+        "laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a laser and a camera "
         "to each side.",
+        panel="Sensors",
+        default="the scenario's, laser",
     )
     detector: Detector = None
-    hours: Annotated[
-        Several[Hours],
-        Option(takes="HH:MM-HH:MM[,...]", panel="World", default="08:00-10:00,11:00-14:00,16:00-18:00"),
-    ] = Field(
-        ("08:00-10:00", "11:00-14:00", "16:00-18:00"), min_length=1, max_length=1_000,
-        description="When sessions begin, on the scenario's days; the windows are used in turn.",
-    )  # fmt: skip
-    weather: Annotated[WeatherName | None, Option(panel="Sensors", default="drawn each time")] = Field(
-        None, description="Of all sessions."
+    hours: Several[Hours] = option(
+        ("08:00-10:00", "11:00-14:00", "16:00-18:00"),
+        "When sessions begin, on the scenario's days; the windows are used in turn.",
+        takes="HH:MM-HH:MM[,...]",
+        panel="World",
+        default="08:00-10:00,11:00-14:00,16:00-18:00",
+        min_length=1,
+        max_length=1_000,
     )
-    every: Annotated[CaptureDistance, Option(takes="M >= 0.1")] = Field(
-        1.25, description="Metres between captures."
+    weather: WeatherName | None = option(None, "Of all sessions.", panel="Sensors", default="drawn each time")
+    every: CaptureDistance = option(1.25, "Metres between captures.", takes="M")
+    pose_noise: float = option(
+        0.0, "Localisation error of the car, m.", takes="M", panel="Sensors", ge=0.0, le=100.0
     )
-    pose_noise: Annotated[float, Option(takes="M >= 0", panel="Sensors")] = Field(
-        0.0, ge=0.0, le=100.0, description="Localisation error of the car, m."
-    )
-    odometry_drift: Annotated[float, Option(takes="0 <= P <= 0.5", panel="Sensors")] = Field(
+    odometry_drift: float = option(
         0.0,
+        "Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.",
+        takes="P",
+        panel="Sensors",
         ge=0.0,
         le=0.5,
-        description="Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.",
     )
-    localise: Annotated[LocaliserName, Option(panel="Sensors")] = Field(
-        "none", description="scan-matching: correct the odometry by parked cars, walls and slots."
+    localise: LocaliserName = option(
+        "none", "scan-matching: correct the odometry by parked cars, walls and slots.", panel="Sensors"
     )
-    picture_width: Annotated[int | None, Option(takes="64 <= PX <= 4096", panel="Sensors", default="640")] = (
-        Field(None, ge=64, le=4_096, description="Width of the cameras' pictures; searches have 400.")
+    picture_width: int | None = option(
+        None,
+        "Width of the cameras' pictures; searches have 400.",
+        takes="PX",
+        panel="Sensors",
+        default="640",
+        ge=64,
+        le=4_096,
     )
     seed: Seed = Field(0, description="Seed of the drives.")
 

@@ -11,7 +11,6 @@ import numpy as np
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, WHOLE, Kind, typed_records
 from parkenv.show.columns import columns_of
-from parkenv.studies.statistics import mean_interval
 
 CURVE = "curve.csv"
 
@@ -53,6 +52,8 @@ def across_seeds(curves: Sequence[Sequence[Row]], measure: str = "total_s") -> l
     Returns:
         Rows with steps, `measure` and its `columns_of`.
     """
+    from parkenv.studies.statistics import mean_interval
+
     low_name, high_name, median_name = columns_of(measure)
     rows = []
     for evaluations in zip(*curves, strict=False):

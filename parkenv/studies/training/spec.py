@@ -16,10 +16,21 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import WHOLE
 from parkenv.files.known_names import KnowledgeName
 from parkenv.files.limited_reading import read_json
-from parkenv.files.spec_file import Several
+from parkenv.files.option import Inside, Option, option, words_in
+from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.agent_spec import AgentItem, AgentSpec
-from parkenv.studies.fields import MAX_EPISODES, ArrivalRate, Level, Scenarios, Stay
+from parkenv.studies.agent_spec import AgentItem, AgentSpec, split_agents
+from parkenv.studies.fields import (
+    MAX_EPISODES,
+    SCENARIOS_TAKE,
+    ArrivalRate,
+    Level,
+    MeanStay,
+    Patience,
+    ScenarioList,
+    Scenarios,
+    Seed,
+)
 from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row, without_nan
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.training.curve_file import CURVE, read_curve
@@ -32,10 +43,54 @@ if TYPE_CHECKING:
     from parkenv.studies.training.training import Training
 
 Steps = Annotated[int, Field(ge=1, le=10**12, description="Decisions of a training.")]
-EvaluateEvery = Annotated[int, Field(ge=1, le=10**12, description="Decisions between evaluations.")]
-Episodes = Annotated[int, Field(ge=2, le=1_000_000)]
-ObservedSlots = Annotated[int, Field(ge=1, le=1_000, description="Slots in an observation.")]
-TensorBoard = Annotated[bool, Field(description="Keep logs for TensorBoard.")]
+EvaluateEvery = Annotated[
+    int,
+    Field(ge=1, le=10**12, description="Decisions between evaluations."),
+    Option(panel="Evaluation", default="100000; in a fleet, a tenth of --steps; to drive, a twentieth"),
+]
+Episodes = Annotated[
+    int,
+    Field(ge=2, le=1_000_000),
+    Option(
+        panel="Evaluation",
+        default="256; to drive, 64; in a fleet, 8",
+        description="Episodes of an evaluation, in held-out worlds; to drive, on each lot for each kind of slot; in a "
+        "fleet, days.",
+    ),
+]
+ObservedSlots = Annotated[
+    int,
+    Field(ge=1, le=1_000, description="Slots in an observation (search, fleet)."),
+    Option(panel="Learning", default="5; with --observation scan, 4 scans"),
+]
+TensorBoard = Annotated[
+    bool, Field(description="Keep logs for TensorBoard in the folder."), Option(panel="Results")
+]
+_DAYS = Inside(only=("--day-error",))
+TrainedOn = Annotated[
+    Scenarios,
+    Option(
+        "--scenario",
+        takes=SCENARIOS_TAKE,
+        parse=words_in,
+        default="campus; to drive, campus,street; for network, made lots alone",
+    ),
+    _DAYS,
+]
+
+
+def agents_or_none(text: str) -> list[str]:
+    """Split agents at commas; none for `none`."""
+    return [] if text == "none" else split_agents(text)
+
+
+_COMPARED = Option(
+    takes="NAME[,...]|none",
+    panel="Evaluation",
+    parse=agents_or_none,
+    default="belief, mdp-tuned, mdp, first-free, greedy-drive, greedy-goal; with held-out places, belief, mdp, "
+    "first-free, greedy-drive; in a fleet, greedy-drive, first-free; to drive, planner",
+)
 
 
 FILES = "files"
@@ -83,16 +138,25 @@ class TrainingSpec(Study):
     kind: Literal["train"] = "train"
     env: Literal["search", "fleet", "drive"] = "search"
     algorithm: str
-    scenarios: Scenarios | None = None
-    trainings: int = Field(5, ge=1, le=10_000, description="How many, one for each seed.")
-    seed: int = Field(0, ge=0, lt=2**31, description="Of the first.")
+    scenarios: TrainedOn | None = None
+    trainings: int = option(5, "How many, one for each seed.", ge=1, le=10_000)
+    seed: Seed = Field(0, description="First seed of the trainings.")
     evaluation_episodes: Episodes
-    agents: Several[AgentItem] | None = Field(None, max_length=1_000, description="Drawn for comparison.")
-    beside: Several[str] = Field(
-        (),
-        max_length=100,
-        description="Folders of other trainings with the same evaluations, drawn in the same figure.",
+    agents: Annotated[Several[AgentItem] | None, _COMPARED] = Field(
+        None, max_length=1_000, description="Agents that are drawn for comparison."
     )
+    beside: Several[str] = option(
+        (),
+        "Folders of other trainings with the same evaluations, drawn in the same figure.",
+        takes="DIR[,...]",
+        panel="Evaluation",
+        max_length=100,
+    )
+
+    @classmethod
+    def variants(cls) -> tuple[type[Spec], ...]:
+        """See `Spec`."""
+        return KINDS if cls is TrainingSpec else ()
 
     @classmethod
     def parse(
@@ -261,7 +325,14 @@ class TrainingSpec(Study):
 class TestedTrainingSpec(TrainingSpec):
     """A training whose models may be tested in other scenarios."""
 
-    test_on: Scenarios | None = Field(None, description="Tested on in the end; the same if absent.")
+    test_on: Annotated[ScenarioList | None, _DAYS] = option(
+        None,
+        "Scenarios to test in at the end.",
+        takes=SCENARIOS_TAKE,
+        panel="Evaluation",
+        parse=words_in,
+        default="those of the training; with held-out places, all of either side together",
+    )
 
     @property
     def tested(self) -> Scenarios | None:
@@ -272,13 +343,21 @@ class TestedTrainingSpec(TrainingSpec):
 class PlacesTrainingSpec(TestedTrainingSpec):
     """A training that can hold out places."""
 
-    held_out: Level | None = Field(
+    held_out: Level | None = option(
         None,
-        description="Share of the places that is kept for evaluation: a place is held out by a hash of its lot, "
-        "whatever other places there are.",
+        "Train on other places than evaluations are in: hold out this share of the scenarios, by a hash of "
+        "each lot, whatever other places there are (search).",
+        takes="0 < X < 1",
+        panel="Evaluation",
+        default="none",
     )
-    evaluate_on: Scenarios | None = Field(
-        None, description="Also evaluated on, during training and in the end; no place to train on."
+    evaluate_on: Annotated[ScenarioList | None, _DAYS] = option(
+        None,
+        "Hold out these places instead: evaluate on them, during training and in the end (search).",
+        takes=SCENARIOS_TAKE,
+        panel="Evaluation",
+        parse=words_in,
+        default="none",
     )
     evaluation_episodes: Episodes = Field(
         256, description="Episodes of an evaluation; the test in the end has twice as many."
@@ -302,23 +381,53 @@ class SearchTrainingSpec(PlacesTrainingSpec):
     chosen_by: ClassVar[str] = "env search"
     trained_by: ClassVar[str] = "search:SearchTraining"
 
-    env: Literal["search"] = "search"
-    algorithm: Literal["ppo", "maskable-ppo", "recurrent-ppo", "dqn"] = "maskable-ppo"
-    scenarios: Scenarios = Field((scenario_spec("campus"),), description="Trained on, drawn for each search.")
-    observation: Literal["local"] = "local"
+    env: Literal["search"] = option(
+        "search",
+        "Learn to search (parkenv/Search-v2), to search as all cars of a fleet, or to drive into slots "
+        "(parkenv/Drive-v1).",
+        takes="search|fleet|drive",
+        default="search",
+    )
+    algorithm: Literal["ppo", "maskable-ppo", "recurrent-ppo", "dqn"] = option(
+        "maskable-ppo",
+        "To search: dqn, ppo, maskable-ppo, recurrent-ppo, network. In a fleet: ppo, maskable-ppo. To "
+        "drive: sac, tqc, ppo.",
+        argument=True,
+        default="maskable-ppo; to drive, ppo",
+    )
+    scenarios: TrainedOn = (scenario_spec("campus"),)
+    observation: Literal["local"] = option(
+        "local",
+        "What is observed (search; ppo, maskable-ppo). local: what is near the car, from belief and "
+        "forecast; scan: the last laser scans and poses alone, in one scenario.",
+        takes="local|scan",
+        panel="Learning",
+        default="local",
+    )
     k: ObservedSlots = 5
-    curriculum: Literal["size"] | None = Field(
+    curriculum: Literal["size"] | None = option(
         None,
-        description="size: begin with the smallest tenth of the places, and add larger ones evenly until half of the "
-        "steps.",
+        "size: begin with the smallest tenth of the places, and add larger ones evenly until half of the "
+        "steps (search).",
+        panel="Learning",
+        default="all places from the start",
     )
-    clone: str | None = Field(
-        None, description="Behaviour cloning of this planner first (ppo, maskable-ppo)."
+    clone: str | None = option(
+        None,
+        "Start with behaviour cloning of this planner (search; ppo, maskable-ppo).",
+        takes="AGENT",
+        panel="Learning",
     )
-    demonstrations: int | None = Field(
-        None, ge=1, le=MAX_EPISODES, description="Searches of the planner to clone; 2000 if absent."
+    demonstrations: int | None = option(
+        None, "Episodes of the planner to clone.", panel="Learning", default="2000", ge=1, le=MAX_EPISODES
     )
-    steps: Steps = 2_000_000
+    steps: Annotated[
+        Steps,
+        Option(
+            default="2000000; in a fleet, 500000; for network, 10000; to drive, the training config's",
+            description="Decisions of a training; for network, those that belief labels.",
+        ),
+    ] = 2_000_000
     evaluate_every: EvaluateEvery = 100_000
     tensorboard: TensorBoard = False
 
@@ -343,7 +452,7 @@ class ScanTrainingSpec(TestedTrainingSpec):
 
     env: Literal["search"] = "search"
     algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
-    scenarios: Scenarios = Field((scenario_spec("campus"),), description="The one that is trained on.")
+    scenarios: TrainedOn = (scenario_spec("campus"),)
     observation: Literal["scan"] = "scan"
     k: int = Field(4, ge=1, le=1_000, description="Scans in an observation.")
     steps: Steps = 2_000_000
@@ -365,12 +474,16 @@ class NetworkTrainingSpec(PlacesTrainingSpec):
 
     env: Literal["search"] = "search"
     algorithm: Literal["network"] = "network"
-    scenarios: Scenarios | None = Field(
+    scenarios: Annotated[TrainedOn | None, _DAYS] = Field(
         None, description="Trained on beside made lots; made lots alone if absent."
     )
     steps: Annotated[int, Field(ge=1, le=10**12, description="Decisions that belief labels.")] = 10_000
-    without: Several[Literal["lookahead", "tokens", "day", "memory"]] = Field(
-        (), description="Parts of the network to leave out, to see what they are worth."
+    without: Several[Literal["lookahead", "tokens", "day", "memory"]] = option(
+        (),
+        "Parts of network to leave out: lookahead, tokens, day, memory.",
+        takes="PART[,...]",
+        panel="Learning",
+        default="none",
     )
 
 
@@ -382,16 +495,28 @@ class FleetTrainingSpec(TrainingSpec):
 
     env: Literal["fleet"] = "fleet"
     algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
-    scenarios: Scenarios = Field((scenario_spec("campus"),), description="The one that is trained on.")
-    arrivals_per_hour: ArrivalRate = Field(120.0, description="Cars.")
-    stay_s: Stay = Field(3600.0, description="Mean of the exponentially distributed stays, s.")
-    patience_s: Stay = Field(600.0, description="Search time after which a car goes elsewhere, s.")
-    knows: KnowledgeName = Field("own", description="What the learning cars know.")
-    among: AgentItem | None = Field(
-        None, description="Compiled driver of the other cars; every car learns if absent."
+    scenarios: TrainedOn = (scenario_spec("campus"),)
+    arrivals_per_hour: ArrivalRate = option(
+        120.0, "Cars that arrive in the hours of the scenario (fleet).", panel="Demand"
     )
-    learners: Level | None = Field(
-        None, description="With among: share of the cars that learn; 0.1 if absent."
+    stay_s: MeanStay = 3600.0
+    patience_s: Patience = 600.0
+    knows: KnowledgeName = option(
+        "own", "What the learning cars know, as in parkenv fleet.", panel="Knowledge"
+    )
+    among: AgentItem | None = option(
+        None,
+        "Driver of the other cars: greedy-drive, first-free, random or a model.",
+        takes="AGENT",
+        panel="Knowledge",
+        default="none, every car learns",
+    )
+    learners: Level | None = option(
+        None,
+        "Share of the cars that learn, with --among.",
+        takes="0 < X < 1",
+        panel="Knowledge",
+        default="0.1",
     )
     k: ObservedSlots = 5
     steps: Steps = 500_000
@@ -404,10 +529,13 @@ class FleetTrainingSpec(TrainingSpec):
         max_length=1_000,
         description="Drawn for comparison.",
     )
-    test_among: Several[AgentItem] = Field(
+    test_among: Several[AgentItem] = option(
         (AgentSpec(name="greedy-drive"),),
+        "Test also with the model as each tenth car among these (fleet).",
+        takes="NAME[,...]|none",
+        panel="Evaluation",
+        parse=agents_or_none,
         max_length=100,
-        description="Tested also as each tenth car among these.",
     )
     tensorboard: TensorBoard = False
 
@@ -434,7 +562,7 @@ class DriveTrainingSpec(TestedTrainingSpec):
 
     env: Literal["drive"] = "drive"
     algorithm: Literal["ppo", "sac", "tqc"] = "ppo"
-    scenarios: Scenarios = Field(
+    scenarios: TrainedOn = Field(
         (scenario_spec("campus"), scenario_spec("street")), description="Their lots are trained on."
     )
     steps: Steps | None = Field(None, description="The algorithm's own number if absent.")

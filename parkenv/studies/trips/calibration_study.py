@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, Self
 
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
-from parkenv.files.option import Option
+from parkenv.files.option import option
+from parkenv.files.spec_file import Spec
 from parkenv.scenarios.spec import Speed, scenario_spec
-from parkenv.studies.agent_spec import AgentItem, AgentSpec, split_agents
-from parkenv.studies.fields import Detector, OneScenario, Rig, Seed, require_rig
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, require_rig
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
@@ -28,13 +29,6 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 CALIBRATED = "calibrated.json"
-
-
-def _one_agent(text: str) -> str:
-    names = split_agents(text)
-    if len(names) != 1:
-        raise InputError(f"names {len(names)} agents, want one")
-    return names[0]
 
 
 class _Trips(NamedTuple):
@@ -54,38 +48,28 @@ def _trip(row: Row) -> Row:
     return trip_of_row(row)
 
 
-class CalibrationStudy(Study):
-    """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
+class DrivenTrips(Spec):
+    """Trips that a simulated car drives along the lanes and into slots, as an agent decides."""
 
-    Agents that observe slots hardly ever attempt a taken one, so every seed is driven twice: trips without observations
-    provide failed attempts.
-    """
-
-    table: ClassVar = JsonTable("trips.jsonl", ("slots", "seed"), _trip, "trip")
-    block: ClassVar = 5
-    doing: ClassVar = "Driving"
-    unit: ClassVar = "trips"
-
-    kind: Literal["calibrate"] = "calibrate"
     scenario: OneScenario = scenario_spec("campus")
-    agent: Annotated[AgentItem, Option("--agents", takes="NAME", parse=_one_agent)] = Field(
-        AgentSpec(name="mdp"),
-        description="The agent that searches, with any options in brackets: mdp(failure_s=90).",
-    )
-    episodes: Annotated[int, Option(short="-n", takes="1 <= N <= 1000000")] = Field(
-        100, ge=1, le=1_000_000, description="Trips with observations, and as many without."
-    )
+    agent: OneAgent = AgentSpec(name="mdp")
     seed: Seed = 0
-    notice_m: Annotated[float, Option("--notice", takes="M", panel="Costs and speeds")] = Field(
+    notice_m: float = option(
         2.0,
+        "Metres along its path at which the car notices at the latest that it would drive into a taken slot.",
+        name="--notice",
+        takes="M",
+        panel="Costs and speeds",
         ge=0.0,
         le=1_000.0,
-        description="Metres along its path at which the car notices at the latest that it would drive into a taken "
-        "slot.",
     )
-    v_drive_kmh: Annotated[
-        Speed | None, Option(takes="V", panel="Costs and speeds", default="the scenario's, 10")
-    ] = Field(None, description="Speed limit on the lanes, km/h.")
+    v_drive_kmh: Speed | None = option(
+        None,
+        "Speed limit on the lanes, km/h.",
+        takes="V",
+        panel="Costs and speeds",
+        default="the scenario's, 10",
+    )
     rig: Rig = None
     detector: Detector = None
 
@@ -126,6 +110,24 @@ class CalibrationStudy(Study):
 
         scenario, rig = (self.built, self.rig) if slots == OBSERVED else (blind_scenario(self.built), None)
         return DrivenSearch(scenario, self.agent, style=self.style, rig=rig, detector=self.detector)
+
+
+class CalibrationStudy(DrivenTrips, Study):
+    """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
+
+    Agents that observe slots hardly ever attempt a taken one, so every seed is driven twice: trips without observations
+    provide failed attempts.
+    """
+
+    table: ClassVar = JsonTable("trips.jsonl", ("slots", "seed"), _trip, "trip")
+    block: ClassVar = 5
+    doing: ClassVar = "Driving"
+    unit: ClassVar = "trips"
+
+    kind: Literal["calibrate"] = "calibrate"
+    episodes: int = option(
+        100, "Trips with observations, and as many without.", short="-n", ge=1, le=1_000_000
+    )
 
     def check(self) -> None:
         """See `Study`."""

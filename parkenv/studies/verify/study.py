@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
 from parkenv import __version__
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import VERIFY_CASES
-from parkenv.files.option import Option
+from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
 from parkenv.studies.fields import Seed
 from parkenv.studies.results import JsonTable, Results, Row
@@ -56,8 +56,8 @@ class Verification(Study):
     goes_on: ClassVar = "unfinished"
 
     kind: Literal["verify"] = "verify"
-    cases: Annotated[Axis[str], Option(takes="NAME[,...]", default="all")] = Field(
-        VERIFY_CASES, description=f"Some of {', '.join(VERIFY_CASES)}."
+    cases: Axis[str] = option(
+        VERIFY_CASES, f"Some of {', '.join(VERIFY_CASES)}.", takes="NAME[,...]", default="all"
     )
     seed: Seed = Field(0, description="First seed of the simulated cases.")
 

@@ -1,0 +1,266 @@
+"""`parkenv trip`, `parkenv calibrate` and `parkenv park`: a car that steers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from pydantic import Field
+
+from parkenv.cli.options import Command
+from parkenv.cli.study_command import Rerun, StudyCommand
+from parkenv.cli.tables import make_console, make_table, print_recorded, save_summary, stages, writing_into
+from parkenv.cli.trust import TrustModel, readable_models
+from parkenv.errors import InputError
+from parkenv.files.option import Inside, option, words_in
+from parkenv.files.spec_file import Axis
+from parkenv.scenarios.spec import Probability, scenario_spec
+from parkenv.show.plurals import plural
+from parkenv.studies.fields import Scenarios, Seed
+from parkenv.studies.study import ExecutionSpec
+from parkenv.studies.trips.calibration_study import CalibrationStudy, DrivenTrips
+from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
+from planners.names import PARKING_PLANNER
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.studies.runner import Result
+    from parkenv.studies.trips.driven_search import Trip as DrivenTrip
+
+SHOWN_ROWS = 20
+
+
+class Calibrate(StudyCommand):
+    """A simulated car drives along the lanes and into slots, as the agent decides. Every seed is driven twice.
+
+    Once with the scenario's observations of slots, for the speed and the manoeuvre; and once without observations
+    before an attempt, for failed attempts. `parkenv compare --calibrated OUT/calibrated.json` then compares agents
+    under both costs.
+    """
+
+    examples = """
+        parkenv calibrate --scenario campus --episodes 200
+        parkenv compare --calibrated results/calibrate/calibrated.json
+        """
+
+    study: CalibrationStudy = CalibrationStudy()
+    out: Path = option(
+        Path("results/calibrate"),
+        "Folder for calibrated.json, trips.jsonl, summary.json and the figure.",
+        short="-o",
+    )
+
+    def show(self, console: Console, result: Result) -> None:
+        """Print the distributions and the calibration."""
+        from parkenv.world.scenario import KMH
+
+        cells = (
+            (
+                row["what"],
+                str(row["n"]),
+                f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",
+                *(f"{row[name]:.2f}" if name in row else "" for name in ("median", "p95")),
+            )
+            for row in result.rows
+        )
+        console.print(make_table(self.study.title, ("what", "n", "mean [95 %]", "median", "p95"), cells))
+        if (made := result.summary["calibrated"]) is not None:
+            trips, touched, stuck = (result.summary[name] for name in ("trips", "contacts", "rescues"))
+            console.print(
+                f"Calibrated: driving at {made['v_drive'] / KMH:.2f} km/h, a failed attempt costs "
+                f"{made['failure_s']:.1f} s, and parking takes {made['manoeuvre_s']:.1f} s that the drive graph leaves "
+                f"out. In {trips} trips: {touched} contacts, {stuck} times stuck."
+            )
+
+
+class Trip(Command, DrivenTrips):
+    """The film shows the car's surroundings, with the whole lot in a corner."""
+
+    examples = """
+        parkenv trip --scenario campus --seed 7 --blind --out trip.gif
+        parkenv trip --scenario campus --rig laser --rerun trip.rrd
+        parkenv trip --scenario campus --cars 6 --pedestrians 8
+        """
+
+    seed: Seed = Field(0, description="Seed of the world.")
+    blind: bool = option(False, "Observe no slot before an attempt to park there, so that attempts fail.")
+    rerun: Rerun = None
+    out: Path = option(Path("results/trip.gif"), "The film.", short="-o", takes="FILE.gif")
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import make_folder
+        from parkenv.show.figures.picture_files import save_film
+        from parkenv.studies.trips.sensor_log import record_trip, require_viewer, sensor_log
+        from parkenv.studies.trips.trip_film import COLORS, FPS, film_trip
+
+        if self.out.suffix.lower() != ".gif":
+            raise InputError(f"--out is {self.out}, want a file that ends in .gif")
+        if self.blind and self.rig is not None:
+            raise InputError(
+                "--blind and --rig: without observations no sensors are needed; name one of the two"
+            )
+        if self.rerun is not None:
+            if self.rig is None:
+                raise InputError("--rerun records what sensors measure: add --rig laser")
+            require_viewer()
+        search = self.search(UNOBSERVED if self.blind else OBSERVED)
+        make_folder(self.out.parent)
+        console = make_console()
+        with console.status("Driving and drawing"):
+            driven, frames = film_trip(search, self.seed)
+            save_film(frames, self.out, fps=FPS, colors=COLORS)
+        _show_trip(console, driven)
+        console.print(f"The film is {self.out}")
+        if self.rerun is not None:
+            assert search.env.perception is not None
+            with (
+                console.status(f"Driving once more for {self.rerun}"),
+                sensor_log(self.rerun, self.built.lot, search.env.perception.sampler.rig) as recording,
+            ):
+                record_trip(search, self.seed, recording)
+            print_recorded(console, self.rerun)
+
+
+def _show_trip(console: Console, driven: DrivenTrip) -> None:
+    from parkenv.world.cost_terms import COST_TERMS
+
+    end = f"parked in {driven.slot}" if driven.parked else "not parked"
+    parts = (
+        (driven.lanes_s, "on the lanes", False), (driven.manoeuvre_s, "manoeuvre", False),
+        *((driven.costs[t.field], t.label, t.optional) for t in COST_TERMS if t.field in driven.costs),
+    )  # fmt: skip
+    terms = " + ".join(f"{s:.1f} s {what}" for s, what, optional in parts if s or not optional)
+    console.print(f"{end}: {driven.total_s:.1f} s = {terms}")
+    if driven.waited_s or driven.contacts:
+        console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")
+    for t in driven.attempts:
+        console.print(
+            f"  {t.slot} ({t.kind}{', ' + t.way if t.way else ''}): {t.seconds:.1f} s, {t.reason or 'parked'}"
+        )
+
+
+_TASKS = "Parking tasks"
+
+
+def _all_or(text: str) -> object:
+    return None if text in ("all", "both") else words_in(text)
+
+
+class Park(Command, ExecutionSpec):
+    """Writes pictures of one successful episode per kind of slot and orientation, and an animation of one.
+
+    Failures are also drawn, if any; with several agents, into one folder per agent.
+    """
+
+    examples = """
+        parkenv park --episodes 250 --scenario campus,street,jam
+        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors
+        parkenv park --lot parking_map.yml --way back-in
+        """
+
+    agents: Axis[str] = option(
+        (PARKING_PLANNER,),
+        "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
+        "`parkenv train --env drive`.",
+        takes="NAME[,...]",
+    )
+    scenarios: Annotated[Scenarios, Inside(only=())] = (scenario_spec("campus"), scenario_spec("street"))
+    episodes: int = option(100, "Episodes per lot.", short="-n", ge=1, le=1_000_000)
+    seed: Seed = 0
+    kinds: Axis[Literal["perpendicular", "oblique", "parallel"]] | None = option(
+        None,
+        "Slots: perpendicular, oblique, parallel.",
+        name="--kind",
+        panel=_TASKS,
+        takes="NAME[,...]|all",
+        default="all",
+        parse=_all_or,
+    )
+    ways: Axis[Literal["nose-in", "back-in"]] | None = option(
+        None,
+        "Orientation in the slot: nose-in, back-in.",
+        name="--way",
+        panel=_TASKS,
+        takes="NAME|both",
+        default="both",
+        parse=_all_or,
+    )
+    occupied: Probability = option(
+        0.85, "Fraction of the other slots that are taken.", takes="P", panel=_TASKS
+    )
+    slack: float = option(
+        0.0,
+        "Distance around the slot kept clear of parked cars, m.",
+        takes="M",
+        panel=_TASKS,
+        ge=0.0,
+        le=100.0,
+    )
+    trust_model: TrustModel = False
+    out: Path = option(
+        Path("results/park"), "Folder for pictures, episodes.csv and summary.json.", short="-o"
+    )
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.driving.parking_task import WAYS
+        from parkenv.scenarios.build import build
+        from parkenv.studies.trips.parking_comparison import compare_parking
+        from parkenv.studies.trips.parking_runs import ParkingCase
+
+        cases = [
+            ParkingCase(build(spec).lot, self.kinds, self.ways or WAYS, self.occupied, self.slack)
+            for spec in self.scenarios
+        ]
+        agents = readable_models(self.agents) if self.trust_model else self.agents
+        seeds = range(self.seed, self.seed + self.episodes)
+        console = make_console()
+        with writing_into(self.out):
+            with stages(console, "episodes") as progress, self.workers() as workers:
+                found = compare_parking(cases, agents, seeds, self.out, workers=workers, progress=progress)
+            names = [case.lot.name for case in cases]
+            save_summary(self.out, self.seed, found.table, lots=names, agents=found.labels)
+        _show_parkings(
+            console, f"{', '.join(names)}: {plural(self.episodes, 'episode')} per lot", found.table
+        )
+        for row in [row for row in found.rows if not row["parked"]][:SHOWN_ROWS]:
+            agent = f"{row['agent']}, " if len(found.labels) > 1 else ""
+            console.print(
+                f"failed: {agent}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+            )
+        console.print(f"Episodes, summary and pictures are in {self.out}")
+
+
+def _show_parkings(console: Console, title: str, table: list[dict[str, Any]]) -> None:
+    headings = (
+        "agent", "slot", "parked", "success [95 %]", "contacts", "plan ms (p95)", "drive s (p95)", "changes (p95)",
+        "driven m", "turned rad",
+    )  # fmt: skip
+    cells = (
+        (
+            row["agent"],
+            f"{row['kind']} {row['way']}".strip(),
+            f"{row['parked']}/{row['episodes']}",
+            f"{row['success']:.1%} [{row['success_ci95'][0]:.1%}, {row['success_ci95'][1]:.1%}]",
+            str(row["contacts"]),
+            _pair(row, "planning_ms", 0),
+            _pair(row, "time_s", 1),
+            _pair(row, "direction_changes", 0),
+            _known(row["driven_m"], 1),
+            _known(row["turned_rad"], 1),
+        )
+        for row in table
+    )
+    console.print(make_table(title, headings, cells))
+
+
+def _pair(row: dict[str, Any], name: str, digits: int) -> str:
+    """Format a median with its 95th percentile; empty for agents without the quantity, e.g. planning time."""
+    median, p95 = (_known(row[key], digits) for key in (name, f"{name}_p95"))
+    return median and f"{median} ({p95})"
+
+
+def _known(value: float, digits: int) -> str:
+    return "" if value != value else f"{value:.{digits}f}"

@@ -1,0 +1,333 @@
+"""Options of a command from the fields of its class, and the command that given options make."""
+
+from __future__ import annotations
+
+import inspect
+import types
+from abc import abstractmethod
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+from importlib import import_module
+from keyword import iskeyword
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeVar, Union, get_args, get_origin
+
+import annotated_types
+from pydantic.fields import FieldInfo
+
+from parkenv.errors import InputError
+from parkenv.files.file_names import file_name
+from parkenv.files.option import Inside, Option, words_in
+from parkenv.files.spec_file import Spec, models_in
+from parkenv.scenarios.spec import ScenarioSpec
+
+SpecT = TypeVar("SpecT", bound=Spec)
+_SHOWN_BOUND = 1_000  # larger bounds only guard against mistakes
+_LETTERS = {int: "N", float: "X", Path: "FILE"}
+
+
+Given = Mapping[str, Any]
+"""What was given for each option, such as `--episodes`: text, a tuple of texts, or for switches a bool."""
+
+
+class Command(Spec):
+    """A command: its fields are its arguments and options, and its docstring is part of its help page.
+
+    Attributes:
+        examples: command lines for the help page.
+    """
+
+    examples: ClassVar[str]
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        """Make the command from what was given.
+
+        Raises:
+            InputError: a value cannot be used, or options exclude each other; the message names the options.
+        """
+        return made(cls, given)
+
+    @abstractmethod
+    def run(self) -> None:
+        """Run it, and print what it found."""
+
+
+def command_class(source: str) -> type[Command]:
+    """Import the class of a command, `MODULE:CLASS` below `parkenv.cli`."""
+    module, _, name = source.partition(":")
+    found: type[Command] = getattr(import_module(f"parkenv.cli.{module}"), name)
+    return found
+
+
+@dataclass(frozen=True)
+class FieldOption:
+    """An option of a command: a field of its specification, or of a table in it.
+
+    Args:
+        path: names of the tables, and of the field.
+        field: the field.
+        option: how it is given on the command line.
+        model: class of the table that the field belongs to.
+    """
+
+    path: tuple[str, ...]
+    field: FieldInfo
+    option: Option
+    model: type[Spec]
+
+    @property
+    def name(self) -> str:
+        """The option, such as `--episodes`; of an argument, its name in capitals."""
+        name = self.path[-1]
+        return self.option.name or (name.upper() if self.option.argument else f"--{name.replace('_', '-')}")
+
+    @property
+    def parameter(self) -> str:
+        """Its name among the parameters of a command."""
+        name = self.name.lstrip("-").replace("-", "_").lower()
+        return f"{name}_" if iskeyword(name) else name
+
+    @property
+    def is_required(self) -> bool:
+        """Whether the command needs it."""
+        return len(self.path) == 1 and self.field.is_required()
+
+    @property
+    def is_switch(self) -> bool:
+        """Whether the option takes no value."""
+        return self.field.annotation is bool
+
+    @property
+    def has_opposite(self) -> bool:
+        """Whether the switch also has the form `--no-...`: it is on by default, or in the file of a study."""
+        return self.is_switch and (bool(self.field.default) or len(self.path) > 1)
+
+    @property
+    def is_repeated(self) -> bool:
+        """Whether it may be given several times."""
+        is_list = get_origin(_bare(self.field.annotation)) is tuple
+        return self.option.repeat or (self.option.argument and is_list)
+
+    @property
+    def takes(self) -> str:
+        """What the option takes: choices, or a letter with the field's bounds."""
+        takes = self.option.takes or ("DIR" if self.name == "--out" else "")
+        takes = takes or (self.name if self.option.argument else "")
+        if len(takes) > 2:
+            return takes
+        kind = get_args(_bare(self.field.annotation))[0] if self.is_repeated else self.field.annotation
+        return _taken(kind, self.field.metadata, takes)
+
+    @property
+    def choices(self) -> tuple[str, ...]:
+        """The words that the option takes, if these are all."""
+        kind = _bare(self.field.annotation)
+        return get_args(kind) if get_origin(kind) is Literal else ()
+
+    @property
+    def help(self) -> str:
+        """The description with the default."""
+        default = self.option.default or self._default()
+        text = self.option.description or self.field.description or ""
+        return f"{text}  [default: {default}]" if default else text
+
+    def _default(self) -> str:
+        value = self.field.get_default(call_default_factory=True)
+        if self.is_switch:
+            return "" if not self.has_opposite else self.name[2:] if value else f"no-{self.name[2:]}"
+        if self.option.description or value is None or self.is_required:
+            return ""
+        return ",".join(_shown(part) for part in (value if isinstance(value, tuple) else (value,)))
+
+    def value(self, given: Any) -> object:
+        """Convert what was given.
+
+        Raises:
+            InputError: the text has another form; the message names the option.
+        """
+        if self.is_switch:
+            return given
+        try:
+            if self.is_repeated:
+                kind = get_args(_bare(self.field.annotation))[0]
+                return tuple(
+                    self.option.parse(t) if self.option.parse else _converted(kind, t) for t in given
+                )
+            return self.option.parse(given) if self.option.parse else _converted(self.field.annotation, given)
+        except InputError as error:
+            message = str(error)
+            raise InputError(
+                f"{self.name} {message}" if message.startswith(("is ", "names ")) else message
+            ) from None
+
+
+_Values = dict[tuple[str, ...], tuple[FieldOption, object]]  # of options and what they are set to, by path
+
+
+def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[FieldOption]:
+    """Yield the options of a specification and of its tables; its own go before those of the same name in a table.
+
+    What a command itself declares is an option anyway; other fields if they have an `Option`.
+    """
+    if variants := model.variants():
+        for variant in variants:
+            yield from field_options(variant, path)
+        return
+    of_command = {
+        name for kind in model.__mro__ if issubclass(kind, Command) for name in inspect.get_annotations(kind)
+    }
+    own = []
+    for name, field in model.model_fields.items():
+        marks = {mark.name: mark for mark in field.metadata if isinstance(mark, Option)}
+        if not marks and name in of_command and not any(models_in(field.annotation)):
+            marks = {"": Option()}
+        own += [FieldOption((*path, name), field, mark, model) for mark in marks.values()]
+    names = {option.name for option in own}
+    for name, field in model.model_fields.items():
+        yield from (option for option in own if option.path[-1] == name)
+        inside = [Inside(), *(mark for mark in field.metadata if isinstance(mark, Inside))][-1]
+        for inner in models_in(field.annotation):
+            if issubclass(inner, Spec):
+                for option in field_options(inner, (*path, name)):
+                    if option.name not in names and inside.has(option.name):
+                        yield option
+
+
+def made(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
+    """Return a specification as options make it.
+
+    An option of a table, such as a scenario's, changes each table of that name; options of a whole table come first.
+
+    Args:
+        model: its class.
+        given: what was given, by option.
+        base: what to change; without it, what is not given has its default.
+
+    Raises:
+        InputError: a value cannot be used, or options exclude each other; the message names the options.
+    """
+    chosen: dict[tuple[str, ...], FieldOption] = {}
+    for option in field_options(model if base is None else type(base)):
+        if option.name in given:
+            other = chosen.setdefault(option.path, option)
+            if other.name != option.name:
+                raise InputError(f"{other.name} and {option.name} exclude each other")
+    return _made(model, base, {path: (o, o.value(given[o.name])) for path, o in chosen.items()})
+
+
+def _made(model: type[SpecT], base: SpecT | None, values: _Values) -> SpecT:
+    own = {path[0]: (option, value) for path, (option, value) in values.items() if len(path) == 1}
+    sets = {name: value for option, _ in own.values() for name, value in option.option.sets.items()}
+    names = {name: option.name for name, (option, _) in own.items()}
+    fields = sets | {name: value for name, (_, value) in own.items()}
+    spec = base
+    if spec is None:
+        spec = model.parse(fields, names)
+    elif fields:
+        spec = spec.changed(names, **fields)
+    for name in dict.fromkeys(path[0] for path in values if len(path) > 1):
+        inner = {path[1:]: value for path, value in values.items() if path[0] == name and len(path) > 1}
+        if name not in type(spec).model_fields:
+            continue  # an option of another variant
+        table = getattr(spec, name)
+        if table is None:
+            annotation = type(spec).model_fields[name].annotation
+            table = () if get_origin(_bare(annotation)) is tuple else next(models_in(annotation))()
+        several = isinstance(table, tuple)
+        tables = table if several else (table,)
+        if _CAR_PARK in inner:
+            tables = tuple(one for scenario in tables for one in _by_car_park(scenario, inner))
+            if not several and len(tables) > 1:
+                raise InputError(f"--car-park names {len(tables)} scenarios, want one")
+            inner = {path: value for path, value in inner.items() if path not in _COUNTS}
+        tables = tuple(_made(type(one), one, inner) for one in tables)
+        options = ", ".join(option.name for option, _ in inner.values()) or "--car-park"
+        if tables:
+            spec = spec.changed(options, **{name: tables if several else tables[0]})
+    return spec
+
+
+_CAR_PARK = ("occupancy", "counts", "car_park")
+_COUNTS = (_CAR_PARK, ("occupancy",), ("occupancy", "replay_from"))
+
+
+def _by_car_park(scenario: ScenarioSpec, values: _Values) -> list[ScenarioSpec]:
+    """Return a scenario for each of the car parks of a file of counts."""
+    if not all(path in values for path in _COUNTS):
+        raise InputError("--car-park goes with --occupancy FILE.csv and --replay-from DATE")
+    from parkenv.scenarios.build import car_parks
+
+    names, file, replay_from = (str(values[path][1]) for path in _COUNTS)
+    return [
+        scenario.changed(
+            "--car-park",
+            name=file_name(f"{scenario.title} {name}").replace(",", " ")[:80],
+            occupancy={"counts": {"file": file, "car_park": name}, "replay_from": replay_from},
+            forecast="own",
+        )
+        for name in (car_parks(Path(file)) if names == "all" else words_in(names))
+    ]
+
+
+def _bare(annotation: Any) -> Any:
+    """Return a type without annotations and without None."""
+    while True:
+        if get_origin(annotation) is Annotated:
+            annotation = get_args(annotation)[0]
+        elif get_origin(annotation) in (Union, types.UnionType):
+            kinds = [kind for kind in get_args(annotation) if kind is not type(None)]
+            if len(kinds) > 1:
+                return None
+            annotation = kinds[0]
+        else:
+            return annotation
+
+
+def _converted(annotation: Any, text: str) -> object:
+    kind = _bare(annotation)
+    if get_origin(kind) is tuple:
+        if text == "none":
+            return ()
+        return [_converted(get_args(kind)[0], word.strip()) for word in text.split(",") if word.strip()]
+    if kind is Path:
+        return Path(text)
+    if kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            return text
+    return text
+
+
+def _taken(annotation: Any, metadata: Collection[Any], letter: str = "") -> str:
+    kind = _bare(annotation)
+    if get_origin(kind) is Literal:
+        return "|".join(get_args(kind))
+    if get_origin(kind) is tuple:
+        return f"{_taken(get_args(kind)[0], (), letter)}[,...]"
+    letter = letter or _LETTERS.get(kind, "TEXT")
+    low = high = ""
+    for bound in metadata:
+        match bound:
+            case annotated_types.Ge(ge=value):
+                low = f"{value:g} <= {letter}"
+            case annotated_types.Gt(gt=value):
+                low = f"{value:g} < {letter}"
+            case annotated_types.Le(le=float() | int() as value) if value < _SHOWN_BOUND:
+                high = f"{letter} <= {value:g}"
+            case annotated_types.Lt(lt=float() | int() as value) if value < _SHOWN_BOUND:
+                high = f"{letter} < {value:g}"
+    if low and high:
+        return f"{low}{high.removeprefix(letter)}"
+    if low:
+        value, sign, _ = low.split()
+        return f"{letter} {sign.replace('<', '>')} {value}"
+    return high or letter
+
+
+def _shown(value: object) -> str:
+    for name in ("label", "title"):
+        if isinstance(shown := getattr(value, name, None), str) and isinstance(value, Spec):
+            return shown
+    return f"{value:g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,128 @@
+"""Commands that run a study into a folder, with progress bars, and print its result."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Self
+
+from pydantic import Field
+
+from parkenv.cli.options import Command, Given, field_options, made
+from parkenv.cli.report import make_report
+from parkenv.cli.tables import command_line, make_console, stages
+from parkenv.cli.trust import Trust, TrustModel, readable_models, require_trust
+from parkenv.errors import InputError
+from parkenv.files.option import Option, option
+from parkenv.studies.agent_spec import split_agents
+from parkenv.studies.results import SPEC_FILE
+from parkenv.studies.study import Study
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.studies.runner import Result
+
+Rerun = Annotated[
+    Path | None,
+    Option(takes="FILE.rrd", panel="Results"),
+    Field(
+        description="Also record images, boxes, scans, grid, slots and path for the Rerun viewer (extra viewer; then: "
+        "rerun FILE.rrd)."
+    ),
+]
+
+
+class RunCommand(Command):
+    """A command that runs a study into a folder."""
+
+    out: Annotated[Path | None, Option(short="-o")]
+    resume: bool = option(
+        False,
+        "Go on with the run in --out. Options that are given change it, such as more --episodes.",
+        panel="Results",
+    )
+    overwrite: bool = option(False, "Replace the run in --out.", panel="Results")
+    report: bool = option(False, "Also write report.html, as `parkenv report` does.", panel="Results")
+    trust: Trust = False
+
+
+class StudyCommand(RunCommand):
+    """A command that runs one kind of study."""
+
+    study: Study
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        """See `Command`: options change the study, which with --resume is the one in the folder.
+
+        Raises:
+            InputError: see `Command`; or the folder holds no run to resume, or is not trusted.
+        """
+        options = [option for option in field_options(cls) if option.name in given]
+        command = made(cls, {option.name: given[option.name] for option in options if len(option.path) == 1})
+        study, file = command.study, (command.out or Path()) / SPEC_FILE
+        if command.resume and (file.exists() or study.goes_on != "always"):
+            if not file.exists():
+                raise InputError(f"--resume: {command.out} holds no run to resume: no {SPEC_FILE}")
+            study = type(study).read(file)
+        if "--backend" in given and "--address" not in given:
+            # The address belongs to the other backend.
+            study = study.changed(address=None)
+        inner = {option.name: option.path[1] for option in options if len(option.path) > 1}
+        require_trust(study, file.parent, command.trust or not command.resume, given=set(inner.values()))
+        return made(cls, {name: given[name] for name in inner}, command.changed(study=study))
+
+    def run(self) -> None:
+        """See `Command`."""
+        self.run_study()
+
+    def run_study(self) -> Result:
+        """Run the study, print its result, and write its report on request.
+
+        Raises:
+            InputError: the study cannot be run, or the folder cannot be used.
+            KeyboardInterrupt: the run was interrupted; what is finished is printed and in the folder.
+        """
+        from parkenv.studies.runner import Interrupted, run
+
+        console = make_console()
+        try:
+            with stages(console, self.study.unit) as progress:
+                result = run(
+                    self.study, self.out, resume=self.resume, overwrite=self.overwrite, progress=progress,
+                    command=command_line(),
+                )  # fmt: skip
+        except KeyboardInterrupt as stopped:
+            if isinstance(stopped, Interrupted):
+                self.show(console, stopped.result)
+            rest = f" What was finished is in {self.out}; parkenv run {self.out} --resume goes on."
+            console.print(f"Interrupted.{rest if self.out else ''}", soft_wrap=True)
+            raise
+        self.show(console, result)
+        if self.out is not None:
+            console.print(f"Results are in {self.out}")
+            if self.report:
+                self.write_report(result)
+        return result
+
+    def write_report(self, result: Result) -> Path:
+        """Write the page on the run; return its path."""
+        return make_report(result.folder, self.study)
+
+    @abstractmethod
+    def show(self, console: Console, result: Result) -> None:
+        """Print a result, perhaps of an interrupted run."""
+
+
+class AgentStudyCommand(StudyCommand):
+    """A command that runs one kind of study, with agents."""
+
+    trust_model: TrustModel = False
+
+    @classmethod
+    def of(cls, given: Given) -> Self:
+        """See `StudyCommand`."""
+        if "--agents" in given and "--trust-model" in given:
+            given = {**given, "--agents": ",".join(readable_models(split_agents(given["--agents"])))}
+        return super().of(given)

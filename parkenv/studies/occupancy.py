@@ -1,0 +1,205 @@
+"""Fit models to recorded occupancy, and score forecasts of it: pictures into a folder, and what a summary holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+from datetime import date
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from parkenv.errors import InputError
+from parkenv.forecast.comparison import MODELS, Compared, compare
+from parkenv.forecast.counts import Counts
+from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
+from parkenv.forecast.slot_comparison import ComparedSlots, compare_slot_days
+from parkenv.forecast.typical_week_fit import LEVEL_SHARES, fit_typical_week
+from parkenv.show.figures.forecast import save_forecast, shown_counts, shown_slots, shown_week
+from parkenv.show.figures.rates import save_rates
+from parkenv.show.plurals import plural
+from parkenv.studies.results import Row
+from parkenv.studies.study import Progress, counted
+from parkenv.world.occupancy.fit import fit_process
+from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.week import DAY_S, HOUR_S
+
+
+class Found(NamedTuple):
+    """What was found.
+
+    Attributes:
+        title: what it was found in.
+        summary: content of `summary.json`; `rows` is its table.
+    """
+
+    title: str
+    summary: Row
+
+
+def fit_log(log: Path, folder: Path, *, max_gap_s: float = 7200.0) -> Found:
+    """Fit arrival and departure rates to a log of slots; write process.json and rates.png.
+
+    Args:
+        log: the log.
+        folder: where the files go.
+        max_gap_s: observations farther apart are not linked, s.
+
+    Raises:
+        InputError: the log cannot be read.
+    """
+    fitted = fit_process(OccupancyLog.read(log), max_gap_s=max_gap_s)
+    process = fitted.process
+    process.to_file(folder / "process.json")
+    save_rates(process, folder / "rates.png", title=log.name)
+    rows = [
+        {
+            "day": name,
+            "hour": hour,
+            "arrival_rate_per_h": float(process.arrival_profile[24 * day + hour] * 3600.0),
+            "departure_rate_per_h": float(process.departure_profile[24 * day + hour] * 3600.0),
+            "occupancy": float(np.mean(process.marginal(day * DAY_S + hour * HOUR_S))),
+        }
+        for name, day in (("weekday", 0), ("weekend", 5))
+        for hour in range(7, 19)
+    ]
+    counts = {"log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
+    title = f"{log.name}: {len(fitted.slot_ids)} slots, {fitted.n_intervals} intervals"
+    return Found(title, {"rows": rows, **counts, "day_error": asdict(process.day_error)})
+
+
+def fit_counts(counts: Counts, progress: Progress = lambda *_: None) -> Found:
+    """Estimate by how much days of whole car parks differ from their forecasts, and the typical week.
+
+    Args:
+        counts: the counts.
+        progress: called as steps and days are finished.
+    """
+    n = len(counts.days)
+    settings = fit_settings(counts, n, counted(progress, "Fit", FIT_STEPS))
+    forecast = forecast_days(counts, 0, "rolling", settings, lambda day: progress("Forecast days", day, n))
+    rows: list[Row] = []
+    for i, name in enumerate(counts.car_parks):
+        seen = np.isfinite(counts.occupied[i])
+        days = np.flatnonzero(seen.any(axis=1))
+        row = {
+            "car_park": name,
+            "capacity": float(counts.capacity[i, -1]),
+            "days": int(days.size),
+            "mean_occupancy": float(counts.occupied[i][seen].mean()) if days.size else None,
+            "day_error": float(np.median(forecast.level_sd[i, days[-28:]])) if days.size else None,
+        }
+        rows.append(row | counts.faults[i])
+    week = fit_typical_week(counts)
+    typical_week = week and {
+        "occupied": week.occupied.round(3).tolist(),
+        "levels": dict(zip(map(str, LEVEL_SHARES), week.levels.round(3).tolist(), strict=True)),
+        "day_error": float(np.nanmedian(week.day_errors).round(3)),
+    }
+    summary = {
+        "rows": rows,
+        "idle": counts.idle(),
+        "variances": asdict(settings),
+        "level_drift_per_week": float(np.sqrt(7 * settings.level_drift)),
+        "faults": counts.total_faults(),
+        "typical_week": typical_week,
+    }
+    return Found(f"{counts.source}: {plural(n, 'day')}", summary)
+
+
+def evaluate_counts(
+    counts: Counts,
+    folder: Path,
+    *,
+    from_day: date | None = None,
+    seed: int = 0,
+    progress: Progress = lambda *_: None,
+) -> Found:
+    """Score forecasts of car parks, each day from the days before it; draw a picture of each model.
+
+    Args:
+        counts: the counts.
+        folder: where the pictures go.
+        from_day: first day that is scored; None: halfway.
+        seed: seed of the bootstrap.
+        progress: called as steps, days and models are finished.
+
+    Raises:
+        InputError: there are no usable readings from that day on.
+    """
+    n = len(counts.days)
+    first = n // 2 if from_day is None else counts.day_index(from_day)
+    if not np.isfinite(counts.occupied[:, first:]).any():
+        raise InputError(f"--from is {from_day}: {counts.source} has no usable readings from then on")
+    settings = fit_settings(counts, first, counted(progress, "Fit", FIT_STEPS))
+    week = shown_week(counts, first)
+    models: list[Compared] = []
+    done = counted(progress, "Models", len(MODELS))
+    for compared in compare(counts, first, settings, lambda day: progress("Forecast days", day, n)):
+        save_forecast(shown_counts(compared, counts, week), folder / f"{compared.model}.png")
+        models.append(compared)
+        done()
+    rows = [_row(compared, models[0], seed) for compared in models]
+    summary = {
+        "rows": rows,
+        "first_day": counts.days[first].isoformat(),
+        "faults": counts.total_faults(),
+        "faults_by_car_park": dict(zip(counts.car_parks, counts.faults, strict=True)),
+        "idle": counts.idle(),
+        "variances": asdict(settings),
+    }
+    return Found(_scored(rows[0], plural(rows[0]["car_parks"], "car park"), summary), summary)
+
+
+def evaluate_log(
+    log: Path,
+    folder: Path,
+    *,
+    from_day: date | None = None,
+    seed: int = 0,
+    progress: Progress = lambda *_: None,
+) -> Found:
+    """Score forecasts of every slot of a log in each half-hour; draw a picture of each model.
+
+    Args:
+        log: the log.
+        folder: see `evaluate_counts`.
+        from_day: see `evaluate_counts`.
+        seed: see `evaluate_counts`.
+        progress: called as days are finished.
+
+    Raises:
+        InputError: the log cannot be read, or has no day from then on with one of its class before it.
+    """
+    recorded = OccupancyLog.read(log)
+    first = recorded.days[len(recorded.days) // 2] if from_day is None else str(from_day)
+    classes = [np.flatnonzero(recorded.weekend == weekend) for weekend in (False, True)]
+    days = [recorded.slot_days(days) for days in classes if days.size]
+    done = counted(progress, "Forecast days", sum(day >= first for day in recorded.days))
+    found: Sequence[ComparedSlots] = compare_slot_days(days, date.fromisoformat(first).toordinal(), done)
+    if not found:
+        raise InputError(f"--from is {first}: {log} has no day from then on with one of its class before it")
+    for compared in found:
+        save_forecast(shown_slots(compared, log.name), folder / f"{compared.model}.png")
+    rows = [_row(compared, found[0], seed) for compared in found]
+    summary = {"rows": rows, "first_day": first}
+    return Found(_scored(rows[0], plural(len(recorded.slot_ids), "slot"), summary), summary)
+
+
+def _scored(row: Row, what: str, summary: Row) -> str:
+    return f"{what}, {plural(row['days'], 'day')} from {summary['first_day']}"
+
+
+def _row(compared: Compared | ComparedSlots, ours: Compared | ComparedSlots, seed: int) -> Row:
+    """Return the row of a model in the summary; differences are to `ours`."""
+    scores = compared.scores
+    difference = scores.log_loss_beyond(ours.scores, np.random.default_rng(seed))
+    return {
+        "model": compared.model,
+        **scores.means(),
+        "difference": difference.value,
+        "difference_ci95": [difference.low, difference.high],
+        "coverage_90_by_band": scores.coverage_by_band(),
+        "coverage_90_by_observed_band": scores.coverage_by_band(observed=True),
+    }

@@ -1,0 +1,75 @@
+"""Import every car park of a town: a lot of each, a table of what became of them, and contact sheets."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import NamedTuple
+
+from parkenv.lots import write_lot
+from parkenv.lots.draft import ImportOptions
+from parkenv.lots.osm.town import LEAST_SPACES, import_town
+from parkenv.lots.quality import Provenance
+from parkenv.show.figures.contact_sheet import save_contact_sheets
+from parkenv.studies.drivability import check_drivability
+from parkenv.studies.results import Row
+from parkenv.studies.study import Progress, counted
+
+
+class TownLots(NamedTuple):
+    """The car parks of a town.
+
+    Attributes:
+        rows: a row for each: lot, spaces, slots, lanes, result, error_probability, reason.
+        pictures: contact sheets.
+    """
+
+    rows: list[Row]
+    pictures: list[Path]
+
+
+def import_town_lots(
+    place: Path,
+    folder: Path,
+    options: ImportOptions,
+    least: int = LEAST_SPACES,
+    progress: Progress = lambda *_: None,
+) -> TownLots:
+    """Write a lot of every car park of a town into a folder.
+
+    Args:
+        place: the file of the town.
+        folder: where the lots go.
+        options: see `import_town`.
+        least: number of spaces of the smallest car park.
+        progress: called as car parks are finished.
+
+    Raises:
+        InputError: see `import_town`.
+    """
+    rows: list[Row] = []
+    lots = []
+    done = counted(progress, "car parks")
+    for park in import_town(place, options, least):
+        row: Row = {"lot": park.name, "spaces": park.spaces, "slots": 0, "lanes": 0}
+        if park.draft is None:
+            row |= {"result": "refused", "error_probability": None, "reason": park.reason}
+        else:
+            lot = park.draft.lot()
+            drivability = check_drivability(lot, park.draft.issues)
+            left = "; ".join(map(str, park.draft.left_out))
+            problems = "; ".join(problem.message for problem in drivability.problems)
+            error = drivability.error_probability
+            row |= {
+                "slots": lot.n_slots,
+                "lanes": len(lot.lanes),
+                "result": "warnings" if drivability.problems else "clean",
+                "error_probability": round(error, 3),
+                "reason": problems or (f"left out: {left}" if left else ""),
+            }
+            lots.append((lot, Provenance(place.name, park.draft.guesses, drivability.issues), error))
+        rows.append(row)
+        done()
+    for lot, provenance, _ in lots:
+        write_lot(lot, folder / f"{lot.name}.geojson", provenance)
+    drawn = [(f"{lot.name}\n{lot.n_slots} slots, error probability {p:.2f}", lot) for lot, _, p in lots]
+    return TownLots(rows, save_contact_sheets(drawn, folder))
