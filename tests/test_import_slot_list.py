@@ -16,7 +16,7 @@ from parkenv.lots.checks import check_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.lot_import import import_lot
+from parkenv.lots.lot_files import import_lot
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.show.figures.lot_import import SOURCE_COLORS, save_import_picture
 from parkenv.studies.compare.cases import Case

@@ -95,7 +95,7 @@ class Check(Command):
     def run(self) -> None:
         """See `Command`."""
         from parkenv.lots import check_lot, read_lot
-        from parkenv.lots.formats.recognition import lot_format
+        from parkenv.lots.lot_files import lot_format
         from parkenv.studies.drivability import check_drivability
 
         console = make_console(soft_wrap=True)

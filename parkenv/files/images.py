@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import io
+import re
 import struct
 import warnings
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -85,17 +85,4 @@ def files_in(folder: Path, suffixes: tuple[str, ...]) -> list[Path]:
 
 def natural_order(path: Path) -> list[tuple[str, int]]:
     """Return a sort key that puts pos-9 before pos-10."""
-    return list(_parts(str(path)))
-
-
-def _parts(text: str) -> Iterator[tuple[str, int]]:
-    word, digits = "", ""
-    for letter in text:
-        if letter.isdecimal():
-            digits += letter
-        else:
-            if digits:
-                yield word, int(digits)
-                word, digits = "", ""
-            word += letter
-    yield word, int(digits or -1)
+    return [(word, int(digits or -1)) for word, digits in re.findall(r"(\D*)(\d*)", str(path))]

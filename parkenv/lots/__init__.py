@@ -8,8 +8,7 @@ from parkenv.lots.checks import check_lot
 from parkenv.lots.formats.contents import LotProblem
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import city_lot, grid_lot
-from parkenv.lots.lot_files import load_lot, packaged_lot, read_lot
-from parkenv.lots.lot_import import import_lot
+from parkenv.lots.lot_files import import_lot, load_lot, packaged_lot, read_lot
 
 __all__ = [
     "PACKAGED_LOTS",

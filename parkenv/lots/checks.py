@@ -13,8 +13,7 @@ from parkenv.errors import InputError
 from parkenv.lots.formats.contents import LotContents, LotProblem, graph_errors
 from parkenv.lots.formats.dragon_lake import dragon_lake_lot
 from parkenv.lots.formats.geojson import read_contents
-from parkenv.lots.formats.recognition import LotFormat, lot_format
-from parkenv.lots.lot_import import import_lot
+from parkenv.lots.lot_files import LotFormat, import_lot, lot_format
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import node_labels
 from parkenv.world.lot import Lane, ParkingLot

@@ -1,19 +1,61 @@
-"""Read lot files that describe a whole lot, and the packaged lots."""
+"""Recognise lot files; read those that describe a whole lot, and the packaged lots; import the others."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+from enum import Enum
 from importlib import resources
 from pathlib import Path
 
 from parkenv.errors import InputError
 from parkenv.files.known_names import PACKAGED_LOTS
-from parkenv.files.limited_reading import is_there
+from parkenv.files.limited_reading import is_there, read_json
+from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
 from parkenv.lots.formats.contents import graph_errors
 from parkenv.lots.formats.dragon_lake import dragon_lake_lot
 from parkenv.lots.formats.geojson import read_contents
-from parkenv.lots.formats.recognition import LotFormat, lot_format
+from parkenv.lots.formats.slot_list import slot_list_draft
+from parkenv.lots.osm.draft import osm_draft
+from parkenv.lots.osm.elements import holds_osm
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
+
+
+class LotFormat(Enum):
+    """Format of a file that a lot is read or imported from."""
+
+    GEOJSON = "native GeoJSON"
+    DRAGON_LAKE = "Dragon Lake map"
+    OSM = "OpenStreetMap"
+    SLOT_LIST = "list of slot centres"
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether a file of this format defines a whole lot; for other formats, `import_lot` derives one by rules."""
+        return self in (LotFormat.GEOJSON, LotFormat.DRAGON_LAKE)
+
+
+def lot_format(path: Path) -> LotFormat | None:
+    """Return a file's format by its suffix and, for JSON, its content; None for an unknown suffix. Does not raise.
+
+    A JSON file that cannot be read counts as native: its reader then reports the error.
+    """
+    suffix = path.suffix.lower()
+    if suffix in (".json", ".geojson"):
+        try:
+            is_osm = holds_osm(read_json(path))
+        except InputError:
+            is_osm = False
+        return LotFormat.OSM if is_osm else LotFormat.GEOJSON
+    by_suffix = {
+        ".yml": LotFormat.DRAGON_LAKE,
+        ".yaml": LotFormat.DRAGON_LAKE,
+        ".osm": LotFormat.OSM,
+        ".xml": LotFormat.OSM,
+        ".pbf": LotFormat.OSM,
+        ".csv": LotFormat.SLOT_LIST,
+    }
+    return by_suffix.get(suffix)
 
 
 def load_lot(name_or_path: str | Path) -> ParkingLot:
@@ -77,3 +119,45 @@ def read_lot(path: str | Path) -> ParkingLot:
         raise InputError(f"{path}: {first}; `parkenv lot import {path}` makes a lot of it")
     more = f" (and {len(errors) - 1} more; `parkenv lot check {path}` lists all)" if len(errors) > 1 else ""
     raise InputError(f"{path}: {first}{more}")
+
+
+def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
+    """Draft a lot from a file of a real place.
+
+    Supported formats are OpenStreetMap (`.osm`, `.xml`, `.osm.pbf`, Overpass JSON, overpass-turbo GeoJSON; see
+    `parkenv.lots.osm.draft`), lists of slot centres (`.csv`; see
+    `parkenv.lots.formats.slot_list`), the Dragon Lake map and native lots.
+    Latitudes and longitudes are projected to metres east and north of the file's centre.
+
+    Args:
+        path: the file.
+        options: goals, entries and bounds given by the user.
+
+    Returns:
+        A draft; `LotDraft.lot()` converts it to a lot, or states what is missing.
+
+    Raises:
+        InputError: the file cannot be read, contains no parking, or has an unknown format.
+    """
+    path = Path(path)
+    options = options or ImportOptions()
+    file_format = lot_format(path)
+    if file_format is LotFormat.OSM:
+        return osm_draft(path, options)
+    if file_format is LotFormat.SLOT_LIST:
+        return slot_list_draft(path, options)
+    if file_format is None:
+        raise InputError(
+            f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), "
+            ".json or .geojson (Overpass, overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
+        )
+    if options.bounds is not None:
+        raise InputError(
+            f"{path}: bounds apply to OpenStreetMap and lists of slots; this file is a whole lot"
+        )
+    draft = LotDraft.of_lot(read_lot(path))
+    if options.goals:
+        draft = replace(draft, goals=points_in_frame(None, options.goals))
+    if options.entries:
+        draft = replace(draft, entries=points_in_frame(None, options.entries))
+    return draft

@@ -36,12 +36,11 @@ from parkenv.files.recordings import (
 )
 from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, Lens, StereoSpec
 from parkenv.mapping.grid import OccupancyGrid
-from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.store import Session
-from parkenv.mapping.survey import Survey, update_grid
+from parkenv.mapping.survey import SessionMap, Survey
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline
-from parkenv.perception.slot_filter import SlotFilter, SlotStates
+from parkenv.perception.slot_filter import SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
 from sim_sensors.camera.models import Frame, StereoFrame
@@ -428,12 +427,12 @@ class RecordedDrive:
         self, frame: tuple[int, dict[str, int], FloatArray], images: dict[str, NDArray[np.uint8]]
     ) -> tuple[TimedCapture, FloatArray]:
         stamp, partners, pose = frame
-        its = {key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS) for key, image in images.items()}
+        frames = {key: Frame(image, _NO_DEPTH, _NO_DEPTH, _NO_IDS) for key, image in images.items()}
         capture = Capture(
             pose,
-            {name: its[f"image:{name}:mono"] for name, _, _ in self.rig.cameras},
+            {name: frames[f"image:{name}:mono"] for name, _, _ in self.rig.cameras},
             {
-                name: StereoFrame(its[f"image:{name}:left"], its[f"image:{name}:right"])
+                name: StereoFrame(frames[f"image:{name}:left"], frames[f"image:{name}:right"])
                 for name, _, _ in self.rig.stereo_cameras
             },
             {name: self._scans[name][partners[f"scan:{name}"]] for name, _, _ in self.rig.lasers},
@@ -482,24 +481,16 @@ def map_drive(
     Raises:
         InputError: an unknown localiser; see also `RecordedDrive` and `make_detector`.
     """
-    pipeline, slots = PerceptionPipeline(drive.rig, lot, detector), SlotFilter(lot)
-    low_x, low_y, high_x, high_y = lot.bounds()
-    grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
-    cars = [np.empty((0, 3))]
-    locate = make_locate(localise, lot)
+    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector), lot, localise)
     shifts = []
     for captured, recorded in drive.captures(every):
-        result = pipeline.process(captured, slots, locate(recorded))
-        shifts.append(np.hypot(*(result.vehicle - recorded)[:2]))
-        for view in result.views:
-            update_grid(grid, view, result.vehicle)
-            cars.append(view.cars.poses)
+        shifts.append(np.hypot(*(mapped.add(captured, recorded).vehicle - recorded)[:2]))
         on_frame()
-    states = slots.states()
-    p = np.where(states.in_view, states.p_occupied, np.nan)
     rig, weather = (drive.head.rig, drive.head.weather) if drive.head else ("recorded", "unknown")
-    session = Session(drive.key, drive.start, rig, weather, p, np.concatenate(cars))
-    return MappedDrive(session, states, grid, len(shifts), float(max(shifts, default=0.0)))
+    session = mapped.session(drive.key, drive.start, rig, weather)
+    return MappedDrive(
+        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0))
+    )
 
 
 def record_drive(survey: Survey, number: int, path: Path) -> None:
@@ -512,8 +503,8 @@ def record_drive(survey: Survey, number: int, path: Path) -> None:
         driven = survey.drive(
             number, on_frame=lambda frame: writer.add(frame.result.captured, frame.odometry)
         )
-        its = driven.session
-        writer.close(Head(its.key, its.time, its.rig, its.weather))
+        session = driven.session
+        writer.close(Head(session.key, session.time, session.rig, session.weather))
 
 
 def _pose_of(message: Any) -> tuple[float, float, float]:

@@ -23,6 +23,7 @@ from parkenv.mapping.survey_score import SurveyScore, TrueBoxes, true_boxes
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
+from parkenv.world.lot import ParkingLot
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, World
@@ -248,66 +249,42 @@ def drive_together(
     return [session.result() for session in sessions]
 
 
-class _OpenSession:
-    """A session of one survey while it drives."""
+class SessionMap:
+    """What a session maps: slots, the grid, and the located cars.
 
-    def __init__(self, survey: Survey, drive: SurveyDrive, number: int, pictures: int) -> None:
-        lot = survey.scenario.lot
-        self._survey, self._drive, self._key, self._pictures = survey, drive, survey.key_of(number), pictures
-        self._locate = make_locate(survey.settings.localise, lot)
-        self._estimated = np.empty_like(drive.odometry)
-        self._slots, self._score = SlotFilter(lot), SurveyScore(lot.n_slots)
-        self._observed_at = np.full(lot.n_slots, drive.arrival.time)
+    Args:
+        pipeline: processes the captures.
+        lot: the lot.
+        localise: what corrects the odometry, see `make_locate`.
+
+    Attributes:
+        slots, grid: the estimates so far.
+        cars: poses, (k, 3), of the cars that each camera has located in each capture so far.
+    """
+
+    def __init__(self, pipeline: PerceptionPipeline, lot: ParkingLot, localise: str) -> None:
+        self._pipeline, self._locate = pipeline, make_locate(localise, lot)
         low_x, low_y, high_x, high_y = lot.bounds()
-        self._grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
-        self._cars: list[FloatArray] = []
-        self._at: list[int] = []
-        self._frame_s: list[float] = []
-        # For each section of the route, the capture with the most cars.
-        self._shown: dict[int, PerceptionResult] = {}
+        self.slots = SlotFilter(lot)
+        self.grid = OccupancyGrid((low_x - 2.0, low_y - 2.0), (high_x + 2.0, high_y + 2.0), 0.25)
+        self.cars: list[FloatArray] = []
 
-    def add(self, i: int, scene: Scene, capture: Capture, true: TrueBoxes) -> SurveyFrame:
-        """Process capture i; the true scene is only for figures and scores."""
-        drive, slots, time = self._drive, self._slots, float(self._drive.times[i])
-        slots.updated[:] = False
-        begun = clock.perf_counter()
-        captured = TimedCapture(time, capture)
-        result = self._survey.pipeline.process(captured, slots, self._locate(drive.odometry[i]))
-        self._estimated[i] = vehicle = result.vehicle
+    def add(self, captured: TimedCapture, odometry: FloatArray) -> PerceptionResult:
+        """Process a capture at a pose of the odometry, (3,)."""
+        result = self._pipeline.process(captured, self.slots, self._locate(odometry))
         for view in result.views:
-            update_grid(self._grid, view, vehicle)
-            self._cars.append(view.cars.poses)
-            self._at.append(i)
-        self._frame_s.append(clock.perf_counter() - begun)
-        self._observed_at[slots.updated] = time
-        self._score.add(i, scene, result, [localize_as_thesis(view, vehicle) for view in result.views], true)
-        section = i * self._pictures // len(drive.poses)
-        if self._pictures and (section not in self._shown or result.n_cars > self._shown[section].n_cars):
-            self._shown[section] = result
-        taken = drive.world.occupied(np.arange(len(self._observed_at)), time)
-        return SurveyFrame(result, self._grid, slots, taken, drive.odometry[i])
+            _update_grid(self.grid, view, result.vehicle)
+            self.cars.append(view.cars.poses)
+        return result
 
-    def result(self) -> SessionResult:
-        """Return the session after its last capture."""
-        drive, score, states = self._drive, self._score, self._slots.states()
-        truth = np.array(
-            [drive.world.occupied([s], t)[0] for s, t in enumerate(self._observed_at.tolist())],
-            dtype=np.bool_,
-        )
-        car_captures = np.repeat(np.array(self._at, dtype=np.int64), [len(c) for c in self._cars])
-        found_cars = np.concatenate(self._cars) if self._cars else np.empty((0, 3))
+    def session(self, key: str, time: float, rig: str, weather: str) -> Session:
+        """Return the record for the map file."""
+        states = self.slots.states()
         p = np.where(states.in_view, states.p_occupied, np.nan)
-        rig = self._survey.settings.rig
-        return SessionResult(
-            Session(self._key, drive.arrival.time, rig, drive.preset, p, found_cars),
-            drive.arrival, states, truth,
-            int(truth.sum()), int((truth & score.found).sum()), score,
-            drive.odometry, self._estimated, drive.poses, car_captures,
-            np.array(self._frame_s), self._grid, tuple(self._shown.values()),
-        )  # fmt: skip
+        return Session(key, time, rig, weather, p, np.concatenate([np.empty((0, 3)), *self.cars]))
 
 
-def update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> None:
+def _update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> None:
     """Update a grid by the cars that one camera sees from a vehicle at (3,) x, y, yaw."""
     x, y, yaw = view.mount.in_world(vehicle)
     away = view.cars.xy - np.array([x, y])
@@ -315,3 +292,52 @@ def update_grid(grid: OccupancyGrid, view: CameraView, vehicle: FloatArray) -> N
     polar = np.column_stack([(bearing + np.pi) % (2 * np.pi) - np.pi, view.cars.distance])
     half_angle = float(np.arctan(view.camera.width / view.camera.fx / 2.0))
     grid.update((x, y), yaw, half_angle, polar)
+
+
+class _OpenSession:
+    """A session of one survey while it drives."""
+
+    def __init__(self, survey: Survey, drive: SurveyDrive, number: int, pictures: int) -> None:
+        lot = survey.scenario.lot
+        self._survey, self._drive, self._key, self._pictures = survey, drive, survey.key_of(number), pictures
+        self._map = SessionMap(survey.pipeline, lot, survey.settings.localise)
+        self._estimated = np.empty_like(drive.odometry)
+        self._score = SurveyScore(lot.n_slots)
+        self._observed_at = np.full(lot.n_slots, drive.arrival.time)
+        self._at: list[int] = []
+        self._frame_s: list[float] = []
+        # For each section of the route, the capture with the most cars.
+        self._shown: dict[int, PerceptionResult] = {}
+
+    def add(self, i: int, scene: Scene, capture: Capture, true: TrueBoxes) -> SurveyFrame:
+        """Process capture i; the true scene is only for figures and scores."""
+        drive, slots, time = self._drive, self._map.slots, float(self._drive.times[i])
+        slots.updated[:] = False
+        begun = clock.perf_counter()
+        result = self._map.add(TimedCapture(time, capture), drive.odometry[i])
+        self._estimated[i] = vehicle = result.vehicle
+        self._at += [i] * len(result.views)
+        self._frame_s.append(clock.perf_counter() - begun)
+        self._observed_at[slots.updated] = time
+        self._score.add(i, scene, result, [localize_as_thesis(view, vehicle) for view in result.views], true)
+        section = i * self._pictures // len(drive.poses)
+        if self._pictures and (section not in self._shown or result.n_cars > self._shown[section].n_cars):
+            self._shown[section] = result
+        taken = drive.world.occupied(np.arange(len(self._observed_at)), time)
+        return SurveyFrame(result, self._map.grid, slots, taken, drive.odometry[i])
+
+    def result(self) -> SessionResult:
+        """Return the session after its last capture."""
+        drive, score = self._drive, self._score
+        truth = np.array(
+            [drive.world.occupied([s], t)[0] for s, t in enumerate(self._observed_at.tolist())],
+            dtype=np.bool_,
+        )
+        car_captures = np.repeat(np.array(self._at, dtype=np.int64), [len(c) for c in self._map.cars])
+        return SessionResult(
+            self._map.session(self._key, drive.arrival.time, self._survey.settings.rig, drive.preset),
+            drive.arrival, self._map.slots.states(), truth,
+            int(truth.sum()), int((truth & score.found).sum()), score,
+            drive.odometry, self._estimated, drive.poses, car_captures,
+            np.array(self._frame_s), self._map.grid, tuple(self._shown.values()),
+        )  # fmt: skip

@@ -8,7 +8,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import ConfigDict, Field, Strict
 
-from parkenv.errors import InputError
+from parkenv.errors import naming
 from parkenv.files.limited_reading import read_yaml
 from parkenv.files.spec_file import Spec
 from parkenv.lots.generators import Slots, bay_row
@@ -72,10 +72,8 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
         InputError: the file cannot be read or is not a Dragon Lake map.
     """
     document = _Map.parse(read_yaml(path), str(path))
-    try:
+    with naming(path):
         return _lot(document)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from error
 
 
 def _lot(document: _Map) -> ParkingLot:

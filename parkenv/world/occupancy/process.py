@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.occupancy import kernel as kernels
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -388,12 +388,10 @@ class OccupancyProcess(OccupancyModel):
             odd = ", ".join(sorted(content.keys() ^ wanted))
             raise InputError(f"{path}: missing or unknown fields: {odd}; want {', '.join(sorted(wanted))}")
         sizes = content.pop("day_error")
-        try:
+        with naming(path):
             if not isinstance(sizes, dict) or not sizes.keys() <= {"level", "slope"}:
                 raise InputError(f"day_error is {sizes!r:.60}, want an object with level and slope")
             return cls(**content, day_error=DayError(**sizes))
-        except InputError as error:
-            raise InputError(f"{path}: {error}") from error
 
     def to_file(self, path: str | os.PathLike[str]) -> None:
         """Write as JSON, replacing an existing file atomically."""
