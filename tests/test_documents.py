@@ -112,6 +112,30 @@ def test_commands_have_options_that_exist(words):
     assert {word for word in rest if word.startswith("--")} <= options
 
 
+def test_options_that_pages_name_exist():
+    """Every option in backticks is one of some command."""
+    known = {
+        "--help",
+        *(option for p in parameters(typer.main.get_command(app)) for option in (*p.opts, *p.secondary_opts)),
+    }
+    for name, page in PAGES.items():
+        named = {
+            word for code in re.findall(r"`(--[^`]*)`", page) for word in re.findall(r"^--[a-z-]+", code)
+        }
+        assert named - known <= OTHERS, name
+
+
+OTHERS = {"--version", "--install-completion", "--show-completion"}
+"""Options of programs, and of `parkenv` itself."""
+
+
+def parameters(command):
+    """Yield the parameters of a command and of those in it."""
+    yield from command.params
+    for its in getattr(command, "commands", {}).values():
+        yield from parameters(its)
+
+
 def test_agents_in_the_table_are_the_agents_there_are():
     from planners.names import AGENTS
 

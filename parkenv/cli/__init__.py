@@ -31,14 +31,12 @@ COMMANDS = {
         "Compare agents over costs and speeds, all in the same worlds.", "compare:Compare", SEARCH
     ),
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", SEARCH),
-    "commute": Entry("Let drivers come day after day, with a map that learns.", "commute:Commute", SEARCH),
-    "fleet": Entry("Let many cars search one lot, and compare what they know.", "fleet:Fleet", SEARCH),
-    "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "plan:Plan", SEARCH),
+    "commute": Entry("Let drivers come day after day, with a map that learns.", "drivers:Commute", SEARCH),
+    "fleet": Entry("Let many cars search one lot, and compare what they know.", "drivers:Fleet", SEARCH),
+    "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),
-    "publish": Entry(
-        "Make a folder for the Hugging Face Hub; nothing is uploaded.", "publish:Publish", SEARCH
-    ),
-    "run": Entry("Run an experiment file.", "run:Run", SEARCH),
+    "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", SEARCH),
+    "run": Entry("Run an experiment file.", "study_command:Run", SEARCH),
     "benchmark": Entry("Run a fixed benchmark suite, and check the results of others.", heading=SEARCH),
     "benchmark run": Entry("Run agents through all episodes of a suite.", "benchmark:RunSuite"),
     "benchmark check": Entry("Check results of a suite, and print them side by side.", "benchmark:Check"),
@@ -86,9 +84,9 @@ COMMANDS = {
     "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=DATA),
     "occupancy fit": Entry("Fit a model to recorded occupancy by maximum likelihood.", "occupancy:Fit"),
     "occupancy evaluate": Entry("Score forecasts of occupancy beside simple ones.", "occupancy:Evaluate"),
-    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "schema:Schema", DATA),
-    "verify": Entry("Compare closed forms of the literature with this package.", "verify:Verify", DATA),
-    "bench": Entry("Measure throughput, and that of other software for the same task.", "bench:Bench", DATA),
+    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "checks:Schema", DATA),
+    "verify": Entry("Compare closed forms of the literature with this package.", "checks:Verify", DATA),
+    "bench": Entry("Measure throughput, and that of other software for the same task.", "checks:Bench", DATA),
 }
 """Commands and groups of commands, as the help page lists them."""
 app = make_app(

@@ -1,4 +1,4 @@
-"""Commands that run a study into a folder, with progress bars, and print its result."""
+"""Commands that run a study into a folder, with progress bars, and print its result; `parkenv run`."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import Field
 
-from parkenv.cli.options import Command, Given, field_options, made
+from parkenv.cli.options import Command, Given, command_class, field_options, made
 from parkenv.cli.report import make_report
 from parkenv.cli.tables import command_line, make_console, stages
 from parkenv.cli.trust import Trust, TrustModel, readable_models, require_trust
@@ -16,7 +16,7 @@ from parkenv.errors import InputError
 from parkenv.files.option import Option, option
 from parkenv.studies.agent_spec import split_agents
 from parkenv.studies.results import SPEC_FILE
-from parkenv.studies.study import Study
+from parkenv.studies.study import ExecutionSpec, Study, read_study
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -126,3 +126,53 @@ class AgentStudyCommand(StudyCommand):
         if "--agents" in given and "--trust-model" in given:
             given = {**given, "--agents": ",".join(readable_models(split_agents(given["--agents"])))}
         return super().of(given)
+
+
+COMMANDS = {
+    "compare": "compare:Compare",
+    "commute": "drivers:Commute",
+    "fleet": "drivers:Fleet",
+    "benchmark": "benchmark:RunSuite",
+    "survey": "survey:Survey",
+    "detectors": "detect:CompareDetectors",
+    "demo": "demo:Demo",
+    "calibrate": "drive:Calibrate",
+    "verify": "checks:Verify",
+    "train": "train:Train",
+}
+"""The command of each kind of study."""
+
+
+class Run(RunCommand, ExecutionSpec):
+    """Settings that the file leaves out have the defaults of its command.
+
+    The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
+    command: compare (the default), commute, fleet, benchmark, survey, demo or train.
+    """
+
+    examples = """
+        parkenv run sweep.toml --out results/sweep --report
+        parkenv run results/sweep --resume
+        """
+
+    experiment: Path = option(
+        ..., "An experiment file (.toml, .json), or the folder of a run.", takes="FILE|DIR", argument=True
+    )
+    out: Path | None = option(None, "Folder for the results.", short="-o", default="results/NAME of the file")
+
+    def run(self) -> None:
+        """See `Command`; the folder of a run goes on there."""
+        file, out = self.experiment, self.out
+        if file.is_dir():
+            if out is not None:
+                raise InputError(f"{file} is the folder of a run, which goes on there; leave out --out")
+            file, out = file / SPEC_FILE, file
+        study = read_study(file)
+        require_trust(study, self.experiment, self.trust)
+        given = self.model_fields_set & ExecutionSpec.model_fields.keys()
+        if "backend" in given:
+            given |= {"address"}
+        study = study.changed(**{name: getattr(self, name) for name in given})
+        options = {name: True for name in ("resume", "overwrite", "report") if getattr(self, name)}
+        command = command_class(COMMANDS[study.kind])
+        command.parse({"study": study, "out": out or Path("results") / file.stem, **options}, "").run()

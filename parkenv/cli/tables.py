@@ -13,7 +13,7 @@ from parkenv.files.file_names import is_plain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import Progress, TaskID
+    from rich.progress import TaskID
     from rich.table import Table
 
 WIDE = 200
@@ -56,8 +56,12 @@ def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequen
     return table
 
 
-def progress_bar(console: Console, unit: str = "") -> Progress:
-    """Make a progress bar that counts, with the time that it took and is left."""
+@contextmanager
+def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int], None]]:
+    """Show a bar for each stage of a run during the block, or a line where nothing can be redrawn.
+
+    Yields a `parkenv.studies.study.Progress`.
+    """
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
@@ -67,15 +71,8 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
         TimeRemainingColumn,
     )
 
-    class Stages(Progress):
-        """Progress bars, or a line per stage where nothing can be redrawn."""
-
-        def add_task(self, description: str, *args: Any, **options: Any) -> TaskID:
-            if self.disable:
-                self.console.print(f"{description} ...")
-            return super().add_task(description, *args, **options)
-
-    return Stages(
+    bars: dict[str, TaskID] = {}
+    with Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(20),
         MofNCompleteColumn(),
@@ -84,18 +81,13 @@ def progress_bar(console: Console, unit: str = "") -> Progress:
         TimeRemainingColumn(),
         console=console,
         disable=not console.is_terminal or console.is_dumb_terminal,
-    )
-
-
-@contextmanager
-def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int], None]]:
-    """Show a bar for each stage of a run during the block; yield a `parkenv.studies.study.Progress`."""
-    bars: dict[str, TaskID] = {}
-    with progress_bar(console, unit) as progress:
+    ) as progress:
 
         def advance(doing: str, done: int, total: int) -> None:
             if doing not in bars:
-                bars[doing] = progress.add_task(doing, total=total or None)
+                bars[doing] = progress.add_task(doing)
+                if progress.disable:
+                    console.print(f"{doing} ...")
             progress.update(bars[doing], completed=done, total=total or None)
 
         yield advance

@@ -1,0 +1,188 @@
+"""`parkenv verify`, `parkenv bench` and `parkenv schema`: the package against theory, other software and files."""
+
+from __future__ import annotations
+
+import json
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import typer
+from pydantic import Field
+from typer import echo
+
+from parkenv.cli.options import Command
+from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.tables import make_console, make_table, save_summary
+from parkenv.errors import InputError, nearest
+from parkenv.files.option import option
+from parkenv.files.spec_file import Several
+from parkenv.studies.fields import Seed
+from parkenv.studies.schemas import KINDS, schemas
+from parkenv.studies.verify.study import Verification
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from parkenv.studies.bench.rows import BenchRow
+    from parkenv.studies.runner import Result
+    from parkenv.studies.verify.rows import Row
+
+
+class Verify(StudyCommand):
+    """A case without chance has to be found exactly. A simulated one agrees if theory is in an interval of the mean.
+
+    It is the 99.99 % interval: right rows then all agree with a probability of 0.995 and more. The exit code is 1 if
+    any row disagrees.
+    """
+
+    examples = """
+        parkenv verify --out results/verify
+        parkenv verify --cases line,inspections --seed 7
+        """
+
+    study: Verification = Verification()
+    out: Path | None = option(None, "Folder for summary.json and verify.png.", short="-o", default="none")
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.studies.verify.rows import disagreeing
+
+        if disagreeing(self.study.statements(self.run_study().results)):
+            raise typer.Exit(1)
+
+    def show(self, console: Console, result: Result) -> None:
+        """Print what theory expects and what is found."""
+        from parkenv.show.plurals import plural
+        from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
+
+        rows = self.study.statements(result.results)
+        cells = (
+            (
+                row.case,
+                _figure(row.expected),
+                _figure(row.found),
+                _interval(row),
+                "" if row.agrees else "DISAGREES",
+            )
+            for row in rows
+        )
+        console.print(
+            make_table(None, ("case", "expected", "found", f"{CONFIDENCE:.2%} interval", ""), cells)
+        )
+        agree = len(rows) - len(disagreeing(rows))
+        console.print(f"{agree} of {plural(len(rows), 'row')} agree with theory.")
+
+
+def _interval(row: Row) -> str:
+    return "exact" if row.exact else " to ".join(map(_figure, row.interval))
+
+
+def _figure(value: float) -> str:
+    return f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
+
+
+PARTS = {
+    "sensors": "sensor_rows",
+    "perception": "perception_rows",
+    "planning": "planning_rows",
+    "env": "env_rows",
+    "drive": "drive_rows",
+    "fleet": "fleet_rows",
+}
+"""Modules of `parkenv.studies.bench`, and the function of each that measures."""
+
+
+class Bench(Command):
+    """A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine."""
+
+    examples = """
+        parkenv bench sensors
+        parkenv bench --seconds 2 --out results/bench
+        """
+
+    parts: Several[Literal["sensors", "perception", "planning", "env", "drive", "fleet"]] = option(
+        (), f"Some of {', '.join(PARTS)}.", takes="PART", argument=True, default="all"
+    )
+    seconds: float = option(0.6, "How long each figure is measured.", ge=0.01, le=3600)
+    seed: Seed = Field(0, description="Of the lots and the noise.")
+    out: Path | None = option(
+        None, "Folder for summary.json, and a table of each part for a page.", short="-o", default="none"
+    )
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import make_folder
+
+        chosen = self.parts or PARTS
+        if self.out is not None:
+            make_folder(self.out)
+        console = make_console()
+        console.print("After an installation each part first compiles what it measures, about 20 s.")
+        rows: list[BenchRow] = []
+        for part in chosen:
+            with console.status(f"Measuring {part}"):
+                measure = getattr(import_module(f"parkenv.studies.bench.{part}"), PARTS[part])
+                measured = measure(self.seed, self.seconds)
+            rows += measured
+            if self.out is not None:
+                (self.out / f"{part}.md").write_text(_markdown(measured), encoding="utf-8")
+        cells = []
+        before = None
+        for row in rows:
+            ours = [row["part"], row["case"], _measured(row["value"]), row["unit"]]
+            theirs = [row["peer"] or "", _measured(row["peer_value"]), _measured(row["ratio"])]
+            cells.append([*(ours if ours != before else [""] * len(ours)), *theirs])
+            before = ours
+        console.print(make_table(None, ["part", "case", "value", "unit", "peer", "peer's", "ratio"], cells))
+        if self.out is not None:
+            save_summary(self.out, self.seed, rows)
+            console.print(f"Written: {self.out / 'summary.json'}, and a table of each part, PART.md")
+
+
+def _markdown(rows: list[BenchRow]) -> str:
+    """Return the rows of one part as a table for a page: a line a case, with all of its peers."""
+    lines = ["| | ours | peers | ratio |", "|---|---|---|---|"]
+    cases = dict.fromkeys(
+        (row["case"], row["value"], row["unit"]) for row in rows if row["value"] is not None
+    )
+    for case, value, unit in cases:
+        peers = [row for row in rows if row["case"] == case and row["unit"] == unit and row["peer"]]
+        theirs = "; ".join(f"{row['peer']}: {_measured(row['peer_value'])}" for row in peers)
+        ratios = "; ".join(_measured(row["ratio"]) for row in peers)
+        lines.append(f"| {case} | {_measured(value)} {unit} | {theirs} | {ratios} |")
+    return "\n".join(lines) + "\n"
+
+
+def _measured(value: float | None) -> str:
+    """Format a number with three significant digits and thousands separators."""
+    if value is None:
+        return ""
+    return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+class Schema(Command):
+    """Editors use them to check and complete files."""
+
+    examples = """
+        parkenv schema scenario
+        parkenv schema --out docs/schemas
+        """
+
+    kind: str | None = option(None, f"{', '.join(KINDS)}.", argument=True, default="scenario; all with --out")
+    out: Path | None = option(None, "Folder for all schemas, KIND.schema.json.", short="-o", default="none")
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import make_folder
+
+        if self.kind is not None and self.kind not in KINDS:
+            raise InputError(f"KIND is {self.kind!r}; {nearest(self.kind, KINDS)}")
+        made = schemas()
+        if self.out is None:
+            echo(json.dumps(made[self.kind or "scenario"], indent=1))
+            return
+        make_folder(self.out)
+        for name, content in made.items():
+            file = self.out / f"{name}.schema.json"
+            file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
