@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -218,6 +219,14 @@ class Fleet:
             "leaving_soon_s": leaving_soon_s,
         }
         self._require(background, max_steps, times)
+        self._options: dict[str, Any] = {
+            "background": background,
+            "drivers": self.drivers,
+            "max_steps": max_steps,
+            "leave_full_lot": leave_full_lot,
+            "sees_cars": sees_cars,
+            **times,
+        }
         goals = self._weighted("goal_weights", self.demand.goal_weights, len(self.scenario.lot.goals))
         self.scenarios = tuple(self.scenario.replace(goal=goal) for goal in goals) or (self.scenario,)
         lot = self.scenario.lot
@@ -674,20 +683,10 @@ class Fleet:
 
     def __reduce__(self) -> tuple[Callable[..., Fleet], tuple[Any, ...]]:
         """Copies and pickles are fleets before their first reset: records hold addresses of this process."""
-        record = self._record
-        background = BACKGROUNDS[record["background"]]
-        times = ("tick_s", "delay_s", "manoeuvre_s", "leaving_soon_s")
-        options: dict[str, Any] = {name: float(record[name]) for name in times}
-        options |= {"background": background, "drivers": self.drivers, "max_steps": int(record["max_steps"])}
-        options["leave_full_lot"] = bool(self._tables.records["leave_full_lot"][0])
-        return _fleet, (self.scenario, self.demand, options | {"sees_cars": self.sees_cars})
+        return partial(Fleet, **self._options), (self.scenario, self.demand)
 
 
 def drive_times(problem: SearchProblem, vertex: int) -> NDArray[np.float64]:
     """Return the shortest drive time from a vertex to the stop position of each slot, (n_slots,) s; inf without one."""
     metres = dijkstra(problem.lot.drive_matrix(), indices=np.array([vertex]))
     return np.asarray(metres[0, : problem.lot.n_slots] / problem.v_drive)
-
-
-def _fleet(scenario: Any, demand: Demand, options: dict[str, Any]) -> Fleet:
-    return Fleet(scenario, demand, **options)

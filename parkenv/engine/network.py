@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from itertools import pairwise
 from typing import Any
 from weakref import WeakSet
@@ -276,8 +277,4 @@ class NetworkPolicy(CompiledPolicy):
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the network; records hold addresses of this process."""
         options = {name: getattr(self, name) for name in ("activation", "masked", "sampled", "name")}
-        return _network_policy, (self.layers, self.k, options)
-
-
-def _network_policy(layers: Sequence[Layer], k: int, options: dict[str, Any]) -> NetworkPolicy:
-    return NetworkPolicy(layers, k, **options)
+        return partial(type(self), **options), (self.layers, self.k)
