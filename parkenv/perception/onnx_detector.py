@@ -16,7 +16,7 @@ from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.files.onnx_file import OnnxFile, OnnxValue, read_onnx
 from parkenv.files.spec_file import Several, Spec
-from parkenv.perception.car_regions import END_ASPECT, END_CAR, END_WIDEST, SIDE_ASPECT, SIDE_CAR, region_of
+from parkenv.perception.car_regions import END, END_WIDEST, SIDE
 from parkenv.perception.detector import LEAST_PROBABILITY, Detections
 from parkenv.perception.hog_detector import as_grey, best_boxes
 from parkenv.perception.onnx_outputs import (
@@ -436,10 +436,8 @@ def _regions(boxes: Float32Array, end_on: NDArray[np.bool_]) -> Float32Array:
     """Return the windows around cars that labelled crops have, as those of the HOG models."""
     size = boxes[:, 2:] - boxes[:, :2]
     square = end_on & (size[:, 0] <= END_WIDEST * size[:, 1])
-    regions = [
-        region_of(box, END_CAR, END_ASPECT) if end else region_of(box, SIDE_CAR, SIDE_ASPECT)
-        for box, end in zip(boxes.astype(np.float64), square, strict=True)
-    ]
+    cars = zip(boxes.astype(np.float64), square, strict=True)
+    regions = [(END if end else SIDE).region(box) for box, end in cars]
     return np.array(regions, dtype=np.float32).reshape(-1, 4)
 
 

@@ -12,7 +12,7 @@ import typer
 from rich.progress import track
 
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
+from parkenv.perception.car_regions import END, SIDE
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.lab.simulated_photos import SimulatedPhoto, simulated_photos
 from parkenv.perception.lab.simulated_streets import FRAMES
@@ -27,30 +27,21 @@ def build(photos: list[SimulatedPhoto], seed: int, progress: Callable[[str], Non
     empty = [p.labelled.image for p in photos if not len(p.labelled.boxes)]
     peopled = [p.labelled for p in photos if len(p.labelled.boxes)]
     trained_on = f"{len(photos)} simulated pictures, seed {seed}"
-    side = train(
-        [crop for p in photos for crop in p.sides],
-        empty,
-        photos=peopled,
-        descriptor=Descriptor(128, 64),
-        region_aspect=SIDE_ASPECT,
-        car=SIDE_CAR,
-        settings=settings,
-        trained_on=trained_on,
-        progress=progress,
-    )
-    front = train(
-        [crop for p in photos for crop in p.ends],
-        empty,
-        photos=peopled,
-        descriptor=Descriptor(128, 128),
-        region_aspect=END_ASPECT,
-        car=END_CAR,
-        end_on=True,
-        settings=settings,
-        trained_on=trained_on,
-        progress=progress,
-    )
-    return {"side": side, "front": front}
+    return {
+        name: train(
+            [crop for photo in photos for crop in photo.crops[window]],
+            empty,
+            photos=peopled,
+            descriptor=Descriptor(*window.size),
+            region_aspect=window.aspect,
+            car=window.car,
+            end_on=window is END,
+            settings=settings,
+            trained_on=trained_on,
+            progress=progress,
+        )
+        for name, window in (("side", SIDE), ("front", END))
+    }
 
 
 def main(scenes: int = 60, seed: int = 0, folder: Path = FOLDER) -> None:

@@ -18,7 +18,7 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
 from parkenv.files.spec_file import Several, Spec
-from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
+from parkenv.perception.car_regions import END, SIDE
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.lab.car_datasets import Crops, LabelledImage
 from parkenv.perception.lab.training import cut_out
@@ -169,7 +169,7 @@ def crops_of(
     Raises:
         InputError: fewer than 20 cars are left.
     """
-    aspect, car = (END_ASPECT, END_CAR) if end_on else (SIDE_ASPECT, SIDE_CAR)
+    car = END if end_on else SIDE
     rng = np.random.default_rng(seed)
     positives: list[Image] = []
     negatives: list[Image] = []
@@ -180,12 +180,12 @@ def crops_of(
             size = box[2:] - box[:2]
             inside = (box[:2] > 1.0).all() and box[2] < width - 1.0 and box[3] < height - 1.0
             if inside and size[0] >= LEAST_WIDTH and (size[0] < END_BELOW * size[1]) == end_on:
-                region = region_of(box, car, aspect)
+                region = car.region(box)
                 shape = (max(round(region[2] - region[0]), 8), max(round(region[3] - region[1]), 8))
                 positives.append(cut_out(image, region, shape))
         for _ in range(_WINDOWS):
-            window = rng.uniform(0.15, 0.6) * min(height, width / aspect)
-            window_size = np.array([aspect * window, window])
+            window = rng.uniform(0.15, 0.6) * min(height, width / car.aspect)
+            window_size = np.array([car.aspect * window, window])
             at = rng.uniform(0.0, 1.0, 2) * (np.array([width, height]) - window_size)
             low, high = boxes[:, :2] - at, boxes[:, 2:] - at
             if window >= 16.0 and not ((low < window_size) & (high > 0.0)).all(axis=1).any():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import cv2
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, Image
-from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR, region_of
+from parkenv.perception.car_regions import END, SIDE, CarWindow
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.lab.backdrops import with_backdrop
 from parkenv.perception.lab.car_datasets import LabelledImage
@@ -31,8 +31,9 @@ class SimulatedPhoto:
     """An image, its cars, and crops of them."""
 
     labelled: LabelledImage  # the grey image with the boxes of all its cars
-    sides: list[Image]  # aligned crops of cars seen from the side
-    ends: list[Image]  # aligned crops of fronts and rears
+    crops: Mapping[
+        CarWindow, list[Image]
+    ]  # aligned crops of cars seen from the side, and of fronts and rears
 
 
 def simulated_photos(n_scenes: int, seed: int = 0) -> Iterator[SimulatedPhoto]:
@@ -82,9 +83,9 @@ def _photo(frame: Frame, boxes: VehicleBoxes, rng: np.random.Generator, name: st
         # Cars that the texture may cover are neither positives nor negatives.
         clear &= boxes.distance < behind - 1.5
     grey = roughened(grey, rng)
-    sides, ends = _crops(grey, boxes, clear, rng)
+    crops = _crops(grey, boxes, clear, rng)
     labelled = LabelledImage(name, grey, boxes.visible_box[there_at_all].astype(np.float64))
-    return SimulatedPhoto(labelled, sides, ends)
+    return SimulatedPhoto(labelled, crops)
 
 
 def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamera, FloatArray]:
@@ -99,23 +100,21 @@ def _as_rigs_see(street: Street, rng: np.random.Generator) -> tuple[PinholeCamer
 
 def _crops(
     grey: Image, boxes: VehicleBoxes, clear: NDArray[np.bool_], rng: np.random.Generator
-) -> tuple[list[Image], list[Image]]:
+) -> dict[CarWindow, list[Image]]:
     """Return crops of sides and ends of unoccluded cars that are completely in the image and seen at a right angle."""
-    crops: dict[View, list[Image]] = {View.SIDE: [], View.END: []}
+    crops: dict[CarWindow, list[Image]] = {SIDE: [], END: []}
     height, width = grey.shape
     for i in np.flatnonzero(clear).tolist():
         view, box = View(boxes.view[i]), boxes.box[i].astype(np.float64)
         whole = box[0] > 0 and box[1] > 0 and box[2] < width and box[3] < height
         wide, high = box[2] - box[0], box[3] - box[1]
-        if view not in crops or not whole or wide < _LEAST_WIDTH:
+        if not whole or wide < _LEAST_WIDTH:
             continue
-        if (view is View.SIDE and wide < 2.1 * high) or (view is View.END and wide > 1.7 * high):
-            continue
-        car, aspect = (SIDE_CAR, SIDE_ASPECT) if view is View.SIDE else (END_CAR, END_ASPECT)
-        region = region_of(box, car, aspect)
-        size = (100, 40) if view is View.SIDE else (64, 64)
-        crops[view].append(_patch(grey, region, size, rng))
-    return crops[View.SIDE], crops[View.END]
+        if view is View.SIDE and wide >= 2.1 * high:
+            crops[SIDE].append(_patch(grey, SIDE.region(box), (100, 40), rng))
+        if view is View.END and wide <= 1.7 * high:
+            crops[END].append(_patch(grey, END.region(box), (64, 64), rng))
+    return crops
 
 
 def _patch(grey: Image, region: FloatArray, size: tuple[int, int], rng: np.random.Generator) -> Image:

@@ -113,7 +113,7 @@ class DetectorTraining(Spec):
         """
         if self.simulated is not None:
             return self._train_network(self.simulated, out, progress)
-        from parkenv.perception.car_regions import END_ASPECT, END_CAR, SIDE_ASPECT, SIDE_CAR
+        from parkenv.perception.car_regions import END, SIDE
         from parkenv.perception.hog import Descriptor
         from parkenv.perception.lab.car_datasets import read_crop_folder, read_uiuc_training
         from parkenv.perception.lab.cross_validation import cross_validated
@@ -123,19 +123,19 @@ class DetectorTraining(Spec):
         if out.suffix != ".npz":
             raise InputError(f"--out {out}: want a name that ends in .npz")
         check_writable(out)
+        window = END if self.front else SIDE
         photos: list[LabelledImage] = []
         alignment: dict[str, Any] = {}
         if self.labels is not None:
             labelled = read_labels(self.labels, self.images, self.classes or ())
             data, photos = crops_of(labelled, end_on=self.front, seed=self.seed)
-            aspect, car = (END_ASPECT, END_CAR) if self.front else (SIDE_ASPECT, SIDE_CAR)
-            alignment = {"region_aspect": aspect, "car": car}
+            alignment = {"region_aspect": window.aspect, "car": window.car}
         elif self.uiuc is not None:
             data = read_uiuc_training(self.uiuc)
         else:
             data = read_crop_folder(Path(str(self.crops)))
         how: dict[str, Any] = {
-            "descriptor": Descriptor(128, 128 if self.front else 64, self.normalization),
+            "descriptor": Descriptor(*window.size, self.normalization),
             "end_on": self.front,
             "settings": TrainingSettings(
                 penalty=self.penalty, rounds=self.rounds, jitter=self.jitter, misaligned=self.misaligned,
