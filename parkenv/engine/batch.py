@@ -64,7 +64,7 @@ class Observer(ABC):
         tables: scenarios of the searches.
         n: number of searches.
         space: of the observations of one search; has an `action_mask`.
-        full_belief: whether the searches keep `p_occupied`, `belief` and `step_observed` up to date.
+        full_belief: whether the searches keep `p_occupied` and `belief` up to date.
         kept: names of observations that are arrays of `Searches`.
 
     Attributes:
@@ -86,7 +86,8 @@ class Observer(ABC):
         full_belief: bool = False,
         kept: tuple[str, ...] = (),
     ) -> None:
-        self.searches, self.space = Searches(tables, n, full_belief), space
+        most_observed = None if "step_observed" in kept else 0
+        self.searches, self.space = Searches(tables, n, full_belief, most_observed), space
         self.address = self.searches.address
         own: Any = create_empty_array(spaces.Dict({k: v for k, v in space.items() if k not in kept}), n)
         of_searches = {name: getattr(self.searches, name).reshape(n, -1) for name in kept}

@@ -177,6 +177,8 @@ def set_taken_at(address: int, slot: int) -> None:
     """Set P(taken) of a slot to 1, as after a failed attempt, whatever else the step has observed of it."""
     search = search_at(address, 0)
     set_belief(search, column_of(search, slot), True, 1.0)
+    if search.step_observed == 0:
+        return
     # The last observation of the slot counts.
     n, rows = search.n_step_observed - 1, float32s(search.step_observed)
     while n >= 0 and rows[n] != slot:
@@ -426,21 +428,31 @@ def observe_exact(search: Any) -> None:
     If a slot's state cannot have changed, only the time of its observation is updated.
     """
     scenario, time = scenario_at(search.scenario, 0), search.time
-    viewed, columns = int64s(scenario.viewed), int32s(search.columns)
-    observed_at, since_arrival = float32s(search.belief), time - search.arrival
-    first = OBSERVED_AT * search.width
-    starts = int64s(scenario.view_starts)
-    n = search.n_step_observed
+    viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
+    # Read once: each write below might change the record, for all that the compiler knows.
+    slots, blocks, columns = search.slots, search.blocks, int32s(search.columns)
+    keeps_belief, keeps_observed = search.belief != 0, search.step_observed != 0
+    observed_at, since_arrival = (
+        float32s(search.belief + 4 * OBSERVED_AT * search.width),
+        time - search.arrival,
+    )
+    n, most, observed = search.n_step_observed, search.most_observed, float32s(search.step_observed)
     for i in range(starts[search.vertex], starts[search.vertex + 1]):
         slot = viewed[i]
         column = np.int64(columns[slot])
-        if time >= slot_at(search.slots, column).valid_until:
+        if time >= slot_at(slots, column).valid_until:
             column = observe_changed(search, slot)
-        block_at(search.blocks, column >> BLOCK_BITS).observed_at[column & (BLOCK_SIZE - 1)] = time
-        if search.belief != 0:
-            observed_at[first + slot] = since_arrival
-            taken = np.float64(slot_at(search.slots, column).observed_taken)
-            write_observed(search, n, slot, taken, 1.0, 0.0)
+        block_at(blocks, column >> BLOCK_BITS).observed_at[column & (BLOCK_SIZE - 1)] = time
+        if keeps_belief:
+            observed_at[slot] = since_arrival
+        if keeps_observed:
+            taken = np.float64(slot_at(slots, column).observed_taken)
+            observed[n], observed[most + n], observed[2 * most + n], observed[3 * most + n] = (
+                slot,
+                taken,
+                1.0,
+                0.0,
+            )
             n += 1
     search.n_step_observed = n
     mark_passed(search)
@@ -496,7 +508,7 @@ def observe_attempt(search: Any, column: int, taken: bool) -> None:
 @inlined
 def add_observed(search: Any, slot: int, taken: bool, hit_rate: float, false_alarm_rate: float) -> None:
     """Add a slot to what the step observed, if that is kept."""
-    if search.belief != 0:
+    if search.step_observed != 0:
         write_observed(search, search.n_step_observed, slot, taken, hit_rate, false_alarm_rate)
         search.n_step_observed += 1
 
@@ -575,8 +587,10 @@ def refresh_belief(search: Any) -> None:
 @inlined
 def end_observed(search: Any) -> None:
     """Mark the rest of `step_observed` as unused."""
-    for n in range(search.n_step_observed, search.most_observed):
-        write_observed(search, n, -1.0, 0.0, 0.0, 0.0)
+    if search.step_observed != 0:
+        for n in range(search.n_step_observed, search.n_step_used):
+            write_observed(search, n, -1.0, 0.0, 0.0, 0.0)
+        search.n_step_used = search.n_step_observed
 
 
 @kernel

@@ -109,8 +109,9 @@ _PROGRESS = [
     ("n_observed_free", np.float64),
     ("n_expected_free", np.float64),
     ("n_last_observed_taken", np.int64),
-    # Number of observations of the last step in `step_observed`.
+    # Number of observations of the last step in `step_observed`, and of its entries that may be in use.
     ("n_step_observed", np.int64),
+    ("n_step_used", np.int64),
     # For the local observation: forecast fraction of free slots in each quarter of the lot; the best slot observed
     # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),
@@ -516,7 +517,8 @@ class Searches:
         scenarios: scenarios of the searches; if there are several, one is drawn for each episode.
         n: number of searches.
         full_belief: whether to keep `p_occupied`, `belief` and `step_observed` up to date.
-        most_observed: maximum number of slots that a step observes; None: those in view, and one more.
+        most_observed: maximum number of slots that a step observes; None: those in view, and one more; with 0,
+            `step_observed` is not kept.
 
     Attributes:
         records: (n,) of the dtype SEARCH.
@@ -554,8 +556,8 @@ class Searches:
         self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
         self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
         k = most_observed_in(scenarios.scenarios) if most_observed is None else most_observed
-        self.step_observed = np.zeros((n, 4, k) if full_belief else (0, 4, 0), np.float32)
-        self.records["width"], self.records["most_observed"] = m, k
+        self.step_observed = np.zeros((n, 4, k) if full_belief and k > 0 else (0, 4, 0), np.float32)
+        self.records["width"], self.records["most_observed"], self.records["n_step_used"] = m, k, k
         self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
         self.records["n_places"] = len(scenarios.records)
         self._find_scenarios()
