@@ -13,7 +13,7 @@ from parkenv.errors import InputError
 from parkenv.lots import grid_lot, read_lot, write_lot
 from parkenv.lots.lot_files import PLACES
 from parkenv.lots.quality import combined_error_probability, read_provenance
-from parkenv.scenarios.places import lot_share
+from parkenv.scenarios.selection import lot_share
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.show.report.page import SCHEMA
 from parkenv.studies.agent_spec import AgentSpec

@@ -17,7 +17,7 @@ from parkenv import InputError, SensorModel, make_scenario, make_scenarios
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import write_lot
-from parkenv.scenarios.places import by_size, lot_share, open_places, place_of_episode, split_places
+from parkenv.scenarios.selection import by_size, lot_share, open_scenarios, scenario_of_episode, split_by_lot
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.bench.env import grids
 from parkenv.studies.compare.comparison import Comparison
@@ -154,11 +154,11 @@ def test_a_seed_decides_the_places_whatever_was_done_before():
     env = gym.make("parkenv/Search-v2", scenario=PLACES).unwrapped
     first = places_of(env, 3)
     assert set(first) == {one.name for one in PLACES} or len(set(first)) > 3
-    assert first == [PLACES[place_of_episode(3, episode, 6)].name for episode in range(12)]
+    assert first == [PLACES[scenario_of_episode(3, episode, 6)].name for episode in range(12)]
     places_of(env, 4, n=5, act=2)
     assert places_of(env, 3, act=1) == first
     assert places_of(env, 4) != first
-    counts = np.bincount([place_of_episode(seed, 0, 6) for seed in range(6_000)])
+    counts = np.bincount([scenario_of_episode(seed, 0, 6) for seed in range(6_000)])
     assert (np.abs(counts - 1_000) < 150).all(), "each place as often as the others"
 
 
@@ -239,7 +239,9 @@ def test_a_batch_draws_a_place_at_each_automatic_reset():
     rng = np.random.default_rng(0)
     for _ in range(60):
         names = [PLACES[i].name for i in envs.place_of]
-        assert envs.place_of.tolist() == [place_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)]
+        assert envs.place_of.tolist() == [
+            scenario_of_episode(20 + i, int(e), 6) for i, e in enumerate(episode)
+        ]
         observation, _, terminated, truncated, info = envs.step(rng.integers(0, 5, 5))
         assert envs.observation_space.contains(observation)
         done = terminated | truncated
@@ -291,10 +293,10 @@ def test_tiny_lots_with_equal_tables_keep_their_own_forecasts():
 def test_the_split_is_by_lot_and_stable():
     packaged = make_scenarios(["campus", "street", "jam", "mini"])
     assert [round(lot_share(one.lot), 3) for one in packaged] == [0.475, 0.881, 0.292, 0.279]
-    learned, held_out = split_places(PLACES, 0.5)
+    learned, held_out = split_by_lot(PLACES, 0.5)
     assert {*learned, *held_out} == set(PLACES)
     for further in (PLACES[1:], [*packaged, *PLACES[::-1]]):
-        more = split_places(further, 0.5)
+        more = split_by_lot(further, 0.5)
         for one in further:
             if one in PLACES:
                 assert (one in more[1]) == (one in held_out), "whatever other places there are"
@@ -302,22 +304,22 @@ def test_the_split_is_by_lot_and_stable():
     renamed = PLACES[0].replace(name="other", failure_s=3.0)
     assert lot_share(renamed.lot) == lot_share(PLACES[0].lot)
     for share, what in (
-        (1e-9, "holds out none of 6 places"),
-        (1.0 - 1e-9, "leaves none to train on of 6 places"),
+        (1e-9, "holds out none of 6 scenarios"),
+        (1.0 - 1e-9, "leaves none to train on of 6 scenarios"),
     ):
         with pytest.raises(InputError, match=what):
-            split_places(PLACES, share)
+            split_by_lot(PLACES, share)
 
 
 def test_a_curriculum_opens_places_by_size():
     sizes = [one.lot.n_slots for one in by_size(PLACES)]
     assert sizes == sorted(sizes)
-    opened = [open_places(50, p) for p in np.linspace(0.0, 1.0, 21)]
+    opened = [open_scenarios(50, p) for p in np.linspace(0.0, 1.0, 21)]
     assert opened[0] == 5
     assert opened == sorted(opened)
     assert opened[9] < 50
     assert opened[10:] == [50] * 11
-    assert open_places(1, 0.0) == open_places(3, 0.0) == 1
+    assert open_scenarios(1, 0.0) == open_scenarios(3, 0.0) == 1
 
 
 def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
@@ -332,7 +334,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
 
     monkeypatch.setattr(SearchTraining, "before_rollout", watched)
     curve = training.train(0, tmp_path)
-    assert met == [(steps, open_places(4, steps / 2_048)) for steps in (0, 512, 1024, 1536)]
+    assert met == [(steps, open_scenarios(4, steps / 2_048)) for steps in (0, 512, 1024, 1536)]
     assert [n for _, n in met] == [1, 3, 4, 4]
     card = ModelCard.of_file(tmp_path / "model.safetensors")
     assert card.scenarios == ("lot0", "lot1", "lot2", "lot3")
@@ -350,7 +352,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     agent = LearnedAgent(PLACES[0], "ppo", tmp_path / "model.safetensors")
     seeds = range(2_000_000, 2_000_012)
     together, _ = episode_times(agent.model, PLACES, seeds)
-    apart = [episode_times(agent.model, PLACES[place_of_episode(s, 0, 6)], [s])[0][0] for s in seeds]
+    apart = [episode_times(agent.model, PLACES[scenario_of_episode(s, 0, 6)], [s])[0][0] for s in seeds]
     np.testing.assert_array_equal(together, apart)
 
 
@@ -366,7 +368,7 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     same = scenario_spec(folder / "busy.toml").changed(name="again")
     for others, message in (
         ((same,), "evaluate_on has 'again', whose lot is that of 'busy', which is trained on"),
-        (specs[1:2], "scenarios has 'lot0' twice, want places of different names"),
+        (specs[1:2], "scenarios has 'lot0' twice, want different names"),
     ):
         with pytest.raises(InputError, match=message):
             SearchTraining(SearchTrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()

@@ -109,8 +109,8 @@ def gradient_boosting(counts: Counts, first: int) -> FloatArray:
             )
             model.fit(known[:, used], y[park, day, hour])
             days = slice(start, start + _REFIT_DAYS)
-            told = features[:, days][..., used]
-            result[:, days] = model.predict(told.reshape(-1, told.shape[-1])).reshape(told.shape[:3])
+            inputs = features[:, days][..., used]
+            result[:, days] = model.predict(inputs.reshape(-1, inputs.shape[-1])).reshape(inputs.shape[:3])
     return result
 
 

@@ -296,8 +296,8 @@ def fit_settings(counts: Counts, before: int, on_step: Callable[[], None] | None
                     odds = best.day_memory / (1.0 - best.day_memory) * change
                     value = odds / (1.0 + odds)
                 tried = replace(best, **{name: value})
-                if (its := loss(tried)) < lowest:
-                    best, lowest = tried, its
+                if (of_tried := loss(tried)) < lowest:
+                    best, lowest = tried, of_tried
                     break
             if on_step is not None:
                 on_step()

@@ -66,8 +66,8 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
         raise InputError(f"least is {least} cars, want at least 1")
     # Twice the angle is the same for nose-in and nose-out.
     turn = _TURN_M / 2.0 * np.stack([np.cos(2.0 * cars[:, 2]), np.sin(2.0 * cars[:, 2])], axis=1)
-    place = np.column_stack([cars[:, :2], turn])
-    tree = cKDTree(place)
+    poses = np.column_stack([cars[:, :2], turn])
+    tree = cKDTree(poses)
     density, near = _density(tree, reach)
     within = cKDTree(cars[:, :2])
     open_to_slots = near >= least
@@ -75,10 +75,10 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
     for k in np.argsort(-density, kind="stable").tolist():
         if not open_to_slots[k]:
             continue
-        middle = np.median(place[tree.query_ball_point(place[k], reach)], axis=0)
+        middle = np.median(poses[tree.query_ball_point(poses[k], reach)], axis=0)
         # Repeat from the median, which also has the cars on its other side within reach.
         these = tree.query_ball_point(middle, reach) or [k]
-        middle = np.median(place[these], axis=0)
+        middle = np.median(poses[these], axis=0)
         direction = 0.5 * math.atan2(middle[3], middle[2]) % math.pi
         around = np.array(within.query_ball_point(middle[:2], math.hypot(*_ROOM)), dtype=np.int64)
         open_to_slots[around[_inside(cars[around, :2] - middle[:2], direction)]] = False

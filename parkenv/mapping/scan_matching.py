@@ -295,9 +295,9 @@ def _thinned(points: FloatArray, cell: float) -> FloatArray:
     """Return the first point in each square cell."""
     if not len(points):
         return points
-    place = np.floor(points / cell).astype(np.int64)
-    place -= place.min(axis=0)
-    _, first = np.unique(place[:, 0] * (place[:, 1].max() + 1) + place[:, 1], return_index=True)
+    cells = np.floor(points / cell).astype(np.int64)
+    cells -= cells.min(axis=0)
+    _, first = np.unique(cells[:, 0] * (cells[:, 1].max() + 1) + cells[:, 1], return_index=True)
     return points[np.sort(first)]
 
 

@@ -389,9 +389,9 @@ class MapStore:
 
 def lot_digest(lot: ParkingLot) -> str:
     """Return a hash of the lot's slot poses."""
-    places = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
+    poses = np.column_stack([lot.slot_xy, lot.slot_yaw, lot.slot_length, lot.slot_width])
     # Adding 0 turns -0.0 into 0.0.
-    return hashlib.sha256((np.round(places, 3) + 0.0).tobytes()).hexdigest()[:16]
+    return hashlib.sha256((np.round(poses, 3) + 0.0).tobytes()).hexdigest()[:16]
 
 
 def _names_another_file(journal: Path) -> bool:

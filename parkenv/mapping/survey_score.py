@@ -127,10 +127,10 @@ class SurveyScore:
         clear = (boxes.visible_fraction >= CLEAR) & (boxes.ids <= n_parked)
         clear &= (boxes.box[:, 0] > 0) & (boxes.box[:, 2] < view.camera.width)
         clear &= boxes.distance < DISTANCE_ENDS[-1]
-        place = np.searchsorted(DISTANCE_ENDS, boxes.distance[clear], side="right")
+        distance_bin = np.searchsorted(DISTANCE_ENDS, boxes.distance[clear], side="right")
         detected = np.isin(boxes.ids[clear], matched)
-        self.in_frame[:, 0] += np.bincount(place, minlength=len(DISTANCE_ENDS))
-        self.in_frame[:, 1] += np.bincount(place[detected], minlength=len(DISTANCE_ENDS))
+        self.in_frame[:, 0] += np.bincount(distance_bin, minlength=len(DISTANCE_ENDS))
+        self.in_frame[:, 1] += np.bincount(distance_bin[detected], minlength=len(DISTANCE_ENDS))
 
     def _add_errors(
         self,

@@ -55,10 +55,10 @@ def make_scenario(source: ScenarioSource, **changes: Any) -> Scenario:
         >>> scenario.lot.name, scenario.failure_s
         ('campus', 90.0)
     """
-    made = make_scenarios(source, **changes)
-    if len(made) > 1:
-        raise InputError(f"scenario has {len(made)} scenarios, want one")
-    return made[0]
+    scenarios = make_scenarios(source, **changes)
+    if len(scenarios) > 1:
+        raise InputError(f"scenario has {len(scenarios)} scenarios, want one")
+    return scenarios[0]
 
 
 def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
@@ -81,7 +81,7 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
     """
     if "day_error" in changes:
         day_error = changes.pop("day_error")
-        return [_with_day_error(made, day_error) for made in make_scenarios(source, **changes)]
+        return [_with_day_error(scenario, day_error) for scenario in make_scenarios(source, **changes)]
     if isinstance(source, Scenario):
         return [source.replace(**changes)]
     if isinstance(source, ParkingLot):
@@ -97,7 +97,7 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
         )
     if not source:
         raise InputError("scenario is an empty sequence, want at least one scenario")
-    return [made for one in source for made in make_scenarios(one, **changes)]
+    return [scenario for each in source for scenario in make_scenarios(each, **changes)]
 
 
 def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
@@ -114,8 +114,8 @@ def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec
 def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
     goal = changes.get("goal", 0)
     occupancy = changes.get("occupancy") or typical_occupancy(lot, goal=goal)
-    made = Scenario(name=lot.name, lot=lot, goal=goal, occupancy=occupancy)
-    return made.replace(**changes | {"occupancy": occupancy})
+    scenario = Scenario(name=lot.name, lot=lot, goal=goal, occupancy=occupancy)
+    return scenario.replace(**changes | {"occupancy": occupancy})
 
 
 def build(spec: ScenarioSpec) -> Scenario:
@@ -134,7 +134,7 @@ def build(spec: ScenarioSpec) -> Scenario:
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
         occupancy = _occupancy(spec.occupancy, lot, goal)
-        made = Scenario(
+        scenario = Scenario(
             name=spec.title,
             lot=lot,
             goal=goal,
@@ -155,7 +155,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             detector=spec.detector,
         )
         error = spec.occupancy.day_error
-        return made if error is None else _with_day_error(made, DayError(error.level, error.slope))
+        return scenario if error is None else _with_day_error(scenario, DayError(error.level, error.slope))
     except InputError as error:
         message = str(error)
         for kind in ("goal", "entry"):

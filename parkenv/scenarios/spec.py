@@ -505,9 +505,11 @@ class ScenarioSpec(Spec):
         """Return every file named in the specification, and the settings beside the detector's."""
         files = super().files()
         if self.detector not in DETECTORS:
-            its = Path(self.detector)
-            beside = (its.with_suffix(s) for s in (".toml", ".json") if its.suffix.lower() == ".onnx")
-            files += [its, *(file for file in beside if is_there(file))]
+            detector = Path(self.detector)
+            beside = (
+                detector.with_suffix(s) for s in (".toml", ".json") if detector.suffix.lower() == ".onnx"
+            )
+            files += [detector, *(file for file in beside if is_there(file))]
         return list(dict.fromkeys(files))
 
     @property

@@ -73,13 +73,13 @@ def entries_from_streets(
         nodes, kept = on_street[degree[on_street] == 1], list(lines)
         reason = "where a street leaves the map"
     ends = np.concatenate([line.points[[0, -1]] for line in lines])
-    places = np.array([ends[np.flatnonzero(label.ravel() == node)[0]] for node in nodes]).reshape(-1, 2)
-    if not len(places):
+    entries = np.array([ends[np.flatnonzero(label.ravel() == node)[0]] for node in nodes]).reshape(-1, 2)
+    if not len(entries):
         return None
     corners = np.concatenate([line.points for line in kept])
-    away = np.hypot(*(corners - places[0]).T)
+    away = np.hypot(*(corners - entries[0]).T)
     before = corners[int(np.argmin(np.where(away > 1.0, away, np.inf)))]
-    return kept, places, Entry(np.stack([before, places[0]]), reason, 1.0)
+    return kept, entries, Entry(np.stack([before, entries[0]]), reason, 1.0)
 
 
 def _outermost(lines: Sequence[Line]) -> Entry:
@@ -116,12 +116,12 @@ def _best_way_out(
     shapely.prepare(ground)
     ends = np.concatenate([line.points[[0, -1]] for line in lines])
     label = node_labels(ends)
-    place = {int(k): xy for k, xy in zip(label[::-1], ends[::-1], strict=True)}
+    at = {int(k): xy for k, xy in zip(label[::-1], ends[::-1], strict=True)}
     graph = nx.Graph()
     for (a, b), line in zip(label.reshape(-1, 2).tolist(), lines, strict=True):
         graph.add_edge(a, b, weight=shapely.LineString(line.points).length)
-    nodes = np.array([place[k] for k in sorted(place)])
-    names = sorted(place)
+    nodes = np.array([at[k] for k in sorted(at)])
+    names = sorted(at)
     nearest = shapely.STRtree(np.asarray(shapely.points(nodes))).nearest(
         np.asarray(shapely.points(spaces_xy))
     )

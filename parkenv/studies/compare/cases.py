@@ -13,7 +13,7 @@ import numpy as np
 
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
-from parkenv.scenarios.places import seeds_by_place
+from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s, timed_row
@@ -146,7 +146,7 @@ def rows_of(
     """
     several = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     work: list[tuple[Case, Sequence[int]]] = []
-    for scenario, its in zip(several, seeds_by_place(seeds, len(several)), strict=True):
+    for scenario, its in zip(several, seeds_by_scenario(seeds, len(several)), strict=True):
         cases = [Case(scenario, agent.name, options=agent.options) for agent in agents]
         require_distinct(cases)
         work += [(case, its[i : i + BLOCK]) for case in cases for i in range(0, len(its), BLOCK)]

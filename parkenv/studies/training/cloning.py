@@ -14,7 +14,7 @@ from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.errors import InputError
-from parkenv.scenarios.places import seeds_by_place
+from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.simulate import EpisodeResult, Observer, Step, simulate
 from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE
 from parkenv.world.scenario import Scenario
@@ -73,7 +73,7 @@ class Demonstrations:
         """
         places = [places] if isinstance(places, Scenario) else places
         finished = []
-        for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
+        for place, its in zip(places, seeds_by_scenario(seeds, len(places)), strict=True):
             planner = make_agent(agent, place)
             env = gym.make("parkenv/Search-v2", scenario=place, max_episode_steps=MAX_STEPS)
             recorder = _DecisionRecorder(LocalObservation(env, k))

@@ -16,13 +16,13 @@ from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.scenarios.build import build
-from parkenv.scenarios.places import (
+from parkenv.scenarios.selection import (
     by_size,
     lot_share,
-    open_places,
-    place_of_episode,
+    open_scenarios,
     require_different_names,
-    split_places,
+    scenario_of_episode,
+    split_by_lot,
 )
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
@@ -99,7 +99,7 @@ class SearchTraining(RLTraining):
         """Scenarios to train in, and places to evaluate in and not to train in."""
         given = [build(scenario) for scenario in self.scenarios]
         if self.spec.held_out is not None:
-            sides = split_places(given, self.spec.held_out, suite_lots())
+            sides = split_by_lot(given, self.spec.held_out, suite_lots())
         else:
             sides = given, [build(scenario) for scenario in self.spec.evaluate_on or ()]
         require_apart(*sides)
@@ -178,7 +178,7 @@ class SearchTraining(RLTraining):
 
     def _open_places(self, env: SearchVecEnv, progress: float) -> None:
         if self.spec.curriculum is not None:
-            env.batch.n_places = open_places(len(self.sides[0]), progress)
+            env.batch.n_places = open_scenarios(len(self.sides[0]), progress)
 
     def prepare(self, model: Any, seed: int) -> None:
         """Clone the demonstrations, if any."""
@@ -277,7 +277,7 @@ class SearchTraining(RLTraining):
         self, places: Sequence[Scenario], times: NDArray[np.float64], parked: NDArray[np.bool_]
     ) -> list[Row]:
         """Return a row of the test for each place that a search was in."""
-        place_of = np.array([place_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
+        place_of = np.array([scenario_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
         return [
             {"place": place.name, "slots": place.lot.n_slots, **times_row(times[its], parked[its])}
             for i, place in enumerate(places)

@@ -21,7 +21,7 @@ from gymnasium.wrappers import TimeLimit
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
-from parkenv.scenarios.places import seeds_by_place
+from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.simulate import STEP_LIMIT, simulate
 from parkenv.studies.training.curve_file import CURVE, Row, read_curve
 from parkenv.studies.training.network.data import Labelled, Pairs, Place, label_searches, play_pairs
@@ -156,7 +156,7 @@ def student_times(places: Sequence[Place], policy: NetworkPolicy, seeds: Sequenc
     A search that has not ended after `STEP_LIMIT` decisions is charged `give_up_s`, as in `parkenv compare`.
     """
     infos = dict[int, Row]()
-    for place, its in zip(places, seeds_by_place(seeds, len(places)), strict=True):
+    for place, its in zip(places, seeds_by_scenario(seeds, len(places)), strict=True):
         place.student.policy = policy
         env = TimeLimit(place.env, STEP_LIMIT)
         infos |= {seed: simulate(env, place.student, seed).info for seed in its}

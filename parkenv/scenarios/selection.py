@@ -1,4 +1,4 @@
-"""Places: which of several scenarios an episode is in, and which are held out from training."""
+"""Which of several scenarios an episode is in, and which are kept from training, to evaluate on."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 
 FIRST_SHARE, ALL_AT = 0.1, 0.5
-"""A curriculum begins with this share of the places, and has all of them after this share of the training."""
+"""A curriculum begins with this share of the scenarios, and has all of them after this share of the training."""
 
 
-def place_of_episode(seed: int, episode: int, n: int) -> int:
-    """Return the index of the place, of n, that an environment draws for an episode of a seed.
+def scenario_of_episode(seed: int, episode: int, n: int) -> int:
+    """Return the index of the scenario, of n, that an environment draws for an episode of a seed.
 
     Examples:
-        >>> [place_of_episode(seed, 0, 3) for seed in range(5)]
+        >>> [scenario_of_episode(seed, 0, 3) for seed in range(5)]
         [2, 0, 1, 0, 0]
     """
     return int(keyed_uniform(world_key(seed, episode), PLACE_STREAM, 0, 0) * n)
 
 
-def seeds_by_place(seeds: Sequence[int], n: int) -> list[list[int]]:
-    """Return the seeds whose first episode is in each of n places."""
-    its: list[list[int]] = [[] for _ in range(n)]
+def seeds_by_scenario(seeds: Sequence[int], n: int) -> list[list[int]]:
+    """Return the seeds whose first episode is in each of n scenarios."""
+    groups: list[list[int]] = [[] for _ in range(n)]
     for seed in seeds:
-        its[place_of_episode(seed, 0, n)].append(seed)
-    return its
+        groups[scenario_of_episode(seed, 0, n)].append(seed)
+    return groups
 
 
 def lot_share(lot: ParkingLot) -> float:
@@ -49,7 +49,7 @@ def lot_share(lot: ParkingLot) -> float:
     return int.from_bytes(digest[:8], "little") / 2.0**64
 
 
-def split_places(
+def split_by_lot(
     scenarios: Sequence[Scenario], held_out: float, kept: Container[float] = ()
 ) -> tuple[list[Scenario], list[Scenario]]:
     """Split scenarios by their lots: those to train on, and those held out.
@@ -58,7 +58,7 @@ def split_places(
     added later do not move the others.
 
     Args:
-        scenarios: the places.
+        scenarios: the scenarios.
         held_out: share that is held out.
         kept: further lots that are held out, by their `lot_share`, such as those of a benchmark suite.
 
@@ -72,7 +72,8 @@ def split_places(
     for side, what in zip(sides, ("leaves none to train on", "holds out none"), strict=True):
         if not side:
             raise InputError(
-                f"held_out is {held_out:g}, which {what} of {len(scenarios)} places: name the others with evaluate_on"
+                f"held_out is {held_out:g}, which {what} of {len(scenarios)} scenarios: "
+                "name the others with evaluate_on"
             )
     return sides
 
@@ -82,11 +83,11 @@ def by_size(scenarios: Sequence[Scenario]) -> list[Scenario]:
     return sorted(scenarios, key=lambda scenario: (scenario.lot.n_slots, scenario.name))
 
 
-def open_places(n: int, progress: float) -> int:
-    """Return how many of n places a curriculum draws from after a share of the training.
+def open_scenarios(n: int, progress: float) -> int:
+    """Return how many of n scenarios a curriculum draws from after a share of the training.
 
     Examples:
-        >>> [open_places(100, progress) for progress in (0.0, 0.25, 0.5, 1.0)]
+        >>> [open_scenarios(100, progress) for progress in (0.0, 0.25, 0.5, 1.0)]
         [10, 55, 100, 100]
     """
     share = FIRST_SHARE + (1.0 - FIRST_SHARE) * min(progress / ALL_AT, 1.0)
@@ -94,7 +95,7 @@ def open_places(n: int, progress: float) -> int:
 
 
 def require_different_names(scenarios: Sequence[Scenario]) -> None:
-    """Check that tables can tell places apart.
+    """Check that tables can tell scenarios apart.
 
     Raises:
         InputError: two have one name.
@@ -102,4 +103,4 @@ def require_different_names(scenarios: Sequence[Scenario]) -> None:
     names = [scenario.name for scenario in scenarios]
     for i, name in enumerate(names):
         if name in names[:i]:
-            raise InputError(f"scenarios has {name!r} twice, want places of different names")
+            raise InputError(f"scenarios has {name!r} twice, want different names")
