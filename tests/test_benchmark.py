@@ -19,7 +19,7 @@ from parkenv.show.report.page import SCHEMA
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark import suite as benchmark
 from parkenv.studies.benchmark.suite import Suite, by_group, check_result, result_of, suite_lots
-from parkenv.studies.lot_census import slots_by_kind
+from parkenv.studies.lots.census import slots_by_kind
 from parkenv.studies.results import DECISIONS, EPISODES, write_summary
 from parkenv.studies.training.search import SearchTraining
 from parkenv.studies.training.spec import SearchTrainingSpec

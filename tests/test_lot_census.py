@@ -14,7 +14,7 @@ from parkenv.lots import grid_lot, import_lot, packaged_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.scenarios.build import largest_lots
 from parkenv.scenarios.spec import scenario_specs
-from parkenv.studies.lot_census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
+from parkenv.studies.lots.census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
 
 TOWN = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)

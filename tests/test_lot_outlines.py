@@ -23,7 +23,7 @@ from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
 from parkenv.lots.quality import Provenance, read_provenance
 from parkenv.show.colors import PALETTE
-from parkenv.studies.drivability import ManoeuvreKind, can_park, check_drivability
+from parkenv.studies.lots.drivability import ManoeuvreKind, can_park, check_drivability
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)

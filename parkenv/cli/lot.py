@@ -96,7 +96,7 @@ class Check(Command):
         """See `Command`."""
         from parkenv.lots import check_lot, read_lot
         from parkenv.lots.lot_files import lot_format
-        from parkenv.studies.drivability import check_drivability
+        from parkenv.studies.lots.drivability import check_drivability
 
         console = make_console(soft_wrap=True)
         problems = check_lot(self.place)
@@ -257,7 +257,7 @@ class Import(Command):
         console.print(f"Wrote {self.out}. {_summary(lot)}")
 
     def _import_town(self) -> None:
-        from parkenv.studies.town_import import import_town_lots
+        from parkenv.studies.lots.town_import import import_town_lots
 
         console = make_console(soft_wrap=True)
         with stages(console) as progress:
@@ -318,7 +318,7 @@ class Census(Command):
 
     def run(self) -> None:
         """See `Command`."""
-        from parkenv.studies.lot_census import take_census
+        from parkenv.studies.lots.census import take_census
 
         with stages(make_console(soft_wrap=True), "lots") as progress:
             rows = take_census(self.places, self.out, drive=self.drive, progress=progress)

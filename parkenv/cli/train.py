@@ -114,7 +114,7 @@ class Publish(Command, ExecutionSpec):
 
     def run(self) -> None:
         """See `Command`."""
-        from parkenv.studies.publish_model import TrainedModel, publish
+        from parkenv.studies.publish.model_folder import TrainedModel, publish
 
         if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
             raise InputError(f"--out {self.out}: exists; name a new folder")

@@ -18,7 +18,7 @@ from parkenv.lots import import_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.quality import Provenance
 from parkenv.scenarios.selection import lot_share
-from parkenv.studies.lot_census import lot_columns
+from parkenv.studies.lots.census import lot_columns
 
 LEAST_SURE = 0.3
 """Largest error probability of a place."""

@@ -12,7 +12,7 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
-from parkenv.studies.publication import CARD, FILM, MODEL, kind_of
+from parkenv.studies.publish.publication import CARD, FILM, MODEL, kind_of
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import write_summary
 from parkenv.studies.study import Progress

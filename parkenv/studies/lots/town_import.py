@@ -10,7 +10,7 @@ from parkenv.lots.draft import ImportOptions
 from parkenv.lots.osm.town import LEAST_SPACES, import_town
 from parkenv.lots.quality import Provenance
 from parkenv.show.figures.contact_sheet import save_contact_sheets
-from parkenv.studies.drivability import check_drivability
+from parkenv.studies.lots.drivability import check_drivability
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
 

@@ -13,7 +13,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import read_lot
 from parkenv.lots.quality import QualityIssue, read_provenance
-from parkenv.studies.drivability import check_drivability, manoeuvre_kinds
+from parkenv.studies.lots.drivability import check_drivability, manoeuvre_kinds
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
 from parkenv.world.lot import ParkingLot
