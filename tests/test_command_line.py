@@ -9,10 +9,14 @@ import sys
 
 import pytest
 import typer
+from annotated_types import Ge
 from command_line import parkenv
 
+from parkenv.cli import COMMANDS as LISTED
 from parkenv.cli import app
 from parkenv.cli.compare import LEVELS, Compare
+from parkenv.cli.options import command_class, field_options, made
+from parkenv.errors import InputError
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, RigName
 from planners.names import AGENTS
 from sim_sensors.camera.weather import PRESETS
@@ -72,6 +76,18 @@ def test_an_option_means_the_same_everywhere():
     assert short == {"-n": {"--episodes"}, "-o": {"--out"}, "-j": {"--jobs"}}
 
 
+@pytest.mark.parametrize("entry", [entry for entry in LISTED.values() if entry.source])
+def test_a_number_out_of_its_range_is_refused_by_every_command(entry):
+    command = command_class(entry.source)
+    for option in field_options(command):
+        if any(field.is_required() for field in option.model.model_fields.values()):
+            continue  # what is missing is said first
+        bounds = [mark.ge for mark in option.field.metadata if isinstance(mark, Ge)]
+        if bounds and option.option.parse is None:
+            with pytest.raises(InputError, match=rf"^{option.name} is -?[\d.]+, want a number of at least"):
+                made(option.model, {option.name: str(bounds[0] - 1)})
+
+
 def test_names_are_those_of_the_modules_behind_them():
     assert tuple(PRESETS) == WEATHERS
     assert set(RigName.__args__) == set(RIG_NAMES)
@@ -92,7 +108,6 @@ def test_names_are_those_of_the_modules_behind_them():
         (("compare", "--occupancy-levels", "0.5,2"), "--occupancy-levels is 2.0, want a number below 1"),
         (("compare", "--lot", "mini", "--scenario", "mini"), "--scenario and --lot exclude each other"),
         (("compare", "--day-error", "x"), "--day-error is 'x', want a number"),
-        (("park", "-n", "0"), "--episodes is 0, want a number of at least 1"),
         (("compare", "--agents", "gredy-goal"), "unknown agent 'gredy-goal'; did you mean 'greedy-goal'?"),
         (("compare", "--agents", "mdp(failre_s=1)"), "no option 'failre_s'; did you mean 'failure_s'?"),
         (

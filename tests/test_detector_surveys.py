@@ -126,15 +126,6 @@ def test_detectors_on_the_command_line(tmp_path):
             "--rig is 'sonar', want 'laser', 'stereo' or",
         ),
         (["--drives", "mini", "--sessions", 1, "--detector", "hog,none.onnx"], "none.onnx"),
-        (["--drives", "mini", "--sessions", -1], "--sessions is -1, want a number of at least 0"),
-        (
-            ["--drives", "mini", "--sessions", 1, "--every", 0],
-            "--every is 0.0, want a number of at least 0.1",
-        ),
-        (
-            ["--drives", "mini", "--sessions", 1, "--misses", -1],
-            "--misses is -1, want a number of at least 0",
-        ),
         (["--drives", "nowhere", "--sessions", 1], "unknown scenario 'nowhere'"),
     ],
 )

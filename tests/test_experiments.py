@@ -14,7 +14,7 @@ from parkenv.studies.agent_spec import AgentSpec, parse_agent, split_agents
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.runner import run
-from parkenv.studies.schemas import schemas
+from parkenv.studies.study import schemas
 from parkenv.world.scenario import KMH
 
 ROOT = Path(__file__).parents[1]

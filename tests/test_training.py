@@ -33,7 +33,7 @@ from parkenv.files.spec_file import read_tables
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.schemas import schemas
+from parkenv.studies.study import schemas
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS

@@ -18,7 +18,7 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
 from parkenv.studies.fields import Seed
-from parkenv.studies.schemas import KINDS, schemas
+from parkenv.studies.study import STUDIES, schemas
 from parkenv.studies.verify.study import Verification
 
 if TYPE_CHECKING:
@@ -159,6 +159,9 @@ def _measured(value: float | None) -> str:
     if value is None:
         return ""
     return f"{value:,.0f}" if abs(value) >= 100 else f"{value:.3g}"
+
+
+KINDS = ("scenario", *STUDIES)
 
 
 class Schema(Command):

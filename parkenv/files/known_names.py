@@ -23,7 +23,6 @@ LOCALISERS: tuple[LocaliserName, ...] = get_args(LocaliserName)
 """What corrects the pose of a survey's car; see `parkenv.mapping.localisation`."""
 MapName = Literal["empty", "right", "wrong"]
 """Maps that a commute starts from."""
-MAP_NAMES: tuple[MapName, ...] = get_args(MapName)
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
 """What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)

@@ -223,7 +223,7 @@ def _message(model: type[BaseModel], error: ValidationError, source: str | Mappi
     more = f" (and {len(details) - 1} more)" if len(details) > 1 else ""
     if not isinstance(source, str):
         name = str(first["loc"][0]) if first["loc"] else ""
-        return _fault(model, first, source.get(name, ", ".join(source.values()) or name))
+        return _fault(model, first, source.get(name) or name or ", ".join(source.values()))
     if source.startswith("--"):
         # The source is an option, which names the field itself.
         return _fault(model, first, source)
