@@ -8,7 +8,6 @@ from gymnasium.vector.utils import batch_space
 
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, Scenario, SensorModel, make_scenario
-from parkenv.belief.slot_belief import bayes_update
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
@@ -150,21 +149,6 @@ def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():
         assert lean.observation_space.contains(less)
         for name, value in less.items():
             np.testing.assert_array_equal(more[name], value)
-
-
-@pytest.mark.parametrize("observation", ["full", "local"])
-def test_equal_seeds_give_equal_batches_of_any_size(observation):
-    def run(n, seed):
-        envs = make_batch(n, "street", observation=observation, max_episode_steps=LIMIT)
-        seen = [envs.reset(seed=seed)[0]]
-        rng = np.random.default_rng(0)
-        seen += [envs.step(rng.integers(0, 5, 8)[:n])[0] for _ in range(80)]
-        name = "p_occupied" if observation == "full" else "local"
-        return np.array([s[name] for s in seen])
-
-    np.testing.assert_array_equal(run(8, 3), run(8, 3))
-    np.testing.assert_array_equal(run(8, 3)[:, :5], run(5, 3))
-    assert (run(8, 3) != run(8, 4)).any()
 
 
 def test_gymnasium_s_own_batch_of_single_environments_says_the_same():
@@ -357,7 +341,3 @@ def test_wrong_use_is_refused():
         with pytest.raises(InputError, match=rf"actions\[1\] is {wrong}, want a number from 0 to 4"):
             envs.step(np.array([0, wrong]))
     np.testing.assert_array_equal(envs._searches.records, before, err_msg="a refused step changes nothing")
-
-
-def test_looks_are_bayes_rule():
-    assert bayes_update(0.5, False, 0.9, 0.2) == pytest.approx(0.1 * 0.5 / (0.1 * 0.5 + 0.8 * 0.5))
