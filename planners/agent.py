@@ -112,7 +112,7 @@ class SearchAgent(ABC, Generic[Memory]):
     def _predict_one(
         self, observation: Observation, memory: Memory | None
     ) -> tuple[NDArray[np.int64], Memory]:
-        belief = SlotBelief.of_observation(observation)
+        belief = belief_for_decision(observation)
         if memory is None:
             memory = self.begin(observation, belief)
         return np.asarray(self.decide(observation, belief, memory), dtype=np.int64), memory
@@ -132,6 +132,13 @@ class SearchAgent(ABC, Generic[Memory]):
         """
         del observation, action, memory
         return PlanPreview()
+
+
+def belief_for_decision(observation: Observation) -> SlotBelief:
+    """Return the belief that an agent decides on; a car of a guidance system keeps to the slot reserved for it."""
+    belief = SlotBelief.of_observation(observation)
+    is_guided = "reserved" in observation and observation["reserved"].min() >= 0
+    return belief.with_reservation(observation["reserved"]) if is_guided else belief
 
 
 def require_observations(name: str, problem: SearchProblem) -> None:

@@ -146,9 +146,7 @@ def test_what_is_observed_last_holds_even_if_it_was_excluded():
     """A guidance system's word is final until its next one: what it withdraws is taken, not free."""
     _, near, before = forecast_of(10, decay_rate=0.0)
     day, slots = DayBelief(before, near), np.arange(10)
-    for reserved in (3, 7, 2):
-        before = before.decay(5.0).update(slots, slots != reserved)
-        # Bayes' rule cannot turn a certain state round.
-        before.p_observed[:] = before.p_occupied[:] = slots != reserved
-        day.update(before.observations)
-        np.testing.assert_allclose(day.p_occupied(before.time), slots != reserved, atol=1e-9)
+    for slot in (3, 7, 2):
+        guided = before.decay(5.0 + slot).with_reservation((slots == slot).astype(np.int8))
+        day.update(guided.observations)
+        np.testing.assert_allclose(day.p_occupied(guided.time), slots != slot, atol=1e-9)

@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 import parkenv
+from parkenv import SensorModel, make_scenario
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.world.demand import (
     ConstantTime,
@@ -60,6 +62,24 @@ def test_reports_arrive_after_their_delay():
     assert known[0.0] > known[30.0] > known[45.0] >= known[60.0]
 
 
+def test_what_a_car_is_told_at_its_arrival_counts_as_an_observation_then():
+    """Bayes' rule with the error rates of the old reports gives the belief that the car begins with."""
+    sensor = SensorModel(hit_rate=0.9, false_alarm_rate=0.2)
+    for scenario in (make_scenario("campus"), make_scenario("campus", sensor_model=sensor)):
+        fleet = Fleet(scenario, TWO, drivers=[DriverKind(knows="shared", shares=True)])
+        viewed, _ = second_arrives(fleet)
+        belief = SlotBelief.of_observation(fleet.observation(1))
+        told = belief.observations
+        assert 0 < len(told.slots) <= len(viewed)
+        assert (told.time == 0.0).all()
+        again = SlotBelief.of_forecast(belief.forecast, belief.decay_rate).update(told.slots, *told[2:])
+        if scenario.sensor_model.perfect:
+            np.testing.assert_allclose(again.p_occupied, belief.p_occupied, atol=1e-5)
+        else:
+            same = (again.p_occupied > belief.forecast) == (belief.p_occupied > belief.forecast)
+            assert same[told.slots].mean() > 0.9
+
+
 def test_many_reports_wait_for_their_delay():
     demand = Demand(PoissonArrivals(400.0, 36000.0, 43200.0), ExponentialTime(600.0), ConstantTime(600.0))
     kinds = [DriverKind(policy=POLICIES["random"], knows="shared", shares=True)]
@@ -89,11 +109,12 @@ def test_reservations_are_exclusive_and_cost_the_least_in_total():
     fleet.reset(0)
     while (car := fleet.next_decision()) is not None:
         cars = np.flatnonzero(fleet.cars["state"] == 1)
-        reserved = fleet.cars["reserved"][cars]
-        assert len(set(reserved)) == len(cars)
-        assert (reserved >= 0).all()
-        observation = fleet.observation(car)
-        assert np.flatnonzero(observation["p_occupied"] == 0.0).tolist() == [fleet.cars["reserved"][car]]
+        each = np.array([fleet.observation(int(one))["reserved"] for one in cars])
+        assert (each.sum(axis=1) == 1).all()
+        assert each.sum(axis=0).max() == 1
+        reserved, observation = each.argmax(axis=1), fleet.observation(car)
+        assert fleet.observation_space.contains(observation)
+        assert (observation["belief"].reshape(4, -1)[1] > 0.0).all(), "the belief is the car's own"
         if len(cars) > 1:
             together += 1
             cost = np.array([fleet._time_to_slots(int(one)) for one in cars])

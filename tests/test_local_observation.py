@@ -15,6 +15,7 @@ from parkenv.envs.local_observation import LocalObservation
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
 from parkenv.world.lot import MOVES, PARK
+from parkenv.world.sensor_model import SensorModel
 
 K = 4
 
@@ -151,6 +152,42 @@ def test_the_best_free_slot_is_remembered_until_it_is_seen_taken():
             if over:
                 break
     assert remembered > 10
+
+
+class Replay(gym.Env):
+    """A search that was recorded, without its world."""
+
+    def __init__(self, env, observations):
+        self.observation_space, self.action_space = env.observation_space, env.action_space
+        self.scenario = env.unwrapped.scenario.public()
+        self.scenarios = (self.scenario,)
+        self.observations = iter(observations)
+
+    def reset(self, *, seed=None, options=None):
+        return next(self.observations), {}
+
+    def step(self, action):
+        return next(self.observations), 0.0, False, False, {}
+
+
+@pytest.mark.parametrize("sensor", [SensorModel(), SensorModel(8.0, hit_rate=0.9, false_alarm_rate=0.2)])
+def test_it_is_computed_from_observations_alone(sensor):
+    """A recorded search gives what a batch computes from the tables of its searches."""
+    scenario = make_scenario("mini", sensor_model=sensor)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    batch = gym.make_vec(
+        "parkenv/Search-v2", 1, "vector_entry_point", scenario=scenario, observation="local", k=K
+    )
+    rng, over = np.random.default_rng(3), False
+    recorded, local = [env.reset(seed=5)[0]], [batch.reset(seed=5)[0]["local"][0]]
+    while not over and len(recorded) < 60:
+        action = rng.choice(np.flatnonzero(recorded[-1]["action_mask"]))
+        observation, _, over, *_ = env.step(action)
+        recorded.append(observation)
+        local.append(batch.step(np.array([action]))[0]["local"][0])
+    replay = LocalObservation(Replay(env, recorded), K)
+    replayed = [replay.reset()[0], *(replay.step(0)[0] for _ in recorded[1:])]
+    np.testing.assert_array_equal([observation["local"] for observation in replayed], local)
 
 
 def test_it_has_the_same_size_on_every_lot():

@@ -250,6 +250,16 @@ class SlotBelief:
         later.p_observed[observed], later.observed_at[observed] = later.p_occupied[observed], self.time
         return later
 
+    def with_reservation(self, reserved: NDArray[np.integer]) -> Self:
+        """Return the belief of a car that takes no slot but the one reserved for it, (n_slots,): 1 there, 0 elsewhere.
+
+        To it, all other slots are taken, until the reservation changes.
+        """
+        n, closed = len(reserved), 1.0 - reserved
+        parts = np.concatenate([self.forecast, np.zeros(n), closed, np.full(n, self.time)])
+        observed = np.concatenate([np.arange(n), closed, np.ones(n), np.zeros(n)])
+        return type(self)(closed, parts, self.time, self.day_error, observed)
+
     def decay(self, seconds: float) -> Self:
         """Return the belief after some time without observations."""
         later = type(self)(

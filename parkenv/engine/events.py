@@ -54,7 +54,7 @@ from parkenv.engine.records import (
     N_ACTIONS,
     N_TERMS,
     NO_CAR,
-    OWN_KNOWLEDGE,
+    NO_SLOT,
     PARKED,
     RESERVE_KNOWLEDGE,
     SEARCHING,
@@ -169,18 +169,6 @@ def init_forecast_at(address: int) -> None:
     fleet.pending = NO_CAR
 
 
-@kernel
-def inform_reserving_at(address: int) -> None:
-    """After slots have been reserved: tell the cars that are to decide."""
-    fleet = fleet_at(address, 0)
-    fleet.reservations_stale = False
-    for i in range(fleet.n_ready):
-        number = int64s(fleet.ready)[(fleet.first_ready + i) % fleet.n_cars]
-        car = car_at(fleet.cars, number)
-        if car.knows == RESERVE_KNOWLEDGE and car.state == SEARCHING:
-            _inform(fleet, number)
-
-
 # ---- events
 
 
@@ -260,13 +248,15 @@ def _arrive(fleet: Any) -> int:
     car = car_at(fleet.cars, number)
     fleet.n_free -= 1
     car.search = int64s(fleet.free_searches)[fleet.n_free]
-    car.target, car.n_moves, car.reserved, car.informed_until = NO_CAR, 0, NO_CAR, -np.inf
+    car.target, car.n_moves, car.informed_until = NO_CAR, 0, -np.inf
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
     search.place, search.car = car.place, number
     car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
     search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
     enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)
+    if car.knows == RESERVE_KNOWLEDGE:
+        search.reserved = NO_SLOT
     car.state = SEARCHING
     fleet.n_searching += 1
     _make_ready(fleet, number)
@@ -291,9 +281,11 @@ def _reach(fleet: Any, number: int) -> None:
     observe(search)
     if car.shares:
         report_view(fleet, search)
-    if car.knows != OWN_KNOWLEDGE and car.knows != RESERVE_KNOWLEDGE:
-        inform(fleet, number)
+    inform(fleet, number)
     complete_step(search)
+    leaves = search.reserved == NO_SLOT and scenario_at(search.scenario, 0).leave_full_lot
+    if leaves and not search.over:
+        give_up(search)
     if search.over:
         _end_search(fleet, number, GAVE_UP)
     elif search.time - search.arrival >= car.patience_s:
@@ -322,10 +314,8 @@ def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None
 @inlined
 def _inform(fleet: Any, number: int) -> None:
     """Give a car what it knows beyond its own observations, and refresh its belief."""
-    car = car_at(fleet.cars, number)
-    if car.knows != OWN_KNOWLEDGE:
-        inform(fleet, number)
-        refresh_belief(search_at(car.search, 0))
+    inform(fleet, number)
+    refresh_belief(search_at(car_at(fleet.cars, number).search, 0))
 
 
 @inlined
@@ -334,7 +324,7 @@ def _depart(fleet: Any, number: int) -> None:
     shared_slot_at(fleet.slots, car.slot).car = NO_CAR
     block_lane(fleet, car.slot, fleet.time + fleet.manoeuvre_s, number)
     if car.shares:
-        report_slot(fleet, car.slot, False, 0.0)
+        report_slot(fleet, car.slot, False, 1.0, 0.0, 0.0)
     car.state, car.left_at = LEFT, fleet.time
     fleet.n_parked -= 1
     fleet.n_gone += 1
@@ -372,7 +362,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         block_lane(fleet, search.vertex, fleet.time + fleet.manoeuvre_s, number)
         car.slot = search.vertex
         if car.shares:
-            report_slot(fleet, car.slot, True, 1.0)
+            report_slot(fleet, car.slot, True, 1.0, 0.0, 1.0)
         _end_search(fleet, number, PARKED)
         _push_event(fleet, fleet.time + car.stay_s, number)
         return True

@@ -29,7 +29,6 @@ from parkenv.engine.events import (
     act_at,
     advance_at,
     begin_world_at,
-    inform_reserving_at,
     init_forecast_at,
     release_at,
 )
@@ -47,14 +46,17 @@ from parkenv.engine.records import (
     FLEET,
     LIVE_SLOT,
     NO_CAR,
+    NO_SLOT,
     REPORT,
     SEARCH,
     SEARCHING,
     SHARED_SLOT,
     STATES,
     STEP,
+    UNGUIDED,
     ScenarioRecords,
     Searches,
+    most_observed_in,
 )
 from parkenv.engine.spaces import action_number, space_of
 from parkenv.errors import InputError
@@ -141,11 +143,12 @@ class Fleet:
     at an end (*balked*), or at the limit of steps (*truncated*); the last three cost `give_up_s`. A parked car leaves
     after its stay. The world ends when all searches are over.
 
-    Knowledge reaches a driver through its belief, so every agent uses it. The live map holds the last report of each
-    slot. The guidance system knows the true state of every slot, and reserves slots anew whenever a car with `reserve`
-    decides: those with the least total time to drive and walk (`scipy.optimize.linear_sum_assignment`). To a car with
-    `reserve`, all other slots are taken; others do not know of reservations and may be first. A car that knows every
-    slot to be taken gives up, unless `leave_full_lot` is False.
+    Knowledge reaches a driver through its observations, so every agent uses it. The live map holds the last report of
+    each slot. The guidance system knows the true state of every slot, and reserves slots anew whenever a car with
+    `reserve` decides: those with the least total time to drive and walk (`scipy.optimize.linear_sum_assignment`). A car
+    with `reserve` observes which slot is its own, and takes no other; others do not know of reservations and may be
+    first. A car that knows every slot to be taken, or for which no slot is left, gives up, unless `leave_full_lot` is
+    False.
 
     Cars pass through each other, unless `manoeuvre_s` is above 0. Then a car that parks, or leaves its slot, blocks the
     lane before it for that time, and a car that stands there blocks it, too; cars that reach it wait in a queue, which
@@ -156,6 +159,7 @@ class Fleet:
 
     | Key | Space | Meaning | with |
     |-----|-------|---------|------|
+    | `reserved` | `Box(-1, 1, (n_slots,), int8)` | 1: reserved for this car; -1: it knows of none | `reserve` |
     | `leaving` | `Box(0, 1, (n_slots,), int8)` | slots in view whose cars leave soon | `leaving_soon_s` |
     | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
 
@@ -234,6 +238,10 @@ class Fleet:
         entry = None if self.demand.entry_weights else self.scenario.entry
         self._entries = lot.entry_vertices if entry is None else lot.entry_vertices[[entry]]
         self.full_belief = any(kind.policy is None for kind in self.drivers)
+        self._reserves = any(kind.knows == "reserve" for kind in self.drivers)
+        # A car may learn of every slot at once, and attempt one.
+        is_told = any(kind.knows in ("shared", "full") for kind in self.drivers)
+        self._most_observed = 1 + lot.n_slots if is_told else most_observed_in(self.scenarios)
         self.records = np.zeros(1, FLEET)
         self._record = self.records[0]
         self._address = address_of(self.records, FLEET)
@@ -377,7 +385,7 @@ class Fleet:
         """Make more SEARCH records, so that more cars can search at a time."""
         size = sum(len(one.records) for one in self._pool)
         n = min(max(_FIRST_CHUNK, size), max(len(self._cars) - size, 1))
-        searches = Searches(self._tables, n, self.full_belief)
+        searches = Searches(self._tables, n, self.full_belief, self._most_observed)
         moves = np.zeros((n, self.scenario.lot.n_vertices), np.uint8)
         searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
         self._pool.append(searches)
@@ -514,13 +522,16 @@ class Fleet:
         cars = self._cars
         members = np.flatnonzero((cars["state"] == SEARCHING) & (cars["knows"] == KNOWLEDGE.index("reserve")))
         free = np.flatnonzero(~self.taken())
-        cars["reserved"][members] = NO_CAR
+        reserved = np.full(len(members), NO_SLOT)
         if len(free):
             cost_s = np.array([self._time_to_slots(int(car))[free] for car in members])
             rows, columns = linear_sum_assignment(np.minimum(cost_s, _UNREACHABLE_S))
             reached = cost_s[rows, columns] < _UNREACHABLE_S
-            cars["reserved"][members[rows[reached]]] = free[columns[reached]]
-        inform_reserving_at(self._address)
+            reserved[rows[reached]] = free[columns[reached]]
+        for car, slot in zip(members, reserved, strict=True):
+            searches, row = self._row[int(cars["search"][car])]
+            searches.records["reserved"][row] = slot
+        self._record["reservations_stale"] = False
 
     def _time_to_slots(self, car: int) -> NDArray[np.float64]:
         """Return how long a searching car takes via each slot: step under way, drive, walk and cost, (n_slots,) s."""
@@ -537,8 +548,10 @@ class Fleet:
     @property
     def observation_space(self) -> spaces.Dict:
         """The space of a car's observations: that of `parkenv/Search-v2`, and further keys; see the class."""
-        space, lot = space_of(self.scenarios), self.scenario.lot
+        space, lot = space_of(self.scenarios, self._most_observed), self.scenario.lot
         further: dict[str, spaces.Space[Any]] = {}
+        if self._reserves:
+            further["reserved"] = spaces.Box(-1, 1, (lot.n_slots,), np.int8)
         if self.leaving_soon_s > 0.0:
             further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
         if self.sees_cars:
@@ -560,6 +573,9 @@ class Fleet:
             "day_error": searches.day_error[row].copy(),
             "action_mask": scenario.action_masks[vertex].copy(),
         }
+        if self._reserves:
+            mine = np.arange(scenario.lot.n_slots) == record["reserved"]
+            observation["reserved"] = mine.astype(np.int8) - np.int8(record["reserved"] == UNGUIDED)
         if self.leaving_soon_s > 0.0:
             observation["leaving"] = self._leaving_in_view(int(vertex))
         if self.sees_cars:

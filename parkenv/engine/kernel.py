@@ -36,12 +36,14 @@ from parkenv.engine.records import (
     N_TERMS,
     NEVER_OBSERVED,
     NO_CAR,
+    NO_SLOT,
     OBSERVED_AT,
     P_OBSERVED,
     PROCESS_BACKGROUND,
     RESIDENTS_BACKGROUND,
     SCENARIO,
     SENTINEL,
+    UNGUIDED,
     block_at,
     edge_at,
     scenario_at,
@@ -301,7 +303,7 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
     search.n_observed_free = search.n_expected_free = 0.0
     search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = 0
     search.n_last_observed_taken = search.n_step_observed = 0
-    search.remembered_slot = -1
+    search.remembered_slot, search.reserved = NO_SLOT, UNGUIDED
     _write_day_error(search)
 
 
@@ -550,7 +552,8 @@ def set_belief_of(search: Any, column: int, observed_taken: bool, p: float, time
         record.observed = True
         search.n_observed += 1
         search.n_observed_free += 0.0 if observed_taken else 1.0
-        search.n_expected_free += 1.0 - block.prior[i]
+        # Rounded as in the observation.
+        search.n_expected_free += 1.0 - np.float32(block.prior[i])
     search.n_last_observed_taken += int(observed_taken) - int(record.observed_taken)
     record.observed_taken = observed_taken
     block.p_observed[i], block.observed_at[i] = p, time

@@ -36,7 +36,7 @@ from __future__ import annotations
 
 import heapq
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -46,13 +46,18 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.compiled.memory import float64s, in_one_block, int32s, int64s
-from parkenv.engine.kernel import add_column, decay_belief, forecast_of
+from parkenv.engine.kernel import add_column, column_of, decay_belief, enter, forecast_of, set_belief_of
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
     N_ACTIONS,
     N_REGIONS,
+    OBSERVED_AT,
+    P_OBSERVED,
     SENTINEL,
+    UNGUIDED,
+    ScenarioRecords,
+    Searches,
     block_at,
     scenario_at,
     search_at,
@@ -152,7 +157,82 @@ def observe_surroundings_at(address: int, around: Surroundings, local: NDArray[n
 
 @kernel
 def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.float32]) -> None:
-    """Write the local observation; must be called after each reset and each step."""
+    """Write the local observation of a search; must be called after each reset and each step."""
+    decay_belief(search)
+    _write_local(search, around, local)
+
+
+class FollowedSearch:
+    """Computes the local observations of a search from those of `parkenv/Search-v2`, one after the other.
+
+    Args:
+        problems: the lots and goals that a search may have.
+        k: number of slots described.
+
+    Raises:
+        InputError: as of `Surroundings.of`.
+    """
+
+    def __init__(self, problems: Sequence[SearchProblem], k: int) -> None:
+        self._around = Surroundings.of(problems, k)
+        public = [problem.public() for problem in problems]
+        self._search = Searches(ScenarioRecords(public), 1, full_belief=False)
+        self._n_numbers = FIRST_NEAR + PER_NEAR * int(k)
+
+    def begin(self, observation: Mapping[str, Any], place: int = 0) -> dict[str, NDArray[Any]]:
+        """Return the local observation at the beginning of a search for the problem of index `place`."""
+        self._search.begin_outside(place, observation)
+        return self._follow(observation, True)
+
+    def observe(self, observation: Mapping[str, Any]) -> dict[str, NDArray[Any]]:
+        """Return the local observation after a step."""
+        return self._follow(observation, False)
+
+    def _follow(self, observation: Mapping[str, Any], begins: bool) -> dict[str, NDArray[Any]]:
+        local = np.empty(self._n_numbers, np.float32)
+        parts = (observation[name] for name in ("time", "p_occupied", "belief", "step_observed"))
+        follow_at(self._search.address, self._around, begins, int(observation["vertex"]), *parts, local)
+        return {"local": local, "action_mask": observation["action_mask"]}
+
+
+@kernel
+def follow_at(
+    address: int,
+    around: Surroundings,
+    begins: bool,
+    vertex: int,
+    time: NDArray[np.float32],
+    p_occupied: NDArray[np.float32],
+    belief: NDArray[np.float32],
+    step_observed: NDArray[np.float32],
+    local: NDArray[np.float32],
+) -> None:
+    """Bring a search to the state that an observation tells of, and write its local observation."""
+    search, n, most = search_at(address, 0), p_occupied.size, step_observed.size // 4
+    if begins:
+        enter(search, np.uint64(0), 0, 0.0, 0.0, vertex)
+    else:
+        search.n_steps += 1
+        if vertex != search.vertex:
+            search.previous_vertex, search.vertex = search.vertex, vertex
+    search.time = time[1]
+    for i in range(most):
+        slot = int(step_observed[i])
+        if slot >= 0:
+            p, observed_at = belief[P_OBSERVED * n + slot], belief[OBSERVED_AT * n + slot]
+            set_belief_of(search, column_of(search, slot), step_observed[most + i] == 1.0, p, observed_at)
+    for column in range(SENTINEL + 1, search.n_columns + 1):
+        block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+        block.p_occupied[k] = p_occupied[slot_at(search.slots, column).slot]
+    _write_local(search, around, local)
+
+
+@kernel
+def _write_local(search: Any, around: Surroundings, local: NDArray[np.float32]) -> None:
+    """Write the local observation of a search whose belief is up to date.
+
+    All that it reads is in observations; numbers are rounded as there.
+    """
     lot = search.place
     if search.n_steps == 0:
         _forecast_regions(search, around, lot)
@@ -161,11 +241,10 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
     row = first + search.vertex
     numbers, indices, columns = around.numbers[row], around.indices[row], around.columns
     k = columns.size // (N_MOVES + 1)
-    decay_belief(search)
     _find_columns(search, around, row)
     local[0], local[2] = numbers[0], numbers[1]
     local[1] = 1.0 - _p_occupied(search, columns[indices[0]]) if local[0] == 1.0 else 0.0
-    local[3] = _squashed(search.time - search.arrival)
+    local[3] = _squashed(np.float32(search.time - search.arrival))
     local[4] = local[5] = local[6] = 0.0
     if search.n_observed > 0:
         local[4] = search.n_observed / (search.n_observed + MANY_SLOTS)
@@ -178,7 +257,7 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
     if remembered != _NOWHERE:
         dx = around.crow_s[first + remembered, 0] - around.crow_s[row, 0]
         dy = around.crow_s[first + remembered, 1] - around.crow_s[row, 1]
-        local[11] = 1.0 - _p_occupied(search, int32s(search.columns)[remembered])
+        local[11] = 1.0 - _p_occupied(search, column_of(search, remembered))
         local[12] = _squashed(_arrival_cost_s(scenario, remembered))
         local[13] = _squashed(math.sqrt(dx * dx + dy * dy))
     for move in range(N_MOVES):
@@ -205,7 +284,7 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
             expected += none_free * (1.0 - p_taken) * worst
             none_free *= p_taken
             n_ahead += 1
-            n_observed_ahead += int(slot_at(search.slots, column).observed)
+            n_observed_ahead += int(_is_observed(search, column))
         if n_ahead > 0:
             local[at + 4] = 1.0 - none_free
             local[at + 5] = _squashed(expected + none_free * (worst + MINUTE))
@@ -216,7 +295,7 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
         if which != _NOWHERE:
             column = columns[which]
             local[at] = 1.0 - _p_occupied(search, column)
-            local[at + 1] = 1.0 if slot_at(search.slots, column).observed else 0.0
+            local[at + 1] = 1.0 if _is_observed(search, column) else 0.0
         local[at + 2], local[at + 3] = numbers[_FIRST_SLOT + i], numbers[_FIRST_SLOT + k + i]
         for move in range(N_MOVES):
             local[at + 4 + move] = 1.0 if first_move == move else 0.0
@@ -224,8 +303,17 @@ def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.fl
 
 @inlined
 def _p_occupied(search: Any, column: int) -> float:
-    """P(taken) of the slot of a column, as `decay_belief` last computed it."""
-    return float(block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)])
+    """P(taken) of the slot of a column, as last computed; 0 or 1 where a guidance system reserves slots."""
+    if search.reserved != UNGUIDED:
+        return 0.0 if slot_at(search.slots, column).slot == search.reserved else 1.0
+    p = block_at(search.blocks, column >> BLOCK_BITS).p_occupied[column & (BLOCK_SIZE - 1)]
+    return float(np.float32(p))
+
+
+@inlined
+def _is_observed(search: Any, column: int) -> bool:
+    """Return whether something is known of the slot of a column beyond the forecast."""
+    return bool(slot_at(search.slots, column).observed or search.reserved != UNGUIDED)
 
 
 @inlined
@@ -270,13 +358,17 @@ def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
     for region in range(N_REGIONS):
         free = 0.0
         for i in range(SAMPLES):
-            free += 1.0 - forecast_of(search, np.int64(around.samples[lot, region, i]))[0]
+            forecast, _ = forecast_of(search, np.int64(around.samples[lot, region, i]))
+            free += 1.0 - float(np.float32(forecast))
         search.free_by_region[region] = free / SAMPLES
 
 
 @kernel
 def _remember(search: Any, around: Surroundings, lot: int) -> None:
-    """Remember the best slot observed free, and drop it when it is observed taken."""
+    """Remember the best slot observed free, and drop it when it is observed taken; or the one that is reserved."""
+    if search.reserved != UNGUIDED:
+        search.remembered_slot = search.reserved
+        return
     scenario, columns = scenario_at(search.scenario, 0), int32s(search.columns)
     first, first_view, vertex = around.first[lot], around.first_view[lot], search.vertex
     best, least = search.remembered_slot, np.inf

@@ -15,7 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, may_have_decayed, observed_state
+from parkenv.belief.slot_belief import (
+    OBSERVED_FREE,
+    OBSERVED_TAKEN,
+    UNOBSERVED,
+    may_have_decayed,
+    observed_state,
+)
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_address, int32s, int64s, uint8s
 from parkenv.engine.kernel import belief_now
@@ -24,6 +30,7 @@ from parkenv.engine.records import (
     BLOCK_SIZE,
     N_ACTIONS,
     SENTINEL,
+    UNGUIDED,
     block_at,
     car_at,
     fleet_at,
@@ -145,13 +152,17 @@ def known_slot(search: Any, i: int) -> int:
 
 @inlined
 def p_occupied(search: Any, slot: int) -> float:
-    """Return P(taken) of an observed slot, rounded as in the observation."""
+    """Return P(taken) of an observed slot, rounded as in the observation; as `SlotBelief.with_reservation`."""
+    if search.reserved != UNGUIDED:
+        return 0.0 if slot == search.reserved else 1.0
     return float(np.float32(belief_now(search, np.int64(int32s(search.columns)[slot]))))
 
 
 @inlined
 def recent_state(search: Any, slot: int) -> int:
     """Return the state of a slot as in `SlotBelief.recent_state`, from numbers rounded as in the observation."""
+    if search.reserved != UNGUIDED:
+        return OBSERVED_FREE if slot == search.reserved else OBSERVED_TAKEN
     column = np.int64(int32s(search.columns)[slot])
     if not slot_at(search.slots, column).observed:
         return UNOBSERVED

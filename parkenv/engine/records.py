@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -149,9 +149,11 @@ SEARCH = _with_costs(
         ("scenarios", ADDRESS),
         ("n_places", np.int64),
         # Number of the car in its fleet, where slots are shared; (n_vertices,) uint8 moves to the target of its
-        # compiled policy, the last one first.
+        # compiled policy, the last one first; the slot that a guidance system has reserved for it, `NO_SLOT`, or
+        # `UNGUIDED`.
         ("car", np.int64),
         ("moves", ADDRESS),
+        ("reserved", np.int64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; the
         # record of the world: PROCESS, RECORDED_DAY, FUNCTIONS or SHARED_WORLD.
@@ -175,6 +177,8 @@ SEARCH = _with_costs(
 )
 """A running search; `costs` and `step_costs` are its costs by term, (N_TERMS,)."""
 
+NO_SLOT, UNGUIDED = -1, -2
+"""`reserved` of a search for which a guidance system has no slot, and of one without a guidance system."""
 SENTINEL = 0  # column shared by all slots without their own: they were not observed
 
 SLOT = np.dtype(
@@ -275,10 +279,9 @@ CAR = _with_costs(
         # The driver: address of the compiled policy, or 0 if Python decides; what it knows.
         ("policy", ADDRESS),
         ("knows", np.int64),
-        # Whether it reports to the live map; until when it knows that map, s; the slot reserved for it, or -1.
+        # Whether it reports to the live map; until when it knows that map, s.
         ("shares", np.bool_),
         ("informed_until", np.float64),
-        ("reserved", np.int64),
         # One of the states above; the slot, or -1; when the search ended and when the car left its slot, s since Monday
         # 00:00, infinite before.
         ("state", np.int64),
@@ -304,12 +307,18 @@ CAR = _with_costs(
 )
 """A car of the fleet; `costs` are its costs by term, (N_TERMS,)."""
 
-LIVE_SLOT = np.dtype([("time", np.float64), ("taken", np.bool_), ("p", np.float64)], align=True)
-"""A slot on the live map: time of the last report, s, before all others without one; what it says; P(taken) then."""
+_REPORTED = [
+    ("time", np.float64),
+    ("taken", np.bool_),
+    ("hit_rate", np.float64),
+    ("false_alarm_rate", np.float64),
+    ("p", np.float64),
+]
+LIVE_SLOT = np.dtype(_REPORTED, align=True)
+"""A slot on the live map: time of the last report, s, before all others without one; the observation, and its error
+rates; P(taken) then."""
 
-REPORT = np.dtype(
-    [("time", np.float64), ("slot", np.int64), ("taken", np.bool_), ("p", np.float64)], align=True
-)
+REPORT = np.dtype([("slot", np.int64), *_REPORTED], align=True)
 """A report for the live map."""
 
 STEP = np.dtype(
@@ -402,6 +411,9 @@ live_slot_at, report_at, step_at = record_at(LIVE_SLOT), record_at(REPORT), reco
 class ScenarioRecords:
     """Scenarios as records, and the arrays that the records point to: one set of tables for any number of searches.
 
+    Args:
+        scenarios: the scenarios; or problems without a world, whose searches can only be followed from outside.
+
     Attributes:
         records: (n,) of the dtype SCENARIO.
         scenarios: the scenarios.
@@ -409,14 +421,16 @@ class ScenarioRecords:
 
     """
 
-    def __init__(self, scenarios: Sequence[Scenario]) -> None:
+    def __init__(self, scenarios: Sequence[Scenario] | Sequence[SearchProblem]) -> None:
         self._kept: list[Any] = []
         self._models: list[CompiledModel] = []
-        self.scenarios = tuple(scenarios)
+        self.scenarios: tuple[Any, ...] = tuple(scenarios)
         self.records = np.zeros(len(scenarios), SCENARIO)
         for record, scenario in zip(self.records, scenarios, strict=True):
-            self._write_search(record, scenario)
-            self._write_occupancy(record, scenario)
+            self._write_problem(record, scenario)
+            record["world_kind"] = record["prior_kind"] = EXTERNAL_KIND
+            if isinstance(scenario, Scenario):
+                self._write_world(record, scenario)
         if len(scenarios) > 1:
             self._join()
         arrays = {id(array): array for array in _arrays_in(self._kept)}
@@ -451,9 +465,8 @@ class ScenarioRecords:
         self._kept.append(array)
         return address_of(array, dtype)
 
-    def _write_search(self, record: np.void, scenario: Scenario) -> None:
+    def _write_problem(self, record: np.void, scenario: SearchProblem) -> None:
         lot, masks = scenario.lot, scenario.action_masks
-        entries = lot.entry_vertices if scenario.entry is None else lot.entry_vertices[[scenario.entry]]
         starts, viewed = scenario.slots_in_view
         rates = scenario.sensor_rates
         numbers = {
@@ -462,10 +475,6 @@ class ScenarioRecords:
             "failure_s": scenario.failure_s,
             "give_up_s": scenario.give_up_s,
             "leave_full_lot": True,
-            "window_start": scenario.arrival.start_s,
-            "window_end": scenario.arrival.end_s,
-            "n_entries": len(entries),
-            "entries": self._keep(entries, np.int64),
             "edges": self._keep(scenario.edges, EDGE),
             "action_masks": self._keep(masks, np.uint8),
             "walk_s": self._keep(scenario.walk_s),
@@ -480,7 +489,11 @@ class ScenarioRecords:
         for name, value in numbers.items():
             record[name] = value
 
-    def _write_occupancy(self, record: np.void, scenario: Scenario) -> None:
+    def _write_world(self, record: np.void, scenario: Scenario) -> None:
+        entries = scenario.lot.entry_vertices
+        entries = entries if scenario.entry is None else entries[[scenario.entry]]
+        record["entries"], record["n_entries"] = self._keep(entries, np.int64), len(entries)
+        record["window_start"], record["window_end"] = scenario.arrival.start_s, scenario.arrival.end_s
         occupancy, prior = scenario.occupancy, scenario.prior or scenario.occupancy
         weekdays = [day.weekday for day in occupancy.arrival_days(scenario.arrival)]
         record["weekdays"], record["n_weekdays"] = self._keep(weekdays, np.int64), len(weekdays)
@@ -489,8 +502,6 @@ class ScenarioRecords:
             record["prior_kind"], record["prior"] = record["world_kind"], record["world"]
         elif prior.kind == PROCESS_KIND and (address := self._address_of(prior, scenario)):
             record["prior_kind"], record["prior"] = PROCESS_KIND, address
-        else:
-            record["prior_kind"] = EXTERNAL_KIND
 
     def _address_of(self, model: PriorModel, scenario: Scenario) -> int:
         """Keep the records of a model and return their address; 0 without records."""
@@ -577,9 +588,17 @@ class Searches:
         self.external_forecast[search, :, :n] = forecast.p_occupied, forecast.decay_rate
         self.day_error[search] = forecast.day_error.level, forecast.day_error.slope
 
+    def begin_outside(self, place: int, observation: Mapping[str, Any]) -> None:
+        """Let the only search be one that runs elsewhere: its place among the scenarios, and the forecast."""
+        self.records["place"] = place
+        self._find_scenarios()
+        n = self.external_forecast.shape[2]
+        self.external_forecast[0] = observation["belief"].reshape(4, -1)[[FORECAST, DECAY_RATE], :n]
+
     def scenario_of(self, search: int) -> Scenario:
         """Return the scenario of a search's episode."""
-        return self.scenarios.scenarios[int(self.records["place"][search])]
+        scenario: Scenario = self.scenarios.scenarios[int(self.records["place"][search])]
+        return scenario
 
     def _find_scenarios(self) -> None:
         """Write the addresses that follow from the places and days."""

@@ -19,11 +19,12 @@ LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no 
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 
 
-def space_of(scenarios: Sequence[SearchProblem]) -> spaces.Dict:
-    """The observation space that fits the lots of all scenarios."""
+def space_of(scenarios: Sequence[SearchProblem], most_observed: int | None = None) -> spaces.Dict:
+    """The observation space that fits the lots of all scenarios; see `Searches` for `most_observed`."""
     lots = [one.lot for one in scenarios]
     n_slots, n_vertices = max(lot.n_slots for lot in lots), max(lot.n_vertices for lot in lots)
-    return search_space(n_slots, n_vertices, most_observed_in(scenarios))
+    k = most_observed_in(scenarios) if most_observed is None else most_observed
+    return search_space(n_slots, n_vertices, k)
 
 
 def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Dict:

@@ -7,25 +7,18 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from parkenv.engine.local_observation import (
-    FIRST_NEAR,
-    PER_NEAR,
-    Surroundings,
-    local_space,
-    observe_surroundings_at,
-)
-from parkenv.envs.search import SearchEnv
+from parkenv.engine.local_observation import FollowedSearch, local_space
 
 
 class LocalObservation(
-    gym.ObservationWrapper[dict[str, Any], np.int64, dict[str, Any]], gym.utils.RecordConstructorArgs
+    gym.Wrapper[dict[str, Any], np.int64, dict[str, Any], np.int64], gym.utils.RecordConstructorArgs
 ):
     """Observe `parkenv/Search-v2` as `local` and `action_mask`.
 
-    `parkenv.engine.local_observation` describes `local`.
+    `parkenv.engine.local_observation` describes `local`. It is computed from the observations alone.
 
     Args:
-        env: `parkenv/Search-v2`, or an environment with the same observations.
+        env: `parkenv/Search-v2`, or an environment with its observations and attributes `scenarios` and `scenario`.
         k: number of slots described.
 
     Raises:
@@ -44,15 +37,21 @@ class LocalObservation(
     def __init__(self, env: gym.Env[Any, Any], k: int = 5) -> None:
         gym.utils.RecordConstructorArgs.__init__(self, k=k)
         super().__init__(env)
-        if not isinstance(env.unwrapped, SearchEnv):
+        if "step_observed" not in getattr(env.observation_space, "spaces", ()):
             raise TypeError(f"LocalObservation wraps parkenv/Search-v2, not {type(env.unwrapped).__name__}")
-        self._surroundings = Surroundings.of(env.unwrapped.scenarios, k)
+        self._followed = FollowedSearch(self.get_wrapper_attr("scenarios"), k)
         self.observation_space = local_space(k)
-        self._n_numbers = FIRST_NEAR + PER_NEAR * k
 
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """Return the local observation."""
-        local = np.empty(self._n_numbers, dtype=np.float32)
-        assert isinstance(self.env.unwrapped, SearchEnv)
-        observe_surroundings_at(self.env.unwrapped.searches.address, self._surroundings, local)
-        return {"local": local, "action_mask": observation["action_mask"]}
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Start an episode; as the environment, but with the local observation."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        scenarios, scenario = self.get_wrapper_attr("scenarios"), self.get_wrapper_attr("scenario")
+        place = next(i for i, one in enumerate(scenarios) if one is scenario)
+        return self._followed.begin(observation, place), info
+
+    def step(self, action: np.int64) -> tuple[dict[str, Any], Any, bool, bool, dict[str, Any]]:
+        """Act; as the environment, but with the local observation."""
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return self._followed.observe(observation), reward, terminated, truncated, info

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -166,15 +166,18 @@ class SearchPerceptionEnv(SensingSearchEnv):
         self.perception.reset()
         return super().reset(seed=seed, options=options)
 
-    def _advance(self, action: int) -> tuple[Any, ...]:
+    def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
+        return self._step_with_sensors
+
+    def _step_with_sensors(self, address: int, action: int) -> tuple[Any, ...]:
         """Apply the action, measure on the way, and update the belief from the measurements."""
         state = self._state
-        act_at(self._address, action)
+        act_at(address, action)
         state.extend_path()
         if not state.parked:
             captures = self._sampler.sample_step(state, self._before)
-            self.perception.update_belief(self._address, state.vertex, captures)
-        result: tuple[Any, ...] = finish_step_at(self._address)
+            self.perception.update_belief(address, state.vertex, captures)
+        result: tuple[Any, ...] = finish_step_at(address)
         return result
 
     def _newest(self) -> TimedCapture | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
@@ -205,7 +206,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _make_search(self) -> None:
         self.searches = Searches(ScenarioRecords(self.scenarios), 1, full_belief=True)
-        self._address = self.searches.address
+        self._address, self._needs_python = self.searches.address, self.searches.needs_python
         self._state = SearchState(self.searches)
         # Bound methods that copy the parts of an observation: looking them up takes a tenth of a step.
         self._copies = (
@@ -228,7 +229,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             return
         self._place, self.scenario = place, self.scenarios[place]
         self._name = self.scenario.name
-        self._step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
+        self._step = self._stepper()
         self._copy_mask = self._copy_masks[place]
         self.close()
 
@@ -297,8 +298,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
         number = action_number(action)
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
-        reward, over, vertex, info = read_step(self._name, self._advance(number))
-        if self.searches.needs_python:
+        reward, over, vertex, info = read_step(self._name, self._step(self._address, number))
+        if self._needs_python:
             raise_error()
         state = self._state
         if vertex != state.path[-1]:
@@ -308,10 +309,11 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self.render()
         return self._observation(vertex), reward, over, False, info
 
-    def _advance(self, action: int) -> tuple[Any, ...]:
-        """Act, observe, and return the numbers named by `parkenv.engine.kernel.STEP_RESULT`."""
-        result: tuple[Any, ...] = self._step(self._address, action)
-        return result
+    def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
+        """Return what acts and observes: (address of the search, action) -> numbers named by `STEP_RESULT`."""
+        step: Callable[[int, int], tuple[Any, ...]]
+        step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
+        return step
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""

@@ -17,7 +17,13 @@ from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
-from planners.agent import Observation, PlanPreview, SearchAgent, require_observations
+from planners.agent import (
+    Observation,
+    PlanPreview,
+    SearchAgent,
+    belief_for_decision,
+    require_observations,
+)
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
 from planners.belief.planning_graph import SLOT, BeliefSnapshot, PathBuffers, path_buffers, set_slots
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
@@ -263,7 +269,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:
         """Return the path that the agent would drive if it observed only taken slots."""
-        belief = SlotBelief.of_observation(observation)
+        belief = belief_for_decision(observation)
         # The lot does not change, so it need not be copied.
         imagined = copy.deepcopy(memory, {id(memory.near): memory.near})
         problem, vertex, path = self.problem, int(observation["vertex"]), list[int]()

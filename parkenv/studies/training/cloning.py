@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from stable_baselines3.common.on_policy_algorithm import OnPolicyAlgorithm
 
-from parkenv.envs.local_observation import LocalObservation
+from parkenv.engine.local_observation import FollowedSearch
 from parkenv.errors import InputError
 from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.simulate import EpisodeResult, Observer, Step, simulate
@@ -76,7 +76,7 @@ class Demonstrations:
         for place, its in zip(places, seeds_by_scenario(seeds, len(places)), strict=True):
             planner = make_agent(agent, place)
             env = gym.make("parkenv/Search-v2", scenario=place, max_episode_steps=MAX_STEPS)
-            recorder = _DecisionRecorder(LocalObservation(env, k))
+            recorder = _DecisionRecorder(FollowedSearch([place], k))
             for seed in its:
                 simulate(env, planner, seed, (recorder,))
             finished += recorder.finished
@@ -93,10 +93,10 @@ class _DecisionRecorder(Observer):
     """Record (local observation, action mask, action, reward) of each decision, for searches that are not truncated.
 
     Args:
-        local: computes the local observation from the environment's state.
+        local: computes the local observations.
     """
 
-    def __init__(self, local: LocalObservation) -> None:
+    def __init__(self, local: FollowedSearch) -> None:
         self._local = local
         self.finished: list[list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]]] = []
 
@@ -104,13 +104,13 @@ class _DecisionRecorder(Observer):
         """Start a search."""
         del env
         self._decisions: list[tuple[NDArray[np.float32], NDArray[np.int8], int, float]] = []
-        self._now = self._local.observation(observation)["local"]
+        self._now = self._local.begin(observation)["local"]
 
     def on_step(self, step: Step) -> None:
         """Record the decision."""
         mask = step.observation["action_mask"]
         self._decisions.append((self._now, mask, int(step.action), step.reward))
-        self._now = self._local.observation(step.next_observation)["local"]
+        self._now = self._local.observe(step.next_observation)["local"]
 
     def on_end(self, result: EpisodeResult) -> None:
         """Keep the search unless it was truncated."""

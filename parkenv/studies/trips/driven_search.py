@@ -61,9 +61,12 @@ class DrivenSearchEnv(SearchEnv):
         self.executor.begin(state.key, state.world, state.vertex, state.time)
         return result
 
-    def _advance(self, action: int) -> tuple[Any, ...]:
+    def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
+        return self._drive_step
+
+    def _drive_step(self, address: int, action: int) -> tuple[Any, ...]:
         """Execute the action, and advance the world by the time it took."""
-        state, address = self._state, self._address
+        state = self._state
         vertex, begin = state.vertex, state.time
         possible = self.scenario.action_masks[vertex, action] == 1
         if possible and action == PARK:
