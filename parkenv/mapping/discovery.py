@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_whole
 from parkenv.world.lot import FARTHEST, ParkingLot
 
 _TURN_M = 3.0  # m, distance equivalent to a quarter turn when cars are compared
@@ -60,10 +60,8 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
         raise InputError(
             f"cars have shape {cars.shape}, want (n, 3) of finite numbers, at most {FARTHEST:.0e}"
         )
-    if not (math.isfinite(reach) and reach > 0.0):
-        raise InputError(f"reach is {reach} m, want a finite number above 0")
-    if least < 1:
-        raise InputError(f"least is {least} cars, want at least 1")
+    require_number("reach", reach, above=0.0)
+    require_whole("least", least, least=1)
     # Twice the angle is the same for nose-in and nose-out.
     turn = _TURN_M / 2.0 * np.stack([np.cos(2.0 * cars[:, 2]), np.sin(2.0 * cars[:, 2])], axis=1)
     poses = np.column_stack([cars[:, :2], turn])

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.perception.slot_filter import P_FREE, P_OCCUPIED
 
 Float32Array = NDArray[np.float32]
@@ -97,10 +97,8 @@ class OccupancyGrid:
         Raises:
             InputError: a number outside its range.
         """
-        if not 0.0 < half_angle < math.pi / 2:
-            raise InputError(f"half_angle is {half_angle} rad, want between 0 and π/2")
-        if not reach > 0.0:
-            raise InputError(f"reach is {reach} m, want above 0")
+        require_number("half_angle", half_angle, above=0.0, below=math.pi / 2)
+        require_number("reach", reach, above=0.0)
         polar = np.asarray(cars, dtype=np.float64).reshape(-1, 2)
         x, y = self._cells(*camera)
         self._add(

@@ -10,7 +10,7 @@ from scipy.special import expit, logit
 from scipy.stats import beta
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
 from parkenv.world.occupancy.process import Arrival, Forecast, PriorModel
 from parkenv.world.week import DAY_S, HOUR_S
@@ -94,8 +94,7 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
     """
     if not len(log.time):
         raise InputError("the map holds no session, want at least one")
-    if not 0.0 < confidence < 1.0:
-        raise InputError(f"confidence is {confidence}, want between 0 and 1")
+    require_number("confidence", confidence, above=0.0, below=1.0)
     taken, known = (log.occupied & log.known).astype(np.float64), log.known.astype(np.float64)
     lot_mean = (taken.sum() + 1.0) / (known.sum() + 2.0)
     weight = np.ones(len(log.time)) if time is None else _alike(log.time, time)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import require_one_of
 from parkenv.files.known_names import LOCALISERS
 from parkenv.mapping.scan_matching import ScanMatcher
 from parkenv.perception.range_scan import RangeScan
@@ -26,8 +26,7 @@ def make_locate(name: str, lot: ParkingLot) -> Callable[[FloatArray], Located]:
     Raises:
         InputError: an unknown name.
     """
-    if name not in LOCALISERS:
-        raise InputError(f"localise is {name!r}, want one of {', '.join(LOCALISERS)}")
+    require_one_of("localise", name, LOCALISERS)
     if name == "none":
         return lambda odometry: odometry
     matcher = ScanMatcher(lot)

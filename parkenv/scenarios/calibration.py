@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.scenario import Scenario
 
@@ -35,15 +35,10 @@ class Calibration:
     speed_limit: float  # speed limit on the lanes, m/s
 
     def __post_init__(self) -> None:
-        for name in ("v_drive", "failure_s", "manoeuvre_s", "trips", "speed_limit"):
-            value = getattr(self, name)
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            least = "at least 0" if name in ("failure_s", "manoeuvre_s") else "above 0"
-            in_range = number and (value >= 0.0 if "at" in least else value > 0.0) and value <= MAX_VALUE
-            if not in_range:
-                raise InputError(
-                    f"calibration {name} is {value!r:.60}, want a finite number {least}, at most {MAX_VALUE:,}"
-                )
+        for name in ("v_drive", "trips", "speed_limit"):
+            require_number(f"calibration {name}", getattr(self, name), above=0.0, most=MAX_VALUE)
+        for name in ("failure_s", "manoeuvre_s"):
+            require_number(f"calibration {name}", getattr(self, name), least=0.0, most=MAX_VALUE)
 
     def applied(self, scenario: Scenario) -> Scenario:
         """Return the scenario with the measured speed and failure cost, under the same name."""

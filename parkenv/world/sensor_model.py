@@ -144,8 +144,7 @@ class SensorModel:
 
 def _require_rates(hit_rate: float, false_alarm_rate: float) -> None:
     for name, rate in (("hit_rate", hit_rate), ("false_alarm_rate", false_alarm_rate)):
-        if not 0.0 <= rate <= 1.0:
-            raise InputError(f"{name} is {rate}, want a probability")
+        require_number(name, rate, least=0.0, most=1.0)
     if hit_rate <= false_alarm_rate:
         raise InputError(
             f"hit_rate {hit_rate} is not above false_alarm_rate {false_alarm_rate}: "

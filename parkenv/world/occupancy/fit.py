@@ -16,7 +16,7 @@ from scipy.special import expit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.world.occupancy.day_error_fit import fit_day_error
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.week import HOUR_S
@@ -256,8 +256,7 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
     Raises:
         InputError: no two observations of a slot on one day within `max_gap_s`.
     """
-    if not prior_sd > 0:
-        raise InputError(f"prior_sd is {prior_sd}, want a number > 0")
+    require_number("prior_sd", prior_sd, above=0.0)
     pairs = log.intervals(max_gap_s)
     if not pairs.slot.size:
         raise InputError(f"{log.source}: no two observations of a slot on one day within {max_gap_s:g} s")

@@ -11,14 +11,14 @@ from dataclasses import dataclass, field
 from datetime import date, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_one_of
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import Days, SlotDays
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
@@ -126,8 +126,7 @@ class OccupancyLog:
             raise InputError(f"{self.source}: days: want different ISO dates in order")
         if not np.all((second >= 0) & (second < DAY_S)):
             raise InputError(f"{self.source}: second: want seconds of the day in [0, 86400)")
-        if not self.max_gap_s > 0:
-            raise InputError(f"max_gap_s is {self.max_gap_s}, want seconds > 0")
+        require_number("max_gap_s", self.max_gap_s, above=0.0, finite=False)
         order = np.lexsort((second, slot, day))
         record = (day * len(self.slot_ids) + slot)[order]
         stands = np.append((np.diff(record) > 0) | (np.diff(second[order]) > 0), True)
@@ -265,8 +264,7 @@ class OccupancyLog:
         Returns:
             (m,) float64; NaN for a slot that was not observed in these hours.
         """
-        if kind not in ("weekday", "weekend"):
-            raise InputError(f"class of day is {kind!r}, want weekday or weekend")
+        require_one_of("class of day", kind, get_args(DayClass))
         used = self.weekend == (kind == "weekend")
         if days is not None:
             used &= days

@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, require_number
 from parkenv.files.versioned_json import JsonFormat
 from parkenv.world.occupancy import kernel as kernels
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -364,8 +364,7 @@ class OccupancyProcess(OccupancyModel):
             demand: (168,) float64, logit, by hour of the week.
             mean_stay_s: s, mean parking duration, the same for all slots and hours.
         """
-        if not 0 < mean_stay_s < math.inf:
-            raise InputError(f"mean_stay_s is {mean_stay_s}, want seconds > 0")
+        require_number("mean_stay_s", mean_stay_s, above=0.0)
         attraction, demand = np.asarray(attraction, float), np.asarray(demand, float)
         for name, logits in (("attraction", attraction), ("demand", demand)):
             # Beyond this, the exponential exceeds the floating-point range.
@@ -453,8 +452,7 @@ class OccupancyProcess(OccupancyModel):
 
         Scaling the arrival rates shifts every slot's attraction by the same logit.
         """
-        if not 0 < target < 1:
-            raise InputError(f"target mean occupancy is {target}, want a number between 0 and 1")
+        require_number("target mean occupancy", target, above=0.0, below=1.0)
 
         def scaled(shift: float) -> OccupancyProcess:
             return replace(self, arrival_factor=self.arrival_factor * math.exp(shift))

@@ -17,7 +17,7 @@ from scipy.special import logit
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
 from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
@@ -225,10 +225,7 @@ class RecordedOccupancy(OccupancyModel):
             if mapping.shape != walk.shape or mapping.min() < 0 or mapping.max() >= m:
                 raise InputError(f"mapping: want ({walk.size},) indices of log slots from 0 to {m - 1}")
             object.__setattr__(self, "mapping", mapping)
-        if self.forecast_from not in FORECAST_FROM:
-            raise InputError(
-                f"forecast_from is {self.forecast_from!r}, want one of {', '.join(FORECAST_FROM)}"
-            )
+        require_one_of("forecast_from", self.forecast_from, FORECAST_FROM)
         if self.replay_from is None and self.forecast_from != "others":
             raise InputError(f"forecast_from is {self.forecast_from!r}, want replay_from with it")
 
