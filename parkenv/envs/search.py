@@ -301,9 +301,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         reward, over, vertex, info = read_step(self._name, self._step(self._address, number))
         if self._needs_python:
             raise_error()
-        state = self._state
-        if vertex != state.path[-1]:
-            state.path.append(vertex)
+        path = self._state.path
+        if vertex != path[-1]:
+            path.append(vertex)
         self._over = over
         if self.render_mode == "human":
             self.render()
