@@ -92,7 +92,7 @@ READS = {
         "parkenv/studies/training/checkpoint.py",
     ),
     "pickle.load": (),
-    "pickle.loads": ("parkenv/compiled/jit.py",),
+    "pickle.loads": ("parkenv/compiled/code_files.py",),
 }
 
 

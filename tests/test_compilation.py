@@ -16,13 +16,18 @@ from numba.core.dispatcher import Dispatcher
 import parkenv
 import planners
 import sim_sensors
-from parkenv.compiled import jit as compilation
-from parkenv.compiled.jit import cache_folder, compiled, seconds_spent
+from parkenv.compiled import code_files, source_key
+from parkenv.compiled.clock import seconds_spent
+from parkenv.compiled.code_files import cache_folder
+from parkenv.compiled.jit import compiled
 
 ROOT = Path(__file__).parents[1]
 COMPILES, CANNOT_KEEP = "compiling functions for this machine", "compiled functions cannot be kept in"
 OWN = {
-    "callee.py": "from parkenv.compiled.jit import compiled\n@compiled\ndef f(x):\n    return x + 1.0\n",
+    "callee.py": (
+        "from parkenv.compiled.jit import compiled\n@compiled\ndef f(x):\n"
+        "    if x < 0.0:\n        raise ValueError('x is below 0')\n    return x + 1.0\n"
+    ),
     "package/__init__.py": "from .rates import RATE\n",
     "package/rates.py": "RATE = 2.0\n",
     "caller.py": (
@@ -31,6 +36,14 @@ OWN = {
     ),
 }
 """A user's own modules: g(1.0) is 4."""
+
+PROGRAM = """
+from numba.core import event
+from caller import g
+with event.install_recorder("numba:compile") as compiled:
+    print(g(1.0))
+print(sum(of.is_start for _, of in compiled.buffer))
+"""
 
 
 @pytest.fixture
@@ -49,22 +62,28 @@ def write(path, text):
 
 
 def start(own, cache, **environment):
-    """A new process that prints g(1.0)."""
+    """A new process that prints g(1.0), and how many functions it has compiled."""
     variables = {
         **os.environ, "PYTHONPATH": os.pathsep.join([str(own), str(ROOT)]), "PYTHONDONTWRITEBYTECODE": "1",
         "NUMBA_CACHE_DIR": str(cache), **environment,
     }  # fmt: skip
-    program = [sys.executable, "-c", "from caller import g; print(g(1.0))"]
+    program = [sys.executable, "-c", PROGRAM]
     return subprocess.Popen(
         program, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=own.parent
     )
 
 
-def result(process):
+def ended(process):
     """What it printed, and its lines on standard error."""
     output, errors = process.communicate(timeout=120)
     assert process.returncode == 0, errors
-    return float(output), errors.splitlines()
+    return *map(float, output.split()), errors.splitlines()
+
+
+def result(process):
+    """The value that it printed, and its lines on standard error."""
+    value, _, told = ended(process)
+    return value, told
 
 
 def kept(folder):
@@ -101,12 +120,13 @@ def test_a_folder_that_cannot_be_written_costs_time_and_is_told_of_once(own, tmp
     assert "NUMBA_CACHE_DIR" in told[1]
 
 
-def test_processes_that_compile_at_once_leave_code_that_is_whole(own, tmp_path):
+def test_of_processes_that_need_the_same_code_one_compiles_it(own, tmp_path):
     cache = tmp_path / "cache"
-    together = [start(own, cache) for _ in range(3)]
-    assert [result(process)[0] for process in together] == [4.0] * 3
-    assert result(start(own, cache)) == (4.0, [])
-    assert not list(cache.rglob("*.part"))
+    together = [ended(process) for process in [start(own, cache) for _ in range(3)]]
+    assert [value for value, *_ in together] == [4.0] * 3
+    assert sum(compiled for _, compiled, _ in together) == 2
+    assert ended(start(own, cache)) == (4.0, 0, [])
+    assert all(path.suffix == ".nbc" for path in cache.rglob("*") if path.is_file())
     # A disk that was full, or a machine that lost its power, leaves less than was written.
     for path in kept(cache):
         path.write_bytes(path.read_bytes()[:100])
@@ -139,7 +159,7 @@ def caller(own, tmp_path, monkeypatch):
 
 
 def test_seconds_of_compiling_and_loading_are_counted_and_no_others(caller, monkeypatch, caplog):
-    compilation._announce.cache_clear()
+    code_files._announce.cache_clear()
     before = seconds_spent()
     with caplog.at_level(logging.WARNING, logger="parkenv"):
         caller.g(1.0)
@@ -154,6 +174,16 @@ def test_seconds_of_compiling_and_loading_are_counted_and_no_others(caller, monk
     before = seconds_spent()
     again.g(1.0)
     assert 0.0 < seconds_spent() - before < compiling, "loading is counted, and takes less"
+
+
+def test_a_function_can_be_called_by_compiled_code_and_by_python_and_both_get_its_errors(caller):
+    for _ in ("compiled", "loaded"):
+        assert (caller.g(1.0), caller.f(1.0)) == (4.0, 2.0)
+        for function in (caller.g, caller.f):
+            with pytest.raises(ValueError, match="x is below 0"):
+                function(-1.0)
+        del sys.modules["callee"]
+        importlib.reload(caller)
 
 
 def test_a_module_that_is_edited_and_imported_again_runs_its_new_code(caller, own):
@@ -187,7 +217,7 @@ def test_every_compiled_function_is_kept_under_a_key_of_all_functions_that_it_ca
     """Else an edit of the callee would go unnoticed."""
     checked = 0
     for function in compiled_functions():
-        sources = compilation._closure(Path(function.py_func.__code__.co_filename).resolve())
+        sources = source_key._closure(Path(function.py_func.__code__.co_filename).resolve())
         for name in function.py_func.__code__.co_names:
             called = function.py_func.__globals__.get(name)
             if isinstance(called, Dispatcher):

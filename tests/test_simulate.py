@@ -7,7 +7,7 @@ import pytest
 from gymnasium.wrappers import TimeLimit
 
 from parkenv import make_scenario
-from parkenv.compiled.jit import seconds_spent
+from parkenv.compiled.clock import seconds_spent
 from parkenv.studies.simulate import EpisodeResult, Observer, Step, simulate
 from planners import make_agent
 

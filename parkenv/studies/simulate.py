@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import gymnasium as gym
 
-from parkenv.compiled.jit import seconds_spent
+from parkenv.compiled.clock import seconds_spent
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.scan_observation import ScanObservation
 from parkenv.envs.sensors import SearchSensorsEnv
