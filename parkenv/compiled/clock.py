@@ -5,24 +5,41 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
+
+from numba.core import event
 
 
-class _Clock:
+class _Clock(event.Listener):  # type: ignore[misc]
+    """Counts the time of everything that numba compiles, once where functions compile each other."""
+
     total_s = 0.0
-    depth = 0
+    _depth = 0
+    _begun = 0.0
+
+    def on_start(self, event: Any = None) -> None:  # noqa: ARG002 - numba's interface
+        if self._depth == 0:
+            self._begun = time.perf_counter()
+        self._depth += 1
+
+    def on_end(self, event: Any = None) -> None:  # noqa: ARG002
+        self._depth -= 1
+        if self._depth == 0:
+            self.total_s += time.perf_counter() - self._begun
+
+
+_CLOCK = _Clock()
+event.register("numba:compile", _CLOCK)
 
 
 @contextmanager
 def counted() -> Iterator[None]:
-    """Count the seconds of a block, once where blocks are nested."""
-    begun = time.perf_counter()
-    _Clock.depth += 1
+    """Count the seconds of a block, such as one that loads compiled code."""
+    _CLOCK.on_start()
     try:
         yield
     finally:
-        _Clock.depth -= 1
-        if _Clock.depth == 0:
-            _Clock.total_s += time.perf_counter() - begun
+        _CLOCK.on_end()
 
 
 def seconds_spent() -> float:
@@ -30,4 +47,4 @@ def seconds_spent() -> float:
 
     Subtract the difference between two calls from a measured time to exclude compilation.
     """
-    return _Clock.total_s
+    return _CLOCK.total_s
