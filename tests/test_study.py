@@ -113,8 +113,9 @@ def test_an_interrupted_run_keeps_its_rows_and_is_resumed(tmp_path, monkeypatch)
 def test_a_killed_run_is_resumed_to_the_same_files(tmp_path, number):
     out = tmp_path / "killed"
     script = (
-        "import sys, time; from pathlib import Path; from toy_study import Toy\n"
+        "import signal, sys; from pathlib import Path; from toy_study import Toy\n"
         "from parkenv.cli.stop_signals import stop_signals; from parkenv.studies.runner import run\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where tests run in the background\n"
         "with stop_signals(): run(Toy(numbers=400, pause_s=0.02, jobs=2), Path(sys.argv[1]))\n"
     )
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
