@@ -186,6 +186,18 @@ def test_a_function_can_be_called_by_compiled_code_and_by_python_and_both_get_it
         importlib.reload(caller)
 
 
+def test_damaged_files_are_compiled_again(caller, tmp_path):
+    assert caller.g(1.0) == 4.0
+    files = sorted(tmp_path.rglob("*.nbc"))
+    assert files
+    for number, file in enumerate(files):
+        content = bytearray(file.read_bytes())
+        content[len(content) * (number + 1) // (len(files) + 1)] ^= 0xFF
+        file.write_bytes(content)
+    del sys.modules["callee"]
+    assert importlib.reload(caller).g(1.0) == 4.0
+
+
 def test_a_module_that_is_edited_and_imported_again_runs_its_new_code(caller, own):
     assert caller.g(1.0) == 4.0
     (own / "caller.py").write_text(OWN["caller.py"].replace("RATE * f(x)", "RATE * f(x) + 0.5"))

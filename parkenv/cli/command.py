@@ -6,6 +6,7 @@ import inspect
 import re
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
+from functools import cached_property
 from inspect import Parameter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -163,34 +164,31 @@ class _CommandPage(_Page, TyperCommand):
     """A command; its class is imported when its options are needed."""
 
     source = ""
-    _its: type[Command] | None = None
     _parameters: list[Any]
-    _options: Mapping[str, str]
+    _options: Mapping[str, str] | None = None
 
-    @property
-    def its(self) -> type[Command]:
+    @cached_property
+    def command_class(self) -> type[Command]:
         """The class of the command."""
-        if self._its is None:
-            from parkenv.cli.options import command_class
+        from parkenv.cli.options import command_class
 
-            self._its = command_class(self.source)
-        return self._its
+        return command_class(self.source)
 
     @property
     def text(self) -> str:
         """See `_Page`."""
-        return f"{self.help}\n\n{inspect.cleandoc(self.its.__doc__ or '')}".strip()
+        return f"{self.help}\n\n{inspect.cleandoc(self.command_class.__doc__ or '')}".strip()
 
     @property
     def examples(self) -> str:  # type: ignore[override]
         """Command lines."""
-        return self.its.examples
+        return self.command_class.examples
 
     @property
     def params(self) -> list[Any]:
         """The parameters that the fields of the command's class are."""
-        if self._its is None:
-            self._options, self._parameters = _parameters(self.its)
+        if self._options is None:
+            self._options, self._parameters = _parameters(self.command_class)
         return self._parameters
 
     @params.setter
@@ -199,8 +197,9 @@ class _CommandPage(_Page, TyperCommand):
 
     def invoke(self, ctx: Any) -> None:
         """Run the command."""
+        assert self._options is not None
         given = {self._options[name]: value for name, value in ctx.params.items() if value not in (None, ())}
-        self.its.of(given).run()
+        self.command_class.of(given).run()
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments; an unknown option is answered by the nearest known one."""

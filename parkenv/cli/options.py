@@ -166,7 +166,7 @@ _Values = dict[tuple[str, ...], tuple[FieldOption, object]]  # of options and wh
 
 
 def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[FieldOption]:
-    """Yield the options of a specification and of its tables; its own go before those of the same name in a table.
+    """Yield the options of a specification and of its tables; its own replace those of the same name in a table.
 
     What a command itself declares is an option anyway; other fields if they have an `Option`.
     """
@@ -197,7 +197,8 @@ def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[Fie
 def made(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
     """Return a specification as options make it.
 
-    An option of a table, such as a scenario's, changes each table of that name; options of a whole table come first.
+    An option of a table in a list, such as that of scenarios, changes every table of the list; options that set whole
+    tables, such as `--scenario`, are applied first.
 
     Args:
         model: its class.

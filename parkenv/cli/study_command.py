@@ -147,7 +147,7 @@ class Run(RunCommand, ExecutionSpec):
     """Settings that the file leaves out have the defaults of its command.
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
-    command: compare (the default), commute, fleet, benchmark, survey, demo or train.
+    command: compare (the default), commute, fleet, benchmark, survey, detectors, demo, calibrate, verify or train.
     """
 
     examples = """

@@ -31,6 +31,7 @@ from parkenv.compiled.source_key import source_key
 
 _KEPT_DAYS = 30  # age at which compiled code of other versions of a module is deleted
 _WAIT_S = 120.0  # for another process that compiles the same; a stopped one is not waited for longer
+_DIGEST_BYTES = 32
 _LOGGER = logging.getLogger("parkenv")
 
 
@@ -86,13 +87,16 @@ class CodeFiles:
                 lock.release()
 
     def load_overload(self, types: tuple[Any, ...], context: Any) -> Any:
-        """Return numba's `CompileResult` for the types, or None if there is no file, or one that is cut off."""
+        """Return numba's `CompileResult` for the types, or None if there is no file, or a damaged one."""
         try:
-            parts = pickle.loads(self._path(types).read_bytes())
-        except (OSError, EOFError, pickle.UnpicklingError):
+            content = self._path(types).read_bytes()
+        except OSError:
+            return None
+        data = content[_DIGEST_BYTES:]
+        if content[:_DIGEST_BYTES] != hashlib.sha256(data).digest():
             return None
         context.refresh()  # numba's own functions
-        return CompileResult._rebuild(context, *parts)
+        return CompileResult._rebuild(context, *pickle.loads(data))
 
     def save_overload(self, types: tuple[Any, ...], code: Any) -> None:
         """Write a `CompileResult`; warn once per process if that is not possible."""
@@ -103,7 +107,8 @@ class CodeFiles:
         beside = path.with_name(f"{path.name}.{os.getpid()}.part")
         try:
             self._make_folder()
-            beside.write_bytes(dumps(code._reduce()))
+            data = dumps(code._reduce())
+            beside.write_bytes(hashlib.sha256(data).digest() + data)
             beside.replace(path)
         except OSError as error:
             _warn_of_unwritable_cache(error.strerror or str(error))

@@ -27,8 +27,8 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
             self._finalized = True
 
     def _make(self) -> None:
-        self._made = True
         super()._finalize_final_module()
+        self._made = True
         for variable in self._final_module.global_variables:
             environment = lookup_environment(variable.name)
             if environment is not None:

@@ -49,7 +49,7 @@ class Replay(Protocol):
         """Return what runs again.
 
         Raises:
-            InputError: the run has not the chosen agents, seeds or days, or a table is damaged.
+            InputError: the run lacks a chosen agent, seed or day, or a table is damaged.
         """
 
 
@@ -113,9 +113,9 @@ class RunFolder:
             else:
                 page = Page(f"parkenv {kind}", tables=tables_of(summary, {"rows": "Results"}))
             return cls(path, summary, kind, page)
+        except InputError:
+            raise
         except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
-            if isinstance(error, InputError):
-                raise
             raise InputError(f"{damaged}: {error!r}") from error
 
     def spec(self) -> Study | None:
@@ -163,7 +163,7 @@ def write_report(
         The page, and all notes on it.
 
     Raises:
-        InputError: the run has not the chosen searches, or the page cannot be written.
+        InputError: the run lacks a chosen search, or the page cannot be written.
     """
     options = options or ReportOptions()
     path = out or run.path / PAGE

@@ -1,4 +1,4 @@
-"""Record searches step by step for the replay of a report."""
+"""The searches of a run, run again for the replay of its page."""
 
 from __future__ import annotations
 
@@ -112,8 +112,8 @@ def replay(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
             not checked.
     """
     records = [case.runner().run(encounter.seed, moments=True) for case in encounter.cases]
-    first, one = encounter.cases[0], records[-1]
-    scenario, start = first.scenario, one.arrival.time
+    one_case, last = encounter.cases[0], records[-1]
+    scenario, start = one_case.scenario, last.arrival.time
     searches, moments = [], {0.0}
     for case, record in zip(encounter.cases, records, strict=True):
         search = recorded(record)
@@ -126,16 +126,16 @@ def replay(encounter: Encounter, counted: Mapping[tuple[Any, ...], float]) -> Re
     moments |= set(np.arange(0.0, min(longest, STEADY_S), 1.0).tolist())
     world = {
         "scenario": scenario.name,
-        "setting": {k: v for k, v in first.columns.items() if k != "agent"},
+        "setting": {k: v for k, v in one_case.columns.items() if k != "agent"},
         "seed": encounter.seed,
-        "day": one.arrival.day,
+        "day": last.arrival.day,
         "arrival_s": round(start, 3),
         "goal": scenario.goal,
         "view_range_m": round(float(scenario.sensor_model.view_range), 2),
         "v_walk": round(float(scenario.v_walk), 4),
-        "sensors": first.rig,
-        "forecast": _bytes(one.forecast),
-        **_truth(one.world, scenario.lot.n_slots, start, sorted(moments)),
+        "sensors": one_case.rig,
+        "forecast": _bytes(last.forecast),
+        **_truth(last.world, scenario.lot.n_slots, start, sorted(moments)),
         "searches": searches,
     }
     differences = [
