@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -87,9 +88,10 @@ def save_film(
 
 def _palette(image: NDArray[np.uint8], n: int) -> Image.Image:
     """Return a palette of n colours: the most frequent ones exactly, and others that cover the rest."""
-    seen, counts = np.unique(image.reshape(-1, 3), axis=0, return_counts=True)
-    frequent = seen[np.argsort(-counts, kind="stable")[: n // 2]]
-    spread = Image.fromarray(image).quantize(n - len(frequent), Image.Quantize.MAXCOVERAGE).getpalette() or []
+    picture = Image.fromarray(image)
+    counted: Any = picture.getcolors(picture.width * picture.height)
+    frequent = [color for _, color in sorted(counted, key=lambda seen: (-seen[0], seen[1]))[: n // 2]]
+    spread = picture.quantize(n - len(frequent), Image.Quantize.MAXCOVERAGE).getpalette() or []
     palette = Image.new("P", (1, 1))
-    palette.putpalette([*frequent.ravel().tolist(), *spread])
+    palette.putpalette([*chain.from_iterable(frequent), *spread])
     return palette
