@@ -26,7 +26,7 @@ except ImportError as error:
 from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_whole
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import MAX_CARS, Demand, Headways
 from parkenv.world.lot import ACTIONS
@@ -109,6 +109,7 @@ class _CarsAsAgents:
     def _begin(self, seed: int | None) -> list[str]:
         """Begin the next world, and return its agents: the first of a seed, or the next one of the last seed."""
         if seed is not None:
+            require_whole("seed", seed)
             self._seed, self._episode = int(seed), 0
         elif self._seed is None:
             self._seed = int(np.random.SeedSequence().generate_state(1)[0])
@@ -144,7 +145,8 @@ class _CarsAsAgents:
         return None
 
     def close(self) -> None:
-        """Close the window, if open."""
+        """Close the window, if open, and end the world."""
+        self.agents = []
         if self._renderer is not None:
             self._renderer.window.close()
             self._renderer = None
@@ -367,10 +369,15 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
         """Carry out the actions of the cars that have to decide, and go on to the next tick.
 
         Raises:
+            ResetNeeded: no car searches.
             InputError: a car that has to decide has no action, or a wrong one; the world has not changed.
         """
         if not self.agents:
-            return {}, {}, {}, {}, {}
+            raise ResetNeeded("no car searches: call reset()")
+        if not isinstance(actions, Mapping):
+            raise InputError(
+                f"actions are {actions!r:.60}, want one of each car that has to decide, by its name"
+            )
         for agent in self.agents:
             if agent not in self._deciding:
                 continue

@@ -96,6 +96,10 @@ class SearchAgent(ABC, Generic[Memory]):
             The action, () or (n_envs,) int64, and the state to pass to the next call.
         """
         del deterministic
+        if "vertex" not in observation:
+            raise InputError(
+                f'observation holds {", ".join(observation)}, want one of parkenv/Search-v2 with observation="full"'
+            )
         if np.ndim(observation["vertex"]) == 0:
             if episode_start is not None and np.any(episode_start):
                 state = None

@@ -197,7 +197,6 @@ def test_demand_decides_which_cars_there_are():
         ({"max_cycles": 0}, "max_cycles is 0"),
         ({"render_mode": "ansi"}, "render_mode is 'ansi'"),
         ({"scenario": "moon"}, "moon"),
-        ({"speed": 3}, "speed"),
         ({"knows": "all"}, r"DriverKind\.knows is 'all'"),
         ({"manoeuvre_s": -1}, "manoeuvre_s is -1"),
     ],

@@ -71,7 +71,7 @@ def test_world_keys_accept_big_seeds_and_tell_them_apart(seed, episode):
 
 
 def test_world_key_refuses_negative_seeds():
-    with pytest.raises(InputError, match=r"seed is -1, want an integer >= 0"):
+    with pytest.raises(InputError, match=r"seed is -1, want a whole number of at least 0"):
         world_key(-1, 0)
 
 

@@ -465,7 +465,6 @@ def test_wrong_bands_are_named(wrong, message):
         ({"v_drive": float("nan")}, "v_drive"),
         ({"failure_s": -2.0}, "failure_s"),
         ({"failure_s": "10"}, "failure_s"),
-        ({"failure_cost": 3.0}, "no field 'failure_cost'; known: .*failure_s"),
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
         ({"sensor_model": 3}, "SensorModel"),

@@ -311,7 +311,6 @@ def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
         ({"scenario": []}, "scenario is an empty sequence"),
         ({"scenario": ["mini", 3]}, "scenario is a int"),
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
-        ({"failure_cost": 3.0}, "no field 'failure_cost'"),
         ({"render_mode": "rgb_array"}, "render_mode is 'rgb_array'"),
     ],
 )

@@ -6,13 +6,12 @@ generators", OOPSLA 2014), applied once for each of stream, slot and index.
 """
 
 import math
-import operator
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.jit import compiled
-from parkenv.errors import InputError
+from parkenv.errors import require_whole
 
 # One stream for each purpose, so that their numbers are independent.
 ARRIVAL_STREAM = 0
@@ -121,9 +120,8 @@ def world_key(seed: int, episode: int) -> np.uint64:
 
 
 def _with_words(state: np.uint64, name: str, given: int) -> np.uint64:
-    number = operator.index(given)
-    if number < 0:
-        raise InputError(f"{name} is {number}, want an integer >= 0")
+    require_whole(name, given)
+    number = int(given)
     n_words = max(1, -(-number.bit_length() // _WORD_BITS))
     for word in (n_words, *((number >> (_WORD_BITS * i)) & _WORD for i in range(n_words))):
         state = np.uint64(_absorbed(state, np.uint64(word)))

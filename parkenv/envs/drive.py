@@ -215,7 +215,7 @@ length and width over the car's |
         )
         self._half = np.array([0.5 * self.vehicle.length, 0.5 * self.vehicle.width])
         self._state: DriveState | None = None
-        self._episode = 0
+        self._episode, self._closed = 0, False
         self._renderer: DriveRenderer | None = None
 
     @property
@@ -278,8 +278,8 @@ length and width over the car's |
     def step(self, action: ArrayLike) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Apply an action for 0.1 s; see the class."""
         state = self.state
-        if state.over:
-            raise gym.error.ResetNeeded("the episode has ended: call reset()")
+        if state.over or self._closed:
+            raise gym.error.ResetNeeded("the episode has ended, or was closed: call reset()")
         acceleration, steering = _command(action)
         vehicle, limits, space = state.vehicle, self.vehicle.limits, self._space
         touched = 0
@@ -369,14 +369,15 @@ length and width over the car's |
         }
 
     def close(self) -> None:
-        """Close the window, if open."""
+        """Close the window, if open, and end the episode."""
+        self._closed = True
         if self._renderer is not None:
             self._renderer.window.close()
             self._renderer = None
 
     def _enter(self, state: DriveState) -> None:
         """Set up the collision world and the constant parts of the observation."""
-        task = state.task
+        self._closed, task = False, state.task
         movers: list[tuple[ObstacleKind, FloatArray]] = []
         if self._n_movers:
             self._others = YieldingTraffic(self.tasks.lot, self._traffic, state.key, self.tasks.slot_cars)

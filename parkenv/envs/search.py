@@ -18,10 +18,16 @@ from parkenv.engine.kernel import (
     step_exact_at,
     step_noisy_at,
 )
+from parkenv.engine.local_observation import (
+    NEAR_SLOTS,
+    Surroundings,
+    local_space,
+    observe_surroundings_at,
+)
 from parkenv.engine.records import ScenarioRecords, Searches
 from parkenv.engine.spaces import action_number, space_of
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
 from parkenv.world.lot import ACTIONS
 from parkenv.world.occupancy.python_functions import raise_error
@@ -30,6 +36,9 @@ from parkenv.world.scenario import Scenario
 if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
+OBSERVATIONS = ("full", "occupancy", "local")
+BELIEF_PARTS = ("belief", "step_observed")
+"""What `occupancy` leaves out."""
 _REBUILT = {
     "searches", "scenario", "_state", "_address", "_copies", "_place", "_step", "_copy_mask", "_copy_masks",
     "_seeded_with", "_begun", "_over",
@@ -118,7 +127,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     ## Episode end
     - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
       observed. Then the search ends with the give-up penalty `give_up_s`, the time to park elsewhere.
-    - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`).
+    - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`); Gymnasium's wrapper
+      says so again at every step until the next reset.
+    - `close()` ends the episode, too.
 
     `info` holds the episode's metrics so far: drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m,
     walked_m, failed_parks, slots_passed (slots whose vertex the car stopped at) and parked. The step count of a
@@ -128,13 +139,12 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     With several scenarios, each episode is in one of them, drawn from the seed and the number of the episode: the same
     seed gives the same places, whatever the agent does. `info["place"]` names the scenario after each reset and step,
     and `env.unwrapped.scenario` is it. The observation space fits the largest lot: in smaller ones, slots past the last
-    are taken (1) and never observed. `parkenv.envs.local_observation.LocalObservation` has the same size on every lot.
+    are taken (1) and never observed. `observation="local"` has the same size on every lot.
 
     ```python
     >>> import gymnasium as gym
     >>> import parkenv
-    >>> from parkenv.envs.local_observation import LocalObservation
-    >>> env = LocalObservation(gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"]))
+    >>> env = gym.make("parkenv/Search-v2", scenario=["campus", "street", "mini"], observation="local")
     >>> [env.reset(seed=seed)[1]["place"] for seed in range(5)]
     ['mini', 'campus', 'street', 'campus', 'campus']
 
@@ -149,7 +159,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
       (.geojson), with a week and days as in busy real car parks; a folder of such files; or a sequence of
       these. See `parkenv.make_scenarios`.
     - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`.
-    - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise an error.
+    - `observation`: `full`, as above; `occupancy`, the same without `belief` and `step_observed`; or `local`, a `Dict`
+      of `local` and `action_mask` that describes the car's surroundings, see `parkenv.engine.local_observation`.
+    - `k`: number of slots that `local` describes, 5 if None.
+    - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise a TypeError.
 
     ```python
     >>> import gymnasium as gym
@@ -192,14 +205,30 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     scenario: Scenario
 
     def __init__(
-        self, scenario: ScenarioSources = "campus", render_mode: str | None = None, **changes: Any
+        self,
+        scenario: ScenarioSources = "campus",
+        render_mode: str | None = None,
+        observation: str = "full",
+        k: int | None = None,
+        **changes: Any,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
+        require_one_of("observation", observation, OBSERVATIONS)
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.render_mode = render_mode
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = space_of(self.scenarios)
+        self._without: tuple[str, ...] = ()
+        self._around: Surroundings | None = None
+        if observation == "occupancy":
+            self._without = BELIEF_PARTS
+            self.observation_space = spaces.Dict(
+                {name: one for name, one in self.observation_space.items() if name not in BELIEF_PARTS}
+            )
+        elif observation == "local":
+            k = NEAR_SLOTS if k is None else k
+            self._around, self.observation_space = Surroundings.of(self.scenarios, k), local_space(k)
         self._vertices = list(np.arange(max(one.lot.n_vertices for one in self.scenarios)))
         self._renderer: SearchRenderer | None = None
         self._make_search()
@@ -231,7 +260,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self._name = self.scenario.name
         self._step = self._stepper()
         self._copy_mask = self._copy_masks[place]
-        self.close()
+        self._close_window()
 
     @property
     def state(self) -> SearchState:
@@ -295,7 +324,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def step(self, action: np.int64 | int) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """Drive along an edge, or attempt to park; see the class."""
         if self._over:
-            raise gym.error.ResetNeeded("the search has not begun, or is over: call reset()")
+            raise gym.error.ResetNeeded("the search has not begun, is over, or was closed: call reset()")
         number = action_number(action)
         # A wrapper's time limit may end the episode at any step, so every step has the metrics.
         reward, over, vertex, info = read_step(self._name, self._step(self._address, number))
@@ -351,14 +380,22 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return {(ord(key),): action for action, key in enumerate("wsad ")}
 
     def close(self) -> None:
-        """Close the window, if open."""
+        """Close the window, if open, and end the episode."""
+        self._over = True
+        self._close_window()
+
+    def _close_window(self) -> None:
         if self._renderer is not None:
             self._renderer.window.close()
             self._renderer = None
 
     def _observation(self, vertex: int) -> dict[str, Any]:
+        if self._around is not None:
+            local = np.empty(self.observation_space["local"].shape or (), np.float32)
+            observe_surroundings_at(self._address, self._around, local)
+            return {"local": local, "action_mask": self._copy_mask[vertex]()}
         time, p_occupied, belief, step_observed, day_error = self._copies
-        return {
+        observation = {
             "vertex": self._vertices[vertex],
             "time": time(),
             "p_occupied": p_occupied(),
@@ -367,3 +404,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "day_error": day_error(),
             "action_mask": self._copy_mask[vertex](),
         }
+        for name in self._without:
+            del observation[name]
+        return observation

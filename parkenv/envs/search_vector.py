@@ -24,8 +24,10 @@ from parkenv.engine.batch import (
     copy_fields,
     first_wrong,
 )
+from parkenv.engine.local_observation import NEAR_SLOTS
 from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
-from parkenv.errors import InputError
+from parkenv.envs.search import BELIEF_PARTS, OBSERVATIONS
+from parkenv.errors import InputError, require_whole
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
@@ -34,7 +36,6 @@ from parkenv.world.occupancy.python_functions import raise_error
 if TYPE_CHECKING:
     from sim_sensors.rig import SensorRig
 
-OBSERVATIONS = ("full", "occupancy", "local", "scan")
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
 # Gymnasium's names of the masks that say which searches have a metric.
@@ -218,6 +219,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
         which = self._chosen(options)
+        if seed is not None and not isinstance(seed, (Sequence, np.ndarray)):
+            require_whole("seed", seed)
         if seed is None or isinstance(seed, (int, np.integer)):
             super().reset(seed=None if seed is None else int(seed))
         seeds = [seed] * self.num_envs if seed is None or isinstance(seed, (int, np.integer)) else list(seed)
@@ -243,6 +246,11 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
         return self._observations(), {"place": self._names[self.place_of], "_place": which}
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """End all episodes: there is no step before the next reset."""
+        del kwargs
+        self._begun = False
 
     def get_state(self) -> tuple[NDArray[Any], ...]:
         """Return a copy of the state of all searches, for `set_state`."""
@@ -408,15 +416,15 @@ def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int
     if observation == "full":
         return BeliefObserver
     if observation == "occupancy":
-        return lambda tables, n: BeliefObserver(tables, n, without=("belief", "step_observed"))
+        return lambda tables, n: BeliefObserver(tables, n, without=BELIEF_PARTS)
     if observation == "local":
-        return lambda tables, n: LocalObserver(tables, n, 5 if k is None else k)
+        return lambda tables, n: LocalObserver(tables, n, NEAR_SLOTS if k is None else k)
     if observation == "scan":
         from parkenv.envs.scan_observation import SCANS
         from parkenv.envs.scan_observer import ScansObserver
 
         return lambda tables, n: ScansObserver(tables, n, SCANS if k is None else k)
-    raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
+    raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}, scan")
 
 
 def _require_count(name: str, value: Any, most: int) -> None:

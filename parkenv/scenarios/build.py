@@ -73,7 +73,8 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
             forecast (a `DayError`, or a number, its level): 0 for days that are as forecast.
 
     Raises:
-        InputError: an unknown name or field, or an invalid file; the message is one line.
+        InputError: an unknown scenario, an invalid value or file; the message is one line.
+        TypeError: an unknown field.
 
     Examples:
         >>> [scenario.name for scenario in make_scenarios(["campus", "mini"])]

@@ -556,11 +556,11 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
     if str(source) in SCENARIO_NAMES:
         return [ScenarioSpec.read(_PACKAGED / f"{source}.toml").of_file("")]
     path = Path(source)
-    if is_there(path) and path.is_dir():
+    if str(source) and is_there(path) and path.is_dir():
         return _in_folder(path)
     if path.suffix in LOT_SUFFIXES and (path.suffix != ".json" or _is_geojson(path)):
         return [lot_scenario(path)]
-    if path.suffix in (".toml", ".json") or is_there(path):
+    if str(source) and (path.suffix in (".toml", ".json") or is_there(path)):
         return [ScenarioSpec.read(path)]
     raise InputError(
         f"unknown scenario {str(source)!r}, and no such file; {nearest(str(source), SCENARIO_NAMES)}"

@@ -184,7 +184,8 @@ def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
             )
         return ScanObservation(env, k)
     k = getattr(agent, "local_k", None)
-    return env if k is None else LocalObservation(env, k)
+    is_local = "local" in getattr(env.observation_space, "spaces", ())
+    return env if k is None or is_local else LocalObservation(env, k)
 
 
 def _prepare(agent: Agent, env: gym.Env[Any, Any]) -> None:

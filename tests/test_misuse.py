@@ -1,0 +1,143 @@
+"""What every environment answers to arguments that it does not have, and to calls out of order."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.error import ResetNeeded
+
+from parkenv import InputError, lot_v0, make_agent, make_scenario, simulate
+from parkenv.envs.local_observation import LocalObservation
+from parkenv.envs.sb3 import SearchVecEnv
+
+OPTIONS = {
+    "parkenv/Search-v2": {"scenario": "mini"},
+    "parkenv/SearchSensors-v2": {"scenario": "mini", "observation": "scan"},
+    "parkenv/SearchPerception-v2": {"scenario": "mini"},
+    "parkenv/Drive-v1": {"lot": "mini"},
+}
+EVERY_ID = pytest.mark.parametrize("name", OPTIONS)
+EVERY_LOT = pytest.mark.parametrize("make", [lot_v0.raw_env, lot_v0.parallel_env])
+
+
+def test_every_registered_id_is_tested():
+    assert set(OPTIONS) == {name for name in gym.registry if name.startswith("parkenv/")}
+
+
+@EVERY_ID
+def test_an_unknown_keyword_is_a_type_error_as_of_any_python_function(name):
+    """TorchRL's `GymEnv` asks every environment for `frameskip`, and understands nothing else."""
+    for make in (gym.make, lambda *a, **k: gym.make_vec(a[0], 2, **k)):
+        with pytest.raises(TypeError, match=r"\(\) got an unexpected keyword argument 'frameskip'"):
+            make(name, frameskip=4, **OPTIONS[name])
+
+
+def test_other_makers_say_it_alike_and_name_what_is_near():
+    for make in (lot_v0.env, lot_v0.parallel_env, lambda **k: make_scenario("mini", **k)):
+        with pytest.raises(TypeError, match=r"unexpected keyword argument 'failure_cost'.*'failure_s'"):
+            make(failure_cost=3.0)
+    with pytest.raises(TypeError, match="frameskip"):
+        SearchVecEnv(2, "mini", frameskip=4)
+
+
+@pytest.mark.parametrize("name", ["parkenv/Search-v2", "parkenv/SearchPerception-v2"])
+def test_the_local_observation_by_name_is_that_of_the_wrapper(name):
+    options = {"scenario": "mini"} | ({"weather": "sunny"} if "Perception" in name else {})
+    named = gym.make(name, observation="local", k=3, **options)
+    wrapped = LocalObservation(gym.make(name, **options), k=3)
+    rng = np.random.default_rng(0)
+    ours, theirs = named.reset(seed=3)[0], wrapped.reset(seed=3)[0]
+    for _ in range(8):
+        assert named.observation_space.contains(ours)
+        for key, value in theirs.items():
+            np.testing.assert_array_equal(ours[key], value)
+        action = int(rng.choice(np.flatnonzero(ours["action_mask"][:4])))
+        (ours, *results), (theirs, *expected) = named.step(action), wrapped.step(action)
+        assert results == expected
+
+
+@pytest.mark.parametrize("mode", ["sync", "async", "vector_entry_point"])
+@pytest.mark.parametrize("observation", ["full", "occupancy", "local"])
+def test_batches_of_every_kind_have_the_observations(mode, observation):
+    envs = gym.make_vec("parkenv/Search-v2", 2, mode, scenario="mini", observation=observation)
+    one = gym.make("parkenv/Search-v2", scenario="mini", observation=observation)
+    batch, single = envs.reset(seed=4)[0], one.reset(seed=4)[0]
+    assert set(batch) == set(single)
+    for key, value in single.items():
+        np.testing.assert_array_equal(batch[key][0], value)
+    envs.close()
+
+
+def test_a_copy_of_a_state_holds_the_local_observation():
+    env = gym.make("parkenv/Search-v2", scenario="mini", observation="local").unwrapped
+    env.reset(seed=1)
+    env.step(3)
+    state, ahead = env.get_state(), [env.step(3)[0]["local"] for _ in range(4)]
+    env.set_state(state)
+    np.testing.assert_array_equal([env.step(3)[0]["local"] for _ in range(4)], ahead)
+
+
+def test_a_planner_says_what_it_needs_of_a_local_observation():
+    env = gym.make("parkenv/Search-v2", scenario="mini", observation="local")
+    with pytest.raises(InputError, match="observation holds local, action_mask, want"):
+        simulate(env, make_agent("mdp", env.unwrapped.scenario), seed=0)
+
+
+@EVERY_ID
+def test_calls_out_of_order_are_refused(name):
+    env = gym.make(name, **OPTIONS[name])
+    action = np.zeros(2, np.float32) if "Drive" in name else 3
+    with pytest.raises(ResetNeeded):
+        env.step(action)
+    env.reset(seed=0)
+    env.step(action)
+    env.close()
+    with pytest.raises(ResetNeeded):
+        env.step(action)
+    env.reset(seed=0)
+    env.step(action)
+
+
+@pytest.mark.parametrize("name", ["parkenv/Search-v2", "parkenv/SearchSensors-v2"])
+def test_a_closed_batch_has_no_episodes(name):
+    envs = gym.make_vec(name, 2, "vector_entry_point", **OPTIONS[name])
+    envs.reset(seed=0)
+    envs.close()
+    with pytest.raises(ResetNeeded):
+        envs.step(np.zeros(2, int))
+
+
+@EVERY_LOT
+def test_a_lot_has_no_cars_before_it_begins_and_after_its_end(make):
+    env = make(scenario="mini", cars=2)
+    act = {"car_0": 3} if make is lot_v0.parallel_env else 3
+    for wrong in (act, {}, None):
+        with pytest.raises(ResetNeeded):
+            env.step(wrong)
+    env.reset(seed=0)
+    for wrong in (None, 7, "a"):
+        with pytest.raises(InputError, match="action"):
+            env.step(wrong)
+    env.step(act)
+    env.close()
+    with pytest.raises(ResetNeeded):
+        env.step(act)
+
+
+@EVERY_LOT
+@pytest.mark.parametrize("seed", [1.5, -1, "1", True])
+def test_the_seed_of_a_lot_is_a_whole_number(make, seed):
+    with pytest.raises(InputError, match="seed is"):
+        make(scenario="mini", cars=2).reset(seed=seed)
+
+
+@pytest.mark.parametrize("seed", [1.5, -1, [1.5, 2], [1, -2]])
+def test_the_seeds_of_a_batch_are_whole_numbers(seed):
+    with pytest.raises(InputError, match="seed is"):
+        gym.make_vec("parkenv/Search-v2", 2, scenario="mini").reset(seed=seed)
+
+
+def test_an_empty_name_is_not_the_working_folder(tmp_path, monkeypatch):
+    (tmp_path / "one.toml").write_text('lot = "mini"\n')
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match="unknown scenario ''"):
+        make_scenario("")
