@@ -282,6 +282,46 @@ def test_what_is_handed_out_is_not_live_unless_asked():
         assert (rewards == before[1]).all() == copy
 
 
+@pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
+@pytest.mark.parametrize("kept", [0, 1, 2, 6])
+def test_held_observations_stay_and_equal_those_that_are_overwritten(mode, kept):
+    """Memory that the caller let go of is used again; views and slices count as held."""
+    rng = np.random.default_rng(kept)
+    copied, live = (
+        make_batch(8, ["mini", grid_lot(3, 8)], copy=copy, autoreset_mode=mode, max_episode_steps=9)
+        for copy in (True, False)
+    )
+    parts = {0: lambda o: o, 1: lambda o: {k: v[2:5] for k, v in o.items()}, 2: lambda o: dict(o)}
+    held, saved = [], None
+
+    def check(ours, theirs):
+        assert list(ours) == list(theirs)
+        for name, value in theirs.items():
+            np.testing.assert_array_equal(ours[name], value, err_msg=name)
+        part = parts[int(rng.integers(3))]
+        held.append((part(ours), {name: value.copy() for name, value in part(theirs).items()}))
+        del held[: max(len(held) - kept, 0)]
+        for mine, then in held:
+            for name, value in then.items():
+                np.testing.assert_array_equal(mine[name], value, err_msg=name)
+
+    check(copied.reset(seed=1)[0], live.reset(seed=1)[0])
+    done = np.zeros(8, dtype=bool)
+    for step in range(60):
+        if mode is AutoresetMode.DISABLED and done.any():
+            options = {"options": {"reset_mask": done}}
+            check(copied.reset(**options)[0], live.reset(**options)[0])
+        if step == 20:
+            saved = live.get_state()
+        if step in (33, 47):
+            copied.set_state(saved)
+            live.set_state(saved)
+        actions = rng.integers(0, 5, 8)
+        ours, theirs = copied.step(actions), live.step(actions)
+        check(ours[0], theirs[0])
+        done = ours[2] | ours[3]
+
+
 def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
     scenario = make_scenario(city_lot(10_000))
     envs = make_batch(2, scenario, observation="local")

@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import int32s, int64s, prefetch, uint8s
-from parkenv.engine.kernel import arrive, init_prior, refresh_belief, step_cost_s, take_step, write_clock
+from parkenv.engine.belief_memory import BeliefMemory
+from parkenv.engine.kernel import (
+    arrive,
+    init_prior,
+    refresh_belief,
+    step_cost_s,
+    sum_of_costs,
+    take_step,
+    write_belief,
+    write_clock,
+)
 from parkenv.engine.local_observation import Surroundings, local_space, observe_surroundings
 from parkenv.engine.records import (
     N_ACTIONS,
@@ -106,6 +116,14 @@ class Observer(ABC):
             steps: results to write.
         """
 
+    def renew(self) -> None:
+        """Let later steps leave what `observations` returned as it is."""
+        return
+
+    def observations(self) -> dict[str, NDArray[Any]]:
+        """Return the observations for a caller who may keep them, if `renew` is called before the next step."""
+        return {name: array.copy() for name, array in self.seen.items()}
+
     def get_state(self) -> tuple[NDArray[Any], ...]:
         """Return a copy of everything that changes as arrays of numbers, for `set_state`."""
         return tuple(array.view(np.uint8) if array.dtype.names else array for array in self.searches.save())
@@ -127,11 +145,37 @@ class BeliefObserver(Observer):
         space = {k: v for k, v in space_of(tables.scenarios).items() if k not in without}
         kept = tuple(name for name in ("p_occupied", "belief", "step_observed", "day_error") if name in space)
         super().__init__(tables, n, spaces.Dict(space), full_belief=True, kept=kept)
+        self._memory, self._moved = BeliefMemory(self.searches), False
+        self._beliefs = tuple(name for name in ("p_occupied", "belief") if name in space)
+        self._find_beliefs()
+
+    def _find_beliefs(self) -> None:
+        for name in self._beliefs:
+            self.seen[name] = getattr(self.searches, name).reshape(len(self.searches.records), -1)
+
+    def renew(self) -> None:
+        """See `Observer`."""
+        if self._memory.renew():
+            self._moved = True
+            self._find_beliefs()
+
+    def observations(self) -> dict[str, NDArray[Any]]:
+        """See `Observer`."""
+        hand_out, beliefs = self._memory.hand_out, self._beliefs
+        return {name: hand_out(name) if name in beliefs else seen.copy() for name, seen in self.seen.items()}
+
+    def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
+        """See `Observer`."""
+        self.renew()
+        super().set_state(state)
+        self._memory.forget()
 
     def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
         """See `Observer`."""
+        self._memory.begin(fresh)
         vertex, time = self.seen["vertex"], self.seen["time"]
-        step_with_belief(self.address, actions, fresh, idle, limit, steps, vertex, time)
+        step_with_belief(self.address, self._moved, actions, fresh, idle, limit, steps, vertex, time)
+        self._moved = False
 
 
 class LocalObserver(Observer):
@@ -187,6 +231,7 @@ def advance(search: Any, e: int, action: int, fresh: bool, limit: int, steps: St
 @kernel
 def step_with_belief(
     address: int,
+    moved: bool,
     actions: IntArray,
     fresh: BoolArray,
     idle: BoolArray,
@@ -195,11 +240,13 @@ def step_with_belief(
     vertex: IntArray,
     time: NDArray[np.float32],
 ) -> None:
-    """Step, update the full belief, and write vertex and time."""
+    """Step, update the full belief, and write vertex and time; `moved` if the beliefs stand in other memory."""
     for e in range(len(actions)):
+        search = search_at(address, e)
+        if moved:
+            write_belief(search)
         if idle[e]:
             continue
-        search = search_at(address, e)
         advance(search, e, actions[e], fresh[e], limit, steps)
         if fresh[e]:
             init_prior(search)
@@ -235,6 +282,8 @@ def copy_fields(address: int, which: BoolArray, offsets: IntArray, words: IntArr
     """Write 8 bytes from each offset of the SEARCH records of some searches; `words` is (k, n)."""
     for e in range(len(which)):
         if which[e]:
+            search = search_at(address, e)
+            search.total_s = sum_of_costs(search)
             for i in range(len(offsets)):
                 words[i, e] = int64s(address + e * _SEARCH_BYTES + offsets[i])[0]
 

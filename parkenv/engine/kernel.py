@@ -244,7 +244,7 @@ def step_result(search: Any) -> tuple[Any, ...]:
         terms = tuple_setitem(terms, term, -search.step_costs[term])
     result: tuple[Any, ...] = (
         (-step_cost_s(search),) + terms + to_fixed_tuple(search.costs, N_TERMS) + (  # noqa: RUF005 - for numba
-            search.total_s, search.driven_m, search.walked_m, search.failed_parks, search.slots_passed,
+            sum_of_costs(search), search.driven_m, search.walked_m, search.failed_parks, search.slots_passed,
             search.parked, search.over, search.vertex,
         )
     )  # fmt: skip
@@ -389,7 +389,6 @@ def finish_step(search: Any) -> None:
     search.over = full or search.parked
     for term in range(N_TERMS):
         search.costs[term] += search.step_costs[term]
-    search.total_s = sum_of_costs(search)
 
 
 @inlined
@@ -398,7 +397,6 @@ def give_up(search: Any) -> None:
     penalty = scenario_at(search.scenario, 0).give_up_s
     search.step_gave_up_s += penalty
     search.gave_up_s += penalty
-    search.total_s = sum_of_costs(search)
     search.over = True
 
 
@@ -449,12 +447,8 @@ def observe_exact(search: Any) -> None:
             observed_at[slot] = since_arrival
         if keeps_observed:
             taken = np.float64(slot_at(slots, column).observed_taken)
-            observed[n], observed[most + n], observed[2 * most + n], observed[3 * most + n] = (
-                slot,
-                taken,
-                1.0,
-                0.0,
-            )
+            observed[n], observed[most + n] = slot, taken
+            observed[2 * most + n], observed[3 * most + n] = 1.0, 0.0
             n += 1
     search.n_step_observed = n
     mark_passed(search)
@@ -587,6 +581,19 @@ def refresh_belief(search: Any) -> None:
                 p_occupied[slot_at(search.slots, first + i).slot] = block.p_occupied[i]
 
 
+@kernel
+def write_belief(search: Any) -> None:
+    """Write the belief in all slots with a column, as of the last step, to memory that may hold an older one."""
+    width, slots, blocks, arrival = search.width, search.slots, search.blocks, search.arrival
+    p_occupied, belief = float32s(search.p_occupied), float32s(search.belief)
+    for column in range(1, search.n_columns + 1):
+        slot, i = slot_at(slots, column).slot, column & (BLOCK_SIZE - 1)
+        block = block_at(blocks, column >> BLOCK_BITS)
+        p_occupied[slot] = block.p_occupied[i]
+        belief[P_OBSERVED * width + slot] = block.p_observed[i]
+        belief[OBSERVED_AT * width + slot] = block.observed_at[i] - arrival
+
+
 @inlined
 def end_observed(search: Any) -> None:
     """Mark the rest of `step_observed` as unused."""
@@ -630,7 +637,7 @@ def add_column(search: Any, slot: int) -> int:
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     prior, rate = forecast_of(search, slot)
     block.prior[i] = block.p_observed[i] = block.p_occupied[i] = prior
-    block.decay_rate[i], block.observed_at[i] = rate, search.arrival
+    block.decay_rate[i], block.observed_at[i] = rate, search.arrival + NEVER_OBSERVED
     return int(column)
 
 

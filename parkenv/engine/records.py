@@ -573,8 +573,17 @@ class Searches:
         self.records["n_places"] = len(scenarios.records)
         self._find_scenarios()
         for name, array in self._arrays().items():
-            first = address_of(array, array.dtype)
-            self.records[name] = first + np.arange(n) * array.strides[0] if len(array) else 0
+            self._write_addresses(name, array)
+
+    def _write_addresses(self, name: str, array: NDArray[Any]) -> None:
+        first = address_of(array, array.dtype)
+        self.records[name] = first + np.arange(len(self.records)) * array.strides[0] if len(array) else 0
+
+    def hold(self, p_occupied: NDArray[np.float32], belief: NDArray[np.float32]) -> None:
+        """Use these arrays from now on, with the values that they have; of the shapes and types of the class."""
+        self.p_occupied, self.belief = p_occupied, belief
+        self._write_addresses("p_occupied", p_occupied)
+        self._write_addresses("belief", belief)
 
     def complete_arrival(self, search: int) -> None:
         """Add what only Python can make for a search that has just begun: its world, its forecast."""

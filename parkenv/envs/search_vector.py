@@ -43,7 +43,9 @@ _WHICH = tuple(f"_{name}" for name in ("reward_terms", *METRICS, "place"))
 _WHICH_TERMS = tuple(f"_{name}" for name in REWARD_TERMS)
 # Types and places of the metrics and the step's terms in a SEARCH record.
 _PLACES = [dict(SEARCH.fields or {})[name][:2] for name in (*METRICS, *STEP_FIELDS)]
-_TYPES, _OFFSETS = [dtype for dtype, _ in _PLACES], np.array([offset for _, offset in _PLACES])
+_OFFSETS = np.array([offset for _, offset in _PLACES])
+_TYPES = list({dtype for dtype, _ in _PLACES})
+_METRIC_TYPES = [(name, _TYPES.index(dtype)) for name, (dtype, _) in zip(METRICS, _PLACES, strict=False)]
 
 
 class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]]):
@@ -173,6 +175,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     @property
     def place_of(self) -> IntArray:
         """Index into `scenarios` of the place of each search, (n_envs,)."""
+        if len(self.scenarios) == 1:
+            return np.zeros(self.num_envs, np.int64)  # without reading all records
         place: IntArray = self._searches.records["place"].copy()
         return place
 
@@ -242,6 +246,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             if one is not None:
                 records[i]["seed_state"], records[i]["episode"] = seed_state(one), -1
         self._begun = True
+        if self._copy:
+            self.observer.renew()
         self._arrive(which)
         self._step(np.zeros(self.num_envs, dtype=np.int64), which, ~which)
         self._done = self._done & ~which
@@ -278,6 +284,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             raise InputError(
                 f"actions[{wrong}] is {actions[wrong]}, want a number from 0 to {PARK} ({', '.join(ACTIONS)})"
             )
+        if self._copy:
+            self.observer.renew()
         fresh = self._nobody
         if self._mode is AutoresetMode.NEXT_STEP:
             fresh = self._done
@@ -319,7 +327,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             searches.complete_arrival(int(i))
 
     def _observations(self) -> dict[str, NDArray[Any]]:
-        return {name: a.copy() for name, a in self._seen.items()} if self._copy else dict(self._seen)
+        return self.observer.observations() if self._copy else dict(self._seen)
 
     def _final_observations(self, done: BoolArray) -> NDArray[np.object_]:
         final = np.full(self.num_envs, None, dtype=object)
@@ -332,11 +340,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         words = np.zeros((len(_OFFSETS), self.num_envs), np.int64)
         copy_fields(self.observer.address, done, _OFFSETS, words)
         # A type of fewer bytes stands at the beginning of its eight.
-        metrics: dict[str, Any] = {
-            name: row.view(dtype)[:: 8 // dtype.itemsize]
-            for name, row, dtype in zip(METRICS, words, _TYPES, strict=False)
-        }
-        terms = dict(zip(REWARD_TERMS, -words[len(METRICS) :].view(np.float64), strict=True))
+        views = [words.view(dtype)[:, :: 8 // dtype.itemsize] for dtype in _TYPES]
+        metrics: dict[str, Any] = {name: views[dtype][i] for i, (name, dtype) in enumerate(_METRIC_TYPES)}
+        costs = words[len(METRICS) :].view(np.float64)
+        terms = dict(zip(REWARD_TERMS, np.negative(costs, out=costs), strict=True))
         metrics["reward_terms"] = terms | dict.fromkeys(_WHICH_TERMS, done)
         metrics["place"] = self._names[self.place_of]
         return metrics | dict.fromkeys(_WHICH, done)
