@@ -5,6 +5,7 @@ Importing this package registers the environments; heavy modules are loaded on f
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
@@ -26,6 +27,11 @@ if TYPE_CHECKING:
     from parkenv.world.sensor_model import SensorBand, SensorModel
     from parkenv.world.traffic import Traffic
     from planners.agent import make_agent
+
+if sys.flags.safe_path:
+    from parkenv.files.working_folder import skip_settings
+
+    skip_settings()
 
 __version__ = "0.1.0"
 

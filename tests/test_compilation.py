@@ -9,7 +9,6 @@ import sys
 import typing
 from pathlib import Path
 
-import numba
 import pytest
 from numba.core.dispatcher import Dispatcher
 
@@ -139,19 +138,19 @@ def test_without_compilation_functions_run_as_they_are_written(own, tmp_path):
 
 
 def test_code_is_kept_in_the_users_folder_unless_another_is_named(monkeypatch, tmp_path):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert cache_folder().name == "compiled"
     assert cache_folder().parent.name == "parkenv"
     assert sys.platform != "linux" or cache_folder().is_relative_to(tmp_path)
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "mine"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "mine"))
     assert cache_folder() == tmp_path / "mine"
 
 
 @pytest.fixture
 def caller(own, tmp_path, monkeypatch):
     """The user's module in this process, with an empty cache."""
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
     monkeypatch.syspath_prepend(own)
     yield importlib.import_module("caller")
     for name in ("caller", "callee", "package", "package.rates"):
@@ -206,7 +205,7 @@ def test_a_module_that_is_edited_and_imported_again_runs_its_new_code(caller, ow
 
 
 def test_functions_of_one_name_and_line_are_told_apart_by_their_options(tmp_path, monkeypatch):
-    monkeypatch.setattr(numba.config, "CACHE_DIR", str(tmp_path))
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     halves = [compiled(error_model=model)(one_over) for model in ("python", "numpy")]
     with pytest.raises(ZeroDivisionError):
         halves[0](0.0)

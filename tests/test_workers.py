@@ -65,7 +65,10 @@ def test_a_killed_worker_loses_its_own_task_which_is_run_again(tmp_path, backend
     assert again <= (3 if backend == "loky" else 0)
 
 
-@pytest.mark.parametrize("backend", ["loky", pytest.param("dask", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "backend",
+    ["loky", pytest.param("ray", marks=pytest.mark.slow), pytest.param("dask", marks=pytest.mark.slow)],
+)
 def test_nothing_in_the_working_folder_runs_in_place_of_pythons_own(tmp_path, backend):
     of(backend)
     for name in ("pickle", "socket", "cloudpickle", "queue"):

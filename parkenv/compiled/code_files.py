@@ -19,7 +19,6 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-import numba
 from filelock import FileLock
 from numba.core.compiler import CompileResult
 from numba.core.errors import NumbaWarning
@@ -37,7 +36,8 @@ _LOGGER = logging.getLogger("parkenv")
 
 def cache_folder() -> Path:
     """Return the folder of compiled code: `NUMBA_CACHE_DIR`, else one in the user's cache folder."""
-    configured = numba.config.CACHE_DIR
+    # Numba's own setting may come from a file in the working folder.
+    configured = os.environ.get("NUMBA_CACHE_DIR")
     return Path(configured) if configured else user_cache_path("parkenv", appauthor=False) / "compiled"
 
 

@@ -171,7 +171,7 @@ class Workers:
                 address=self.address or "local",
                 log_to_driver=False,
                 logging_level="error",
-                **({} if self.address else local),
+                **({} if self.address else local | {"job_config": _without_working_folder()}),
             )
         except (ConnectionError, RuntimeError, ValueError) as error:
             raise InputError(f"--backend ray --address {self.address}: {error}") from error
@@ -196,6 +196,13 @@ class Workers:
         opened.enter_context(client)
         self._run = functools.partial(_run_by_dask, client)
         self._lost = distributed.scheduler.KilledWorker
+
+
+def _without_working_folder() -> Any:
+    """Return settings for a Ray cluster of this machine, whose workers would look in the working folder first."""
+    settings = importlib.import_module("ray.job_config").JobConfig()
+    settings._client_job = True  # as Ray's own client does, which transfers folders otherwise
+    return settings
 
 
 def _run_by_ray(tasks: dict[int, Task[Result]]) -> Generator[tuple[int, Result]]:

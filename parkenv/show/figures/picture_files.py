@@ -18,7 +18,9 @@ from parkenv.files.atomic_write import atomic_write
 DPI = 150
 CAPTION = "Description"
 """Key of the caption in the metadata of a PNG."""
+# All settings, so that none of a user's `matplotlibrc` are left, which may want LaTeX.
 STYLE: dict[Any, Any] = {
+    **{name: value for name, value in mpl.rcParamsDefault.items() if name not in ("backend", "interactive")},
     "font.family": "DejaVu Sans",
     "font.size": 9.0,
     "axes.titlesize": 9.0,

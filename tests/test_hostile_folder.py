@@ -1,0 +1,92 @@
+"""Nothing that lies in the working folder runs, or sets how the command works."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+from command_line import PARKENV
+
+COMMAND = [PARKENV[0], "-P", *PARKENV[1:]]
+"""The command as it is installed: Python does not look for modules in the working folder."""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A folder with modules that leave a mark, and settings of libraries that stop or mislead them."""
+    ran = tmp_path / "ran"
+    for name in (
+        "pickle",
+        "socket",
+        "queue",
+        "numpy",
+        "numba",
+        "yaml",
+        "cloudpickle",
+        "sitecustomize",
+        "parkenv",
+    ):
+        (tmp_path / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write({name!r})")
+    (tmp_path / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path / 'theirs'}\ndisable_jit: 1\n")
+    (tmp_path / "matplotlibrc").write_bytes(b"text.usetex: True\n\xff\xfe\n")
+    return tmp_path
+
+
+def run(folder, *arguments, **environment):
+    return subprocess.run(
+        [*COMMAND, *arguments], cwd=folder, capture_output=True, text=True, env={**os.environ, **environment}
+    )
+
+
+@pytest.mark.slow
+def test_a_comparison_with_workers_and_figures_takes_nothing_from_the_folder(folder):
+    arguments = ["--scenario", "mini", "--agents", "greedy-goal,first-free", "-n", "2", "--jobs", "2"]
+    done = run(folder, "compare", *arguments, "--occupancy-levels", "none", "--out", "out", "--report")
+    assert done.returncode == 0, done.stderr
+    assert (folder / "out" / "report.html").is_file()
+    assert not (folder / "ran").exists()
+    assert not (folder / "theirs").exists()
+
+
+def test_compiled_code_is_kept_where_the_environment_says_and_nowhere_else(folder, tmp_path):
+    code = (
+        "import parkenv.compiled.code_files as files, numba\n"
+        "numba.njit(lambda x: x)(1)\n"
+        "print(files.cache_folder(), [numba.config.CACHE_DIR, numba.config.DISABLE_JIT])"
+    )
+    environment = {**os.environ, "NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(tmp_path / "home")}
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", code], cwd=folder, capture_output=True, text=True, env=environment
+    )
+    assert done.stdout.endswith("['', 0]\n"), done.stderr
+    assert "theirs" not in done.stdout
+
+
+def test_an_import_changes_no_settings_of_a_users_own_process(folder):
+    (folder / "matplotlibrc").write_text("text.usetex: True\n")
+    for module in folder.glob("*.py"):
+        module.unlink()
+    code = (
+        "import sys, os, parkenv\n"
+        "loaded = {'numba', 'matplotlib'} & set(sys.modules)\n"
+        "import matplotlib\n"
+        "print(loaded, matplotlib.rcParams['text.usetex'], os.environ.get('PYTHONSAFEPATH'))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True)
+    assert done.stdout == "set() True None\n", done.stderr
+
+
+def test_figures_have_one_style_whatever_the_users_settings_are(tmp_path):
+    import matplotlib as mpl
+    from matplotlib.figure import Figure
+
+    from parkenv.show.figures.picture_files import STYLE, save_picture
+
+    pictures = []
+    for settings in ({"text.usetex": True, "savefig.facecolor": "red", "lines.linewidth": 9.0}, {}):
+        with mpl.rc_context(settings), mpl.rc_context(STYLE):
+            figure = Figure(figsize=(1, 1))
+            figure.add_subplot().plot([1, 2], label="a $ in a name")
+            save_picture(figure, tmp_path / "one.png")
+        pictures.append((tmp_path / "one.png").read_bytes())
+    assert pictures[0] == pictures[1]
