@@ -16,9 +16,11 @@ from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.files.known_names import PACKAGED_LOTS
-from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot, write_lot
+from parkenv.lots import city_lot, grid_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.builders.packaged import LOTS, build
 from parkenv.lots.checks import check_lot
+from parkenv.lots.draft import ImportOptions
+from parkenv.lots.local_frame import LocalFrame
 from parkenv.show.figures.lot import save_lot_picture
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
@@ -561,13 +563,89 @@ def test_files_that_are_not_there_or_no_text_are_refused(tmp_path):
         read_lot(tmp_path / "lot.json")
 
 
-def test_metres_without_a_frame_are_refused(tmp_path):
-    doc = document()
-    del doc["frame"]
+def moved(doc, change):
+    """Return a document without `frame` whose positions are changed."""
+
+    def of(xy):
+        return [of(part) for part in xy] if isinstance(xy[0], list) else list(change(*xy[:2]))
+
+    made = {key: value for key, value in doc.items() if key != "frame"}
+    made["features"] = copy.deepcopy(doc["features"])
+    for f in made["features"]:
+        f["geometry"]["coordinates"] = of(f["geometry"]["coordinates"])
+    return made
+
+
+def crs(name):
+    return {"type": "name", "properties": {"name": name}}
+
+
+@pytest.mark.parametrize(("east", "north"), [(0, 0), (377_920, 5_823_000)])
+def test_metres_without_a_frame_are_recognised_and_warned_of(tmp_path, east, north):
+    path = written(tmp_path, moved(document(), lambda x, y: (x + east, y + north)))
+    with pytest.warns(UserWarning, match="metres") as said:
+        lot = read_lot(path)
+    assert len(said) == 1
+    np.testing.assert_allclose(lot.slot_xy, [[11.25 + east, 5.5 + north], [21.25 + east, 5.5 + north]])
+    np.testing.assert_allclose(lot.slot_length, 5.0)
+    (problem,) = check_lot(path)
+    assert problem.severity == "warning"
+    assert "frame" in problem.message
+
+
+@pytest.mark.parametrize(("east", "north"), [(0, 0), (377_920, 5_823_000)])
+def test_bare_outlines_in_metres_keep_their_numbers(tmp_path, east, north):
+    spaces = [feature(None, "Polygon", box(2.5 * i, 0, 2.5 * i + 2.5, 5)) for i in range(6)]
+    for space in spaces:
+        space["properties"] = {}
+    doc = moved({"type": "FeatureCollection", "features": spaces}, lambda x, y: (x + east, y + north))
+    goal, entry = (east + 0.5, north - 0.5), (east - 10.0, north - 3.0)
+    with pytest.warns(UserWarning, match="metres"):
+        draft = import_lot(written(tmp_path, doc), ImportOptions(goals=(goal,), entries=(entry,)))
+    lot = draft.lot()
+    said = import_lot(
+        written(tmp_path, {**doc, "frame": "local"}), ImportOptions(goals=(goal,), entries=(entry,))
+    )
+    np.testing.assert_array_equal(said.lot().slot_xy, lot.slot_xy)
+    assert sorted(lot.slot_xy[:, 0].round(3)) == [2.5 * i + 1.25 + east for i in range(6)]
+    np.testing.assert_allclose(lot.goals, [goal])
+
+
+@pytest.mark.parametrize("name", ["EPSG:25832", "urn:ogc:def:crs:EPSG::25832", "EPSG:2263"])
+def test_positions_in_a_map_grid_are_converted(tmp_path, name):
+    from pyproj import Transformer
+
+    middle = (-74.0, 40.7) if "2263" in name else (9.0, 48.0)  # New York's grid is in feet
+    to_grid = Transformer.from_crs("OGC:CRS84", f"EPSG:{name.rpartition(':')[2]}", always_xy=True)
+    frame = LocalFrame(*middle)
+    doc = moved(document(), lambda x, y: to_grid.transform(*frame.to_lonlat([x, y])[0]))
+    lot = read_lot(written(tmp_path, {**doc, "crs": crs(name)}))
+    np.testing.assert_allclose(np.diff(lot.slot_xy, axis=0), [[10.0, 0.0]], atol=0.01)
+    np.testing.assert_allclose(lot.slot_width, 2.5, atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("change", "head"),
+    [
+        (lambda x, y: (x / 0.3048, y / 0.3048), {}),  # feet
+        (lambda x, y: (x, y), {"crs": crs("EPSG:99999")}),
+        (lambda x, y: (x, y), {"crs": crs("+proj=pipeline +step +init=/etc/passwd")}),
+        (lambda x, y: (x, y), {"crs": {"type": "link", "properties": {"href": "http://localhost"}}}),
+        (lambda x, y: (x + 1e7, y + 9e7), {"crs": crs("EPSG:25832")}),
+    ],
+)
+def test_positions_of_no_known_kind_are_refused_with_what_to_add(tmp_path, change, head):
+    path = written(tmp_path, {**moved(document(), change), **head})
+    with pytest.raises(InputError, match="crs"):
+        read_lot(path)
+
+
+def test_a_position_off_the_globe_among_others_is_named(tmp_path):
+    frame = LocalFrame(9.0, 48.0)
+    doc = moved(document(), lambda x, y: frame.to_lonlat([x, y])[0].tolist())
     doc["features"][4]["geometry"]["coordinates"] = [450.0, 0.0]
     (problem,) = check_lot(written(tmp_path, doc))
     assert problem.feature == 4
-    assert 'needs the member "frame": "local"' in problem.message
 
 
 def test_all_faults_are_listed_at_once(tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -104,8 +105,10 @@ class Check(Command):
         drivability = None
         if form is not None and form.is_complete and not any(p.severity == "error" for p in problems):
             origin = _provenance(self.place)
+            with warnings.catch_warnings(action="ignore"):  # listed already
+                lot = read_lot(self.place)
             drivability = check_drivability(
-                read_lot(self.place), origin.issues if origin is not None else (), drive=self.drive
+                lot, origin.issues if origin is not None else (), drive=self.drive
             )
             problems += drivability.problems
         for problem in problems:
@@ -124,7 +127,7 @@ class Check(Command):
         if errors:
             raise Exit(2)
         if drivability is not None:
-            console.print(_summary(read_lot(self.place)))
+            console.print(_summary(lot))
             if self.drive:
                 console.print(f"{drivability.planned} of {drivability.kinds} kinds of manoeuvres planned")
             reasons = "; ".join(map(str, drivability.issues))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from warnings import catch_warnings
 
 import numpy as np
 import shapely
@@ -45,8 +46,10 @@ def check_lot(path: str | Path) -> list[LotProblem]:
         except InputError as error:
             return [LotProblem("error", None, str(error).removeprefix(f"{path}: "))]
         return []
-    contents = read_contents(path)
-    problems = [*contents.errors, *graph_errors(contents), *_drawing_warnings(contents)]
+    with catch_warnings(record=True, action="always") as caught:
+        contents = read_contents(path)
+    assumed = [LotProblem("warning", None, str(w.message).removeprefix(f"{path}: ")) for w in caught]
+    problems = [*contents.errors, *graph_errors(contents), *assumed, *_drawing_warnings(contents)]
     if not any(problem.severity == "error" for problem in problems):
         lot = ParkingLot(**contents.columns())
         problems += _reach_warnings(lot, contents.numbers["slot"], contents.numbers["entry"])

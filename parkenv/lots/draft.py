@@ -64,7 +64,7 @@ def points_in_frame(frame: LocalFrame | None, pairs: tuple[tuple[float, float], 
     A pair within a degree of the frame's origin is a latitude and a longitude; any other pair is metres.
     """
     points = np.array(pairs, dtype=np.float64).reshape(-1, 2)
-    if frame is None or not len(points):
+    if frame is None or frame.origin is not None or not len(points):
         return points
     on_globe = np.all(np.abs(points - [frame.lat, frame.lon]) <= NEAR_ON_GLOBE, axis=1, keepdims=True)
     return np.where(on_globe, frame.to_xy(points[:, ::-1]), points)

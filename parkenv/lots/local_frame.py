@@ -31,6 +31,8 @@ class LocalFrame:
 
     lon: float  # longitude of the centre, degrees, WGS 84
     lat: float  # latitude of the centre, degrees
+    # m, what the centre is called; of a file in metres, whose own numbers stay the lot's
+    origin: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (abs(self.lon) <= 360.0 and abs(self.lat) <= 90.0):
@@ -47,12 +49,19 @@ class LocalFrame:
     def to_xy(self, lonlat: ArrayLike) -> FloatArray:
         """Convert positions, (n, 2) degrees, longitude first, to metres east and north, (n, 2)."""
         lon, lat = np.asarray(lonlat, dtype=np.float64).reshape(-1, 2).T
-        return np.column_stack(self._projection(lon, lat))
+        return np.column_stack(self._projection(lon, lat)) + (self.origin or (0.0, 0.0))
 
     def to_lonlat(self, xy: ArrayLike) -> FloatArray:
         """Convert points, (n, 2) m, to positions, (n, 2) degrees, longitude first."""
-        x, y = np.asarray(xy, dtype=np.float64).reshape(-1, 2).T
+        x, y = (np.asarray(xy, dtype=np.float64).reshape(-1, 2) - (self.origin or (0.0, 0.0))).T
         return np.column_stack(self._projection(x, y, inverse=True))
+
+    def __str__(self) -> str:
+        return (
+            "metres as in the file"
+            if self.origin
+            else f"metres east and north of {self.lat:.7f}, {self.lon:.7f}"
+        )
 
     @cached_property
     def _projection(self) -> Proj:

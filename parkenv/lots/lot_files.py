@@ -103,14 +103,18 @@ def read_lot(path: str | Path) -> ParkingLot:
         InputError: the file cannot be read or contains no valid lot; the message states the first fault and the
             number of further ones, and `parkenv.lots.check_lot` lists all.
     """
-    path = Path(path)
+    return _read_whole(Path(path))[0]
+
+
+def _read_whole(path: Path) -> tuple[ParkingLot, str]:
+    """Return the lot of a file, and what was recognised of its positions."""
     file_format = lot_format(path)
     if file_format is LotFormat.DRAGON_LAKE:
-        return dragon_lake_lot(path)
+        return dragon_lake_lot(path), ""
     contents = read_contents(path)
     if not contents.errors:
         try:
-            return ParkingLot(**contents.columns())
+            return ParkingLot(**contents.columns()), contents.found
         except GraphError:
             pass
     errors = [*contents.errors, *graph_errors(contents)]
@@ -155,7 +159,10 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
         raise InputError(
             f"{path}: bounds apply to OpenStreetMap and lists of slots; this file is a whole lot"
         )
-    draft = LotDraft.of_lot(read_lot(path))
+    lot, recognised = _read_whole(path)
+    draft = LotDraft.of_lot(lot)
+    if recognised:
+        draft = replace(draft, found=(recognised, *draft.found))
     if options.goals:
         draft = replace(draft, goals=points_in_frame(None, options.goals))
     if options.entries:

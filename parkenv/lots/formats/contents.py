@@ -41,6 +41,7 @@ class LotContents:
     """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` those of the other features."""
 
     name: str
+    found: str = ""  # what was recognised of the positions
     slot_ids: list[str] = field(default_factory=list)
     slots: Slots = NO_SLOTS
     lanes: list[Lane] = field(default_factory=list)

@@ -2,8 +2,9 @@
 
 The native file is a GeoJSON FeatureCollection with the additional members
 `"parkenv": {"format": "lot", "version": 1}`, `"name"` and `"frame": "local"` (metres). Without
-`frame`, positions are longitude and latitude (RFC 7946), and are projected to metres east and north of the
-centre of the features. `properties.kind` is the kind of a feature:
+`frame`, positions are longitude and latitude (RFC 7946) or those of the map grid that `crs` names, and are projected
+to metres east and north of the centre of the features; metres without either are recognised by their size
+(`parkenv.lots.formats.positions`). `properties.kind` is the kind of a feature:
 
 | kind | geometry | properties |
 |---|---|---|
@@ -32,6 +33,7 @@ from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.formats.contents import KINDS, LotContents
 from parkenv.lots.formats.geojson_slots import SLOT_SHAPE, RawFeature, is_coordinate, read_slots
+from parkenv.lots.formats.positions import Positions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.quality import Provenance
 from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, is_building
@@ -120,7 +122,9 @@ def read_contents(path: Path) -> LotContents:
     contents = LotContents(path.stem)
     try:
         document = _load(path)
-        contents.name, local = _check_head(document, path.stem)
+        contents.name = _check_head(document, path.stem)
+        system = Positions(True) if "frame" in document else Positions.of(document, path)
+        contents.found = system.found
     except InputError as error:
         contents.error(None, str(error))
         return contents
@@ -140,7 +144,8 @@ def read_contents(path: Path) -> LotContents:
             contents.error(None, f"no {kind}: an empty lot, want at least one feature of kind {kind!r}")
 
     xy = np.array(positions, dtype=np.float64).reshape(-1, 2)
-    if not local:
+    if not system.in_metres:
+        xy = system.to_lonlat(xy)
         off_globe = np.flatnonzero((np.abs(xy) > (180.0, 90.0)).any(axis=1))
         if len(off_globe):
             number = next(f.number for f in raw if any(p.stop > off_globe[0] for p in f.parts))
@@ -148,7 +153,7 @@ def read_contents(path: Path) -> LotContents:
             contents.error(
                 number,
                 f"position [{lon:g}, {lat:g}] is no longitude and latitude; "
-                'for metres, the file needs the member "frame": "local"',
+                'for metres, the file needs the member "frame": "local", for a map grid "crs"',
             )
             return contents
         xy = LocalFrame.around(xy).to_xy(xy) if len(xy) else xy
@@ -156,7 +161,7 @@ def read_contents(path: Path) -> LotContents:
     for feature in raw:
         if feature.kind != "slot":
             _add_feature(contents, feature, [xy[part] for part in feature.parts])
-    read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=local)
+    read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=system.in_metres)
     contents.errors.sort(key=lambda problem: -1 if problem.feature is None else problem.feature)
     return contents
 
@@ -186,8 +191,8 @@ def _load(path: Path) -> Any:
         raise InputError(str(error).removeprefix(f"{path}: ")) from error
 
 
-def _check_head(document: Any, stem: str) -> tuple[str, bool]:
-    """Validate the top-level members; return the lot's name, and whether positions are metres in a local frame."""
+def _check_head(document: Any, stem: str) -> str:
+    """Validate the top-level members; return the lot's name."""
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         kind = document.get("type") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"type is {kind!r:.40}, want a GeoJSON 'FeatureCollection'")
@@ -206,7 +211,7 @@ def _check_head(document: Any, stem: str) -> tuple[str, bool]:
         raise InputError(f"name is {name!a:.40}, want a text without control characters")
     if document.get("frame", "local") != "local":
         raise InputError(f"frame is {document['frame']!r:.40}, want 'local', or no frame for lon/lat")
-    return name, "frame" in document
+    return name
 
 
 def _check_feature(

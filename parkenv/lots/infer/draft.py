@@ -97,7 +97,7 @@ def _found(lot: InferredLot, n: int, unit: str, frame: LocalFrame | None) -> Ite
     width = f", {min(wide):.1f} to {max(wide):.1f} m wide" if wide else ""
     yield f"{len(lot.aisles)} aisles{width}, {len(lot.connections)} connections, {len(lot.lanes)} lanes"
     if frame is not None:
-        yield f"frame: metres east and north of {frame.lat:.7f}, {frame.lon:.7f}"
+        yield f"frame: {frame}"
 
 
 def _guesses(lot: InferredLot, options: ImportOptions, goal_note: str) -> Iterator[str]:

@@ -80,21 +80,24 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
             the elements are too far apart.
     """
     path = Path(path)
-    elements = read_map(path)
+    elements, positions = read_map(path)
     with naming(path):
-        return draft_of_elements(path.stem, elements, options or ImportOptions())
+        draft = draft_of_elements(path.stem, elements, options or ImportOptions(), positions.frame)
+    return replace(draft, found=(*([positions.found] if positions.found else []), *draft.found))
 
 
-def draft_of_elements(name: str, elements: Sequence[OsmElement], options: ImportOptions) -> LotDraft:
-    """Draft a lot from the elements of a map; see `osm_draft`.
+def draft_of_elements(
+    name: str, elements: Sequence[OsmElement], options: ImportOptions, frame: LocalFrame | None = None
+) -> LotDraft:
+    """Draft a lot from the elements of a map, in a frame or one around its parking; see `osm_draft`.
 
     Without a road for cars among them, the lanes are inferred from the spaces' outlines; the same holds if guesses are
     allowed and the roads do not reach all spaces or lack an entry.
     """
     has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
     if has_spaces and not any(_may_be_lane(e) for e in elements):
-        return outline_draft(name, elements, [], map_frame(elements), options)
-    importer = _OsmImporter(name, elements, options)
+        return outline_draft(name, elements, [], frame or map_frame(elements), options)
+    importer = _OsmImporter(name, elements, options, frame)
     importer.read_spaces()
     importer.fill_outlines()
     importer.line_kerbs()
@@ -150,7 +153,9 @@ class _Group:
 class _OsmImporter:
     """The state of an import: roads, areas, slots, and elements left out."""
 
-    def __init__(self, name: str, elements: Sequence[OsmElement], options: ImportOptions) -> None:
+    def __init__(
+        self, name: str, elements: Sequence[OsmElement], options: ImportOptions, frame: LocalFrame | None
+    ) -> None:
         self.name = name
         self.options = options
         self.left_out: dict[str, list[str]] = {}
@@ -162,7 +167,7 @@ class _OsmImporter:
                 "parking:left, parking:right or parking:both"
             )
         _refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
-        self.frame = LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
+        self.frame = frame or LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
         self.box = options.box(self.frame)
         box = None if self.box is None else shapely.box(*self.box)
         self.nodes = [e for e in elements if e.is_node]
@@ -434,7 +439,7 @@ class _OsmImporter:
         if len(draft.goals):
             yield f"{len(draft.goals)} goals: {goal_note or 'as given'}"
         yield from self.notes
-        yield f"frame: metres east and north of {self.frame.lat:.7f}, {self.frame.lon:.7f}"
+        yield f"frame: {self.frame}"
 
 
 def _is_parking(element: OsmElement) -> bool:

@@ -12,7 +12,8 @@ expand into gigabytes or fetch other files.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.files.limited_reading import is_there, read_bytes, read_json
+from parkenv.lots.formats.positions import Positions
 
 OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
@@ -54,19 +56,23 @@ class OsmElement:
         return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
 
 
-def read_map(path: Path) -> list[OsmElement]:
-    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON, in its order.
+def read_map(path: Path) -> tuple[list[OsmElement], Positions]:
+    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON in order, and what its positions are.
 
     Raises:
         InputError: the file cannot be read, is incomplete or has another format; a position is not on the globe; a
             tagged way refers to a node that is not in the file; or an element appears twice with different content.
     """
     if path.suffix.lower() == ".pbf":
-        return read_pbf(path)
+        return read_pbf(path), Positions()
     is_xml = path.suffix.lower() in (".osm", ".xml")
-    content = read_bytes(path) if is_xml else read_json(path)
+    content: Any = read_bytes(path) if is_xml else read_json(path)
     with naming(path):
-        return _elements_of_xml(content) if is_xml else elements_of_json(content)
+        if is_xml:
+            return _elements_of_xml(content), Positions()
+        has_features = isinstance(content, dict) and isinstance(content.get("features"), list)
+        positions = Positions.of(content, path) if has_features else Positions()
+        return elements_of_json(content, positions), positions
 
 
 def holds_osm(document: object) -> bool:
@@ -76,10 +82,12 @@ def holds_osm(document: object) -> bool:
     if isinstance(document.get("elements"), list):
         return True
     features = document.get("features")
-    if not isinstance(features, list) or "parkenv" in document or "frame" in document:
+    if not isinstance(features, list) or "parkenv" in document:
         return False
     if _holds_outlines(features):
         return True
+    if "frame" in document:
+        return False
     properties = [f["properties"] for f in features if isinstance(f, dict) and _is_object(f, "properties")]
     return not any("kind" in p for p in properties) and any(
         "@id" in p or _is_object(p, "tags") or any(key in p for key in MAPPED_KEYS) for p in properties
@@ -301,8 +309,8 @@ def _elements_of_xml(data: bytes) -> list[OsmElement]:
 # ---- JSON ----
 
 
-def elements_of_json(document: Any) -> list[OsmElement]:
-    """Return the elements of parsed Overpass JSON or GeoJSON.
+def elements_of_json(document: Any, positions: Positions | None = None) -> list[OsmElement]:
+    """Return the elements of parsed Overpass JSON, or of GeoJSON with positions that are yet to be converted.
 
     Raises:
         InputError: see `read_map`; the message does not name the file.
@@ -312,9 +320,10 @@ def elements_of_json(document: Any) -> list[OsmElement]:
     if isinstance(document.get("elements"), list):
         return _overpass_elements(document["elements"])
     if isinstance(document.get("features"), list):
+        to_lonlat = positions.to_lonlat if positions is not None and positions.converts else None
         elements: dict[str, tuple[int, OsmElement]] = {}
         for index, feature in enumerate(document["features"]):
-            element = _feature_element(index, feature)
+            element = _feature_element(index, feature, to_lonlat)
             if element is None:
                 continue
             first = elements.setdefault(element.id, (index, element))[0]
@@ -371,7 +380,9 @@ def _geometry(name: str, holder: Mapping[str, Any]) -> FloatArray | None:
     return np.array([_position(name, p.get("lat"), p.get("lon")) for p in points]).reshape(-1, 2)
 
 
-def _feature_element(index: int, feature: Any) -> OsmElement | None:
+def _feature_element(
+    index: int, feature: Any, to_lonlat: Callable[[FloatArray], FloatArray] | None
+) -> OsmElement | None:
     """Convert a GeoJSON feature; None without a usable geometry."""
     if not isinstance(feature, dict):
         raise InputError(f"features[{index}] is {feature!r:.40}, want a GeoJSON feature")
@@ -395,7 +406,11 @@ def _feature_element(index: int, feature: Any) -> OsmElement | None:
             or not all(isinstance(p, list) and len(p) >= 2 for p in positions)
         ):
             raise InputError(f"{name}: coordinates are {positions!r:.40}, want positions")
-        return np.array([_position(name, p[1], p[0]) for p in positions]).reshape(-1, 2)
+        points: Any = positions
+        with suppress(TypeError, ValueError, OverflowError):  # named below
+            if to_lonlat is not None:
+                points = to_lonlat(np.array([p[:2] for p in positions], dtype=np.float64)).tolist()
+        return np.array([_position(name, p[1], p[0]) for p in points]).reshape(-1, 2)
 
     match geometry.get("type"):
         case "Point":

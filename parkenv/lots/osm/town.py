@@ -47,13 +47,13 @@ def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPA
         InputError: the file cannot be read, has no parking spaces or an outline that is none.
     """
     path = Path(path)
-    elements = read_map(path)
+    elements, positions = read_map(path)
     with naming(path):
         parts = list(split_town(path.stem, elements, least))
     for name, part in parts:
         count = sum(map(is_space, part))
         try:
-            draft = draft_of_elements(name, part, options)
+            draft = draft_of_elements(name, part, options, positions.frame)
             draft.lot()
         except InputError as error:
             yield CarPark(name, count, None, str(error))
