@@ -70,7 +70,9 @@ class Positions:
                 message does not name the file.
         """
         rings, spaces = _outlines(document)
-        low, high = (f(np.concatenate([*rings, np.zeros((not rings, 2))]), axis=0) for f in (np.min, np.max))
+        low, high = (
+            f(np.concatenate([*rings, np.zeros((0 if rings else 1, 2))]), axis=0) for f in (np.min, np.max)
+        )
         in_metres = cls(True, frame=LocalFrame(0.0, 0.0, tuple((0.5 * (low + high)).tolist())))
         if "frame" in document:
             return in_metres
