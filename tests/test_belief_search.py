@@ -36,6 +36,7 @@ def has_large_trees(seed):
     return seed % 6 not in (3, 5) and seed // 18 % 2 == 0
 
 
+@pytest.mark.slow
 def test_it_stays_near_the_optimum_on_small_lots():
     gaps = np.array([gap(seed, day=False) for seed in LOTS if not has_large_trees(seed)])
     assert len(gaps) > 25

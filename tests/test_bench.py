@@ -65,6 +65,7 @@ def test_the_measured_scene_is_full():
     assert len(parked_cars().present) == 200
 
 
+@pytest.mark.slow
 def test_bench_writes_its_rows(tmp_path):
     result = CliRunner().invoke(app, ["bench", "sensors", "--seconds", "0.01", "--out", str(tmp_path / "b")])
     assert result.exit_code == 0, result.output

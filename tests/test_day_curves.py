@@ -91,6 +91,7 @@ def test_intervals_hold_nine_days_of_ten(trained):
     assert mean_where(late.hour_covered) == pytest.approx(0.9, abs=0.06)
 
 
+@pytest.mark.slow
 def test_the_settings_follow_the_data():
     noisy, calm = (fit_settings(car_parks(4, 100, level_sd=sd)[0], 100) for sd in (1.0, 0.15))
     assert noisy.day_level_spread + noisy.level_drift > 1.5 * (calm.day_level_spread + calm.level_drift)
@@ -154,6 +155,7 @@ def test_baselines_are_what_their_names_say():
     np.testing.assert_array_equal(forecast.occupancy[:, 0], y[:, 23])
 
 
+@pytest.mark.slow
 def test_our_model_is_ahead_of_every_baseline():
     counts, _ = car_parks(6, 160, level_sd=0.3, drift=0.1)
     compared = list(compare(counts, 110, fit_settings(counts, 110)))

@@ -268,9 +268,9 @@ def pairs():
     for name in ("campus", "street"):
         lot = packaged_lot(name)
         scene = slot_lot(lot, 2).scene(np.random.default_rng(2).random(lot.n_slots) < 0.7)
-        way = poses_along(survey_route(lot).path, 1.0)
+        way = poses_along(survey_route(lot).path, 3.0)
         cars = [len(look(scene, pose)[1]) for pose in way]
-        for pose in way[np.argsort(cars)[-40::8]]:
+        for pose in way[np.argsort(cars)[-14::3]]:
             pair = rig.capture(scene, pose).pairs["right"]
             boxes = vehicle_boxes(stereo.camera, scene, mount.camera_pose(pose), pair.left)
             near = (boxes.visible_fraction > 0.6) & (boxes.distance < 10.0) & (boxes.ids <= scene.n_vehicles)
