@@ -41,7 +41,7 @@ class Observations(NamedTuple):
 
     def take(self, slots: NDArray[np.integer]) -> Observations:
         """Return the observations of some slots, (n,), numbered by their position among these."""
-        which, number = np.nonzero(self.slots[:, None] == slots)
+        which, number = _places(self.slots, slots)
         _, time, taken, hit_rate, false_alarm_rate = self
         return Observations(number, time[which], taken[which], hit_rate[which], false_alarm_rate[which])
 
@@ -160,10 +160,7 @@ class SlotBelief:
     @cached_property
     def observations(self) -> Observations:
         """The observations of the last step."""
-        slots, taken, hit_rate, false_alarm_rate = self._step_observed
-        observed = slots.astype(np.int64)
-        time = self.observed_at[observed].astype(np.float64)
-        return Observations(observed, time, taken == 1.0, hit_rate, false_alarm_rate)
+        return Observations(*_read_observations(self.step_observed, self.parts))
 
     @cached_property
     def _step_observed(self) -> FloatArray:
@@ -211,8 +208,12 @@ class SlotBelief:
         """Return the belief of some of the slots, (k,), in float64."""
         parts = self._rows[:, slots].astype(np.float64)
         p_occupied = self.p_occupied[slots].astype(np.float64)
-        slot, _, *rest = self.observations.take(slots)
-        return type(self)(p_occupied, parts.ravel(), self.time, self.day_error, np.concatenate([slot, *rest]))
+        observed = slot, _, *rest = self.observations.take(slots)
+        taken = type(self)(
+            p_occupied, parts.ravel(), self.time, self.day_error, np.concatenate([slot, *rest])
+        )
+        taken.observations = observed
+        return taken
 
     def update(
         self,
@@ -308,6 +309,36 @@ def observed_state(forecast: float, p_observed: float) -> int:
 def may_have_decayed(decay_rate: float, time: float, observed_at: float) -> bool:
     """Whether an observation is so old that P(taken) may be the forecast again; times in s, rate in 1/s."""
     return bool(np.float64(decay_rate) * (np.float64(time) - np.float64(observed_at)) > _SURELY_LEFT)
+
+
+@compiled
+def _read_observations(
+    step_observed: NDArray[np.floating], parts: NDArray[np.floating]
+) -> tuple[IntArray, FloatArray, BoolArray, FloatArray, FloatArray]:
+    most, first = len(step_observed) // 4, 3 * len(parts) // 4
+    k = 0
+    while k < most and step_observed[k] >= 0.0:
+        k += 1
+    slots, taken = np.empty(k, np.int64), np.empty(k, np.bool_)
+    time, hit_rate, false_alarm_rate = np.empty(k), np.empty(k), np.empty(k)
+    for i in range(k):
+        slots[i], taken[i] = step_observed[i], step_observed[most + i] == 1.0
+        time[i] = parts[first + slots[i]]
+        hit_rate[i], false_alarm_rate[i] = step_observed[2 * most + i], step_observed[3 * most + i]
+    return slots, time, taken, hit_rate, false_alarm_rate
+
+
+@compiled
+def _places(values: IntArray, among: IntArray) -> tuple[IntArray, IntArray]:
+    which, place = np.empty(len(values), np.int64), np.empty(len(values), np.int64)
+    n = 0
+    for i in range(len(values)):
+        for k in range(len(among)):
+            if among[k] == values[i]:
+                which[n], place[n] = i, k
+                n += 1
+                break
+    return which[:n], place[:n]
 
 
 @compiled
