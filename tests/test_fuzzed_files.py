@@ -6,6 +6,7 @@ import random
 import shutil
 import tempfile
 import tomllib
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -383,12 +384,14 @@ BESIDE = {
 
 
 def read(kind, content, folder):
-    """Read a file; only an InputError may come out of it."""
+    """Read a file; only an InputError may come out of it, or a word on units."""
     for name, text in BESIDE.get(kind.name, {}).items():
         (folder / name).write_text(text)
     path = folder / kind.name
     path.write_bytes(content)
-    with contextlib.suppress(InputError):
+    with contextlib.suppress(InputError), warnings.catch_warnings():
+        # A lot that has lost its `frame` is read, and said to be in metres.
+        warnings.filterwarnings("ignore", ".* are taken for metres", UserWarning)
         kind.read(path)
 
 
