@@ -12,10 +12,14 @@ from command_line import parkenv
 from pictures import shows_color
 from scipy import stats
 
-from parkenv import InputError, SensorModel
+from parkenv import InputError, SensorModel, make_scenario
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.studies.results import Results
-from parkenv.studies.statistics import mean_interval, summarize
+from parkenv.show.report.tables import table_of
+from parkenv.studies.compare.cases import Case, table
+from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.results import DECISIONS, Results
+from parkenv.studies.statistics import MEANS, mean_interval, summarize
+from parkenv.studies.study import Cell
 
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -210,19 +214,52 @@ def test_degenerate_samples_have_sane_intervals():
     assert np.isnan(high)
 
 
-def test_differences_are_paired_by_seed():
-    def episode(seed, total):
-        zero = dict.fromkeys(("drive_s", "failed_s", "walk_s", "gave_up_s", "failed_parks", "replans"), 0.0)
-        more = dict.fromkeys(
-            ("parking_cost_s", "driven_m", "walked_m", "slots_passed", "occupancy", "bound_s"), 0.0
-        )
-        return {"seed": seed, "total_s": total, "parked": True, **zero, **more}
+def episode(seed, total, parked=True):
+    return {**dict.fromkeys(MEANS, 0.0), "seed": seed, "total_s": total, "parked": parked, DECISIONS: ""}
 
+
+def test_differences_are_paired_by_seed():
     first = [episode(s, 100.0 * s) for s in range(20)]
     other = [episode(s, 100.0 * s + 1.0) for s in range(19, 5, -1)]
     row = summarize({}, other, first)
     assert row["difference_s"] == pytest.approx(1.0)
     assert row["difference_s_ci95"] == pytest.approx([1.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("n", "slower_s", "leaders"),
+    [(30, 8.0, ["mdp"]), (30, 0.5, ["mdp", "belief"]), (2, 8.0, ["mdp", "belief"])],
+)
+def test_an_agent_is_called_the_fastest_only_where_no_interval_includes_0(n, slower_s, leaders):
+    """The oracle, which is faster than all, is no competitor; two searches show nothing, however they end."""
+    rng = np.random.default_rng(1)
+    scenario, noise = make_scenario("mini"), rng.normal(0.0, 5.0, n)
+    cases = [Case(scenario, name) for name in ("mdp", "belief", "oracle")]
+    later = {"mdp": np.zeros(n), "belief": slower_s + noise - noise.mean(), "oracle": np.full(n, -20.0)}
+    finished = {
+        case.key(seed): episode(seed, 100.0 + seed + later[case.agent][seed])
+        for case in cases
+        for seed in range(n)
+    }
+    rows = table([Cell(case, range(n)) for case in cases], finished)
+    assert [row["agent"] for row in rows if row["leads"]] == leaders
+    (finding,) = Comparison.findings({"rows": rows})
+    assert all(name in finding for name in leaders)
+    assert ("belief" in finding) == (len(leaders) == 2)
+
+
+def test_where_a_search_gave_up_the_median_and_their_share_stand_beside_the_mean():
+    rows = [
+        summarize(
+            {"scenario": "mini", "agent": name},
+            [episode(s, t, parked=t < 1000.0) for s, t in enumerate(times)],
+        )
+        for name, times in (("mdp", [30.0, 40.0, 50.0, 1800.0]), ("belief", [30.0, 40.0, 50.0, 60.0]))
+    ]
+    assert (rows[0]["median_s"], rows[0]["gave_up_fraction"]) == (45.0, 0.25)
+    shown = [column["key"] for column in table_of("rows", "Results", rows)["columns"]]
+    assert {"median_s", "gave_up_fraction"} < set(shown)
+    assert "median_s" not in [column["key"] for column in table_of("rows", "Results", rows[1:])["columns"]]
 
 
 # --- faults ----------------------------------------------------------------------------------------

@@ -56,6 +56,7 @@ def test_the_tables_hold_every_number_of_the_summary(run):
     keys = [column["key"] for column in table["columns"]]
     same = {column["key"]: column["value"] for column in table["same"]}
     assert len(table["rows"]) == len(rows)
+    assert table["leads"] == [i for i, row in enumerate(rows) if row.pop("leads")]
     for row, cells in zip(rows, table["rows"], strict=True):
         shown = same | dict(zip(keys, cells, strict=True))
         for key, value in row.items():

@@ -133,6 +133,10 @@ _DETAILS: tuple[Column, ...] = (
     ("ms/decision", lambda r: f"{r['decision_ms']:.2f}" if "decision_ms" in r else ""),
     ("p99", lambda r: f"{r['decision_ms_p99']:.2f}" if "decision_ms" in r else ""),
 )
+_OF_GIVING_UP: tuple[Column, ...] = (
+    ("median s", lambda r: _seconds(r["median_s"])),
+    ("found no slot", lambda r: f"{r['gave_up_fraction']:.0%}"),
+)
 
 
 def result_tables(rows: list[Row], width: int) -> list[Table]:
@@ -146,6 +150,7 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
         first = its_rows[0]["agent"]
         results: tuple[Column, ...] = (
             ("total s [95 %]", lambda r: _interval(r["total_s"], r["total_s_ci95"])),
+            *(_OF_GIVING_UP if any(row["gave_up_fraction"] for row in its_rows) else ()),
             (f"minus {first} [95 %]", lambda r, a=first: _difference(r, a)),  # type: ignore[misc]
             ("regret s", lambda r: _seconds(r["regret_s"])),
         )

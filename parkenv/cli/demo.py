@@ -10,12 +10,11 @@ from parkenv.cli.report import make_report
 from parkenv.cli.study_command import Rerun, StudyCommand
 from parkenv.cli.tables import make_console, print_recorded
 from parkenv.files.option import option
-from parkenv.show.plurals import plural
 from parkenv.studies.demo.study import FILM, QUICK
 from parkenv.studies.demo.study import Demo as DemoStudy
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import PAGE
-from parkenv.studies.sensing.survey_study import SHOWN
+from parkenv.studies.sensing.survey_study import SHOWN, SurveyStudy
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -42,7 +41,7 @@ class Demo(StudyCommand):
     2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
 
     3. Searches on other days, with camera, laser and detector: the thesis's planner, the planner in belief space and
-    two heuristic baselines, all with the same map, in the same worlds; and the clairvoyant lower bound.
+    two heuristic baselines, all with the same map, in the same worlds; and an oracle that knows every slot's future.
 
     4. A report with replays, and a film of one search.
     """
@@ -91,10 +90,9 @@ class Demo(StudyCommand):
     def show(self, console: Console, result: Result) -> None:
         """Print the errors of the survey, and the table of the searches."""
         if (surveyed := result.summary["survey"]) is not None:
+            (found,) = SurveyStudy.findings({"rows": [surveyed]})
             console.print(
-                f"{plural(surveyed['sessions'], 'drive')} past {surveyed['slots']} slots: "
-                f"{surveyed['car_detection_rate']:.1%} of the parked cars were found, {surveyed['slot_accuracy']:.1%} "
-                f"of the slots classified correctly. Mean absolute error of the map: {surveyed['occupancy_mae']:.2f} "
+                f"{found} Mean absolute error of the map: {surveyed['occupancy_mae']:.2f} "
                 f"(raw counts for that hour: {surveyed['occupancy_mae_expected']:.2f})."
             )
         for printed in result_tables(result.rows, console.width):

@@ -107,6 +107,7 @@ class Survey(StudyCommand):
                 for name, r in row["by_weather"].items()
             )
             console.print(make_table(None, ["weather", "sessions", "cars found", "slots right"], by_weather))
+        console.print(*self.study.findings(result.summary))
 
 
 class MapDrive(Command):

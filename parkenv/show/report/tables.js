@@ -64,15 +64,8 @@ function sortableTable(table) {
   const settings = columns.map((column, i) => (SETTING.includes(column.key) ? i : -1)).filter((i) => i >= 0);
   const agent = columns.findIndex((column) => column.key === "agent");
   const settingOf = (row) => JSON.stringify(settings.map((i) => row[i]));
-  const least = new Map();
-  if (lead >= 0 && agent >= 0) {
-    rows.forEach((row, i) => {
-      const best = least.get(settingOf(row));
-      if (row[agent] !== "oracle" && (best === undefined || sortValue(row[lead]) < sortValue(rows[best][lead]))) least.set(settingOf(row), i);
-    });
-  }
   const lines = rows.map((row, i) => {
-    const line = make("tr", { "data-row": i, class: [...least.values()].includes(i) ? "least" : null });
+    const line = make("tr", { "data-row": i, class: table.leads?.includes(i) ? "leads" : null });
     columns.forEach((column, k) => {
       const value = column.key === "agent" || column.key === "model" ? shortName(String(row[k])) : row[k];
       const cell = make("td", { class: classOf(k) });

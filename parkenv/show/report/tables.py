@@ -109,7 +109,8 @@ _KNOWN = {
         Column("share", "members", share=True, digits=0),
         Column("arrivals_per_hour", "cars an hour", digits=0),
         Column("cars", "cars", digits=0),
-        Column("median_s", "median", "s", help="Median of the total times of a day's cars"),
+        Column("median_s", "median", "s", help="Median of the total times"),
+        Column("gave_up_fraction", "found no slot", share=True, help="Searches that gave up; charged the penalty"),
         Column("p95_s", "95 % quantile", "s", 0),
         Column("gini", "Gini", digits=3, help="Inequality of total times: 0 if all are equal"),
         Column("search_s", "search time", "s", help="From the entry to the end of the search"),
@@ -132,7 +133,8 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "difference_s", "gap_to_exact",
+    "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "median_s", "gave_up_fraction",
+    "difference_s", "gap_to_exact",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
@@ -140,6 +142,7 @@ OF_FLEETS = {
     column.key: column
     for column in (
         Column("difference_s", "minus own", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
+        Column("median_s", "median", "s", help="Median of the total times of a day's cars"),
         Column("bound_s", "alone", "s", help="Mean total time of a car alone in an empty lot that it knows"),
         Column(
             "occupancy", "occupied", share=True, digits=0, help="Mean share of slots taken while cars arrive"
@@ -147,6 +150,8 @@ OF_FLEETS = {
     )
 }
 """Columns that mean something else in the table of `parkenv fleet`."""
+_OF_GIVING_UP = ("median_s", "gave_up_fraction")
+"""Columns that are left out where no search gave up."""
 _TABLES_OF_THEIR_OWN = ("by_weather",)
 _UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
 
@@ -177,7 +182,7 @@ def table_of(
     """Build a table of the page's data.
 
     Intervals (`NAME_ci95`) are merged into the column of their value. Columns that are equal in all rows go to `same`,
-    which is printed above the table.
+    which is printed above the table. `leads` holds the numbers of the rows whose agent leads.
 
     Args:
         name: identifier of the table in the page.
@@ -192,7 +197,9 @@ def table_of(
 
     flat = [_flat(row) for row in rows]
     keys = list(dict.fromkeys(key for row in flat for key in row))
-    keys = [k for k in _ORDER if k in keys] + [k for k in keys if k not in _ORDER]
+    keys = [k for k in _ORDER if k in keys] + [k for k in keys if k not in _ORDER and k != "leads"]
+    if not any(row.get("gave_up_fraction", 1.0) for row in flat):
+        keys = [k for k in keys if k not in _OF_GIVING_UP]
     values = {key: [row.get(key) for row in flat] for key in keys}
     same = []
     if len(rows) > 1:
@@ -210,6 +217,7 @@ def table_of(
         "facts": facts,
         "columns": [written(key) for key in shown],
         "rows": [[values[key][i] for key in shown] for i in range(len(rows))],
+        "leads": [i for i, row in enumerate(flat) if row.get("leads")],
         "same": [{**written(key), "value": values[key][0]} for key in same if values[key][0] is not None],
     }
 

@@ -24,10 +24,9 @@ function timePanel(rows, end, width) {
     label.textContent = `${tick}${tick === 0 ? " s" : ""}`;
     svg.append(label);
   }
-  const best = rows.filter((row) => row.agent !== "oracle").reduce((a, b) => (b.total_s[0] < a.total_s[0] ? b : a), rows[0]);
   rows.forEach((row, i) => {
     const y = i * line + 5;
-    const name = makeSvg("text", { x: left - 10, y: y + 12, "text-anchor": "end", class: row === best ? "lead" : "strong" });
+    const name = makeSvg("text", { x: left - 10, y: y + 12, "text-anchor": "end", class: row.leads ? "lead" : "strong" });
     name.textContent = shortName(row.agent);
     svg.append(name);
     let from = 0;
@@ -43,7 +42,7 @@ function timePanel(rows, end, width) {
       svg.append(makeSvg("line", { class: "whisker", x1: x(low), x2: x(high), y1: y + 7.5, y2: y + 7.5 }));
       for (const at of [low, high]) svg.append(makeSvg("line", { class: "whisker", x1: x(at), x2: x(at), y1: y + 4, y2: y + 11 }));
     }
-    const total = makeSvg("text", { x: Math.min(x(Math.max(mean, mean > end ? mean : high ?? mean)) + 7, width - right + 7), y: y + 12, class: row === best ? "lead" : "strong" });
+    const total = makeSvg("text", { x: Math.min(x(Math.max(mean, mean > end ? mean : high ?? mean)) + 7, width - right + 7), y: y + 12, class: row.leads ? "lead" : "strong" });
     total.textContent = written(mean, 1);
     svg.append(total);
   });
@@ -55,7 +54,7 @@ function timePanel(rows, end, width) {
 
 /** Draw the chart of a table that has the parts of the total time; returns whether it does. */
 function showTimeChart(root, table) {
-  const named = (row) => Object.fromEntries([...table.same.map((column) => [column.key, column.value]), ...table.columns.map((column, i) => [column.key, row[i]])]);
+  const named = (row, i) => Object.fromEntries([["leads", table.leads?.includes(i)], ...table.same.map((column) => [column.key, column.value]), ...table.columns.map((column, i) => [column.key, row[i]])]);
   const rows = table.rows.map(named);
   if (!rows.length || !rows.every((row) => Array.isArray(row.total_s) && "drive_s" in row && "agent" in row)) return false;
   const columns = [...table.same, ...table.columns].filter((column) => SETTING.includes(column.key)).sort((a, b) => SETTING.indexOf(a.key) - SETTING.indexOf(b.key));
@@ -90,7 +89,7 @@ function showTimeChart(root, table) {
   keys.push(make("span", { class: "key" }, line, "95 % interval of the mean"));
   if (rows.some((row) => row.bound_s)) keys.push(make("span", { class: "key" }, dashes, "clairvoyant lower bound"));
   root.append(
-    make("p", { class: "quiet" }, "Mean seconds from the entry of the lot to the goal. Bars far longer than the others are cut off."),
+    make("p", { class: "quiet" }, "Mean seconds from the entry of the lot to the goal; in bold, the agents that no other is shown to be faster than. Bars far longer than the others are cut off."),
     make("div", { class: "card chart" }, make("div", { class: "legend" }, ...keys), grid),
   );
   return true;

@@ -17,7 +17,7 @@ from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s, timed_row
-from parkenv.studies.statistics import columns_of, mean_interval, summarize
+from parkenv.studies.statistics import LEAST_PAIRS, columns_of, mean_interval, paired_differences, summarize
 from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
@@ -181,6 +181,7 @@ def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
 def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> list[Row]:
     """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
+    `leads` says whether no other agent of the setting, the oracle apart, is shown to be faster (`_mark_leaders`).
     If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
 
     Args:
@@ -188,7 +189,7 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
         finished: rows of episodes, by `Case.key`.
     """
     rows = []
-    first: dict[tuple[Any, ...], list[Row]] = {}
+    by_setting: dict[tuple[Any, ...], list[tuple[Row, list[Row]]]] = {}
     for case, seeds in cells:
         episodes = [finished[key] for s in seeds if (key := case.key(s)) in finished]
         if not episodes:
@@ -196,8 +197,11 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
         columns = case.columns
         setting = tuple(v for k, v in columns.items() if k != "agent")
         times = list(itertools.chain.from_iterable(decision_s(row) for row in episodes))
-        rows.append(summarize(columns, episodes, first.get(setting), times))
-        first.setdefault(setting, episodes)
+        its = by_setting.setdefault(setting, [])
+        rows.append(summarize(columns, episodes, its[0][1] if its else None, times))
+        its.append((rows[-1], episodes))
+    for its in by_setting.values():
+        _mark_leaders(its)
     names = [c for c in SETTING_COLUMNS if c != "agent"]
     optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == "exact"}
     for row in rows:
@@ -205,6 +209,21 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
         if best is not None:
             row["gap_to_exact"] = row["total_s"] / best - 1.0
     return rows
+
+
+def _mark_leaders(its: Sequence[tuple[Row, list[Row]]]) -> None:
+    """Set `leads` in the rows of a setting, given with their episodes.
+
+    An agent leads unless the 95 % interval of its paired difference to the lowest mean lies above 0. Several lead where
+    the searches cannot tell them apart. The oracle is no competitor.
+    """
+    best = min(
+        (i for i in its if i[0]["agent"] != "oracle"), key=lambda i: float(i[0]["total_s"]), default=its[0]
+    )
+    for row, episodes in its:
+        behind = paired_differences(episodes, best[1])
+        shown = len(behind) >= LEAST_PAIRS and mean_interval(behind)[1] > 0.0
+        row["leads"] = row["agent"] != "oracle" and not shown
 
 
 def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:

@@ -15,6 +15,7 @@ from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
 from parkenv.show.columns import SETTING_AXES
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
     AGENTS_HELP,
@@ -43,7 +44,7 @@ if TYPE_CHECKING:
     from parkenv.world.scenario import Scenario
 
 DEFAULT_AGENTS = (
-    "mdp", "mdp-static", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
+    "mdp", "mdp-tuned", "belief", "greedy-goal", "greedy-drive", "first-free", "random", "oracle",
 )  # fmt: skip
 FAILURE_COST_SWEEP = (0.0, 1.0, 2.0, 3.0, 5.0, 8.0, 12.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0)
 """Failure costs of `--failure-cost sweep`, s."""
@@ -138,11 +139,11 @@ class Comparison(CaseStudy):
     table_titles: ClassVar = {"rows": "Results", "occupancy_rows": "By occupancy level"}
 
     kind: Literal["compare"] = "compare"
-    agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents, default="all but exact")] = (
-        Field(
-            tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS),
-            description=f"{AGENTS_HELP} Differences are to the first.",
-        )
+    agents: Annotated[
+        Agents, Option(takes="NAME[,...]", parse=split_agents, default=",".join(DEFAULT_AGENTS))
+    ] = Field(
+        tuple(AgentSpec(name=name) for name in DEFAULT_AGENTS),
+        description=f"{AGENTS_HELP} Differences are to the first.",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
     grid: Grid = Grid()
@@ -346,7 +347,7 @@ class Comparison(CaseStudy):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: the fastest agent in each setting with several, the oracle apart."""
+        """See `Study`: the fastest agents in each setting with several, the oracle apart."""
         settings: dict[tuple[Any, ...], list[Row]] = {}
         for row in summary["rows"]:
             settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
@@ -356,14 +357,27 @@ class Comparison(CaseStudy):
             agents = [row for row in its if row["agent"] != "oracle"]
             if len(agents) < 2:
                 continue
-            best = min(agents, key=lambda row: float(row["total_s"]))
-            at = f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
-            interval = best["total_s_ci95"]
-            between = f" [{interval[0]:.1f}, {interval[1]:.1f}]" if None not in interval else ""
-            findings.append(
-                f"{name}, failure cost {failure:g} s{at}: {best['agent']} has the lowest mean total time, "
-                f"{best['total_s']:.1f} s{between}; the clairvoyant lower bound is {best['bound_s']:.1f} s."
-            )
+            leaders = sorted((row for row in agents if row["leads"]), key=lambda row: float(row["total_s"]))
+            best, at = leaders[0], f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
+            found = f"{name}, failure cost {failure:g} s{at}: "
+            if len(leaders) == 1:
+                low, high = best["total_s_ci95"]
+                found += (
+                    f"{best['agent']} has the lowest mean total time, {best['total_s']:.1f} s [{low:.1f}, {high:.1f}], "
+                    "and the paired differences of all others to it are above 0"
+                )
+            else:
+                found += (
+                    f"{plural(best['episodes'], 'search', 'searches')} cannot tell which of "
+                    f"{', '.join(row['agent'] for row in leaders)} is fastest; their mean total times are "
+                    f"{best['total_s']:.1f} to {leaders[-1]['total_s']:.1f} s"
+                )
+            findings.append(f"{found}. The clairvoyant lower bound is {best['bound_s']:.1f} s.")
+            if most := max(row["gave_up_fraction"] for row in agents):
+                findings.append(
+                    f"{name}{at}: up to {most:.0%} of an agent's searches found no slot. Each of them counts with the "
+                    "give-up penalty, which raises the mean far above the median."
+                )
         return findings
 
 

@@ -203,7 +203,8 @@ class SurveyStudy(Study):
         (row,) = summary["rows"]
         return [
             f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: {row['car_detection_rate']:.1%} "
-            f"of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots classified correctly."
+            f"of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots classified correctly. "
+            "Ranges alone classify slots, too, so a car that was detected in no image can still be in the map."
         ]
 
     @classmethod

@@ -296,8 +296,9 @@ class TrainingSpec(Study):
         finding = f"Tested on {name} in held-out worlds, the models take {between}"
         planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
         if planners:
-            best = min(planners, key=lambda row: float(row["total_s"]))
-            finding += f"; the best planner there, {best['agent']}, takes {best['total_s']:.1f} s"
+            finding += "; planners there: " + ", ".join(
+                f"{row['agent']} {row['total_s']:.1f} s" for row in planners
+            )
         return [f"{finding}."]
 
     @classmethod
