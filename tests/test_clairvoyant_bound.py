@@ -96,7 +96,8 @@ def test_no_fleet_is_below_it(knows):
     scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
     spec = FleetStudy().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
     its = spec
-    roads = Roads(its.built)
+    (scenario,) = its.built.values()
+    roads = Roads(scenario)
     for setting in its.fleet_settings:
         for day in range(3):
             fleet, agents = its.fleet(setting)

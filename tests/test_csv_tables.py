@@ -38,7 +38,7 @@ def read_sessions(path):
 
 
 def read_rows(path):
-    return replace(EPISODES, file=path.name, timings=None).read(path.parent)
+    return replace(EPISODES, file=path.name, lists=None).read(path.parent)
 
 
 def test_good_tables_are_read(tmp_path):

@@ -160,7 +160,7 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
     with (tmp_path / "a" / "days.csv").open() as file:
         days = list(csv.DictReader(file))
     assert len(days) == 2 * len(rows)
-    assert done.stdout.count("greedy-drive") == len(rows)
+    assert done.stdout.count("reserve ") >= 4
     again = parkenv("fleet", *words, "--out", tmp_path / "b")
     assert again.returncode == 0
     assert (tmp_path / "b" / "days.csv").read_bytes() == (tmp_path / "a" / "days.csv").read_bytes()
@@ -252,7 +252,8 @@ def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
     measured = Calibration("mini", 2.0, 15.0, 14.0, 40, 2.8)
     measured.to_file(tmp_path / "calibrated.json")
     calibrated = crowded.changed(calibrated=tmp_path / "calibrated.json")
-    assert (calibrated.built.v_drive, calibrated.built.failure_s) == (2.0, 15.0)
+    (built,) = calibrated.built.values()
+    assert (built.v_drive, built.failure_s) == (2.0, 15.0)
     assert calibrated.blocked_s == 14.0
     assert calibrated.changed(manoeuvre_s=0.0).blocked_s == 0.0
     (day,), (queueing,) = days_of(crowded)[0], days_of(calibrated)[0]

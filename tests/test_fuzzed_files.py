@@ -34,6 +34,7 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.suite import Suite, check_result
 from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.fleet.changes import CHANGES
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import EPISODES, Results, decision_s
@@ -273,6 +274,14 @@ FLEET_SUMMARY = {
             "price_of_anarchy": price, "price_of_anarchy_ci95": [price, price], "others_s": None,
         }
         for knows, price in (("own", 1.1), ("shared", None))
+    ],
+    "changes": [
+        {
+            "change": "knows", "before": "own observations", "after": "a live map for 50 %", "scenario": "mini",
+            "agents": "random", "knows": "shared", "share": 0.5, "arrivals_per_hour": 20.0, "days": 2,
+            "cars_a_day": 20.0,
+        }
+        | dict.fromkeys(CHANGES, -0.5) | {f"{name}_ci95": [-0.75, -0.25] for name in CHANGES}
     ],
 }  # fmt: skip
 DAY = dict.fromkeys((*FleetStudy.table.keys, *FleetStudy.table.columns), "1.5") | {

@@ -23,7 +23,7 @@ class Power(NamedTuple):
 class Toy(Study):
     """Powers of whole numbers."""
 
-    table: ClassVar = CsvTable("powers.csv", ("power", "number"), ("value",), {}, other=WHOLE, timings=None)
+    table: ClassVar = CsvTable("powers.csv", ("power", "number"), ("value",), {}, other=WHOLE, lists=None)
     block: ClassVar = 2
     unit: ClassVar = "numbers"
 

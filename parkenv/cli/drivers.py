@@ -10,8 +10,9 @@ from parkenv.cli.tables import make_table
 from parkenv.files.option import option
 from parkenv.show.plurals import plural
 from parkenv.studies.commute.study import Commute as CommuteStudy
+from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown_changes
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.results import Row
+from parkenv.studies.results import Row, without_nan
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -73,12 +74,16 @@ class Fleet(AgentStudyCommand):
     Cars arrive as a Poisson process. All settings have the same days: arrivals, stays, patience and residents. The
     table gives the mean over cars and days with 95 % intervals over days. The price of anarchy is the total time over
     that of a guidance system that reserves slots for all cars; it needs reserve among --knows, and 1 among --share.
+
+    Several scenarios, such as a lot before and after a change, are compared with the first one: the same cars come on
+    the same days. The second table says what changes for whom, with guidance as with scenarios.
     """
 
     examples = """
         parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
+        parkenv fleet --scenario before.geojson,after.geojson --hours 08:00-12:00 --report
         parkenv fleet --manoeuvre 15 --leaving-soon 10
         parkenv fleet --resume --episodes 20
         """
@@ -89,32 +94,66 @@ class Fleet(AgentStudyCommand):
     )
 
     def show(self, console: Console, result: Result) -> None:
-        """Print the table of a study of many cars."""
+        """Print the tables of a study of many cars, and what changes between scenarios in sentences."""
         if not result.rows:
             return
-        headings = (
-            "agents", "knows", "share", "per hour", "total s [95 %]", "search s", "p95 s", "failed", "balked",
-            "cruising", "occupancy", "price of anarchy", "over bound",
-        )  # fmt: skip
-        console.print(make_table(self.study.title, headings, map(_cells, result.rows)))
+        several = [name for name in ("scenario", "agents") if len({row[name] for row in result.rows}) > 1]
+        mixed = any(0.0 < row["share"] < 1.0 for row in result.rows)
+        setting = [*several, "members know", "members", "cars/h"]
+        headings = [
+            *setting, "total s [95 %]", *(["members s", "others s"] if mixed else []), "search s", "95 % below s",
+            "failed attempts", "no slot found", "cruising", "slots taken", "price of anarchy", "over bound",
+        ]  # fmt: skip
+        cells = [[*(row[name] for name in several), *_cells(row, mixed=mixed)] for row in result.rows]
+        agents = "" if "agents" in several else f", {result.rows[0]['agents']}"
+        console.print(make_table(f"{self.study.title}{agents}", headings, cells))
+        changes = without_nan(result.summary["changes"])
+        if changes:
+            groups = ["members s [95 %]", "others s [95 %]"] if mixed else []
+            headings = ["after", "before", *setting, "all cars s [95 %]", *groups, "better off", "worse off"]
+            cells = [
+                [row["after"], row["before"], *(row[name] for name in several), *_changed(row, mixed=mixed)]
+                for row in changes
+            ]
+            title = "What changes for whom: time after minus before, of the same cars on the same days"
+            console.print(make_table(title, headings, cells))
+        for row in shown_changes(changes):
+            if row["change"] == "scenario":
+                console.print(sentence(row), soft_wrap=True)
 
 
-def _cells(row: Row) -> tuple[str, ...]:
-    low, high = row["total_s_ci95"]
-    cheap, dear = row["price_of_anarchy_ci95"]
-    price = row["price_of_anarchy"]
-    return (
-        row["agents"],
-        row["knows"],
-        f"{row['share']:g}",
-        f"{row['arrivals_per_hour']:g}",
-        f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]",
+def _setting(row: Row) -> list[str]:
+    return [row["knows"], f"{row['share']:.0%}", f"{row['arrivals_per_hour']:g}"]
+
+
+def _cells(row: Row, *, mixed: bool) -> list[str]:
+    return [
+        *_setting(row),
+        _interval(row, "total_s", ".1f"),
+        *([_number(row[name], ".1f") for name in ("members_s", "others_s")] if mixed else []),
         f"{row['search_s']:.1f}",
         f"{row['p95_s']:.0f}",
         f"{row['failed_attempts']:.3f}",
         f"{row['balked_fraction']:.1%}",
         f"{row['cruising_share']:.0%}",
         f"{row['occupancy']:.0%}",
-        "" if price != price else f"{price:.3f} [{cheap:.3f}, {dear:.3f}]",
+        _interval(row, "price_of_anarchy", ".3f"),
         f"{row['price_over_bound']:.3f}",
-    )
+    ]
+
+
+def _changed(row: Row, *, mixed: bool) -> list[str]:
+    columns = ("change_s", "members_change_s", "others_change_s") if mixed else ("change_s",)
+    shares = [_number(row[name], ".0%") for name in ("better_off", "worse_off")]
+    return [*_setting(row), *(_interval(row, name, "+.1f") for name in columns), *shares]
+
+
+def _number(value: float | None, digits: str) -> str:
+    return format(value, digits) if is_known(value) else ""
+
+
+def _interval(row: Row, name: str, digits: str) -> str:
+    """Return a value and its interval, each as far as it is known."""
+    ends = interval_of(row, name)
+    shown = f" [{', '.join(format(end, digits) for end in ends)}]" if ends else ""
+    return _number(row[name], digits) + shown

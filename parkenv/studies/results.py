@@ -128,7 +128,8 @@ class CsvTable(Table):
         columns: the other columns.
         kinds: what a column holds.
         other: what all other columns hold.
-        timings: name of a second file, with the wall times of decisions; None for a run that measures none.
+        lists: name of a second file, and its columns, which hold a list for each row as a text, such as the wall times
+            of decisions; None for none.
     """
 
     file: str = "episodes.csv"
@@ -136,16 +137,16 @@ class CsvTable(Table):
     columns: Sequence[str] = OUTCOME_COLUMNS
     kinds: Mapping[str, Kind] = field(default_factory=lambda: KINDS)
     other: Kind = NUMBER
-    timings: str | None = "timings.csv"
+    lists: tuple[str, Sequence[str]] | None = ("timings.csv", (DECISIONS,))
 
     def read(self, folder: Path) -> list[Row]:
-        """See `Table`; a row without wall times, as a crash lost them, has none."""
+        """See `Table`; a row without lists, as a crash lost them, has empty ones."""
         rows = self._read(folder / self.file, (*self.keys, *self.columns))
-        if self.timings is not None:
-            timings = self._read(folder / self.timings, (*self.keys, DECISIONS))
-            measured = {self.key(row): row[DECISIONS] for row in timings}
+        if self.lists is not None:
+            file, columns = self.lists
+            found = {self.key(row): row for row in self._read(folder / file, (*self.keys, *columns))}
             for row in rows:
-                row[DECISIONS] = measured.get(self.key(row), "")
+                row |= dict.fromkeys(columns, "") | found.get(self.key(row), {})
         return rows
 
     def _read(self, path: Path, columns: Sequence[str]) -> list[Row]:
@@ -155,10 +156,10 @@ class CsvTable(Table):
         return [row for _, row in typed_records(path, kind_of, columns, whole_lines=True)]
 
     def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        """See `Table`; timings come first: a finished row would not run again for its timing."""
-        if self.timings is not None:
-            timed = [row for row in rows if row.get(DECISIONS)]
-            yield self.timings, self._text((*self.keys, DECISIONS), timed, header)
+        """See `Table`; lists come first: a finished row would not run again for them."""
+        if self.lists is not None:
+            file, columns = self.lists
+            yield file, self._text((*self.keys, *columns), [r for r in rows if r.get(columns[0])], header)
         yield self.file, self._text((*self.keys, *self.columns), rows, header)
 
     def _text(self, columns: Sequence[str], rows: Sequence[Row], header: bool) -> str:

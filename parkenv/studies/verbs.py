@@ -45,14 +45,14 @@ def fleet(
     progress: Progress | None = None,
     **fields: Any,
 ) -> Result:
-    """Let many cars search one lot for days, and compare what they know.
+    """Let many cars search a lot for days, and compare lots, and what the cars know.
 
     Args:
         folder: see `compare`.
         resume: see `compare`.
         overwrite: see `compare`.
         progress: see `compare`.
-        fields: fields of the specification, as in a file of kind `fleet`: `agents`, `scenario`, `knows`, `shares`,
+        fields: fields of the specification, as in a file of kind `fleet`: `agents`, `scenarios`, `knows`, `shares`,
             `arrivals_per_hour`, `days` and others.
 
     Raises:

@@ -49,11 +49,11 @@ class FleetReplay(NamedTuple):
         study = self.study
         agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
         numbers = options.chosen_numbers(range(study.days))
-        if (n := study.built.lot.n_slots) > MOST_SLOTS:
+        if (n := max(scenario.lot.n_slots for scenario in study.built.values())) > MOST_SLOTS:
             return Again(
                 notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
             )
-        window = study.built.arrival
+        window = next(iter(study.built.values())).arrival
         most = MOST_CARS / ((window.end_s - window.start_s) / 3600.0)
         settings = [one for one in study.fleet_settings if one.agent.label in agents]
         rates = dict.fromkeys(one.arrivals_per_hour for one in settings if one.arrivals_per_hour > most)
@@ -77,8 +77,8 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
         day: number of the day.
         counted: mean total time, s, of the days in the original run, by `FleetStudy.keys`.
     """
-    scenario = study.built
     fleet, agents = study.fleet(setting)
+    scenario = fleet.scenario
     fleet.keep_steps()
     fleet.reset(study.seed, day)
     fleet.run(agents, until=fleet.begin)

@@ -116,6 +116,12 @@ def day_measures(
     }
 
 
+def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
+    """Return `CAR_LISTS` of a day whose searches are all over, as texts."""
+    lists = {"total_cs": np.rint(100.0 * fleet.cars["total_s"]).astype(int), "member": members.astype(int)}
+    return {name: " ".join(map(str, values.tolist())) for name, values in lists.items()}
+
+
 def _mean(values: FloatArray) -> float:
     return float(values.mean()) if len(values) else float("nan")
 

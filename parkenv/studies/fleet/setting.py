@@ -14,6 +14,8 @@ MEASURES = (
     "cruising_share", "balked_fraction", "occupancy", "members_s", "others_s", "bound_s", "clairvoyant_s",
 )  # fmt: skip
 """Measures of a day, of which a summary has the mean over days."""
+CAR_LISTS = ("total_cs", "member")
+"""Lists over the cars of a day, in the order of their arrivals: total time in centiseconds, and 1 for members."""
 
 
 @dataclass(frozen=True)

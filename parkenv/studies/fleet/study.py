@@ -1,9 +1,10 @@
-"""Days on which many cars search one lot: agents, knowledge, shares and demand, all on the same days."""
+"""Days on which many cars search a lot: lots, agents, knowledge, shares and demand, all on the same days."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -12,27 +13,26 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
-from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE
+from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE, wholes
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
-from parkenv.files.option import Inside, Option, option
+from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis, FilePath
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
-    TRAFFIC,
     Agents,
     ArrivalRate,
     Figures,
     MeanStay,
-    OneScenario,
     Patience,
+    Scenarios,
     Seed,
     Values,
     listed,
     require_at_most,
     require_distinct_names,
 )
-from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS, Setting
+from parkenv.studies.fleet.setting import CAR_LISTS, MEASURES, OWN, SETTING_COLUMNS, Setting
 from parkenv.studies.results import CsvTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
@@ -50,13 +50,15 @@ MAX_SETTINGS = 10_000
 """Maximum number of settings of a study."""
 SAMPLE_S = 300.0
 """Time between two samples of the occupancy, s."""
+MOST_LISTED = 8_000_000
+"""Cars that are expected in all settings up to which `cars.csv` has a list of them for each day."""
 OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
 """Fields of the specification that all settings have in common."""
 PICTURE = "fleet.png"
 
 
 class FleetStudy(Study):
-    """Days on which many cars search one lot, and what they know."""
+    """Days on which many cars search a lot: what they know, and what changes with the lot."""
 
     table: ClassVar = CsvTable(
         "days.csv",
@@ -64,13 +66,15 @@ class FleetStudy(Study):
         columns=("cars", *MEASURES),
         kinds=dict.fromkeys(("scenario", "agents", "knows"), TEXT)
         | dict.fromkeys(("day", "cars"), WHOLE)
-        | dict.fromkeys(("members_s", "others_s"), NUMBER_OR_NAN),
-        timings=None,
+        | dict.fromkeys(("members_s", "others_s"), NUMBER_OR_NAN)
+        | dict.fromkeys(CAR_LISTS, wholes()),
+        lists=("cars.csv", CAR_LISTS),
     )
     block: ClassVar = 1
     doing: ClassVar = "Driving"
     unit: ClassVar = "days"
     heading: ClassVar = "Many cars"
+    table_titles: ClassVar = {"changes": "What changes for whom", "rows": "Results"}
 
     kind: Literal["fleet"] = "fleet"
     agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents)] = Field(
@@ -78,7 +82,7 @@ class FleetStudy(Study):
         description="Agents, each of which drives all cars in turn, with any options in brackets. greedy-drive, "
         "first-free and random are compiled; any other agent decides in Python.",
     )
-    scenario: Annotated[OneScenario, Inside(without=TRAFFIC)] = scenario_spec("campus")
+    scenarios: Scenarios = (scenario_spec("campus"),)
     knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = option(
         KNOWLEDGE,
         "What members know. own: what they observe; shared: also a live map of what members observe; "
@@ -139,39 +143,47 @@ class FleetStudy(Study):
     seed: Seed = 0
     figures: Figures = True
 
+    @model_validator(mode="before")
+    @classmethod
+    def _one_scenario(cls, tables: Any) -> Any:
+        """A file may name one `scenario`."""
+        if isinstance(tables, Mapping) and "scenario" in tables:
+            return {**{k: v for k, v in tables.items() if k != "scenario"}, "scenarios": [tables["scenario"]]}
+        return tables
+
     @model_validator(mode="after")
     def _bounded(self) -> Self:
-        require_distinct_names(self.agents)
+        require_distinct_names(self.agents, self.scenarios)
         if self.decision_limit_s is not None and self.backend == "dask":
             raise PydanticCustomError(
                 "whole",
                 "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
             )
-        settings = len(self.agents) * len(self.knows) * len(self.shares) * len(self.arrivals_per_hour)
-        axes = "agents x knows x shares x arrivals_per_hour"
+        axes = "scenarios x agents x knows x shares x arrivals_per_hour"
+        settings = math.prod(len(getattr(self, axis)) for axis in axes.split(" x "))
         require_at_most(settings, axes, "settings", MAX_SETTINGS)
         require_at_most(settings * self.days, f"{axes} x days", "days")
         return self
 
     @cached_property
-    def built(self) -> Scenario:
-        """Lot, residents, hours of arrival, speeds and costs."""
+    def built(self) -> dict[str, Scenario]:
+        """Lot, residents, hours of arrival, speeds and costs of each scenario, by its name."""
         from parkenv.scenarios.build import build
 
-        scenario = build(self.scenario)
-        return scenario if self.calibration is None else self.calibration.applied(scenario)
+        built = [build(spec) for spec in self.scenarios]
+        return {one.name: one if self.calibration is None else self.calibration.applied(one) for one in built}
 
     @cached_property
     def calibration(self) -> Calibration | None:
         """The measured speed, failure cost and manoeuvre, if any."""
-        from parkenv.scenarios.build import build
         from parkenv.scenarios.calibration import Calibration
 
         if (path := self.calibrated) is None:
             return None
-        measured = Calibration.from_file(path)
-        if measured.scenario != (name := build(self.scenario).name):
-            raise InputError(f"{path} was measured on {measured.scenario!r}, the fleet drives on {name!r}")
+        measured, names = Calibration.from_file(path), [spec.title for spec in self.scenarios]
+        if names != [measured.scenario]:
+            driven = " and ".join(map(repr, names))
+            raise InputError(f"{path} was measured on {measured.scenario!r}, the fleet drives on {driven}")
         return measured
 
     @property
@@ -182,10 +194,10 @@ class FleetStudy(Study):
         return 0.0 if self.calibration is None else self.calibration.manoeuvre_s
 
     @cached_property
-    def _roads(self) -> Roads:
+    def _roads(self) -> dict[str, Roads]:
         from parkenv.studies.fleet.measures import Roads
 
-        return Roads(self.built)
+        return {name: Roads(scenario) for name, scenario in self.built.items()}
 
     @cached_property
     def fleet_settings(self) -> list[Setting]:
@@ -197,10 +209,10 @@ class FleetStudy(Study):
                 self.arrivals_per_hour, range(len(self.agents)), self.knows, self.shares
             )
         )
-        name = self.built.name
         return [
             Setting(name, self.agents[number], knows, share, per_hour)
             for per_hour, number, knows, share in made
+            for name in self.built
         ]
 
     def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
@@ -213,14 +225,15 @@ class FleetStudy(Study):
         from parkenv.studies.fleet.decision_limit import LimitedAgent
         from parkenv.studies.fleet.drivers import demand_in, policy_of
 
-        policy, agent = policy_of(setting.agent, self.built, setting.arrivals_per_hour)
+        scenario = self.built[setting.scenario]
+        policy, agent = policy_of(setting.agent, scenario, setting.arrivals_per_hour)
         kinds = [
             DriverKind(setting.share, policy, setting.knows, shares=setting.knows == "shared"),
             DriverKind(1.0 - setting.share, policy),
         ]
         fleet = Fleet(
-            self.built,
-            demand_in(self.built, setting.arrivals_per_hour, self.stay_s, self.patience_s),
+            scenario,
+            demand_in(scenario, setting.arrivals_per_hour, self.stay_s, self.patience_s),
             background="residents",
             drivers=kinds,
             leave_full_lot=False,
@@ -240,12 +253,13 @@ class FleetStudy(Study):
         import numpy as np
 
         from parkenv.studies.fleet.clairvoyant_bound import clairvoyant_bound_s
-        from parkenv.studies.fleet.measures import day_measures
+        from parkenv.studies.fleet.measures import car_lists, day_measures
 
         fleet, agents = self.fleet(setting)
         fleet.reset(self.seed, day)
-        bound_s = clairvoyant_bound_s(self._roads.parking_day(fleet))
-        window = self.built.arrival
+        roads = self._roads[setting.scenario]
+        bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
+        window = fleet.scenario.arrival
         taken = []
         try:
             for second in np.arange(0.0, window.end_s - window.start_s, SAMPLE_S):
@@ -255,11 +269,27 @@ class FleetStudy(Study):
         except InputError as error:
             raise InputError(f"{setting}, day {day}, {error}") from error
         members = fleet.cars["kind"] == 0
-        measured = day_measures(fleet, self._roads, members, float(np.mean(taken)), bound_s)
-        return {**setting.columns, "day": day, **measured}
+        measured = day_measures(fleet, roads, members, float(np.mean(taken)), bound_s)
+        lists = car_lists(fleet, members) if self._lists_cars else {}
+        return {**setting.columns, "day": day, **measured, **lists}
+
+    @property
+    def _lists_cars(self) -> bool:
+        per_hour = sum(setting.arrivals_per_hour for setting in self.fleet_settings)
+        windows = [one.arrival for one in self.built.values()]
+        hours = max(window.end_s - window.start_s for window in windows) / 3600.0
+        return per_hour * hours * self.days <= MOST_LISTED
 
     def check(self) -> None:
-        """See `Study`."""
+        """See `Study`: days are equal only in equal hours."""
+        hours = {name: scenario.arrival for name, scenario in self.built.items()}
+        for name, its in hours.items():
+            first = next(iter(hours))
+            if (its.start_s, its.end_s) != (hours[first].start_s, hours[first].end_s):
+                raise InputError(
+                    f"arrivals.hours of {name!r} are not those of {first!r}, want equal hours, in which the same cars "
+                    "arrive; set --hours, e.g. 08:00-12:00"
+                )
         for setting in self.fleet_settings:
             self.fleet(setting)
 
@@ -283,51 +313,66 @@ class FleetStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
+        from parkenv.studies.fleet.changes import summarize_changes
         from parkenv.studies.fleet.tables import summarize_days
 
         days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
         options = {name: getattr(self, name) for name in OPTIONS}
-        return {"manoeuvre_s": self.blocked_s, **options, "rows": summarize_days(days)}
+        return {
+            "manoeuvre_s": self.blocked_s,
+            **options,
+            "rows": summarize_days(days),
+            "changes": summarize_changes(days),
+        }
 
     @property
     def title(self) -> str:
         """Title of the table and of the picture."""
         from parkenv.show.plurals import plural
 
-        return f"{self.built.name}: {self.built.lot.n_slots} slots, {plural(self.days, 'day')}"
+        lots = [f"{name}: {plural(its.lot.n_slots, 'slot')}" for name, its in self.built.items()]
+        return f"{'; '.join(lots)}, {plural(self.days, 'day')}"
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: the picture."""
+        """See `Study`: a picture of each scenario."""
+        from parkenv.files.file_names import file_name
         from parkenv.show.figures.fleet import save_fleet_figure
+        from parkenv.show.plurals import plural
         from parkenv.studies.fleet.measures import looks_s
 
         return [
             partial(
                 save_fleet_figure,
-                result.rows,
-                partial(looks_s, self.built),
-                self.title,
-                result.folder / PICTURE,
+                [row for row in result.rows if row["scenario"] == name],
+                partial(looks_s, scenario),
+                f"{name}: {plural(scenario.lot.n_slots, 'slot')}, {plural(self.days, 'day')}",
+                result.folder / (PICTURE if len(self.built) == 1 else file_name(f"fleet_{name}", ".png")),
             )
+            for name, scenario in self.built.items()
         ]
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: what competition costs, for each agent and demand."""
-        rows = summary["rows"]
+        from parkenv.studies.fleet.changes import sentence, shown_changes
+
         shown: dict[tuple[Any, ...], Row] = {}
-        for row in sorted(rows, key=lambda row: row["knows"] != OWN):
-            shown.setdefault((row["agents"], row["arrivals_per_hour"]), row)
-        findings = []
-        for agent, per_hour in dict.fromkeys((row["agents"], row["arrivals_per_hour"]) for row in rows):
-            row = shown[agent, per_hour]
+        for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
+            shown.setdefault((row["scenario"], row["agents"], row["arrivals_per_hour"]), row)
+        findings = [sentence(row) for row in shown_changes(summary["changes"])]
+        for (scenario, agent, per_hour), row in shown.items():
             finding = (
-                f"{agent}, {per_hour:g} cars an hour, {row['occupancy']:.0%} of the slots taken: {row['total_s']:.1f} "
-                f"s a car, {row['balked_fraction']:.1%} find no slot"
+                f"{agent} on {scenario}, {per_hour:g} cars an hour, {row['occupancy']:.0%} of the slots taken: "
+                f"{row['total_s']:.1f} s a car, {row['balked_fraction']:.1%} find no slot"
             )
             low, high = row["price_of_anarchy_ci95"]
             if None not in (row["price_of_anarchy"], low, high) and row["knows"] == OWN:
                 finding += f"; the price of anarchy is {row['price_of_anarchy']:.3f} [{low:.3f}, {high:.3f}]"
+                if low > 1.0:
+                    finding += (
+                        f": everybody for himself takes {row['price_of_anarchy'] - 1.0:.0%} longer than with slots "
+                        "reserved for all"
+                    )
             findings.append(f"{finding}.")
         return findings
 

@@ -38,8 +38,7 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
     def paired(days: list[Row], knows: str, share: float) -> Pairs:
         first = days[0]
         key = (first["scenario"], first["agents"], knows, share, first["arrivals_per_hour"])
-        others = {day["day"]: day for day in by_setting.get(key, ())}
-        return [(day, others[day["day"]]) for day in days if day["day"] in others]
+        return paired_days(days, by_setting.get(key, ()))
 
     return [
         {
@@ -53,6 +52,12 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
         }
         for days in settings
     ]
+
+
+def paired_days(days: Sequence[Row], others: Sequence[Row]) -> Pairs:
+    """Return the days of a setting, each with the same day in another one, as far as both have it."""
+    by_day = {day["day"]: day for day in others}
+    return [(day, by_day[day["day"]]) for day in days if day["day"] in by_day]
 
 
 def _differences(pairs: Pairs) -> Row:

@@ -363,7 +363,7 @@ class FleetPublication(Publication):
         """See `Publication`: a minute of the first day, in the middle of its arrivals."""
         fleet, agents = self.study.fleet(self.study.fleet_settings[-1])
         fleet.reset(self.seed, 0)
-        window, renderer = self.study.built.arrival, FleetRenderer(fleet)
+        window, renderer = fleet.scenario.arrival, FleetRenderer(fleet)
         middle = fleet.begin + (window.end_s - window.start_s) / 2.0
         frames = []
         for second in np.arange(0.0, _FILM_S, _STEP_S):

@@ -30,7 +30,7 @@ class DetectorStudy(Study):
     """Detectors compared on whole survey drives, each with every rig."""
 
     table: ClassVar = SessionTable(
-        "sessions.csv", keys=("rig", "detector", "key"), columns=SESSION_COLUMNS[1:], timings=None
+        "sessions.csv", keys=("rig", "detector", "key"), columns=SESSION_COLUMNS[1:], lists=None
     )
     block: ClassVar = 1
     doing: ClassVar = "Driving (compiles first after an installation)"

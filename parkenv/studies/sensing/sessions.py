@@ -52,4 +52,4 @@ class SessionTable(CsvTable):
         return rows
 
 
-SESSIONS = SessionTable("sessions.csv", keys=SESSION_COLUMNS[:1], columns=SESSION_COLUMNS[1:], timings=None)
+SESSIONS = SessionTable("sessions.csv", keys=SESSION_COLUMNS[:1], columns=SESSION_COLUMNS[1:], lists=None)

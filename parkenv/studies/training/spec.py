@@ -124,7 +124,7 @@ class TrainingSpec(Study):
     trained_by: ClassVar[str] = ""
     """`MODULE:CLASS` of the training, in this package; importing it loads torch."""
     table: ClassVar = CsvTable(
-        "trainings.csv", ("seed",), ("steps", "wall_s"), {"seed": WHOLE, "steps": WHOLE}, timings=None
+        "trainings.csv", ("seed",), ("steps", "wall_s"), {"seed": WHOLE, "steps": WHOLE}, lists=None
     )
     block: ClassVar = 1
     doing: ClassVar = "Training"

@@ -1,0 +1,200 @@
+"""What changes for whom: the same cars on the same days in another scenario, or with other guidance."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.show.plurals import plural
+from parkenv.studies.fleet.setting import OWN, SETTING_COLUMNS
+from parkenv.studies.fleet.tables import day_means, paired_days
+from parkenv.studies.results import Row
+
+NOTICED_S = 1.0
+"""A car is better or worse off if its total time differs by at least this, s."""
+CHANGES = (
+    "change_s", "members_change_s", "others_change_s", "search_change_s", "balked_change", "better_off", "worse_off",
+)  # fmt: skip
+"""Columns of a change: each has a 95 % interval over the days of both."""
+GUIDANCE = {
+    OWN: "own observations", "shared": "a live map", "reserve": "reservations", "full": "full knowledge",
+}  # fmt: skip
+"""What members know, in sentences."""
+
+
+def summarize_changes(settings: Sequence[list[Row]]) -> list[Row]:
+    """Return a row for each change between two settings, from the days of each setting, at least one.
+
+    A scenario is compared with the first one, and guidance with nobody knowing more than what it observes; everything
+    else is equal. Days are paired, and on each of them the cars: members, and others, are the same cars before and
+    after. Times after are subtracted by those before, so that negative ones are gains.
+    """
+    by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
+    first = settings[0][0]["scenario"] if settings else ""
+    rows = []
+    for days in settings:
+        its = {name: days[0][name] for name in SETTING_COLUMNS}
+        for what, before in (("scenario", {"scenario": first}), ("knows", {"knows": OWN, "share": 0.0})):
+            earlier = by_setting.get(tuple((its | before)[name] for name in SETTING_COLUMNS), [])
+            if its[what] != before[what] and (pairs := paired_days(days, earlier)):
+                names = _words(what, its | before), _words(what, its)
+                changes = day_means([_change(*pair) for pair in pairs], CHANGES, CHANGES)
+                cars = float(np.mean([after["cars"] for after, _ in pairs]))
+                head = {"change": what, "before": names[0], "after": names[1], **its}
+                rows.append(head | {"days": len(pairs), "cars_a_day": cars} | changes)
+    return sorted(rows, key=lambda row: row["change"] != "scenario")
+
+
+def _words(what: str, setting: Row) -> str:
+    """Return what is compared of a setting.
+
+    Examples:
+        >>> _words("knows", {"knows": "reserve", "share": 0.25}), _words("knows", {"knows": "own", "share": 0.0})
+        ('reservations for 25 %', 'own observations')
+    """
+    if what == "scenario" or setting["knows"] == OWN:
+        return str(setting["scenario"] if what == "scenario" else GUIDANCE[OWN])
+    members = "all" if setting["share"] == 1.0 else f"{100.0 * setting['share']:g} %"
+    return f"{GUIDANCE[setting['knows']]} for {members}"
+
+
+def _change(after: Row, before: Row) -> Row:
+    """Return what changes on a day; NaN for groups without cars, and for cars whose lists are lost or left out."""
+    row = {
+        "change_s": after["total_s"] - before["total_s"],
+        "search_change_s": after["search_s"] - before["search_s"],
+        "balked_change": after["balked_fraction"] - before["balked_fraction"],
+        **dict.fromkeys(("members_change_s", "others_change_s", "better_off", "worse_off"), float("nan")),
+    }
+    times, earlier, member = (
+        _numbers(day, name) for day, name in ((after, "total_cs"), (before, "total_cs"), (after, "member"))
+    )
+    if not len(times) == len(earlier) == len(member) > 0:
+        return row
+    gained = (times - earlier) / 100.0
+    for group, its in (("members", gained[member == 1.0]), ("others", gained[member == 0.0])):
+        row |= {f"{group}_change_s": float(its.mean())} if len(its) else {}
+    off = {"better_off": gained <= -NOTICED_S, "worse_off": gained >= NOTICED_S}
+    return row | {name: float(cars.mean()) for name, cars in off.items()}
+
+
+def _numbers(day: Mapping[str, Any], name: str) -> FloatArray:
+    return np.array(day.get(name, "").split(), np.float64)
+
+
+# ---- in words
+
+
+def sentence(row: Row) -> str:
+    """Return a change in a sentence; it calls nothing better or worse whose interval includes 0."""
+    said = [_gain(row, "change_s", "a car saves", "a car loses", "a car")]
+    minutes = abs(row["change_s"]) * row["cars_a_day"] / 60.0
+    if is_clear(row, "change_s") and minutes >= 1.0:
+        said[0] += f", all cars of a day together {minutes:,.0f} min"
+    if is_known(row["members_change_s"]) and is_known(row["others_change_s"]):
+        said.append(_gain(row, "members_change_s", "members save", "members lose", "members"))
+        said.append(_gain(row, "others_change_s", "the others save", "the others lose", "the others"))
+    if is_known(row["better_off"]):
+        said.append(off_in_words(row))
+    if is_clear(row, "balked_change"):
+        way = "falls" if row["balked_change"] < 0.0 else "rises"
+        said.append(
+            f"the share that finds no slot {way} by {100.0 * abs(row['balked_change']):.1f} percentage points"
+        )
+    after = row["after"] if row["change"] == "scenario" else row["after"][0].upper() + row["after"][1:]
+    return f"{after} instead of {row['before']} ({', '.join(where(row))}): {'; '.join(said)}."
+
+
+def where(row: Row) -> list[str]:
+    """Return what is equal before and after a change, in words."""
+    equal = [row["agents"], f"{row['arrivals_per_hour']:g} cars an hour"]
+    if row["change"] == "knows":
+        return [f"{row['agents']} on {row['scenario']}", *equal[1:]]
+    return equal if row["knows"] == OWN else [*equal, _words("knows", row)]
+
+
+def off_in_words(row: Row) -> str:
+    """Return the shares of the cars that gain and lose, in words."""
+    gain, lose = row["better_off"], row["worse_off"]
+    return f"{gain:.0%} of the cars are better off by {NOTICED_S:g} s or more, {lose:.0%} worse off"
+
+
+def is_clear(row: Row, name: str) -> bool:
+    """Return whether a column has an interval, and it does not include 0."""
+    low, high = interval_of(row, name) or (0.0, 0.0)
+    return low * high > 0.0
+
+
+def _gain(row: Row, name: str, saves: str, loses: str, who: str) -> str:
+    value, ends = row[name], interval_of(row, name)
+    if ends is None:
+        return f"{who}: {value:+.1f} s on {plural(row['days'], 'day')}, too few for an interval"
+    low, high = ends
+    if low <= 0.0 <= high:
+        if low == high:
+            return f"{who}: no difference"
+        return f"{who}: no clear difference, {value:+.1f} s [{low:+.1f}, {high:+.1f}]"
+    if high < 0.0:
+        return f"{saves} {-value:.1f} s [{-high:.1f}, {-low:.1f}]"
+    return f"{loses} {value:.1f} s [{low:.1f}, {high:.1f}]"
+
+
+def is_known(value: float | None) -> bool:
+    """Return whether there is a number."""
+    return value is not None and value == value
+
+
+def interval_of(row: Row, name: str) -> tuple[float, float] | None:
+    """Return the 95 % interval of a column, None where there is none."""
+    low, high = row[f"{name}_ci95"]
+    return (low, high) if is_known(low) and is_known(high) else None
+
+
+def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> list[Row]:
+    """Return what a page says in large type: the changes of all cars, or else their total times.
+
+    Each has a `label`, a `value` in words, and for a change the shares `better` and `worse`, if they are known.
+    """
+    if not (chosen := shown_changes(changes)):
+        return [
+            {"label": ", ".join(where(row | {"change": "knows"})), "value": f"{row['total_s']:.1f} s a car"}
+            for row in rows[:most]
+        ]
+    made = []
+    for row in chosen[:most]:
+        ends, size = interval_of(row, "change_s"), f"{abs(row['change_s']):.1f} s"
+        way = "less" if row["change_s"] < 0.0 else "more"
+        made.append(
+            {
+                "label": f"{row['after']} instead of {row['before']}",
+                "where": ", ".join(where(row)),
+                "value": f"{size} {way} a car" if is_clear(row, "change_s") else "no clear difference",
+                "interval": ""
+                if ends is None
+                else f"{row['change_s']:+.1f} s [{ends[0]:+.1f}, {ends[1]:+.1f}]",
+            }
+            | (
+                {"better": row["better_off"], "worse": row["worse_off"]}
+                if is_known(row["better_off"])
+                else {}
+            )
+        )
+    return made
+
+
+def shown_changes(changes: Sequence[Row]) -> list[Row]:
+    """Return the changes that are told in sentences: of scenarios, then of guidance for as many cars as there are."""
+    scenarios = [row for row in changes if row["change"] == "scenario"]
+    of_guidance: dict[tuple[Any, ...], list[Row]] = {}
+    for row in changes:
+        if row["change"] == "knows":
+            key = row["scenario"], row["agents"], row["arrivals_per_hour"]
+            of_guidance.setdefault(key, []).append(row)
+    # One for each demand: a choice by the result would be a winner of chance.
+    guided = [
+        max(its, key=lambda row: (row["share"], row["knows"] == "reserve")) for its in of_guidance.values()
+    ]
+    return sorted(scenarios, key=lambda row: row["knows"] != OWN) + guided

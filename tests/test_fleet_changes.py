@@ -1,0 +1,118 @@
+"""Before and after: the same cars in several scenarios, and with other guidance."""
+
+import json
+import math
+
+import numpy as np
+import pytest
+from command_line import parkenv
+
+from parkenv.errors import InputError
+from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.studies.fleet.changes import CHANGES, headlines, sentence, summarize_changes
+from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.results import without_nan
+from parkenv.studies.statistics import mean_interval
+
+HOURS = {"arrivals": {"hours": "08:00-09:00"}, "occupancy": {"typical": {"demand": -0.8}}}
+BEFORE = {"name": "before", "lot": "mini", **HOURS}
+AFTER = {"name": "after", "lot": {"grid": {"rows": 2, "columns": 7}}, **HOURS}
+
+
+def study(*scenarios, **changes):
+    fields = {"arrivals_per_hour": (12.0,), "days": 4, "knows": ("own", "reserve"), "shares": (0.5,)}
+    return FleetStudy(figures=False).changed(scenarios=scenarios, **fields | changes)
+
+
+@pytest.fixture(scope="module")
+def days():
+    """The days of two lots, with and without members, by scenario and knowledge."""
+    its = study(BEFORE, AFTER)
+    return {
+        (one.scenario, one.knows): [its.run_day(one, day) for day in range(its.days)]
+        for one in its.fleet_settings
+    }
+
+
+def test_the_same_cars_come_whatever_the_lot():
+    its = study(BEFORE, AFTER, shares=(0.5,))
+    plans, kinds = [], []
+    for setting in its.fleet_settings[2:]:
+        fleet, _ = its.fleet(setting)
+        fleet.reset(5, 2)
+        plans.append(fleet.cars[["arrival", "stay_s", "patience_s"]].copy())
+        kinds.append(fleet.cars["kind"].copy())
+    assert [setting.scenario for setting in its.fleet_settings[2:]] == ["before", "after"]
+    assert len(plans[0]) > 5
+    assert np.array_equal(*plans)
+    assert np.array_equal(*kinds)
+
+
+def test_a_lot_compared_with_itself_differs_by_exactly_nothing():
+    its = study(BEFORE, BEFORE | {"name": "same"})
+    rows = summarize_changes([[its.run_day(one, day) for day in range(2)] for one in its.fleet_settings])
+    compared = [row for row in rows if row["change"] == "scenario"]
+    assert [(row["before"], row["after"], row["knows"]) for row in compared] == [
+        ("before", "same", "own"), ("before", "same", "reserve"),
+    ]  # fmt: skip
+    for row in compared:
+        values = [row[name] for name in CHANGES] + [end for name in CHANGES for end in row[f"{name}_ci95"]]
+        assert {value for value in values if not math.isnan(value)} == {0.0}
+        assert not math.isnan(row["others_change_s"])
+
+
+def test_changes_are_paired_by_day_and_by_car(days):
+    rows = summarize_changes(list(days.values()))
+    (row,) = (r for r in rows if r["change"] == "scenario" and r["knows"] == "reserve")
+    pairs = list(zip(days["after", "reserve"], days["before", "reserve"], strict=True))
+    for name, measure in (("change_s", "total_s"), ("search_change_s", "search_s")):
+        expected = mean_interval([one[measure] - other[measure] for one, other in pairs])
+        assert (row[name], *row[f"{name}_ci95"]) == pytest.approx(expected)
+    for group in ("members", "others"):
+        expected = mean_interval([one[f"{group}_s"] - other[f"{group}_s"] for one, other in pairs])
+        assert row[f"{group}_change_s"] == pytest.approx(expected[0], abs=0.01)
+    (row,) = (r for r in rows if r["change"] == "knows" and r["scenario"] == "before")
+    gains, faster = [], []
+    for after, before in zip(days["before", "reserve"], days["before", "own"], strict=True):
+        member = np.array(after["member"].split()) == "1"
+        gained = np.subtract(*(np.array(day["total_cs"].split(), float) for day in (after, before))) / 100.0
+        gains.append(gained[member].mean())
+        faster.append((gained <= -1.0).mean())
+    assert row["members_change_s"] == pytest.approx(np.mean(gains)), "members are compared with themselves"
+    assert row["better_off"] == pytest.approx(np.mean(faster))
+    assert 0.0 <= row["better_off"] + row["worse_off"] <= 1.0
+
+
+@pytest.mark.parametrize("ends", [(-3.0, 1.0), (-1.0, 0.0), (math.nan, math.nan)])
+def test_nobody_wins_where_the_interval_includes_nothing(days, ends):
+    row = summarize_changes(list(days.values()))[0]
+    for name in CHANGES:
+        row = {**row, f"{name}_ci95": list(ends)}
+    said = sentence(without_nan(row))
+    assert "saves" not in said
+    assert "loses" not in said
+    assert headlines([], [without_nan(row)])[0]["value"] == "no clear difference"
+
+
+def test_only_equal_hours_have_the_same_cars():
+    with pytest.raises(InputError, match=r"arrivals\.hours of 'after' are not those of 'before'"):
+        study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
+
+
+def test_the_command_compares_lots_and_goes_on_with_another(tmp_path):
+    for spec in (BEFORE, AFTER):
+        ScenarioSpec.parse(spec, "").write(tmp_path / f"{spec['name']}.json")
+    words = ("--arrivals-per-hour", "12", "--knows", "own", "-n", 2, "--jobs", 1, "--no-figures")
+    out, whole = tmp_path / "out", tmp_path / "whole"
+    assert parkenv("fleet", "--scenario", "before.json", *words, "--out", out, cwd=tmp_path).returncode == 0
+    both = ("--scenario", "before.json,after.json")
+    more = parkenv("fleet", "--resume", *both, "--out", out, cwd=tmp_path)
+    done = parkenv("fleet", *both, *words, "--out", whole, cwd=tmp_path)
+    assert (more.returncode, more.stderr, done.stderr) == (0, "", "")
+    for file in ("days.csv", "cars.csv"):
+        assert (out / file).read_bytes() == (whole / file).read_bytes()
+    summary = json.loads((whole / "summary.json").read_text())
+    (change,) = summary["changes"]
+    first, second = summary["rows"]
+    assert change["change_s"] == pytest.approx(second["total_s"] - first["total_s"])
+    assert "after instead of before" in done.stdout
