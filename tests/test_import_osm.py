@@ -436,7 +436,7 @@ def test_a_shallow_bay_beside_a_road_holds_cars_along_it(tmp_path):
     assert len(beside) == 5  # 30 m
     assert set(draft.slots.mouth[beside].tolist()) == {Mouth.LEFT}
     # Slots on the public street make it a lane.
-    assert any("1 streets" in line for line in draft.found)
+    assert any("streets: 1;" in line for line in draft.found)
 
 
 def test_slots_by_rule_keep_clear_of_buildings_and_holes(tmp_path):
@@ -639,7 +639,7 @@ def test_rows_follow_bends_without_overlaps(tmp_path):
 def test_entries_are_where_service_roads_meet_the_street(tmp_path):
     draft = car_park().draft(tmp_path)
     np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, -20]], atol=0.02)
-    assert "2 lanes: 1 parking aisles, 1 other service roads, 0 streets; 1 one-way" in draft.found
+    assert "lanes: 2 (parking aisles: 1, other service roads: 1, streets: 0; one-way: 1)" in draft.found
 
 
 def test_nobody_comes_in_by_a_one_way_exit(tmp_path):
@@ -692,7 +692,7 @@ def test_car_parks_apart_are_joined_by_the_street(tmp_path):
         place.box(66 + 2.5 * k, -48, 68.5 + 2.5 * k, -43, SPACE)
     draft = place.draft(tmp_path)
     assert len(draft.slots) == 26
-    assert any("1 streets" in line for line in draft.found)
+    assert any("streets: 1;" in line for line in draft.found)
     lot = draft.lot()
     reached = np.isfinite(shortest(lot)[:, : lot.n_slots])
     assert reached.all()
@@ -1016,7 +1016,7 @@ def test_the_command_line_imports_draws_and_checks(tmp_path):
 
     done = run("import", place, "--out", lot, "--picture", picture)
     assert done.exit_code == 0, done.output
-    assert "22 slots from amenity=parking_space" in done.output
+    assert "slots from amenity=parking_space: 22" in done.output
     assert "left out: spaces for disabled drivers: 2 (way/5, way/7)" in done.output
     assert read_lot(lot).n_slots == 22
     assert all(shows_color(picture, color) for color in (SOURCE_COLORS[0], TWO_WAY))

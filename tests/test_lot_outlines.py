@@ -160,7 +160,7 @@ class TestRoads:
         draft = imported(tmp_path, double_row(), more=[aisle, street])
         lot = draft.lot()
         assert lot.n_slots == 32
-        assert "1 aisles along the rows' fronts" in draft.guesses
+        assert "aisles along the rows' fronts: 1" in draft.guesses
         assert any("where a lane meets a street" in guess for guess in draft.guesses)
         assert lot.entries[:, 0] == pytest.approx(lot.slot_xy[:, 0].min() - 9.25, abs=0.1)
         assert clean(lot, tmp_path)

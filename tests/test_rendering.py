@@ -243,3 +243,26 @@ def test_a_window_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
     with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "parkenv\[human\]"'):
         check_env(gym.make("parkenv/Search-v2", scenario="mini").unwrapped)
+
+
+@pytest.mark.parametrize("lot", ["campus", "street"])
+def test_obstacles_stand_out_of_a_drive_more_than_anything_painted_on_the_ground(lot):
+    """WCAG's contrast to the ground that is driven on: of cars, kerbs and walls above 7, of painted lines below 2."""
+
+    def luminance(name):
+        part = np.array(PALETTE[name]) / 255
+        return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4) @ [
+            0.2126,
+            0.7152,
+            0.0722,
+        ]
+
+    env = gym.make("parkenv/Drive-v1", lot=lot, render_mode="rgb_array")
+    env.reset(seed=3)
+    frame = env.render()[:440]
+    contrast = {}
+    for name in ("floor", "parked", "paint"):
+        assert (frame == PALETTE[name]).all(axis=2).mean() > 0.003, name
+        low, high = sorted((luminance(name), luminance("floor")))
+        contrast[name] = (high + 0.05) / (low + 0.05)
+    assert contrast["parked"] > 7 > 2 > contrast["paint"]

@@ -11,6 +11,7 @@ from parkenv.cli.tables import command_line, make_console, make_table
 from parkenv.errors import InputError
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
+from parkenv.show.plurals import plural
 from parkenv.studies.benchmark.study import RESULT, Benchmark
 
 if TYPE_CHECKING:
@@ -118,7 +119,7 @@ class Page(Command):
             checked = [check_result(file) for file in files]
         write_page(benchmark_data(checked, command_line()), self.out)
         agents = sum(len(result["scores"]) for result in checked)
-        console.print(f"Written: {self.out}, {agents} agents in {len(checked)} results")
+        console.print(f"Written: {self.out}, {plural(agents, 'agent')} in {plural(len(checked), 'result')}")
 
 
 class Show(Command):

@@ -123,7 +123,7 @@ class Check(Command):
             console.print(f"{self.place}: no errors, no warnings")
         else:
             counts = (errors, "error"), (len(problems) - errors, "warning")
-            console.print(f"{self.place}: " + ", ".join(f"{n} {word}{'s' * (n != 1)}" for n, word in counts))
+            console.print(f"{self.place}: " + ", ".join(plural(n, word) for n, word in counts))
         if errors:
             raise Exit(2)
         if drivability is not None:
@@ -336,7 +336,7 @@ class Census(Command):
         )
         slots = sum(row.get("slots", 0) for row in rows)
         make_console(soft_wrap=True).print(
-            f"{len(rows)} lots, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
+            f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
         )
         if results["invalid"]:
             raise Exit(2)
@@ -377,16 +377,16 @@ def _summary(lot: ParkingLot) -> str:
     low_x, low_y, high_x, high_y = lot.bounds()
     oneway = sum(lane.oneway for lane in lot.lanes)
     parts = [
-        f"{lot.name}: {lot.n_slots} slots",
-        f"{len(lot.lanes)} lanes ({oneway} one-way)",
-        f"{len(lot.entries)} entries",
-        f"{len(lot.goals)} goals",
-        f"{lot.n_vertices} vertices",
+        f"{lot.name}: {plural(lot.n_slots, 'slot')}",
+        f"{plural(len(lot.lanes), 'lane')} ({oneway} one-way)",
+        plural(len(lot.entries), "entry", "entries"),
+        plural(len(lot.goals), "goal"),
+        plural(lot.n_vertices, "vertex", "vertices"),
         f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m",
     ]
     cost = lot.slot_parking_cost_s
     if cost.any():
         parts.append(
-            f"parking costs {cost.min():g} to {cost.max():g} s ({int((cost != 0).sum())} slots above 0)"
+            f"parking costs {cost.min():g} to {cost.max():g} s ({plural(int((cost != 0).sum()), 'slot')} above 0)"
         )
     return ", ".join(parts)

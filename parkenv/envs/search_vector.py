@@ -29,6 +29,7 @@ from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecor
 from parkenv.envs.search import BELIEF_PARTS, OBSERVATIONS
 from parkenv.errors import InputError, require_whole
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios
+from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.python_functions import raise_error
@@ -206,7 +207,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return self.table_bytes + round(self.bytes_each * self.num_envs)
 
     def __repr__(self) -> str:
-        places = f"{len(self.scenarios)} place{'s' * (len(self.scenarios) > 1)}"
+        places = plural(len(self.scenarios), "scenario")
         return f"{type(self).__name__}({self.num_envs} searches, {places}, {self.memory_bytes / 1e6:.1f} MB)"
 
     def reset(

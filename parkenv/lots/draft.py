@@ -116,7 +116,7 @@ class LotDraft:
             entries=lot.entries,
             goals=lot.goals,
             walls=lot.walls,
-            found=(f"{lot.n_slots} slots and {len(lot.lanes)} lanes of a lot file",),
+            found=(f"slots: {lot.n_slots}, lanes: {len(lot.lanes)}, of a lot file",),
         )
 
     def lot(self) -> ParkingLot:

@@ -15,7 +15,6 @@ PALETTE: Mapping[str, Color] = {
     "ground": (228, 231, 223),
     "asphalt": (104, 108, 114),
     "paint": (255, 255, 255),
-    "kerb": (150, 148, 140),
     "building": (200, 194, 182),
     "wall": (126, 118, 107),
     "entry": (29, 138, 78),
@@ -28,10 +27,17 @@ PALETTE: Mapping[str, Color] = {
     "ink": (24, 27, 31),
     "white": (255, 255, 255),
     "warning": (255, 140, 90),
-    "star": (255, 197, 58),
+    "floor": (206, 209, 212),
+    "side": (255, 127, 80),
+    "oblique": (120, 200, 80),
+    "end": (86, 180, 233),
+    "wrong": (224, 33, 138),
     "graph": (255, 217, 138),
 }
-"""Names of colours; pages have their own values, for light and dark themes, in `report/style.css`."""
+"""Names of colours, each with one meaning: yellow is the car, blue the goal and the walk to it.
+
+Pages have their own values, for light and dark themes, in `report/style.css`.
+"""
 
 BELIEF_ANCHORS: tuple[Color, ...] = (
     (0, 128, 115),

@@ -65,7 +65,7 @@ def fit_log(log: Path, folder: Path, *, max_gap_s: float = 7200.0) -> Found:
         for hour in range(7, 19)
     ]
     counts = {"log_likelihood": fitted.log_likelihood, "intervals": fitted.n_intervals}
-    title = f"{log.name}: {len(fitted.slot_ids)} slots, {fitted.n_intervals} intervals"
+    title = f"{log.name}: {plural(len(fitted.slot_ids), 'slot')}, {plural(fitted.n_intervals, 'interval')}"
     return Found(title, {"rows": rows, **counts, "day_error": asdict(process.day_error)})
 
 

@@ -92,10 +92,10 @@ def _found(lot: InferredLot, n: int, unit: str, frame: LocalFrame | None) -> Ite
         slant = np.degrees(part.row.slant)
         kinds["kerbside" if slant < 15 else "oblique" if slant < 75 else "perpendicular"] += 1
     listed = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
-    yield f"{len(lot.index)} slots of {n} {unit}, in {len(rows)} rows: {listed}"
+    yield f"slots: {len(lot.index)} of {n} {unit}, in rows ({len(rows)}): {listed}"
     wide = [aisle.width for aisle in lot.aisles if aisle.width < 2 * SLOT_REACH]
     width = f", {min(wide):.1f} to {max(wide):.1f} m wide" if wide else ""
-    yield f"{len(lot.aisles)} aisles{width}, {len(lot.connections)} connections, {len(lot.lanes)} lanes"
+    yield f"aisles: {len(lot.aisles)}{width}; connections: {len(lot.connections)}; lanes: {len(lot.lanes)}"
     if frame is not None:
         yield f"frame: {frame}"
 
@@ -103,24 +103,24 @@ def _found(lot: InferredLot, n: int, unit: str, frame: LocalFrame | None) -> Ite
 def _guesses(lot: InferredLot, options: ImportOptions, goal_note: str) -> Iterator[str]:
     unsure = [part for part in lot.rows if part.certainty < SHARE_UNSURE]
     yield (
-        f"open sides of {len(lot.rows)} rows: where the ground in front is free and rows share aisles"
+        f"open sides of rows ({len(lot.rows)}): where the ground in front is free and rows share aisles"
         + (f"; {len(unsure)} could open to either side" if unsure else "")
     )
     if lot.aisles:
-        yield f"{len(lot.aisles)} aisles along the rows' fronts"
+        yield f"aisles along the rows' fronts: {len(lot.aisles)}"
     if lot.connections:
         far = max(shapely.LineString(c.points).length for c in lot.connections)
-        yield f"{len(lot.connections)} connections through free ground, the longest {far:.0f} m"
+        yield f"connections through free ground: {len(lot.connections)}, the longest {far:.0f} m"
     narrow = sum(c.clearance < TWO_WAY_WIDTH / 2 - 0.05 for c in lot.connections)
     if narrow:
-        yield f"{narrow} connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless"
+        yield f"connections narrower than {TWO_WAY_WIDTH:g} m, two-way nevertheless: {narrow}"
     one_way = sum(aisle.one_way != 0 for aisle in lot.aisles) - len(lot.two_way)
     if one_way:
-        yield f"{one_way} aisles one-way by the slant of their spaces"
+        yield f"aisles one-way by the slant of their spaces: {one_way}"
     if lot.two_way:
-        yield f"{len(lot.two_way)} aisles two-way against the slant of their spaces: no other way leads back"
+        yield f"aisles two-way against the slant of their spaces, as no other way leads back: {len(lot.two_way)}"
     if lot.widened:
-        yield f"{lot.widened} kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane"
+        yield f"kerbside spaces narrower than {KERB_WIDTH:g} m, widened towards the lane: {lot.widened}"
     if lot.entry is not None and not options.entries and options.guess_entry:
         x, y = lot.entries[0].tolist()
         yield f"entry at {x:.1f}, {y:.1f} m: {lot.entry.reason}"

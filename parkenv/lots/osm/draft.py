@@ -427,17 +427,17 @@ class _OsmImporter:
             owner_of = dict(zip(group.ids, group.owners, strict=True))
             owners = [owner_of[name] for name in draft.slot_ids if name in owner_of]
             if owners:
-                yield f"{len(owners)} slots from {group.source} ({len(set(owners))} elements)"
+                yield f"slots from {group.source}: {len(owners)} (elements: {len(set(owners))})"
         aisles, service = (sum(road.rank is rank for road in roads) for rank in (Rank.AISLE, Rank.SERVICE))
         yield (
-            f"{len(roads)} lanes: {aisles} parking aisles, {service} other service roads, "
-            f"{len(roads) - aisles - service} streets; {sum(road.oneway for road in roads)} one-way"
+            f"lanes: {len(roads)} (parking aisles: {aisles}, other service roads: {service}, "
+            f"streets: {len(roads) - aisles - service}; one-way: {sum(road.oneway for road in roads)})"
         )
         how = "as given" if self.options.entries else "where the lanes are left or meet a public street"
         if len(draft.entries):
-            yield f"{len(draft.entries)} entries {how}"
+            yield f"entries: {len(draft.entries)}, {how}"
         if len(draft.goals):
-            yield f"{len(draft.goals)} goals: {goal_note or 'as given'}"
+            yield f"goals: {len(draft.goals)}, {goal_note or 'as given'}"
         yield from self.notes
         yield f"frame: {self.frame}"
 

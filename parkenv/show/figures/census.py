@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.plurals import plural
 
 KIND_COLORS = {"perpendicular": "#0072b2", "oblique": "#e69f00", "kerbside": "#009e73", "mixed": "#8c8c8c"}
 KINDS = ("perpendicular", "oblique", "kerbside")
@@ -44,7 +45,7 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
         size, kind, drive, error = figure.subplots(1, 4, width_ratios=(1.2, 0.9, 1.3, 0.9))
         size.hist(by_kind("slots"), edges, stacked=True, color=colors, edgecolor="white", linewidth=0.4)
         size.set_xscale("log", base=2)
-        size.set(xlabel="slots", ylabel="lots", title=f"{len(rows)} lots by size")
+        size.set(xlabel="slots", ylabel="lots", title=f"{plural(len(rows), 'lot')} by size")
         ticks = edges[:: _EDGES_AN_OCTAVE * (1 if high - low < 6 else 2)]
         size.set_xticks(ticks, [f"{tick:.0f}" for tick in ticks])
         size.minorticks_off()
@@ -78,5 +79,5 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
         save_picture(
             figure,
             path,
-            f"{len(rows)} lots: sizes, kinds of slots, drive times at 10 km/h, error probabilities.",
+            f"{plural(len(rows), 'lot')}: sizes, kinds of slots, drive times at 10 km/h, error probabilities.",
         )

@@ -13,13 +13,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from parkenv.compiled.arrays import Image
+from parkenv.show.colors import hex_color
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 
 Row = Mapping[str, Any]
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 LINES = ("-", "--", ":")
-BOX = "#ffd000"
+BOX = hex_color("wrong")
 _CROP = (4, 3)  # width and height of a crop, in proportion
 _LEAST_CROP = 176  # px, its width
 

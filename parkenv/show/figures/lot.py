@@ -25,7 +25,7 @@ from parkenv.show.scene import ARROWHEAD, DISC, STAR, Layer, Lines, LotScene, Ma
 from parkenv.world.lot import ParkingLot
 
 INK = "#333333"
-GROUND, ENTRY, GOAL = (hex_color(name) for name in ("ground", "entry", "star"))
+GROUND, ENTRY, GOAL = (hex_color(name) for name in ("ground", "entry", "goal"))
 ARROWHEAD_LENGTH = 0.9  # m, of a move in the drive graph
 ENTRY_ARROW = np.array(
     [[1.0, 0.0], [0.6, 0.28], [0.6, 0.1], [0.0, 0.1], [0.0, -0.1], [0.6, -0.1], [0.6, -0.28]]
@@ -70,7 +70,7 @@ def draw_lot(
         paint(ax, drive_graph(lot), 1.5)
     marks = [
         Marks(scene.entries, ENTRY_ARROW, "entry", px=32.0, edge="paint", edge_px=0.7),
-        Marks(posed(scene.lot.goals), STAR, "star", px=21.0, edge="ink", edge_px=0.9),
+        Marks(posed(scene.lot.goals), STAR, "goal", px=21.0, edge="paint", edge_px=0.9),
     ]
     paint(ax, marks, 5.0)
     draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0, INK)
@@ -161,17 +161,22 @@ def save_lot_picture(
 
 def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:
     """Mark entries and goals that an import guessed, and list all of its guesses below the lot."""
+    middle = 0.5 * (lot.bounds()[0] + lot.bounds()[2])
     for start, points in (("entry", lot.entries), ("goal", lot.goals)):
         if any(guess.startswith(start) for guess in guesses):
             for xy in points:
+                is_east = bool(xy[0] > middle)
                 ax.annotate(
                     f"guessed {start}",
                     xy,
-                    (16, 0),
+                    (-22 if is_east else 22, 0),
                     textcoords="offset points",
+                    ha="right" if is_east else "left",
                     va="center",
-                    fontsize=9,
+                    weight="bold",
                     color=INK,
+                    bbox={"boxstyle": "round", "facecolor": "white", "edgecolor": hex_color(start)},
+                    zorder=7,
                 )
     if guesses:
         lines = [line for guess in guesses for line in wrap(f"guessed: {guess}", 100)]

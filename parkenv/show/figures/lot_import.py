@@ -17,6 +17,7 @@ from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
 from parkenv.show.figures.picture_files import save_picture
 from parkenv.show.figures.schematic import schematic
 from parkenv.show.painters.axes import paint
+from parkenv.show.plurals import plural
 from parkenv.show.scene import DISC, Areas, Marks, building_layers, posed
 from parkenv.world.lot import corner_points, is_building, mouth_points
 
@@ -49,7 +50,8 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     ax.tick_params(labelsize=7)
     ax.set_xlabel("m", fontsize=7)
     _draw(draft, ax)
-    ax.set_title(f"{draft.name}: {len(draft.slots)} slots, {len(draft.lanes)} lanes", loc="left", fontsize=9)
+    counts = f"{plural(len(draft.slots), 'slot')}, {plural(len(draft.lanes), 'lane')}"
+    ax.set_title(f"{draft.name}: {counts}", loc="left", fontsize=9)
     handles: list[Patch | Line2D] = [
         Patch(facecolor=SOURCE_COLORS[k % len(SOURCE_COLORS)], label=source)
         for k, source in enumerate(_sources(draft))
@@ -59,8 +61,9 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
         ("goal", "*", GOAL, draft.goals),
     ):
         if len(many):
+            name = f"guessed {label}" if any(g.startswith(label) for g in draft.guesses) else label
             handles.append(
-                Line2D([], [], marker=marker, color=color, markeredgecolor=INK, linestyle="", label=label)
+                Line2D([], [], marker=marker, color=color, markeredgecolor=INK, linestyle="", label=name)
             )
     if handles:
         figure.legend(handles=handles, loc="lower left", ncols=4, fontsize=7, frameon=False)

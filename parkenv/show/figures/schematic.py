@@ -50,5 +50,5 @@ def schematic(
         *layers,
         Marks(arrows_along(one_way, ARROW_EVERY), ARROWHEAD, ONE_WAY, px=7.0 * thin),
         Marks(posed(entries, np.pi / 2), _TRIANGLE, "entry", px=9.0 * thin, edge="ink", edge_px=0.6),
-        Marks(posed(goals), STAR, "star", px=15.0 * thin, edge="ink", edge_px=0.6),
+        Marks(posed(goals), STAR, "goal", px=15.0 * thin, edge="paint", edge_px=0.6),
     ]

@@ -18,16 +18,18 @@ from matplotlib.textpath import TextPath
 from matplotlib.transforms import Affine2D
 
 from parkenv.errors import InputError
+from parkenv.show.colors import hex_color
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE
 from parkenv.show.painters.axes import paint, points_per_m
+from parkenv.show.plurals import plural
 from parkenv.show.scene import ARROWHEAD, LANE_ARROW, Layer, Lines, Marks, posed, poses_on
 from parkenv.show.search_record import SearchRecord
 from parkenv.world.cost_terms import COST_TERMS
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import KMH
 
-PATH, WALK = "#ffd000", "#1852ba"
+PATH, WALK = hex_color("car"), hex_color("goal")
 POLICY_SCALE = 2.2
 """Least scale, points per metre, at which arrows at every vertex are legible."""
 
@@ -63,7 +65,7 @@ def _title(record: SearchRecord, width: float) -> str:
         if not term.optional or metrics[term.field]
     ]
     replans = metrics.get("replans", 0)
-    planned = f"; {replans} replan{'s' if replans > 1 else ''}" if replans else ""
+    planned = f"; {plural(replans, 'replan')}" if replans else ""
     lines = (
         f"{record.agent}: failure cost {scenario.failure_s:g} s, walk {scenario.v_walk / KMH:g}, "
         f"drive {scenario.v_drive / KMH:g} km/h",

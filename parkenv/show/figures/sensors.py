@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 
 from parkenv.compiled.arrays import Image
 from parkenv.perception.range_scan import disparity
+from parkenv.show.colors import PALETTE, hex_color
 from parkenv.show.figures.lot import draw_lot
 from parkenv.show.figures.picture_files import STYLE, save_picture
 from parkenv.show.painters.opencv import write_tag
@@ -22,7 +23,7 @@ from sim_sensors.rig import Capture, SensorRig
 
 NEAREST, FARTHEST = 2.0, 30.0
 """Limits of the depth colour scale, m."""
-BOX_COLORS = {View.SIDE: (255, 208, 0), View.END: (86, 180, 233), View.OBLIQUE: (230, 159, 0)}
+BOX_COLORS = {view: PALETTE[view.name.lower()] for view in View}
 SEEN = 0.05
 """Least visible fraction of a vehicle for its box to be drawn."""
 
@@ -50,7 +51,7 @@ def draw_scan(ax: Axes, lot: ParkingLot, capture: Capture, rig: SensorRig) -> No
         angle = laser.angles[hit] + at_yaw
         ends = np.stack([at_x + ranges[hit] * np.cos(angle), at_y + ranges[hit] * np.sin(angle)], axis=1)
         ax.scatter(ends[:, 0], ends[:, 1], s=2.0, color="#d0103a", linewidths=0, zorder=4)
-    ax.quiver(x, y, np.cos(yaw), np.sin(yaw), color="#ffd000", scale=18, width=0.012, zorder=5)
+    ax.quiver(x, y, np.cos(yaw), np.sin(yaw), color=hex_color("car"), scale=18, width=0.012, zorder=5)
     # The rest of the lot is out of the laser's range.
     ax.set(xlim=(x - 24.0, x + 24.0), ylim=(y - 18.0, y + 18.0))
 

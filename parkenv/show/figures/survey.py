@@ -22,21 +22,23 @@ from parkenv.mapping.inference import Prediction
 from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import Detections
+from parkenv.show.colors import PALETTE, hex_color
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 from parkenv.show.painters.axes import paint
 from parkenv.show.painters.opencv import write_tag
+from parkenv.show.plurals import plural
 from parkenv.show.scene import DISC, Lines, Marks, posed
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import View
 
-SIDE_COLOR, OBLIQUE_COLOR, END_COLOR = (255, 208, 0), (120, 200, 80), (86, 180, 233)
+SIDE_COLOR, OBLIQUE_COLOR, END_COLOR = (PALETTE[name] for name in ("side", "oblique", "end"))
 UNRANGED_COLOR = (200, 200, 200)
 HIDDEN = 0.8
 """Visible fraction below which it is written beside the probability."""
 TAKEN, FREE, UNKNOWN = BELIEF_MAP(1.0), BELIEF_MAP(0.0), "#b9bec4"
-WRONG = "#ffd000"
-PATH_COLOR, CAR_COLOR = "#0072b2", "#d55e00"
+WRONG = hex_color("wrong")
+PATH_COLOR, CAR_COLOR, SLOT_COLOR = "#0072b2", "#d55e00", "#7030aa"
 WEATHER_COLORS = {
     "sunny": "#e69f00",
     "overcast": "#7f7f7f",
@@ -126,10 +128,10 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
             scale, cax=inset, orientation="horizontal", label="P(a car is here)", ticks=[0, 0.5, 1]
         )
         cars = result.session.cars
-        paint(axes[1], [headings(cars, WRONG)], 3.0)
-        axes[1].set_title(f"{len(cars)} detections of cars, frame by frame")
+        paint(axes[1], [headings(cars, CAR_COLOR)], 3.0)
+        axes[1].set_title(f"{plural(len(cars), 'detection')} of cars, frame by frame")
         heading = Line2D(
-            [], [], color=WRONG, linewidth=2.0, label="a car's middle and heading, from the laser"
+            [], [], color=CAR_COLOR, linewidth=2.0, label="a car's middle and heading, from the laser"
         )
         _draw_key(axes[1], [heading])
         _draw_states(lot, result, axes[2])
@@ -195,14 +197,14 @@ def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, 
         ax = figure.subplots()
         draw_lot(lot, ax)
         slots = posed(found.xy, found.yaw)
-        paint(ax, [headings(slots, WRONG, 4.0), Marks(slots, DISC, WRONG, px=3.0)], 3.0)
+        paint(ax, [headings(slots, SLOT_COLOR, 4.0), Marks(slots, DISC, SLOT_COLOR, px=3.0)], 3.0)
         off = f", mean error {score.error:.2f} m" if score.recall else ""
         ax.set_title(
-            f"{lot.name}: {len(found.xy)} slots discovered without a map; precision {score.precision:.0%}, "
+            f"{lot.name}: {plural(len(found.xy), 'slot')} discovered without a map; precision {score.precision:.0%}, "
             f"recall {score.recall:.0%} of {lot.n_slots}{off}"
         )
         found_slot = Line2D(
-            [], [], color=WRONG, marker="o", markersize=3, label="a discovered slot and its heading"
+            [], [], color=SLOT_COLOR, marker="o", markersize=3, label="a discovered slot and its heading"
         )
         _draw_key(ax, [found_slot])
         save_picture(figure, path, "Slots discovered from detected cars, without a map of the lot")
@@ -262,7 +264,7 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     color[~states.in_view] = to_rgb(UNKNOWN)
     draw_lot(lot, ax, slot_color=color)
     outlines = lot.slot_corners()[wrong][:, [0, 1, 2, 3, 0]]
-    paint(ax, [Lines(list(outlines), WRONG, px=(2.0, 2.0))], 4.0)
+    paint(ax, [Lines(list(outlines), WRONG, px=(2.4, 2.4), halo="white")], 4.0)
     names: dict[str, Any] = {"taken": TAKEN, "free": FREE, "never in view": UNKNOWN}
     handles = [Patch(color=c, label=name) for name, c in names.items()]
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))

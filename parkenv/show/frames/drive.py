@@ -18,7 +18,18 @@ from parkenv.show.colors import FREE, mixed_color
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, painted_finely, strip, write_line
 from parkenv.show.frames.window import Window
 from parkenv.show.painters.opencv import MapView, paint
-from parkenv.show.scene import REAR_WINDOW, SQUARE, WINDSCREEN, Areas, Layer, Lines, LotScene, Marks, cars
+from parkenv.show.scene import (
+    REAR_WINDOW,
+    SQUARE,
+    WINDSCREEN,
+    Areas,
+    Layer,
+    Lines,
+    LotScene,
+    Marks,
+    building_layers,
+    cars,
+)
 from parkenv.world.lot import ParkingLot, corner_points
 
 LARGEST_SCALE = 26.0  # px/m
@@ -26,6 +37,7 @@ LARGEST_SCALE = 26.0  # px/m
 _SIZE = (WIDTH, HEIGHT - HUD)
 _MARGIN = 5.0  # m, shown around start and slot
 _LINE = 0.12  # m, paint between slots
+_BARRIER = 0.25  # m, kerbs and walls
 _TYRE = (0.64, 0.2)  # m
 _NOSE = np.array([[0.5, 0.0], [-0.3, 0.55], [-0.1, 0.0], [-0.3, -0.55]])
 
@@ -91,7 +103,7 @@ def movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
     layers: list[Layer] = []
     for outline, pose in zip(outlines, poses, strict=False):
         size = np.ptp(outline, axis=0)
-        layers.append(Areas([[placed(outline, pose)]], "mover"))
+        layers.append(Areas([[placed(outline, pose)]], "mover", "white", 1.2))
         if size[0] > 2.0:
             layers += _panes(pose[None], size)
     return layers
@@ -131,29 +143,28 @@ def _trail(state: DriveState) -> list[Layer]:
     turns = moving[1:][forward[moving[1:]] * forward[moving[:-1]] < 0.0]
     outlines = [_closed(vehicle.corners(pose)) for pose in poses[[0, *turns.tolist()]]]
     return [
-        Lines(outlines, mixed_color("asphalt", "car", 0.55)),
-        Lines([vehicle.at_middle(poses)[:, :2]], mixed_color("asphalt", "car", 0.75), px=(2.0, 2.0)),
+        Lines(outlines, "car", px=(1.4, 1.4), halo="parked"),
+        Lines([vehicle.at_middle(poses)[:, :2]], "car", px=(2.4, 2.4), halo="parked"),
     ]
 
 
 def _ground(scene: LotScene, task: ParkingTask) -> list[Layer]:
-    """Return everything static: the lot around the task's slot, the slot, and the obstacles."""
+    """Return everything static: the lot around the task's slot, the slot, and the obstacles, dark on a light floor."""
     lot, own = scene.lot, _box(task)
     near = np.abs(lot.slot_xy - task.slot[:2]).max(axis=1) < REACH
     layers = [
-        *scene.ground(task.slot[:2], REACH, apron=0.0),
+        *building_layers(scene.buildings, ()),
+        Areas(scene.paved(task.slot[:2], REACH, apron=0.0), "floor"),
         Lines([_closed(corners) for corners in scene.slots[near]], "paint", _LINE),
-        Areas([[own]], mixed_color("asphalt", FREE, 0.75)),
+        Areas([[own]], mixed_color("floor", FREE, 0.75)),
         Lines([_closed(own)], "paint", _LINE),
         Areas([[placed(_NOSE, task.target)]], "paint"),
     ]
     for kind, points in zip(task.obstacles.kind.tolist(), task.obstacles.outlines(), strict=True):
         if kind == ObstacleKind.PARKED_CAR:
             layers += _parked(points)
-        elif kind == ObstacleKind.KERB:
-            layers.append(Lines([points], "kerb", 0.2))
         else:
-            layers.append(Lines([points], "wall", 0.3))
+            layers.append(Lines([points], "parked", _BARRIER, (2.0, math.inf)))
     return layers
 
 

@@ -53,6 +53,10 @@ PIXELS = MapView(np.eye(2), 1.0, np.zeros(2))
 
 _LINE_WIDTH = 0.14  # m, paint between slots
 _EDGE = 3.0  # m, around the lot's features
+_CAR_EDGE, _NEAR = (
+    0.12,
+    8.0,
+)  # m; px/m from which parked cars have a light edge, visible on slots of any colour
 
 
 def clock(time: float) -> str:
@@ -211,14 +215,16 @@ def draw_still_layer(scene: LotScene, view: MapView, size: tuple[int, int]) -> S
     has_car = np.zeros(image.shape[:2], dtype=np.uint8)
     boxes = fixed_point(fine(placed_shape(SQUARE, poses, slot_size - max(_LINE_WIDTH, 0.8 / view.scale))))
     car_size = np.minimum([0.8, 0.62] * slot_size, [4.4, 1.75])
+    edges = fixed_point(fine(placed_shape(CAR_BODY, poses, car_size + 2 * _CAR_EDGE * (view.scale > _NEAR))))
     bodies, *panes = (
         fixed_point(fine(placed_shape(part, poses, car_size))) for part in (CAR_BODY, WINDSCREEN, REAR_WINDOW)
     )
     for i in range(len(slots)):
         cv2.fillConvexPoly(image, boxes[i], PALETTE["paint"], 8, SUBPIXEL_BITS)
         cv2.fillConvexPoly(label, boxes[i], i, 8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(cars, edges[i], PALETTE["paint"], 8, SUBPIXEL_BITS)
+        cv2.fillConvexPoly(has_car, edges[i], 1, 8, SUBPIXEL_BITS)
         cv2.fillConvexPoly(cars, bodies[i], PALETTE["parked"], 8, SUBPIXEL_BITS)
-        cv2.fillConvexPoly(has_car, bodies[i], 1, 8, SUBPIXEL_BITS)
         for pane in panes:
             cv2.fillConvexPoly(cars, pane[i], PALETTE["glass"], 8, SUBPIXEL_BITS)
 

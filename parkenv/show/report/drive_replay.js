@@ -1,9 +1,9 @@
 // Survey drives: camera frame with detections, laser scan, occupancy grid and slots, synchronised.
 
-const SIDE = "#ffd000";
+const SIDE = "#ff7f50";
 const END = "#56b4e9";
 const NOWHERE = "#c8c8c8";
-const SCAN = "#e0218a";
+const WRONG = "#e0218a";
 
 class DriveReplay {
   constructor(root, data) {
@@ -114,9 +114,10 @@ class DriveReplay {
       judged += 1;
       right += (value > 127) === Boolean(this.taken[i]);
     });
+    const cars = frame.boxes.filter((box) => box[6]).length;
     const fact = (name, value) => make("span", {}, make("b", {}, value), name);
     this.facts.replaceChildren(
-      fact("cars in this frame", String(frame.boxes.filter((box) => box[6]).length)),
+      fact(cars === 1 ? "car in this frame" : "cars in this frame", String(cars)),
       fact(`of ${this.belief.length} slots classified`, String(judged)),
       fact("of those correct", judged ? `${((100 * right) / judged).toFixed(1)} %` : "–"),
     );
@@ -158,13 +159,13 @@ class DriveReplay {
     view.canvas.setAttribute("aria-label", `The lot after ${seconds2(frame.t)} s`);
   }
 
-  /** Draw the slot filter's state, pale unless `strong`, with a bright edge around slots that are wrong now. */
+  /** Draw the slot filter's state, pale unless `strong`, the cars that stand there, and a bright edge around slots that are wrong now. */
   drawSlots(view, strong) {
-    view.drawSlots((i) => this.belief[i], () => strong, () => false);
+    view.drawSlots((i) => this.belief[i], () => strong, (i) => this.taken[i]);
     const wrong = (i) => this.belief[i] >= 0 && (this.belief[i] > 127) !== Boolean(this.taken[i]);
     view.slots.forEach((slot, i) => {
-      if (wrong(i)) view.outline(slot, palette.ink, 4.5);
-      if (wrong(i)) view.outline(slot, palette.car, 2.5);
+      if (wrong(i)) view.outline(slot, palette.halo, 5.5);
+      if (wrong(i)) view.outline(slot, WRONG, 3.5);
     });
   }
 
@@ -175,6 +176,7 @@ class DriveReplay {
     const { grid } = this.record;
     context.save();
     context.imageSmoothingEnabled = false;
+    if (document.documentElement.dataset.theme === "dark") context.filter = "brightness(1.9)";
     context.translate(grid.x, grid.y + grid.height);
     context.scale(1, -1);
     context.drawImage(image, 0, 0, grid.width, grid.height);
@@ -185,21 +187,25 @@ class DriveReplay {
   drawScan(view, frame) {
     const { context } = view;
     const [x, y] = frame.pose;
-    context.fillStyle = SCAN;
-    const size = Math.max(0.16, view.px(2.2));
+    context.fillStyle = palette.ink;
+    const size = Math.max(0.16, view.px(3));
     for (let i = 0; i < frame.scan.length; i += 2) context.fillRect(x + frame.scan[i] / 10 - size / 2, y + frame.scan[i + 1] / 10 - size / 2, size, size);
-    for (const [cx, cy, yaw, length, width] of frame.cars) view.outline({ x: cx, y: cy, yaw, length, width }, palette.ink, 2);
+    for (const [cx, cy, yaw, length, width] of frame.cars) {
+      view.outline({ x: cx, y: cy, yaw, length, width }, palette.halo, 4.5);
+      view.outline({ x: cx, y: cy, yaw, length, width }, palette.ink, 2.5);
+    }
   }
 }
 
 function driveLegend() {
   const key = (color, text, hollow) => keyed(make("span", { class: "swatch", style: hollow ? `border: 2px solid ${color}` : `background: ${color}` }), text);
   const scale = make("span", { class: "scale", style: "background: linear-gradient(90deg, var(--belief))" });
-  const grid = make("span", { class: "scale", style: "background: linear-gradient(90deg, #96bed755, #7030aa)" });
+  const grid = make("span", { class: "scale grid", style: "background: linear-gradient(90deg, #96bed755, #7030aa)" });
   return make(
     "div", { class: "legend lot" },
     key(SIDE, "a car's side", true), key(END, "front or rear", true), key(NOWHERE, "not ranged", true),
     keyed(make("span", {}, "free ", scale), "taken, slots"), keyed(make("span", {}, "free ", grid), "car, grid"),
-    key(SCAN, "scan"), key("var(--ink)", "car fitted to its beams", true), key("var(--car)", "slot classified wrong", true),
+    key("var(--parked)", "parked car"), key("var(--car)", "the car and its path"), key("var(--ink)", "scan"), key("var(--ink)", "car fitted to its beams", true),
+    key(WRONG, "slot classified wrong", true),
   );
 }

@@ -152,7 +152,7 @@ class SearchReplay {
     const seeds = [...new Set(worlds.map((its) => its.seed))].sort((a, b) => a - b);
     const which = `${seeds.length > 1 ? "Seeds" : "Seed"} ${seeds.join(", ")} of this run, simulated again: `;
     root.append(
-      make("p", { class: "quiet" }, `${which}under one seed every agent meets the same cars at the same times. Slot colours show the agent's belief, dark cars the true occupancy, which agents observe only nearby.`),
+      make("p", { class: "quiet" }, `${which}under one seed every agent meets the same cars at the same times. Slot colours show the agent's belief, cars the true occupancy, which agents observe only nearby.`),
       make("div", { class: "controls" }, world, this.chips, this.followKey),
       this.panels, transport, lotLegend(),
     );

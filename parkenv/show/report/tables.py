@@ -36,6 +36,15 @@ class Column(NamedTuple):
 
 _OPTIONAL = tuple(term.field for term in COST_TERMS if term.optional)
 _MINUS_OWN = "total time, minus that of all cars if nobody knows more than it observes, on the same days"
+_METHODS = (
+    ("fitted", "rectangle fitted to the beams"), ("thesis", "middle of the beams, as in the thesis")
+)  # fmt: skip
+_CAR_ERRORS = (
+    Column("range_error_m", "distance, median error", "m", 3),
+    Column("range_error_p95_m", "distance, 95th percentile", "m", 2),
+    Column("place_error_m", "position, median error", "m", 2),
+    Column("heading_error_deg", "heading, median error", "°", 1),
+)
 _KNOWN = {
     column.key: column
     for column in (
@@ -81,6 +90,13 @@ _KNOWN = {
         Column("detection_precision", "detections that are cars", share=True),
         Column("range_abs_error_m.median", "distance of a car, median error", "m", 3),
         Column("range_abs_error_m.p95", "distance of a car, 95th percentile", "m", 2),
+        *_CAR_ERRORS,
+        *(
+            column._replace(key=f"car_pose.{key}.{column.key}", label=f"{name}: {column.label}")
+            for key, name in _METHODS
+            for column in _CAR_ERRORS
+        ),
+        Column("localise", "localisation"),
         Column("pose_error_m.odometry", "position by odometry, error", "m", 2, help="Root mean square, of a drive"),
         Column("pose_error_m.estimated", "position as estimated, error", "m", 2),
         Column("pose_error_m.max", "position as estimated, greatest error", "m", 2),

@@ -13,6 +13,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import read_lot
 from parkenv.lots.quality import QualityIssue, read_provenance
+from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability, manoeuvre_kinds
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
@@ -90,7 +91,10 @@ def take_census(
     if lots := [(row, lot) for row, lot in found if lot is not None]:
         save_census([row for row, _ in lots], folder / "census.png")
         drawn = [
-            (f"{row['lot']}\n{row['slots']} slots, error probability {row['error_probability']:.2f}", lot)
+            (
+                f"{row['lot']}\n{plural(row['slots'], 'slot')}, error probability {row['error_probability']:.2f}",
+                lot,
+            )
             for row, lot in lots
         ]
         save_contact_sheets(drawn, folder)

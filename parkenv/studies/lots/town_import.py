@@ -10,6 +10,7 @@ from parkenv.lots.draft import ImportOptions
 from parkenv.lots.osm.town import LEAST_SPACES, import_town
 from parkenv.lots.quality import Provenance
 from parkenv.show.figures.contact_sheet import save_contact_sheets
+from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
@@ -71,5 +72,7 @@ def import_town_lots(
         done()
     for lot, provenance, _ in lots:
         write_lot(lot, folder / f"{lot.name}.geojson", provenance)
-    drawn = [(f"{lot.name}\n{lot.n_slots} slots, error probability {p:.2f}", lot) for lot, _, p in lots]
+    drawn = [
+        (f"{lot.name}\n{plural(lot.n_slots, 'slot')}, error probability {p:.2f}", lot) for lot, _, p in lots
+    ]
     return TownLots(rows, save_contact_sheets(drawn, folder))

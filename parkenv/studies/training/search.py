@@ -25,6 +25,7 @@ from parkenv.scenarios.selection import (
     split_by_lot,
 )
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.suite import suite_lots
 from parkenv.studies.compare.cases import Case, rows_of
@@ -338,7 +339,7 @@ def require_trainable(learned: Sequence[Scenario]) -> None:
 
 
 def _places(scenarios: Sequence[Scenario]) -> str:
-    return f"{len(scenarios)} place{'s' * (len(scenarios) != 1)}"
+    return plural(len(scenarios), "scenario")
 
 
 def times_row(times: NDArray[np.float64], parked: NDArray[np.bool_]) -> Row:
