@@ -12,6 +12,7 @@ from parkenv.show.plurals import plural
 from parkenv.studies.commute.study import Commute as CommuteStudy
 from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown_changes
 from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.fleet.tables import departures
 from parkenv.studies.results import Row, without_nan
 
 if TYPE_CHECKING:
@@ -120,13 +121,17 @@ class Fleet(AgentStudyCommand):
         for row in shown_changes(changes):
             if row["change"] == "scenario":
                 console.print(sentence(row), soft_wrap=True)
+        for line in departures(result.summary["hours"]):
+            console.print(line, soft_wrap=True)
 
 
 def _setting(row: Row) -> list[str]:
-    return [row["knows"], f"{row['share']:.0%}", f"{row['arrivals_per_hour']:g}"]
+    rate = row["arrivals_per_hour"]
+    return [row["knows"], f"{row['share']:.0%}", rate if isinstance(rate, str) else f"{rate:g}"]
 
 
 def _cells(row: Row, *, mixed: bool) -> list[str]:
+    counted = row.get("counted_occupancy")
     return [
         *_setting(row),
         _interval(row, "total_s", ".1f"),
@@ -136,7 +141,7 @@ def _cells(row: Row, *, mixed: bool) -> list[str]:
         f"{row['failed_attempts']:.3f}",
         f"{row['balked_fraction']:.1%}",
         f"{row['cruising_share']:.0%}",
-        f"{row['occupancy']:.0%}",
+        f"{row['occupancy']:.0%}" + (f" (counted {counted:.0%})" if is_known(counted) else ""),
         _interval(row, "price_of_anarchy", ".3f"),
         f"{row['price_over_bound']:.3f}",
     ]

@@ -62,7 +62,7 @@ from parkenv.engine.spaces import action_number, space_of
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
-from parkenv.world.demand import Demand
+from parkenv.world.demand import CarPlans, Demand
 from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, draw_arrival
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.python_functions import raise_error
@@ -184,6 +184,7 @@ class Fleet:
     Attributes:
         scenarios: the scenarios of the cars, one for each goal with a weight; `cars["place"]` are indices into it.
         records: (1,) of the dtype FLEET.
+        day: the day of the present world.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -322,23 +323,23 @@ class Fleet:
         window, occupancy = self.scenario.arrival, self.scenario.occupancy
         days = occupancy.arrival_days(window)
         day, arrival_s = draw_arrival(key, len(days), float(window.start_s), float(window.end_s))
-        midnight = days[day].weekday * DAY_S
-        begin_s = self.demand.arrivals.begin_s(arrival_s)
+        self.day, midnight = days[day], days[day].weekday * DAY_S
+        demand = self.demand.on(self.day)
+        begin_s = demand.arrivals.begin_s(arrival_s)
         begin = midnight + begin_s
         _, hour, second = hour_of_week(begin)
         record["key"], record["day"], record["midnight"], record["arrival"] = key, day, midnight, begin
         record["hour"], record["second_of_hour"] = hour, second
         record["world"] = self._world + (day * RECORDED_DAY.itemsize if occupancy.kind == LOG_KIND else 0)
         if not self._world:
-            self._made = occupancy.world(key, Arrival(begin, days[day].date))
+            self._made = occupancy.world(key, Arrival(begin, self.day.date))
             record["world"] = self._made.address
-        self._write_cars(key, midnight, arrival_s)
+        self._write_cars(demand.draw(key, arrival_s, len(self._entries)), midnight)
         self._memory.clear()
         begin_world_at(self._address)
         raise_error()
 
-    def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
-        plans = self.demand.draw(key, arrival_s, len(self._entries))
+    def _write_cars(self, plans: CarPlans, midnight: float) -> None:
         n = len(plans.arrival_s)
         cars = np.zeros(n, CAR)
         cars["arrival"] = midnight + plans.arrival_s

@@ -57,12 +57,19 @@ def _wholes(text: str, count: int | None) -> str:
     return text
 
 
+def _numbers(text: str) -> str:
+    for word in text.split():
+        _number_or_nan(word)
+    return text
+
+
 TEXT = Kind("text", str)
 NUMBER = Kind(f"a number, at most {MAX_NUMBER:g}", _number)
 NUMBER_OR_NAN = Kind(f"a number, at most {MAX_NUMBER:g}, or nan", _number_or_nan)
 NUMBER_OR_NOTHING = Kind(
     f"a number, at most {MAX_NUMBER:g}, or nothing", lambda text: _number(text) if text else None
 )
+NUMBERS = Kind("numbers, or nan, separated by spaces", _numbers)
 WHOLE = Kind(f"a whole number of at most {_MAX_DIGITS} digits", _whole)
 YES_OR_NO = Kind("True or False", _yes_or_no)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -29,13 +29,17 @@ from parkenv.compiled.keyed_random import (
     car_uniforms,
 )
 from parkenv.errors import InputError, require_number, require_whole
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.log import OccupancyLog
+from parkenv.world.occupancy.process import Arrival, ArrivalDay, OccupancyModel
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
 MAX_CARS = 1_000_000
 """Maximum number of cars of a world."""
 _QUANTILES = 400
 _RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.most`
+_FOLLOWED_S = 300.0
+_NO_RATE = 1e-9  # cars an hour
 
 
 class Duration(Protocol):
@@ -246,11 +250,63 @@ class PoissonArrivals:
 
     def _times(self) -> tuple[FloatArray, FloatArray]:
         """Return full hours in the window, with its ends, s, and the expected number of arrivals until then."""
-        hours = np.arange(self.start_s // HOUR_S + 1, math.ceil(self.end_s / HOUR_S)) * HOUR_S
-        times = np.concatenate(([self.start_s], hours, [self.end_s]))
+        times = hours_between(self.start_s, self.end_s)
         rates = np.broadcast_to(np.asarray(self.per_hour, np.float64), DAY_HOURS)
         hour = ((times[:-1] + 1e-9) // HOUR_S).astype(np.int64) % DAY_HOURS
         return times, np.concatenate(([0.0], np.cumsum(rates[hour] * np.diff(times) / HOUR_S)))
+
+
+@dataclass(frozen=True)
+class FollowingArrivals:
+    """Cars arrive such that a lot becomes as full as its occupancy model says: as counted, recorded or expected.
+
+    Residents leave and cars come: the rate of each hour is that with which the expected number of parked cars comes
+    closest to the model's, every five minutes (least squares, no rate below 0), were the lot large enough for all. Of
+    recorded days, each is followed for itself. A lot that empties faster than cars leave cannot be followed.
+
+    Args:
+        occupancy: the model of the lot.
+        window: weekdays, beginning of the world, and end of the arrivals.
+        stay: law of the time that a car stays in its slot.
+        times: so many times these arrivals, above 0.
+    """
+
+    occupancy: OccupancyModel
+    window: ArrivalWindow
+    stay: Duration
+    times: float = 1.0
+
+    def __post_init__(self) -> None:
+        require_number("FollowingArrivals.times", self.times, above=0.0)
+
+    @property
+    def most(self) -> int:
+        """Maximum number of cars of a day."""
+        return max(self.on(day).most for day in self.occupancy.arrival_days(self.window))
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return the beginning of the window."""
+        del arrival_s
+        return self.window.start_s
+
+    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+        """Draw nothing: arrivals depend on the day."""
+        raise InputError(f"FollowingArrivals.draw({key}, {arrival_s}): want the arrivals of a day, see `on`")
+
+    def on(self, day: ArrivalDay) -> PoissonArrivals:
+        """Return the arrivals of one of the days."""
+        start, end = self.window.start_s, self.window.end_s
+        seconds = np.append(np.arange(start + _FOLLOWED_S, end, _FOLLOWED_S), end).astype(np.float64)
+        midnight = day.weekday * DAY_S
+        course = self.occupancy.course(Arrival(midnight + start, day.date), midnight + seconds)
+        edges = hours_between(start, end)
+        stays = self.stay.quantile((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
+        wanted = self.occupancy.n_slots * (course.occupied - course.residents)
+        rates, _ = nnls(_parked(stays, edges, seconds), wanted)
+        # Where nobody has to come, arrivals still need some rate above 0.
+        by_hour = np.full(DAY_HOURS, _NO_RATE)
+        by_hour[(edges[:-1] // HOUR_S).astype(np.int64)] += self.times * rates
+        return PoissonArrivals(tuple(by_hour), start, end)
 
 
 @dataclass(frozen=True)
@@ -341,6 +397,12 @@ class Demand:
         for name in ("entry_weights", "goal_weights"):
             object.__setattr__(self, name, _weights(f"Demand.{name}", getattr(self, name)))
 
+    def on(self, day: ArrivalDay) -> Demand:
+        """Return the demand of a day, with arrivals that can be drawn."""
+        if isinstance(self.arrivals, FollowingArrivals):
+            return replace(self, arrivals=self.arrivals.on(day))
+        return self
+
     def draw(self, key: np.uint64, arrival_s: float, n_entries: int) -> CarPlans:
         """Draw the cars of the world with this key.
 
@@ -384,7 +446,8 @@ class Demand:
             raise InputError(f"{log.source}: no car comes and leaves on a {kind}, so no demand can be fitted")
         stays = _stay_quantiles(cars.stay_s, cars.ended)
         seen = cars.seen > 0
-        filled = _filled_by_hour(np.array(stays))[seen]
+        edges, times = np.arange(DAY_HOURS + 1.0) * HOUR_S, np.arange(1.0 * DAY_PERIODS) * PERIOD_S
+        filled = _parked(np.array(stays), edges, times)[seen]
         weight = np.sqrt(cars.seen[seen])
         per_slot, _ = nnls(filled * weight[:, None], cars.arrived[seen] / cars.seen[seen] * weight)
         hours = per_slot.nonzero()[0]
@@ -436,13 +499,20 @@ def _cars_of(log: OccupancyLog, kind: str) -> _RecordedCars:
     return _RecordedCars(np.array(stays), np.array(ended, dtype=np.bool_), arrived, seen)
 
 
-def _filled_by_hour(stays: FloatArray) -> FloatArray:
-    """Return, (48, 24), expected cars at each half-hour if one car an hour arrives in each hour; stays as quantiles."""
-    grid = (np.arange(DAY_PERIODS) * PERIOD_S)[:, None, None]
-    minute = (np.arange(60) + 0.5) * 60.0
-    elapsed = grid - (np.arange(DAY_HOURS)[:, None] * HOUR_S + minute)
-    staying = 1.0 - np.searchsorted(stays, elapsed, side="right") / len(stays)
-    return np.asarray(np.where(elapsed >= 0.0, staying, 0.0).mean(axis=2))
+def hours_between(start_s: float, end_s: float) -> FloatArray:
+    """Return the full hours between two times, and these, s."""
+    hours = np.arange(start_s // HOUR_S + 1, math.ceil(end_s / HOUR_S)) * HOUR_S
+    return np.concatenate(([start_s], hours, [end_s]))
+
+
+def _parked(stays: FloatArray, edges: FloatArray, times: FloatArray) -> FloatArray:
+    """Return the expected cars at k times, (k, m), if one car an hour arrives from one edge, (m + 1,), to the next.
+
+    The share that arrived at u and stays at t is P(stay > t - u); its integral over u is the mean of min(stay, t - u).
+    """
+    since = np.maximum(times[:, None] - edges, 0.0)
+    stayed = np.minimum(stays, since[:, :, None]).mean(axis=2)
+    return np.asarray(-np.diff(stayed, axis=1) / HOUR_S)
 
 
 def _stay_quantiles(stays: FloatArray, ended: NDArray[np.bool_]) -> tuple[float, ...]:

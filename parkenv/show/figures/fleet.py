@@ -19,23 +19,29 @@ Row = dict[str, Any]
 
 KNOWLEDGE_COLORS = {"own": INK, "shared": "#e69f00", "reserve": "#0072b2", "full": "#009e73"}
 _STYLES: tuple[tuple[Any, str], ...] = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
-_GREY = "#999999"
+_GREY, _SIMULATED = "#999999", "#cc79a7"
 _CLOSED_FORM = "slots looked at in random order"
 
 
 def save_fleet_figure(
-    rows: Sequence[Row], closed_form: Callable[[FloatArray], FloatArray], title: str, path: str | Path
+    rows: Sequence[Row],
+    closed_form: Callable[[FloatArray], FloatArray],
+    title: str,
+    path: str | Path,
+    hours: Sequence[Row] = (),
 ) -> None:
     """Draw the summary of an experiment.
 
     Panels: search time against occupancy, with the closed form of slots looked at in random order; price of anarchy
-    against demand, if it is known; what members and others gain, if there are several shares and `own`.
+    against demand, if it is known; what members and others gain, if there are several shares and `own`; occupancy by
+    hour, simulated and as counted, if that is known.
 
     Args:
         rows: of `summarize_days`.
         closed_form: search time, s, of looking at slots in random order, as a function of the occupancy.
         title: title of the figure.
         path: file to write.
+        hours: of `summarize_hours`.
 
     Raises:
         InputError: the file cannot be written.
@@ -48,6 +54,8 @@ def save_fleet_figure(
         panels.append(lambda ax: _draw_price(ax, priced))
     if mixed and any(row["knows"] == "own" for row in rows):
         panels.append(lambda ax: _draw_shares(ax, rows))
+    if hours:
+        panels.append(lambda ax: _draw_hours(ax, hours))
     agents = list(dict.fromkeys(row["agents"] for row in rows))
     known = list(dict.fromkeys(row["knows"] for row in rows))
     with mpl.rc_context(STYLE):
@@ -77,11 +85,15 @@ def _curves(rows: Sequence[Row]) -> Iterator[tuple[list[Row], dict[str, Any]]]:
         for name, color in KNOWLEDGE_COLORS.items():
             its = [row for row in rows if (row["agents"], row["knows"]) == (agent, name)]
             if its:
-                its.sort(key=lambda row: row["arrivals_per_hour"])
+                its.sort(key=_cars_a_day)
                 yield (
                     its,
                     {"color": color, "linestyle": line, "marker": marker, "markersize": 4, "capsize": 2},
                 )
+
+
+def _cars_a_day(row: Row) -> float:
+    return float(row["cars"] / row["days"])
 
 
 def _errors(rows: Sequence[Row], name: str) -> np.ndarray:
@@ -103,17 +115,18 @@ def _draw_search(ax: Axes, rows: Sequence[Row], closed_form: Callable[[FloatArra
 
 
 def _draw_price(ax: Axes, rows: Sequence[Row]) -> None:
+    named = any(isinstance(row["arrivals_per_hour"], str) for row in rows)
     for its, style in _curves(rows):
-        x = [row["arrivals_per_hour"] for row in its]
         ax.errorbar(
-            x,
+            [_demand(rate) if named else rate for rate in (row["arrivals_per_hour"] for row in its)],
             [row["price_of_anarchy"] for row in its],
             _errors(its, "price_of_anarchy"),
             linewidth=1.2,
             **style,
         )
     ax.set(xlabel="arrivals per hour", title="Total time over that of reservations for all")
-    ax.set_xticks(sorted({row["arrivals_per_hour"] for row in rows}))
+    if not named:
+        ax.set_xticks(sorted({row["arrivals_per_hour"] for row in rows}))
 
 
 def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
@@ -124,8 +137,8 @@ def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
     agent = rows[0]["agents"]
     its = [row for row in rows if row["agents"] == agent and row["knows"] != "own"]
     own = [row for row in rows if row["agents"] == agent and row["knows"] == "own"]
-    price = {row["arrivals_per_hour"]: np.nan_to_num(row["price_of_anarchy"]) for row in own}
-    chosen = max(price, key=lambda a: (price[a], a))
+    priced = max(own, key=lambda row: (np.nan_to_num(row["price_of_anarchy"]), _cars_a_day(row)))
+    chosen = priced["arrivals_per_hour"]
     ax.axhline(0.0, color=KNOWLEDGE_COLORS["own"], linewidth=1.0, linestyle=":")
     for name, color in KNOWLEDGE_COLORS.items():
         known = sorted(
@@ -143,5 +156,25 @@ def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
     ax.set(
         xlabel="share of members, %",
         ylabel="s",
-        title=f"Change for members (filled) and others, {chosen:g}/h",
+        title=f"Change for members (filled) and others, {_demand(chosen)}",
     )
+
+
+def _demand(rate: float | str) -> str:
+    return rate if isinstance(rate, str) else f"{rate:g}/h"
+
+
+def _draw_hours(ax: Axes, rows: Sequence[Row]) -> None:
+    """Draw occupancy by hour, simulated at each demand and as counted (dashed), of one agent, with one knowledge."""
+    its = [row for row in rows if all(row[name] == rows[0][name] for name in ("agents", "knows", "share"))]
+    columns = ("hour", "occupancy", "counted_occupancy")
+    for number, demand in enumerate(dict.fromkeys(row["arrivals_per_hour"] for row in its)):
+        there = [[row[name] for name in columns] for row in its if row["arrivals_per_hour"] == demand]
+        hour, simulated, counted = np.array(there).T
+        if number == 0:
+            ax.plot(hour + 0.5, 100.0 * counted, "--", color=INK, label="as counted")
+        line, marker = _STYLES[number % len(_STYLES)]
+        style = {"color": _SIMULATED, "linestyle": line, "marker": marker, "markersize": 4}
+        ax.plot(hour + 0.5, 100.0 * simulated, label=f"simulated, {_demand(demand)}", **style)
+    ax.set(xlabel="hour of the day", ylabel="%", ylim=(0.0, 100.0), title="Occupancy")
+    ax.legend()

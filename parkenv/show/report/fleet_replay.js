@@ -269,7 +269,8 @@ class FleetReplay {
   }
 
   groupOf(its) {
-    return `${its.scenario} · ${its.arrivals_per_hour} cars an hour · day ${its.day}`;
+    const rate = its.arrivals_per_hour;
+    return `${its.scenario} · ${typeof rate === "string" ? `demand ${rate}` : `${rate} cars an hour`} · day ${its.day}`;
   }
 
   /** Name of a setting within its day. */

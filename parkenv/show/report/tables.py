@@ -124,6 +124,9 @@ _KNOWN = {
         Column("knows", "members know"),
         Column("share", "members", share=True, digits=0),
         Column("arrivals_per_hour", "cars an hour", digits=0),
+        Column("hour", "hour", digits=0, help="Of the day: 8 is from 8:00 to 9:00"),
+        Column("counted_occupancy", "as counted", share=True, digits=0, help="By the world's counts, log or process"),
+        Column("excess", "minus counted", share=True, signed=True, help="Simulated minus counted occupancy"),
         Column("cars", "cars", digits=0),
         Column("median_s", "median", "s", help="Median of the total times"),
         Column("gave_up_fraction", "found no slot", share=True, help="Searches that gave up; charged the penalty"),
@@ -149,8 +152,8 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "agent", "agents", "arrivals_per_hour", "knows", "share", "seed", "total_s", "median_s", "gave_up_fraction",
-    "difference_s", "gap_to_exact",
+    "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed", "total_s", "median_s",
+    "gave_up_fraction", "difference_s", "gap_to_exact",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""

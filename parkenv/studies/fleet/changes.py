@@ -9,7 +9,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.show.plurals import plural
-from parkenv.studies.fleet.setting import OWN, SETTING_COLUMNS
+from parkenv.studies.fleet.setting import OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.fleet.tables import day_means, paired_days
 from parkenv.studies.results import Row
 
@@ -110,7 +110,7 @@ def sentence(row: Row) -> str:
 
 def where(row: Row) -> list[str]:
     """Return what is equal before and after a change, in words."""
-    equal = [row["agents"], f"{row['arrivals_per_hour']:g} cars an hour"]
+    equal = [row["agents"], rate_text(row["arrivals_per_hour"])]
     if row["change"] == "knows":
         return [f"{row['agents']} on {row['scenario']}", *equal[1:]]
     return equal if row["knows"] == OWN else [*equal, _words("knows", row)]

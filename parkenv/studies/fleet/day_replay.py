@@ -14,7 +14,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
-from parkenv.studies.fleet.setting import Setting
+from parkenv.studies.fleet.setting import Setting, rate_text
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Key
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from parkenv.studies.fleet.study import FleetStudy
 
 MOST_CARS = 5_000
-"""Days on which more cars are expected are not replayed: the page would not load."""
+"""Demands with which more cars come on a day are not replayed: the page would not load."""
 DRIVE, FAIL, QUEUE, WAIT = range(4)
 """What a car does on its way to a point of its track: drive; a failed attempt, a queue and a wait leave it there."""
 STRAIGHT_M = 0.1
@@ -53,17 +53,16 @@ class FleetReplay(NamedTuple):
             return Again(
                 notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
             )
-        window = next(iter(study.built.values())).arrival
-        most = MOST_CARS / ((window.end_s - window.start_s) / 3600.0)
         settings = [one for one in study.fleet_settings if one.agent.label in agents]
-        rates = dict.fromkeys(one.arrivals_per_hour for one in settings if one.arrivals_per_hour > most)
+        rows = study.table.read(self.folder)
+        crowded = {row["arrivals_per_hour"] for row in rows if row["cars"] > MOST_CARS}
+        rates = [rate for rate in study.demands if rate in crowded]
         notes = [
-            f"days with {rate:g} cars an hour have more than the {MOST_CARS} cars that are drawn: no replay"
+            f"days with {rate_text(rate)} have more than the {MOST_CARS} cars that are drawn: no replay"
             for rate in rates
         ]
-        settings = [one for one in settings if one.arrivals_per_hour <= most]
+        settings = [one for one in settings if one.arrivals_per_hour not in rates]
         chosen = choose_days(study, settings, DAYS if options.episodes is None else options.episodes, numbers)
-        rows = study.table.read(self.folder) if chosen else []
         totals = {study.table.key(row): row["total_s"] for row in rows}
         return Again([partial(record_day, study, setting, day, totals) for setting, day in chosen], notes)
 

@@ -12,10 +12,11 @@ from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.setting import times_counted
 from parkenv.studies.fleet.tables import day_means
 from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers
-from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, FollowingArrivals, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.heuristics import POLICIES
@@ -27,20 +28,20 @@ _WITHOUT_NETWORK_POLICY = ("recurrent-ppo",)
 
 
 def policy_of(
-    spec: AgentSpec, scenario: Scenario, arrivals_per_hour: float | None = None
+    spec: AgentSpec, scenario: Scenario, arrivals_per_hour: float | str | None = None
 ) -> tuple[CompiledPolicy | None, Any]:
     """Return the compiled policy of an agent, or else the agent itself, which decides in Python.
 
     Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
     actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
-    An agent that expects rivals gets how many cars arrive in an hour, if that is given, as by a forecast of traffic.
+    An agent that expects rivals gets how many cars arrive in an hour, if that is a number, as by a forecast of traffic.
 
     Raises:
         InputError: there is no such agent, or it is none for fleets.
     """
     if not spec.options and spec.name in POLICIES:
         return POLICIES[spec.name], None
-    expects = spec.name == EXPECTS_RIVALS and arrivals_per_hour is not None
+    expects = spec.name == EXPECTS_RIVALS and not isinstance(arrivals_per_hour, str | None)
     known = {"arrivals_per_hour": arrivals_per_hour} if expects else {}
     agent = make_agent(spec.name, scenario, **known | spec.options)
     if spec.name in POLICIES and isinstance(agent, TargetAgent):
@@ -60,12 +61,13 @@ def policy_of(
     return None, agent
 
 
-def demand_in(scenario: Scenario, per_hour: float, stay_s: float, patience_s: float) -> Demand:
+def demand_in(scenario: Scenario, per_hour: float | str, stay_s: float, patience_s: float) -> Demand:
     """Return the demand of a number of cars an hour in the hours of a scenario.
 
     Args:
         scenario: its hours of arrival are meant.
-        per_hour: cars an hour.
+        per_hour: cars an hour; or `counted`: as many as make the lot as full as it is in the scenario's world; or so
+            many times these, such as `1.2x`.
         stay_s: mean of the exponentially distributed stays, s.
         patience_s: search time after which a car goes elsewhere, s.
 
@@ -78,11 +80,13 @@ def demand_in(scenario: Scenario, per_hour: float, stay_s: float, patience_s: fl
             f"the arrivals of {scenario.name!r} are at one time, want hours in which cars arrive; "
             "set --hours, e.g. 08:00-12:00"
         )
-    return Demand(
-        PoissonArrivals(per_hour, window.start_s, window.end_s),
-        ExponentialTime(stay_s),
-        ConstantTime(patience_s),
-    )
+    stay = ExponentialTime(stay_s)
+    arrivals: PoissonArrivals | FollowingArrivals
+    if isinstance(per_hour, str):
+        arrivals = FollowingArrivals(scenario.occupancy, window, stay, times_counted(per_hour))
+    else:
+        arrivals = PoissonArrivals(per_hour, window.start_s, window.end_s)
+    return Demand(arrivals, stay, ConstantTime(patience_s))
 
 
 @dataclass(frozen=True)

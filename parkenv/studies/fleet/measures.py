@@ -11,7 +11,9 @@ from scipy.sparse.csgraph import dijkstra
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.engine.fleet import Fleet
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
+from parkenv.studies.fleet.setting import BY_HOUR
 from parkenv.world.scenario import SearchProblem
+from parkenv.world.week import HOUR_S
 
 
 class Roads:
@@ -78,7 +80,7 @@ def gini(values: FloatArray) -> float:
 
 
 def day_measures(
-    fleet: Fleet, roads: Roads, members: BoolArray, occupancy: float, clairvoyant_s: float
+    fleet: Fleet, roads: Roads, members: BoolArray, filled: dict[str, Any], clairvoyant_s: float
 ) -> dict[str, Any]:
     """Return the measures of a day whose searches are all over.
 
@@ -86,7 +88,7 @@ def day_measures(
         fleet: the fleet.
         roads: its shortest drives.
         members: (n_cars,) which cars know more than their own observations.
-        occupancy: mean share of taken slots while cars arrived.
+        filled: of `filling`, while cars arrived.
         clairvoyant_s: lower bound on the total time of all cars together, s.
     """
     cars = fleet.cars
@@ -108,7 +110,7 @@ def day_measures(
         "cruised_m": float(cruised_m.mean()),
         "cruising_share": float(cruised_m.sum()) / driven_m if driven_m else 0.0,
         "balked_fraction": float((~parked).mean()),
-        "occupancy": occupancy,
+        **filled,
         "members_s": _mean(times[members]),
         "others_s": _mean(times[~members]),
         "bound_s": float(roads.alone_s(cars).mean()),
@@ -120,6 +122,16 @@ def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     """Return `CAR_LISTS` of a day whose searches are all over, as texts."""
     lists = {"total_cs": np.rint(100.0 * fleet.cars["total_s"]).astype(int), "member": members.astype(int)}
     return {name: " ".join(map(str, values.tolist())) for name, values in lists.items()}
+
+
+def filling(times: FloatArray, taken: FloatArray, counted: FloatArray) -> dict[str, Any]:
+    """Return means of shares of taken slots, simulated and as counted, at ascending times, (k,) s; also by hour."""
+    hours = np.flatnonzero(np.diff(times // HOUR_S)) + 1
+    by_hour = [
+        " ".join(f"{its.mean():.4f}" for its in np.split(shares, hours)) for shares in (taken, counted)
+    ]
+    means = {"occupancy": float(np.mean(taken)), "counted_occupancy": float(np.mean(counted))}
+    return means | dict(zip(BY_HOUR, by_hour, strict=True))
 
 
 def _mean(values: FloatArray) -> float:

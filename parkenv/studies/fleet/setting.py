@@ -3,19 +3,69 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
+from pydantic import BeforeValidator, WithJsonSchema
+
+from parkenv.files.csv_tables import NUMBER_OR_NAN, NUMBERS, TEXT, WHOLE, Kind, wholes
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.results import Row
 
 OWN = "own"
+COUNTED = "counted"
+"""Arrivals with which the lot becomes as full as counted, or as its world says; `1.2x` are so many times these."""
+MAX_PER_HOUR = 1e6
 SETTING_COLUMNS = ("scenario", "agents", "knows", "share", "arrivals_per_hour")
 MEASURES = (
     "total_s", "median_s", "p95_s", "gini", "search_s", "queued_s", "failed_attempts", "driven_m", "cruised_m",
-    "cruising_share", "balked_fraction", "occupancy", "members_s", "others_s", "bound_s", "clairvoyant_s",
+    "cruising_share", "balked_fraction", "occupancy", "counted_occupancy", "members_s", "others_s",
+    "bound_s", "clairvoyant_s",
 )  # fmt: skip
 """Measures of a day, of which a summary has the mean over days."""
 CAR_LISTS = ("total_cs", "member")
 """Lists over the cars of a day, in the order of their arrivals: total time in centiseconds, and 1 for members."""
+BY_HOUR = ("occupancy_by_hour", "counted_by_hour")
+"""Columns with the mean share of taken slots in each hour of the day's arrivals, simulated and as counted."""
+_WANTED = f"a number above 0 and at most {MAX_PER_HOUR:g}, {COUNTED}, or so many times that, such as 1.2x"
+
+
+def rate_of(value: float | str) -> float | str:
+    """Return cars an hour, `counted`, or a multiple such as `1.2x`, from a number or a text.
+
+    Raises:
+        ValueError: it is none of these; the message says what was wanted.
+    """
+    text = str(value).strip()
+    try:
+        rate = 1.0 if text == COUNTED else float(text.removesuffix("x"))
+    except ValueError:
+        rate = -1.0
+    if not 0.0 < rate <= MAX_PER_HOUR:
+        raise ValueError(_WANTED)
+    if text != COUNTED and not text.endswith("x"):
+        return rate
+    return COUNTED if rate == 1.0 else f"{rate:g}x"
+
+
+def times_counted(rate: str) -> float:
+    """Return how many times the counted demand this is."""
+    return 1.0 if rate == COUNTED else float(rate.removesuffix("x"))
+
+
+_NUMBER_OR_TIMES = {
+    "type": ["number", "string"], "exclusiveMinimum": 0, "maximum": MAX_PER_HOUR, "pattern": rf"^({COUNTED}|[0-9.]+x)$",
+}  # fmt: skip
+Demanded = Annotated[float | str, BeforeValidator(rate_of), WithJsonSchema(_NUMBER_OR_TIMES)]
+"""Cars an hour, or multiples of the counted demand."""
+KINDS = {
+    **dict.fromkeys(("scenario", "agents", "knows"), TEXT),
+    **dict.fromkeys(("day", "cars"), WHOLE),
+    **dict.fromkeys(("members_s", "others_s", "counted_occupancy"), NUMBER_OR_NAN),
+    **dict.fromkeys(BY_HOUR, NUMBERS),
+    **dict.fromkeys(CAR_LISTS, wholes()),
+    "arrivals_per_hour": Kind(_WANTED, rate_of),
+}
+"""What a column of a day holds; all others hold numbers."""
 
 
 @dataclass(frozen=True)
@@ -27,14 +77,14 @@ class Setting:
         agent: agent that drives every car.
         knows: what members know, one of `KNOWLEDGE`.
         share: share of the cars that are members; the others know their own observations.
-        arrivals_per_hour: cars an hour.
+        arrivals_per_hour: cars an hour; `counted`, or a multiple such as `1.2x`, see `rate_of`.
     """
 
     scenario: str
     agent: AgentSpec
     knows: str
     share: float
-    arrivals_per_hour: float
+    arrivals_per_hour: float | str
 
     @property
     def columns(self) -> Row:
@@ -45,5 +95,12 @@ class Setting:
         }  # fmt: skip
 
     def __str__(self) -> str:
-        _, agent, knows, share, per_hour = self.columns.values()
-        return f"{agent}, {knows}, share {share:g}, {per_hour:g} cars an hour"
+        _, agent, knows, share, rate = self.columns.values()
+        return f"{agent}, {knows}, share {share:g}, {rate_text(rate)}"
+
+
+def rate_text(rate: float | str) -> str:
+    """Return a demand in words: `60 cars an hour`, `demand as counted`."""
+    if not isinstance(rate, str):
+        return f"{rate:g} cars an hour"
+    return "demand as counted" if rate == COUNTED else f"{times_counted(rate):g} times the counted demand"

@@ -13,15 +13,13 @@ from pydantic import BeforeValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
-from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE, wholes
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
-from parkenv.files.option import Option, option
+from parkenv.files.option import Option, option, words_in
 from parkenv.files.spec_file import Axis, FilePath
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
     Agents,
-    ArrivalRate,
     Figures,
     MeanStay,
     Patience,
@@ -32,7 +30,19 @@ from parkenv.studies.fields import (
     require_at_most,
     require_distinct_names,
 )
-from parkenv.studies.fleet.setting import CAR_LISTS, MEASURES, OWN, SETTING_COLUMNS, Setting
+from parkenv.studies.fleet.setting import (
+    BY_HOUR,
+    CAR_LISTS,
+    COUNTED,
+    KINDS,
+    MEASURES,
+    OWN,
+    SETTING_COLUMNS,
+    Demanded,
+    Setting,
+    rate_text,
+    times_counted,
+)
 from parkenv.studies.results import CsvTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
@@ -63,18 +73,19 @@ class FleetStudy(Study):
     table: ClassVar = CsvTable(
         "days.csv",
         keys=(*SETTING_COLUMNS, "day"),
-        columns=("cars", *MEASURES),
-        kinds=dict.fromkeys(("scenario", "agents", "knows"), TEXT)
-        | dict.fromkeys(("day", "cars"), WHOLE)
-        | dict.fromkeys(("members_s", "others_s"), NUMBER_OR_NAN)
-        | dict.fromkeys(CAR_LISTS, wholes()),
+        columns=("cars", *MEASURES, *BY_HOUR),
+        kinds=KINDS,
         lists=("cars.csv", CAR_LISTS),
     )
     block: ClassVar = 1
     doing: ClassVar = "Driving"
     unit: ClassVar = "days"
     heading: ClassVar = "Many cars"
-    table_titles: ClassVar = {"changes": "What changes for whom", "rows": "Results"}
+    table_titles: ClassVar = {
+        "changes": "What changes for whom",
+        "rows": "Results",
+        "hours": "Occupancy by hour, simulated and as counted",
+    }
 
     kind: Literal["fleet"] = "fleet"
     agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents)] = Field(
@@ -95,8 +106,14 @@ class FleetStudy(Study):
         name="--share",
         panel="Knowledge",
     )
-    arrivals_per_hour: Values[ArrivalRate] = option(
-        (60.0, 120.0, 240.0), "Cars an hour that arrive.", panel="Demand"
+    arrivals_per_hour: Values[Demanded] | None = option(
+        None,
+        "Cars an hour that arrive; counted: as many as make the lot as full as it is in the scenario's world, by its "
+        "counts, log or process, hour by hour; 1.2x: 1.2 times as many.",
+        takes="X|counted|1.2x[,...]",
+        panel="Demand",
+        default="60,120,240; of a car park that was counted, counted",
+        parse=words_in,
     )
     days: int = option(10, "Days of each setting.", name="--episodes", short="-n", ge=1, le=100_000)
     stay_s: MeanStay = 3600.0
@@ -160,10 +177,17 @@ class FleetStudy(Study):
                 "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
             )
         axes = "scenarios x agents x knows x shares x arrivals_per_hour"
-        settings = math.prod(len(getattr(self, axis)) for axis in axes.split(" x "))
+        lengths = map(len, (self.scenarios, self.agents, self.knows, self.shares, self.demands))
+        settings = math.prod(lengths)
         require_at_most(settings, axes, "settings", MAX_SETTINGS)
         require_at_most(settings * self.days, f"{axes} x days", "days")
         return self
+
+    @property
+    def demands(self) -> tuple[float | str, ...]:
+        """Cars an hour, or multiples of the counted demand."""
+        counted = all(scenario.occupancy.counts for scenario in self.scenarios)
+        return self.arrivals_per_hour or ((COUNTED,) if counted else (60.0, 120.0, 240.0))
 
     @cached_property
     def built(self) -> dict[str, Scenario]:
@@ -206,7 +230,7 @@ class FleetStudy(Study):
         made = dict.fromkeys(
             (per_hour, number, OWN if share == 0.0 else knows, 0.0 if knows == OWN else share)
             for per_hour, number, knows, share in itertools.product(
-                self.arrivals_per_hour, range(len(self.agents)), self.knows, self.shares
+                self.demands, range(len(self.agents)), self.knows, self.shares
             )
         )
         return [
@@ -233,7 +257,7 @@ class FleetStudy(Study):
         ]
         fleet = Fleet(
             scenario,
-            demand_in(scenario, setting.arrivals_per_hour, self.stay_s, self.patience_s),
+            demand_in(self._followed(setting), setting.arrivals_per_hour, self.stay_s, self.patience_s),
             background="residents",
             drivers=kinds,
             leave_full_lot=False,
@@ -244,6 +268,11 @@ class FleetStudy(Study):
             agent = LimitedAgent(agent, self.decision_limit_s)
         return fleet, [agent, agent]
 
+    def _followed(self, setting: Setting) -> Scenario:
+        """Return the first scenario with the same counts, log or process: in lots to compare, the same cars arrive."""
+        its = {spec.title: spec.occupancy for spec in self.scenarios}
+        return self.built[next(name for name in its if its[name] == its[setting.scenario])]
+
     def run_day(self, setting: Setting, day: int) -> Row:
         """Run a day of a setting; return its row of `days.csv`.
 
@@ -253,29 +282,38 @@ class FleetStudy(Study):
         import numpy as np
 
         from parkenv.studies.fleet.clairvoyant_bound import clairvoyant_bound_s
-        from parkenv.studies.fleet.measures import car_lists, day_measures
+        from parkenv.studies.fleet.measures import car_lists, day_measures, filling
+        from parkenv.world.occupancy.process import Arrival
 
         fleet, agents = self.fleet(setting)
         fleet.reset(self.seed, day)
         roads = self._roads[setting.scenario]
         bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
-        window = fleet.scenario.arrival
+        window, occupancy = fleet.scenario.arrival, fleet.scenario.occupancy
+        times = fleet.begin + np.arange(0.0, window.end_s - window.start_s, SAMPLE_S)
         taken = []
         try:
-            for second in np.arange(0.0, window.end_s - window.start_s, SAMPLE_S):
-                fleet.run(agents, until=fleet.begin + second)
+            for time in times:
+                fleet.run(agents, until=float(time))
                 taken.append(fleet.taken().mean())
             fleet.run(agents)
         except InputError as error:
             raise InputError(f"{setting}, day {day}, {error}") from error
+        counted = np.full(len(times), np.nan)
+        if occupancy.recorded or isinstance(setting.arrivals_per_hour, str):
+            counted = occupancy.course(Arrival(fleet.begin, fleet.day.date), times).occupied
         members = fleet.cars["kind"] == 0
-        measured = day_measures(fleet, roads, members, float(np.mean(taken)), bound_s)
+        filled = filling(times, np.array(taken), counted)
+        measured = day_measures(fleet, roads, members, filled, bound_s)
         lists = car_lists(fleet, members) if self._lists_cars else {}
         return {**setting.columns, "day": day, **measured, **lists}
 
     @property
     def _lists_cars(self) -> bool:
-        per_hour = sum(setting.arrivals_per_hour for setting in self.fleet_settings)
+        # Of counted demand, about a car an hour for each slot.
+        most = max(one.lot.n_slots for one in self.built.values())
+        rates = (setting.arrivals_per_hour for setting in self.fleet_settings)
+        per_hour = sum(times_counted(rate) * most if isinstance(rate, str) else rate for rate in rates)
         windows = [one.arrival for one in self.built.values()]
         hours = max(window.end_s - window.start_s for window in windows) / 3600.0
         return per_hour * hours * self.days <= MOST_LISTED
@@ -314,15 +352,17 @@ class FleetStudy(Study):
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
         from parkenv.studies.fleet.changes import summarize_changes
-        from parkenv.studies.fleet.tables import summarize_days
+        from parkenv.studies.fleet.tables import summarize_days, summarize_hours
 
         days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
         options = {name: getattr(self, name) for name in OPTIONS}
+        first = next(iter(self.built.values())).arrival.start_s // 3600.0
         return {
             "manoeuvre_s": self.blocked_s,
             **options,
             "rows": summarize_days(days),
             "changes": summarize_changes(days),
+            "hours": summarize_hours(days, int(first)),
         }
 
     @property
@@ -347,6 +387,7 @@ class FleetStudy(Study):
                 partial(looks_s, scenario),
                 f"{name}: {plural(scenario.lot.n_slots, 'slot')}, {plural(self.days, 'day')}",
                 result.folder / (PICTURE if len(self.built) == 1 else file_name(f"fleet_{name}", ".png")),
+                [row for row in result.summary["hours"] if row["scenario"] == name],
             )
             for name, scenario in self.built.items()
         ]
@@ -355,6 +396,7 @@ class FleetStudy(Study):
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: what competition costs, for each agent and demand."""
         from parkenv.studies.fleet.changes import sentence, shown_changes
+        from parkenv.studies.fleet.tables import departures
 
         shown: dict[tuple[Any, ...], Row] = {}
         for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
@@ -362,7 +404,7 @@ class FleetStudy(Study):
         findings = [sentence(row) for row in shown_changes(summary["changes"])]
         for (scenario, agent, per_hour), row in shown.items():
             finding = (
-                f"{agent} on {scenario}, {per_hour:g} cars an hour, {row['occupancy']:.0%} of the slots taken: "
+                f"{agent} on {scenario}, {rate_text(per_hour)}, {row['occupancy']:.0%} of the slots taken: "
                 f"{row['total_s']:.1f} s a car, {row['balked_fraction']:.1%} find no slot"
             )
             low, high = row["price_of_anarchy_ci95"]
@@ -374,7 +416,7 @@ class FleetStudy(Study):
                         "reserved for all"
                     )
             findings.append(f"{finding}.")
-        return findings
+        return findings + departures(summary["hours"])
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:

@@ -7,11 +7,14 @@ from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
-from parkenv.studies.fleet.setting import MEASURES, OWN, SETTING_COLUMNS
+from parkenv.studies.fleet.setting import BY_HOUR, COUNTED, MEASURES, OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of, mean_interval, ratio_interval
 
 ASSIGNED = "reserve"
+COUNTS = "counted_occupancy"
+FAR = 0.03
+"""Difference between simulated and counted occupancy that is said."""
 WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
 """Measures whose summary has a 95 % interval over days."""
 DIFFERENCES = {
@@ -45,7 +48,9 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
             **{name: days[0][name] for name in SETTING_COLUMNS},
             "days": len(days),
             "cars": sum(day["cars"] for day in days),
-            **day_means(days, MEASURES, WITH_INTERVAL),
+            **day_means(
+                days, [name for name in MEASURES if name != COUNTS or _is_counted(days)], WITH_INTERVAL
+            ),
             **_differences(paired(days, OWN, 0.0)),
             **_ratio("price_of_anarchy", paired(days, ASSIGNED, 1.0), "total_s"),
             **_ratio("price_over_bound", [(day, day) for day in days], "clairvoyant_s"),
@@ -58,6 +63,48 @@ def paired_days(days: Sequence[Row], others: Sequence[Row]) -> Pairs:
     """Return the days of a setting, each with the same day in another one, as far as both have it."""
     by_day = {day["day"]: day for day in others}
     return [(day, by_day[day["day"]]) for day in days if day["day"] in by_day]
+
+
+def _is_counted(days: Sequence[Row]) -> bool:
+    return not math.isnan(days[0][COUNTS])
+
+
+def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
+    """Return the mean occupancy in each hour, simulated and as counted, of settings where it is known.
+
+    Args:
+        settings: the days of each setting.
+        first: the hour of the day in which cars begin to arrive.
+    """
+    rows = []
+    for days in filter(_is_counted, settings):
+        simulated, counted = (np.array([day[name].split() for day in days], float).T for name in BY_HOUR)
+        for hour, (mine, theirs) in enumerate(zip(simulated, counted, strict=True), start=first):
+            its = {name: days[0][name] for name in SETTING_COLUMNS} | {"hour": hour}
+            means = {"occupancy": float(mine.mean()), COUNTS: float(theirs.mean())}
+            rows.append(its | means | columns_of("excess", mean_interval(mine - theirs)))
+    return rows
+
+
+def departures(hours: Sequence[Row]) -> list[str]:
+    """Say for each agent and demand when the lot is least as full as counted: by more than `FAR`, and not by chance.
+
+    Of the first scenario; nothing of so many times the counted demand, which is not meant to be as full.
+    """
+    worst: dict[tuple[str, float | str], Row] = {}
+    for row in sorted(hours, key=lambda row: abs(row["excess"])):
+        low, high = row["excess_ci95"]
+        rate, first = row["arrivals_per_hour"], row["scenario"] == hours[0]["scenario"]
+        meant = first and (rate == COUNTED or not isinstance(rate, str))
+        if meant and abs(row["excess"]) > FAR and (low or 0.0) * (high or 0.0) > 0.0:
+            worst[row["agents"], rate] = row
+    why = "shorter stays (--stay-min) can follow", "it is full at times, and cars go elsewhere"
+    return [
+        f"{agent}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
+        f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}; "
+        f"{why[row['excess'] < 0.0] if rate == COUNTED else '--arrivals-per-hour counted follows the counts'}."
+        for (agent, rate), row in worst.items()
+    ]
 
 
 def _differences(pairs: Pairs) -> Row:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import brentq
 from scipy.special import expit, logit
 
@@ -20,6 +21,7 @@ from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.process import (
     MAX_RATE,
     Arrival,
+    Course,
     Forecast,
     OccupancyModel,
     OccupancyProcess,
@@ -110,6 +112,10 @@ class CountedOccupancy(OccupancyModel):
             curve = _without_gaps(self.occupied[self._index(day)])
             self._worlds[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
         return self._worlds[day]
+
+    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 100) -> Course:
+        """Return the expected course of the occupancy on the arrival's day, as counted; see `OccupancyModel`."""
+        return self.process_of(arrival.day).course(arrival, times, worlds)
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast: the mean over the days that are possible, and by how much their level differs."""

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.keyed_random import world_key
 from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError, naming, require_number
 from parkenv.files.versioned_json import JsonFormat
@@ -27,7 +28,7 @@ from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, draw_arrival, kernel
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.python_functions import functions_of
-from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS
+from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, WEEK_S
 from parkenv.world.week_hours import hour_of_week
 
 MAX_RATE = 1e3
@@ -82,6 +83,13 @@ class ArrivalDay(NamedTuple):
 
     weekday: int  # Monday = 0
     date: str = ""  # ISO date of a recorded day; else empty
+
+
+class Course(NamedTuple):
+    """Expected occupancy of a lot at k times, shares of its slots, (k,) float64."""
+
+    occupied: FloatArray  # taken
+    residents: FloatArray  # taken by the same car since the course began
 
 
 class CompiledModel(NamedTuple):
@@ -158,6 +166,22 @@ class OccupancyModel(PriorModel):
         if self.recorded:
             return [ArrivalDay(weekday_of(day), day) for day in self.days_in(window)]
         return [ArrivalDay(weekday) for weekday in window.weekdays]
+
+    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 100) -> Course:
+        """Return the expected course of the occupancy on a day: by default the mean over some worlds.
+
+        Args:
+            arrival: moment from which on residents are followed, and its day.
+            times: (k,) s since Monday 00:00, ascending, not before the arrival.
+            worlds: number of worlds.
+        """
+        slots, times = np.arange(self.n_slots), np.asarray(times, np.float64)
+        occupied, residents = np.zeros((2, times.size))
+        for number in range(worlds):
+            world = self.world(world_key(0, number), arrival)
+            residents += (world.next_free(slots, arrival.time)[:, None] > times).mean(axis=0)
+            occupied += [world.occupied(slots, float(time)).mean() for time in times]
+        return Course(occupied / worlds, residents / worlds)
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """Draw the day and the time of day at which the search with this key begins, both uniform."""
@@ -474,6 +498,20 @@ class OccupancyProcess(OccupancyModel):
         marginals = np.empty(self.n_slots)
         _marginals(self.address, hour, second, marginals)
         return marginals
+
+    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 100) -> Course:
+        """Return the expected course of the occupancy, see `OccupancyModel`, in closed form."""
+        del worlds
+        times = np.asarray(times, np.float64)
+        week, second = np.divmod(np.append(times, arrival.time), WEEK_S)
+        # The departure rate of a slot with factor 1, integrated over time.
+        sums = self.hazards[1]
+        gone = week * sums[-1] + np.interp(second, np.arange(WEEK_HOURS + 1) * HOUR_S, sums)
+        leaving = (gone[:-1] - gone[-1])[:, None] * self.departure_factor
+        return Course(
+            np.array([self.marginal(time).mean() for time in times]),
+            np.asarray((self.marginal(arrival.time) * np.exp(-leaving)).mean(axis=1)),
+        )
 
     def world(self, key: np.uint64, arrival: Arrival) -> ProcessWorld:
         """Return the world of the episode with this key; its initial state is drawn from the marginal on its day."""
