@@ -18,7 +18,7 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.user_class import file_of_class, load_class
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import SearchProblem
-from planners.names import AGENTS, ALGORITHMS, FILE_AGENTS, NETWORK
+from planners.names import AGENTS, ALGORITHMS, FILE_AGENTS, HUMAN, NETWORK
 
 Observation = Mapping[str, Any]
 Memory = TypeVar("Memory")
@@ -158,9 +158,9 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
 
     Args:
         name: one of `planners.names.AGENTS`; `ALGORITHM:FILE` for a model of `parkenv train`, such as
-            `ppo:ppo.safetensors`; `network:FILE` for other weights of `network`; or `MODULE:CLASS` for your own agent,
-            such as `my_agents:Patient`: a class whose first argument is the problem. The module may be in the working
-            directory.
+            `ppo:ppo.safetensors`; `network:FILE` for other weights of `network`; `human:FILE` for the scores of a
+            game; or `MODULE:CLASS` for your own agent, such as `my_agents:Patient`: a class whose first argument is
+            the problem. The module may be in the working directory.
         scenario: the scenario; its hidden occupancy is not passed to the agent.
         options: options of the agent, such as `failure_s=5.0` for "mdp".
 
@@ -170,9 +170,12 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
     if not isinstance(name, str):
         raise InputError(f"agent is {name!r:.60}, want a name, such as 'mdp'")
     before, colon, after = name.partition(":")
-    if colon and before in ALGORITHMS:
+    if colon and before in (*ALGORITHMS, HUMAN):
         if options:
             raise InputError(f"agent {name!r} has no options; got {', '.join(options)}")
+        if before == HUMAN:
+            human: Agent = import_module("planners.human").HumanAgent(scenario, after)
+            return human
         learned: Agent = import_module("planners.learned").LearnedAgent(scenario, before, after)
         return learned
     agent: Callable[..., Agent]

@@ -32,7 +32,9 @@ NETWORK = "network"
 """The agent whose weights can be another file: `network:FILE`."""
 PARKING_PLANNER = "planner"
 """The agent that plans how to drive into a slot."""
-FILE_AGENTS = (*ALGORITHMS, NETWORK)
+HUMAN = "human"
+"""The agent that repeats what a person did in a game of `parkenv play`: `human:FILE`."""
+FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)
 """Names before the colon of `NAME:FILE`."""
 WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "first-free", "random", "oracle")
 """Agents that make no use of an occupancy forecast."""

@@ -46,3 +46,13 @@ def pytest_xdist_make_scheduler(config, log):
     from xdist.scheduler import WorkStealingScheduling
 
     return WorkStealingScheduling(config, log)
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory):
+    """A headless Chromium for the tests of a module."""
+    from chromium import opened
+
+    driver = opened(tmp_path_factory.mktemp("profile"))
+    yield driver
+    driver.quit()

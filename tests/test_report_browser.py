@@ -1,35 +1,20 @@
 """The report in a real browser: it loads without errors, plays, steps, sorts, and shows the summary's numbers."""
 
 import json
-import shutil
 import time
 
 import pytest
+from chromium import SOCKETS, every, one, painted, screen
 from command_line import parkenv
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.by import By
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
 
-webdriver = pytest.importorskip("selenium.webdriver", reason="selenium is not installed (extra dev)")
+from parkenv.cli.report import make_report
+from parkenv.studies.study import ExecutionSpec
 
-from selenium.webdriver.common.action_chains import ActionChains  # noqa: E402
-from selenium.webdriver.common.by import By  # noqa: E402
-from selenium.webdriver.common.keys import Keys  # noqa: E402
-from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
-
-from parkenv.cli.report import make_report  # noqa: E402
-from parkenv.studies.study import ExecutionSpec  # noqa: E402
-
-CHROMIUM = shutil.which("chromium") or shutil.which("google-chrome")
-DRIVER = shutil.which("chromedriver")
-pytestmark = [
-    pytest.mark.skipif(
-        not (CHROMIUM and DRIVER), reason="chromium or its driver (Debian: chromium-driver) is not here"
-    ),
-    # The browser's driver talks through sockets that its library leaves to be closed by the collector.
-    pytest.mark.filterwarnings("ignore::ResourceWarning"),
-]
-FLAGS = (
-    "--headless=new", "--no-sandbox", "--disable-gpu", "--disable-background-networking",
-    "--disable-component-update", "--disable-sync", "--no-first-run", "--disable-dev-shm-usage",
-)  # fmt: skip
+pytestmark = SOCKETS
 
 
 @pytest.fixture(scope="module")
@@ -45,42 +30,12 @@ def run(tmp_path_factory):
     return out
 
 
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory):
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('profile')}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=webdriver.ChromeService(DRIVER))
-    yield driver
-    driver.quit()
-
-
-def screen(browser, width, height=900, *, dark=False):
-    """The size of the window, and what the reader's system prefers."""
-    size = {"width": width, "height": height, "deviceScaleFactor": 2, "mobile": width < 500}
-    browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
-    scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-    # Without motion a page that scrolls is where it is going at once.
-    still = {"name": "prefers-reduced-motion", "value": "reduce"}
-    browser.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": [scheme, still]})
-
-
 @pytest.fixture
 def page(browser, run):
     screen(browser, 1400)
     browser.get((run / "report.html").as_uri())
     yield browser
     assert browser.get_log("browser") == []
-
-
-def one(page, css):
-    return page.find_element(By.CSS_SELECTOR, css)
-
-
-def every(page, css):
-    return page.find_elements(By.CSS_SELECTOR, css)
 
 
 def seconds(page):
@@ -91,18 +46,6 @@ def cells(page, key):
     """Values of a column of the results, from top to bottom as they stand."""
     found = every(page, f'table[data-table="rows"] td[data-key="{key}"]')
     return [json.loads(cell.get_attribute("data-value")) for cell in found if cell.is_displayed()]
-
-
-def painted(page, css):
-    """How many colours there are on a canvas."""
-    script = """
-    const c = document.querySelector(arguments[0]);
-    const d = c.getContext("2d").getImageData(0, 0, c.width, c.height).data;
-    const seen = new Set();
-    for (let i = 0; i < d.length; i += 16) seen.add(d[i] * 65536 + d[i + 1] * 256 + d[i + 2]);
-    return seen.size;
-    """
-    return page.execute_script(script, css)
 
 
 def test_its_numbers_are_those_of_the_summary(page, run):

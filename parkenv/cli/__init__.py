@@ -30,6 +30,7 @@ COMMANDS = {
     "compare": Entry(
         "Compare agents over costs and speeds, all in the same worlds.", "compare:Compare", SEARCH
     ),
+    "play": Entry("Search yourself, in the worlds of the agents.", "play:Play", SEARCH),
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", SEARCH),
     "commute": Entry("Let drivers come day after day, with a map that learns.", "drivers:Commute", SEARCH),
     "fleet": Entry("Let many cars search one lot, and compare what they know.", "drivers:Fleet", SEARCH),

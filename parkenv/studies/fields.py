@@ -103,7 +103,7 @@ OneScenario = Annotated[
 """The one scenario of a file."""
 AGENTS_HELP = (
     f"Agents, with any options in brackets, mdp(failure_s=90): {', '.join(AGENTS)}; ALGORITHM:FILE for a trained "
-    "model; MODULE:CLASS for your own."
+    "model; human:FILE for the scores of a game; MODULE:CLASS for your own."
 )
 Agents = Annotated[
     Several[AgentItem],

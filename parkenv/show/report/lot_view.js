@@ -20,9 +20,14 @@ const palette = {
 /** Metres shown around the followed car. */
 const AROUND = 44;
 const MARGIN = 2.5;
+/** Around a lot that fills its canvas: the car at an entry is whole. */
+const WIDE_MARGIN = 5;
 
 class LotView {
-  constructor(canvas, lot) {
+  /** With fill, the lot fills the canvas, turned with east up if it is then larger; else the height follows from the lot. */
+  constructor(canvas, lot, { fill = false } = {}) {
+    this.fill = fill;
+    this.turned = false;
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
     this.lot = lot;
@@ -34,17 +39,24 @@ class LotView {
     this.resize();
   }
 
-  /** Adopt the canvas's width; the height follows from the lot. */
+  /** Adopt the canvas's width, and its height if the lot fills it. */
   resize() {
     const [x0, y0, x1, y1] = this.lot.bounds;
-    const [across, up] = [x1 - x0 + 2 * MARGIN, y1 - y0 + 2 * MARGIN];
+    const margin = 2 * (this.fill ? WIDE_MARGIN : MARGIN);
+    const size = [x1 - x0 + margin, y1 - y0 + margin];
     const width = this.canvas.clientWidth || 600;
     const most = Math.min(Math.max(420, window.innerHeight * 0.62), 720);
-    const height = this.follow ? Math.min(width * 0.72, most) : Math.min((width * up) / across, most);
+    let height = this.follow ? Math.min(width * 0.72, most) : Math.min((width * size[1]) / size[0], most);
+    if (this.fill) {
+      height = this.canvas.clientHeight;
+      const scale = ([across, up]) => Math.min(width / across, height / up);
+      this.turned = scale(size) < scale([size[1], size[0]]);
+    }
+    const [across, up] = this.turned ? [size[1], size[0]] : size;
     this.ratio = Math.min(window.devicePixelRatio || 1, 3);
     this.width = width;
     this.height = Math.round(height);
-    this.canvas.style.height = `${this.height}px`;
+    if (!this.fill) this.canvas.style.height = `${this.height}px`;
     this.canvas.width = Math.round(width * this.ratio);
     this.canvas.height = Math.round(this.height * this.ratio);
     this.whole = { scale: Math.min(width / across, this.height / up), x: (x0 + x1) / 2, y: (y0 + y1) / 2 };
@@ -78,11 +90,24 @@ class LotView {
     return context;
   }
 
-  /** Use metres as coordinates, north up. */
+  /** Use metres as coordinates, north up, or east if the lot is turned. */
   toMetres(context) {
-    const { scale, x, y } = this.at;
-    const k = this.ratio * scale;
-    context.setTransform(k, 0, 0, -k, this.ratio * (this.width / 2 - scale * x), this.ratio * (this.height / 2 + scale * y));
+    const k = this.ratio * this.at.scale;
+    const [left, top] = this.toPixels([0, 0]).map((pixels) => this.ratio * pixels);
+    if (this.turned) context.setTransform(0, -k, -k, 0, left, top);
+    else context.setTransform(k, 0, 0, -k, left, top);
+  }
+
+  /** Return where a place is on the canvas. */
+  toPixels([x, y]) {
+    const [east, north] = [this.at.scale * (x - this.at.x), this.at.scale * (y - this.at.y)];
+    return this.turned ? [this.width / 2 - north, this.height / 2 - east] : [this.width / 2 + east, this.height / 2 - north];
+  }
+
+  /** Return the place at a point of the canvas. */
+  toPlace([left, top]) {
+    const [right, up] = [(left - this.width / 2) / this.at.scale, (this.height / 2 - top) / this.at.scale];
+    return this.turned ? [this.at.x + up, this.at.y - right] : [this.at.x + right, this.at.y + up];
   }
 
   /** Convert pixels to metres. */
@@ -94,7 +119,8 @@ class LotView {
     const { lot } = this;
     const { x, y, scale } = this.at;
     context.fillStyle = palette.ground;
-    context.fillRect(x - this.width / scale, y - this.height / scale, (2 * this.width) / scale, (2 * this.height) / scale);
+    const most = Math.max(this.width, this.height) / scale;
+    context.fillRect(x - most, y - most, 2 * most, 2 * most);
     context.lineJoin = "round";
     for (const layer of lot.ground) this.paintLayer(context, layer);
     context.globalAlpha = 1;
@@ -152,13 +178,14 @@ class LotView {
 
   /**
    * Draw all slots: filled by belief, pale until observed, with a car in taken ones.
-   * belief(i) is 0 to 255, or -1 where unknown; seen(i), taken(i) are booleans.
+   * belief(i) is 0 to 255, or -1 where unknown; seen(i) is a boolean; taken(i), too, or the opacity of the car.
    */
   drawSlots(belief, seen, taken) {
     this.slots.forEach((slot, i) => {
       const value = belief(i);
       this.paintSlot(this.context, slot, value < 0 ? null : palette.belief[value], seen(i) ? 1 : 0.42, () => {
-        if (taken(i)) this.parkedCar(this.context, Math.min(0.72 * slot.length, 4.2), Math.min(0.52 * slot.width, 1.6));
+        this.context.globalAlpha = Number(taken(i));
+        if (this.context.globalAlpha > 0) this.parkedCar(this.context, Math.min(0.72 * slot.length, 4.2), Math.min(0.52 * slot.width, 1.6));
       });
     });
   }
@@ -200,16 +227,16 @@ class LotView {
   }
 
   /** Draw the searching car. */
-  drawCar(x, y, yaw) {
+  drawCar(x, y, yaw, color = palette.car, pixels = 15) {
     const context = this.context;
-    const length = Math.max(4.4, this.px(15));
+    const length = Math.max(4.4, this.px(pixels));
     const width = 0.46 * length;
     context.save();
     context.translate(x, y);
     context.rotate(yaw);
     context.strokeStyle = "#1c2126";
     context.lineWidth = this.px(1.5);
-    this.carBody(context, palette.car, length, width);
+    this.carBody(context, color, length, width);
     context.stroke();
     context.fillStyle = "#1c2126";
     context.fillRect(0.08 * length, -0.34 * width, 0.15 * length, 0.68 * width);
@@ -277,9 +304,9 @@ class LotView {
   /** Write a name beside a slot. */
   drawName({ x, y }, name) {
     const context = this.context;
-    const { scale } = this.at;
+    const [middle, low] = this.toPixels([x, y]);
+    const at = [middle, low - Math.max(12, 3.4 * this.at.scale)];
     context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
-    const at = [this.width / 2 + scale * (x - this.at.x), this.height / 2 - scale * (y - this.at.y) - Math.max(12, 3.4 * scale)];
     context.font = "600 12px system-ui, sans-serif";
     const width = context.measureText(name).width + 10;
     const left = Math.min(Math.max(at[0] - width / 2, 2), this.width - width - 2);
@@ -315,8 +342,8 @@ class LotView {
   /** Draw the goal: a mark, or an arrow toward it at the edge. */
   drawGoal(x, y) {
     const context = this.context;
-    const [left, right] = [this.at.x - this.width / 2 / this.at.scale, this.at.x + this.width / 2 / this.at.scale];
-    const [low, high] = [this.at.y - this.height / 2 / this.at.scale, this.at.y + this.height / 2 / this.at.scale];
+    const [across, up] = (this.turned ? [this.height, this.width] : [this.width, this.height]).map((pixels) => this.px(pixels) / 2);
+    const [left, right, low, high] = [this.at.x - across, this.at.x + across, this.at.y - up, this.at.y + up];
     const edge = this.px(14);
     const at = [Math.min(Math.max(x, left + edge), right - edge), Math.min(Math.max(y, low + edge), high - edge)];
     if (at[0] !== x || at[1] !== y) {

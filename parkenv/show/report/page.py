@@ -26,10 +26,12 @@ FORMAT, VERSION = "parkenv-report", 1
 SCHEMA = Path(__file__).with_name("report.schema.json")
 """JSON schema of the data in a page."""
 SCRIPTS = (
-    "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_replay.js",
-    "drive_replay.js", "fleet_replay.js", "page.js",
+    "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_track.js",
+    "search_replay.js", "drive_replay.js", "fleet_replay.js", "page.js",
 )  # fmt: skip
 """Scripts of the page, in order of dependence."""
+GAME_SCRIPTS = ("numbers.js", "lot_view.js", "player.js", "search_track.js", "game_search.js", "game.js")
+"""Scripts of a game's page."""
 MOST_WIDTH = 1800
 """px; wider figures are scaled down."""
 LOSSLESS = 150_000
@@ -98,9 +100,7 @@ def page_data(
             "seed": summary.get("seed"),
             "notes": list(notes),
         },
-        "terms": [
-            {"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS
-        ],
+        "terms": terms_data(),
         "learning": list(page.learning),
         "tables": list(page.tables),
         "lots": lots,
@@ -108,6 +108,11 @@ def page_data(
         "drives": placed("drive"),
         "fleets": placed("fleet"),
     }
+
+
+def terms_data() -> list[dict[str, Any]]:
+    """Return the `terms` of `report.schema.json`: what a search can cost."""
+    return [{"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS]
 
 
 def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()) -> None:
@@ -121,14 +126,27 @@ def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()
     Raises:
         InputError: the file cannot be written.
     """
+    shown = "\n".join(_figure(f) for f in sorted(figures, key=_rank))
+    _write(path, "page.html", data, SCRIPTS, title=html.escape(data["run"]["title"]), figures=shown)
+
+
+def write_game(data: Mapping[str, Any], path: Path) -> None:
+    """Write the page of a game atomically; see `parkenv.studies.play.game_data`.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    _write(path, "game.html", data, GAME_SCRIPTS, game=(_HERE / "game.css").read_text(encoding="utf-8"))
+
+
+def _write(path: Path, page: str, data: Mapping[str, Any], scripts: Iterable[str], **parts: str) -> None:
     # A "<" in a string must not end the script element that holds the data.
     embedded = json.dumps(data, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
-    text = Template((_HERE / "page.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(data["run"]["title"]),
+    text = Template((_HERE / page).read_text(encoding="utf-8")).substitute(
         style=(_HERE / "style.css").read_text(encoding="utf-8") + _term_colors(),
-        figures="\n".join(_figure(f) for f in sorted(figures, key=_rank)),
         data=embedded,
-        program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in SCRIPTS),
+        program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in scripts),
+        **parts,
     )
     with atomic_write(path) as beside:
         beside.write_text(text, encoding="utf-8")

@@ -1,7 +1,5 @@
 // Mean total time: a stacked bar per agent with the confidence interval of its mean, a panel per setting.
 
-/** Return the colour of a term of the costs; the style sheet has a variable for each. */
-const termColor = ({ name }) => `var(--${name.replace("_", "-")})`;
 /** Bars longer than this many times the shortest agent's of the panel may be cut off. */
 const CUT = 2.6;
 

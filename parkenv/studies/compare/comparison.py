@@ -35,6 +35,7 @@ from parkenv.studies.fields import (
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
+from planners.names import HUMAN
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
@@ -245,6 +246,11 @@ class Comparison(CaseStudy):
                 "compare that scenario alone, neither blind nor with constant forecasts"
             )
         require_distinct(case for case, _ in self.cases)
+        for case, seeds in self.cases:
+            if _is_person(case.agent):
+                from parkenv.studies.play import require_same_worlds
+
+                require_same_worlds(case, seeds)
         for scenario in self.built:
             check_worlds(scenario, self.seeds)
 
@@ -280,6 +286,8 @@ class Comparison(CaseStudy):
             for level in self.grid.occupancy_levels
             for setting in self._grid_settings(at_occupancy(scenario, level), first_speeds=True)
             for agent in self._agents_in(scenario)
+            # Nobody has played in worlds of another occupancy.
+            if not _is_person(agent.name)
         ]
 
     def _agents_in(self, scenario: Scenario) -> list[AgentSpec]:
@@ -382,7 +390,11 @@ class Comparison(CaseStudy):
 
 
 def _works_blind(agent: AgentSpec) -> bool:
-    return agent.name not in NEEDS_OBSERVATIONS
+    return agent.name not in NEEDS_OBSERVATIONS and not _is_person(agent.name)
+
+
+def _is_person(agent: str) -> bool:
+    return agent.startswith(f"{HUMAN}:")
 
 
 def _seen_through(spec: ScenarioSpec, rig: str | None) -> ScenarioSpec:

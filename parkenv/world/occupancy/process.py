@@ -68,6 +68,22 @@ class World(ABC):
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
         """(k,) int64, number of the current sojourn (period of constant state) of each slot; distinguishes cars."""
 
+    def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
+        """(k,) float64, s: the first time in (`time`, `until`] of another sojourn of each slot; inf if there is none.
+
+        By default the first float64 at which `sojourn` differs, found by bisection.
+        """
+        changes = np.full(np.size(slots), np.inf)
+        for i, slot in enumerate(np.ravel(slots)):
+            before, after, now = time, until, self.sojourn([slot], time)
+            if self.sojourn([slot], until) != now:
+                while before < (middle := before + (after - before) / 2) < after:
+                    before, after = (
+                        (middle, after) if self.sojourn([slot], middle) == now else (before, middle)
+                    )
+                changes[i] = after
+        return changes
+
     @property
     def address(self) -> int:
         """Address of the record by which compiled code asks this world; valid while this object lives.
@@ -267,6 +283,13 @@ class ProcessWorld(World):
         self._seek(slots, time, np.empty(0))
         begun: IntArray = self._cursors["sojourn"][slots].astype(np.int64)
         return begun
+
+    def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
+        """(k,) float64, s: the first time in (`time`, `until`] of another sojourn of each slot; inf if none."""
+        slots = self._checked(slots)
+        ends = np.empty(slots.size)
+        self._seek(slots, time, ends)
+        return np.where(ends <= until, ends, np.inf)
 
     def _checked(self, slots: ArrayLike) -> IntArray:
         slots = np.ascontiguousarray(slots, np.int64)

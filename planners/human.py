@@ -1,0 +1,85 @@
+"""A person's searches in a game of `parkenv play`, replayed as an agent."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from parkenv.belief.slot_belief import SlotBelief
+from parkenv.errors import InputError
+from parkenv.files.spec_file import Several, Spec
+from parkenv.files.versioned_json import JsonFormat
+from parkenv.world.scenario import SearchProblem
+from planners.agent import Observation, SearchAgent
+
+_FORMAT = JsonFormat("parkenv-scores", 1, "the scores of a game of parkenv play")
+_Seconds = Annotated[float, Field(ge=0.0, strict=False)]
+
+
+class PlayedSearch(Spec):
+    """A search of a person: seed of the world, how it begins, a digit for each action, and its time on the page."""
+
+    seed: int = Field(ge=0)
+    arrival_s: _Seconds
+    entry: int = Field(ge=0)
+    actions: str = Field(pattern="^[0-4]{1,2000}$")
+    total_s: _Seconds
+
+
+class Scores(Spec):
+    """Content of a file of scores."""
+
+    scenario: str
+    worlds: Several[PlayedSearch] = Field(min_length=1, max_length=10_000)
+
+
+class HumanAgent(SearchAgent[Iterator[int]]):
+    """`human:FILE`: takes the actions of a person in the worlds of a game.
+
+    It recognises a world by what every agent observes at the reset: time and entry.
+
+    Args:
+        problem: the scenario of the game.
+        path: the file of scores that the game's page saved.
+
+    Raises:
+        InputError: the file is damaged, or from a game in another scenario.
+
+    Attributes:
+        totals: total time, s, by seed, as the page says.
+    """
+
+    def __init__(self, problem: SearchProblem, path: str | os.PathLike[str]) -> None:
+        super().__init__(problem)
+        self.name = f"human:{path}"  # type: ignore[misc]
+        scores = Scores.parse(_FORMAT.read(path), str(path))
+        name = getattr(problem, "name", scores.scenario)
+        if scores.scenario != name:
+            raise InputError(f"{path}: scenario is {scores.scenario!r:.60}, want {name!r}, which is searched")
+        self.totals = {one.seed: one.total_s for one in scores.worlds}
+        self._actions = {
+            (np.float32(one.arrival_s), one.entry): tuple(map(int, one.actions)) for one in scores.worlds
+        }
+        if not len(self._actions) == len(self.totals) == len(scores.worlds):
+            raise InputError(f"{path}: worlds has a world twice, want each once")
+
+    def begin(self, observation: Observation, belief: SlotBelief) -> Iterator[int]:
+        """Return the person's actions in this world."""
+        del belief
+        start = (np.float32(observation["time"][0]), int(observation["vertex"]))
+        if start not in self._actions:
+            raise InputError(
+                f"{self.name} has no search that begins at {start[0]:.2f} s at vertex {start[1]}"
+            )
+        return iter(self._actions[start])
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: Iterator[int]) -> int:
+        """Return the next action."""
+        del observation, belief
+        if (action := next(memory, None)) is None:
+            raise InputError(f"{self.name}: actions end before the search does")
+        return action

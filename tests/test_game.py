@@ -1,0 +1,346 @@
+"""`parkenv play`: the page searches as Python does, is played by keys and fingers, and its scores are checked."""
+
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from chromium import SOCKETS, every, one, painted, screen
+from command_line import parkenv
+from selenium.webdriver.common.action_chains import ActionChains
+from selenium.webdriver.common.keys import Keys
+from selenium.webdriver.support.ui import WebDriverWait
+
+from parkenv import InputError, make_scenario
+from parkenv.show.report import page as pages
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.play import game_data
+from parkenv.world.occupancy.process import World
+from parkenv.world.sensor_model import SensorModel
+from planners.agent import make_agent
+
+pytestmark = SOCKETS
+SCRIPTS = Path(pages.__file__).parent
+NODE = shutil.which("node")
+
+
+def data_of(page):
+    text = re.search(
+        r'<script type="application/json" id="game-data">(.*?)</script>', page.read_text(), re.DOTALL
+    )
+    return json.loads(text[1])
+
+
+@pytest.fixture(scope="module")
+def game(tmp_path_factory):
+    """The page of three worlds of the lot with ten slots, beside two agents."""
+    out = tmp_path_factory.mktemp("game") / "play.html"
+    done = parkenv("play", "--html", "--scenario", "mini", "--worlds", "3", "--seed", "4", "--out", out)
+    assert done.returncode == 0, done.stderr
+    return out
+
+
+@pytest.fixture(scope="module")
+def scores(game, tmp_path_factory):
+    """What the page would save if a person did what the agent `belief` does."""
+    data = data_of(game)
+    worlds = []
+    for world in data["worlds"]:
+        env = gym.make("parkenv/Search-v2", scenario="mini")
+        env.reset(seed=world["seed"])
+        for action in world["actions"][0]:
+            _, _, over, _, info = env.step(int(action))
+        assert over
+        kept = {name: world[name] for name in ("seed", "arrival_s", "entry")}
+        worlds.append(kept | {"actions": world["actions"][0], "total_s": info["total_s"]})
+    return {"format": "parkenv-scores", "version": 1, "scenario": "mini", "worlds": worlds}
+
+
+def changed(scores, **change):
+    """The scores with another first world."""
+    return scores | {"worlds": [scores["worlds"][0] | change, *scores["worlds"][1:]]}
+
+
+def saved(scores, folder):
+    (folder / "scores.json").write_text(json.dumps(scores))
+    return f"human:{folder / 'scores.json'}"
+
+
+def random_search(scenario, seed, rng, avoids_free):
+    """A search by random actions, some of them waits: the actions, and what Python says of its end."""
+    env = gym.make("parkenv/Search-v2", scenario=scenario, disable_env_checker=True)
+    observation, _ = env.reset(seed=seed)
+    state, actions, over = env.unwrapped.state, "", False
+    while not over:
+        allowed = np.flatnonzero(observation["action_mask"])
+        action = int(rng.choice(allowed)) if rng.random() < 0.8 else int(rng.integers(4))
+        slot = state.vertex
+        if action == 4 and avoids_free and not state.world.occupied([slot], state.time)[0]:
+            action = int(rng.integers(4))
+        observation, _, terminated, truncated, info = env.step(action)
+        actions, over = actions + str(action), terminated or truncated
+    total_s = info["total_s"] + (0.0 if terminated else scenario.give_up_s)
+    return actions, total_s, state.vertex, observation["p_occupied"]
+
+
+def random_searches(scenario, seeds):
+    rng = np.random.default_rng(7)
+    return [
+        (w, random_search(scenario, seed, rng, many))
+        for w, seed in enumerate(seeds)
+        for many in (False, True)
+    ]
+
+
+def require_equal(searches, found):
+    for (_, (actions, total_s, vertex, p_occupied)), its in zip(searches, found, strict=True):
+        assert its["total_s"] == pytest.approx(total_s, abs=1e-9)
+        assert (its["vertex"], its["steps"], its["over"]) == (vertex, len(actions), True)
+        assert its["belief"] == pytest.approx(p_occupied, abs=1e-6)
+
+
+@pytest.mark.skipif(NODE is None, reason="node is not installed")
+@pytest.mark.parametrize("sensor", ["perfect", "laser"])
+@pytest.mark.parametrize("name", ["mini", "street", pytest.param("campus", marks=pytest.mark.slow)])
+def test_the_search_of_the_page_is_that_of_python(name, sensor, tmp_path):
+    """Random searches: parked, given up in a full lot, and ended by the limit of steps."""
+    scenario = make_scenario(name, failure_s=12.5)
+    if sensor != "perfect":
+        scenario = scenario.replace(sensor_model=SensorModel.named(sensor))
+    seeds = (11, 2**31)
+    searches = random_searches(scenario, seeds)
+    program = "\n".join((SCRIPTS / script).read_text() for script in ("search_track.js", "game_search.js"))
+    program += f"""
+    const data = {json.dumps(game_data(scenario, [AgentSpec(name="oracle")], seeds))};
+    unpackGame(data);
+    console.log(JSON.stringify({json.dumps([(w, its[0]) for w, its in searches])}.map(
+      ([w, actions]) => new GameSearch(data.problem, data.worlds[w], data.terms).take(actions).state)));
+    """
+    (tmp_path / "game.js").write_text(program)
+    done = subprocess.run([NODE, tmp_path / "game.js"], capture_output=True, text=True, check=True)
+    require_equal(searches, json.loads(done.stdout))
+
+
+def test_changes_are_found_for_every_kind_of_world():
+    """By bisection as by the process's own sojourns, to the last bit."""
+    scenario = make_scenario("mini")
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    env.reset(seed=3)
+    world, begin = env.unwrapped.state.world, env.unwrapped.state.time
+    slots = np.arange(scenario.lot.n_slots)
+    exact = world.next_change(slots, begin, begin + 7_200.0)
+    assert np.isfinite(exact).any()
+    assert np.array_equal(World.next_change(world, slots, begin, begin + 7_200.0), exact)
+
+
+def test_scores_are_a_row_of_a_comparison(scores, tmp_path):
+    agents = f"belief,{saved(scores, tmp_path)},oracle"
+    out = tmp_path / "compared"
+    command = [
+        "compare",
+        "--scenario",
+        "mini",
+        "--seed",
+        "4",
+        "-n",
+        "3",
+        "--agents",
+        agents,
+        "--jobs",
+        "1",
+        "--no-figures",
+    ]
+    done = parkenv(*command, "--out", out)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    belief, human, _ = summary["rows"]
+    assert human["agent"] == agents.split(",")[1]
+    assert human["total_s"] == belief["total_s"]
+    # Nobody has played in the worlds of other occupancies.
+    assert {row["agent"] for row in summary["occupancy_rows"]} == {"belief", "oracle"}
+
+
+@pytest.mark.parametrize(
+    ("options", "field"),
+    [
+        (["--scenario", "campus", "--seed", "4", "-n", "3"], "scenario is 'mini'"),
+        (["--scenario", "mini", "--seed", "4", "-n", "4"], "--episodes"),
+        (["--scenario", "mini", "--seed", "3", "-n", "3"], "--seed"),
+        (["--scenario", "mini", "--seed", "4", "-n", "3", "--v-drive-kmh", "12"], "total_s"),
+    ],
+)
+def test_scores_of_another_game_are_refused_in_a_line(scores, tmp_path, options, field):
+    require_refused(["compare", *options, "--agents", f"mdp,{saved(scores, tmp_path)}"], field, tmp_path)
+
+
+def test_a_time_that_the_actions_do_not_take_is_refused(scores, tmp_path):
+    agents = f"mdp,{saved(changed(scores, total_s=1.0), tmp_path)}"
+    command = ["compare", "--scenario", "mini", "--seed", "4", "-n", "3", "--agents", agents]
+    require_refused(command, "total_s is 1.0", tmp_path)
+
+
+def require_refused(command, field, folder):
+    done = parkenv(*command, "--out", folder / "compared")
+    assert done.returncode == 2
+    assert field in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (folder / "compared").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "field"),
+    [
+        ({"actions": "0123456789"}, "actions"), ({"actions": ""}, "actions"), ({"total_s": -1.0}, "total_s"),
+        ({"seed": "4"}, "seed"), ({"code": 1}, "code"), ({"seed": 5}, "worlds"),
+    ],
+)  # fmt: skip
+def test_damaged_scores_are_refused(scores, tmp_path, change, field):
+    with pytest.raises(InputError, match=field):
+        make_agent(saved(changed(scores, **change), tmp_path), make_scenario("mini"))
+
+
+MOVES = [Keys.ARROW_UP, Keys.ARROW_DOWN, Keys.ARROW_LEFT, Keys.ARROW_RIGHT]
+
+
+@pytest.fixture
+def page(browser, game):
+    screen(browser, 1280, 800)
+    browser.get(game.as_uri())
+    yield browser
+    assert browser.get_log("browser") == []
+
+
+def steps(page):
+    """Steps of the search so far, once the car stands."""
+    canvas = one(page, "#lot")
+    return int(WebDriverWait(page, 60).until(lambda _: canvas.get_attribute("data-steps")))
+
+
+def total(page):
+    steps(page)
+    return float(one(page, "#clock").text.removesuffix("s"))
+
+
+def results(page):
+    """Rows of the table of worlds."""
+    return [
+        [cell.text for cell in row.find_elements("css selector", "th, td")]
+        for row in every(page, "#result tbody tr")
+    ]
+
+
+def test_the_page_searches_as_python_does(page, game):
+    seeds = [world["seed"] for world in data_of(game)["worlds"]]
+    searches = random_searches(make_scenario("mini"), seeds)
+    found = page.execute_script(
+        "return arguments[0].map(([w, actions]) => game.take(w, actions))",
+        [[w, its[0]] for w, its in searches],
+    )
+    require_equal(searches, found)
+
+
+@pytest.mark.slow
+def test_keys_drive_and_park_and_the_agents_are_shown(page, game):
+    world = data_of(game)["worlds"][0]
+    actions = world["actions"][1]
+    for n, action in enumerate(actions[:-1], start=1):
+        ActionChains(page).send_keys(MOVES[int(action)]).perform()
+        assert steps(page) == n
+    driven = page.execute_script("return game.take(0, arguments[0]).total_s", actions[:-1])
+    assert total(page) == pytest.approx(driven, abs=0.051)
+    assert not one(page, "#result").is_displayed()
+    ActionChains(page).send_keys(" ").perform()
+    WebDriverWait(page, 60).until(lambda _: one(page, "#result").is_displayed())
+    names = [name.text for name in every(page, "#result .who")]
+    totals = [
+        page.execute_script("return game.take(0, arguments[0]).total_s", its)
+        for its in (actions, *world["actions"])
+    ]
+    assert names == ["you", "belief", "oracle"]
+    assert results(page) == [["1", *(f"{t:.1f}" for t in totals), f"{totals[0] - world['bound_s']:.1f}"]]
+    assert painted(page, "#lot") > 20
+    page.find_element("css selector", "#result .first").click()
+    assert one(page, '#worlds [aria-current="true"]').text == "2"
+    assert total(page) == 0.0
+
+
+def touch(page, *points):
+    """A finger goes down at the first point, moves through the others, and goes up."""
+    for kind, at in zip(["touchStart", *["touchMove"] * len(points[1:])], points, strict=True):
+        page.execute_cdp_cmd(
+            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": at[0], "y": at[1]}]}
+        )
+    page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+def on_canvas(page, place):
+    corner, (x, y) = one(page, "#lot").rect, page.execute_script("return game.toPixels(arguments[0])", place)
+    return corner["x"] + x, corner["y"] + y
+
+
+def button(page, css):
+    box = one(page, css).rect
+    assert box["height"] >= 44
+    touch(page, (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
+
+
+@pytest.mark.slow
+def test_a_finger_plays_all_worlds_on_a_phone_and_python_counts_the_scores(browser, game, tmp_path):
+    screen(browser, 390, 844, dark=True)
+    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
+    browser.get(game.as_uri())
+    data = data_of(game)
+    lot, worlds = data["problem"]["lot"], data["worlds"]
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    for number, world in enumerate(worlds):
+        # A drag forward, up on the screen in this lot, drives one step; then a tap drives to the oracle's slot.
+        assert not one(browser, "#park").is_enabled()
+        touch(browser, (195, 400), (195, 370))
+        assert total(browser) > 0.0
+        end = browser.execute_script(
+            "return game.take(arguments[0], arguments[1]).vertex", number, world["actions"][1]
+        )
+        corners = lot["slots"][end]
+        touch(browser, on_canvas(browser, [(corners[0] + corners[4]) / 2, (corners[1] + corners[5]) / 2]))
+        assert steps(browser) > 1
+        assert lot["slot_ids"][end] in one(browser, "#park").text
+        # It may be taken by now: then it takes another attempt.
+        while not one(browser, "#result").is_displayed():
+            before = steps(browser)
+            button(browser, "#park")
+            WebDriverWait(browser, 60).until(lambda _, before=before: steps(browser) > before)
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+        if number + 1 < len(worlds):
+            button(browser, "#result .first")
+    rows = results(browser)
+    assert [row[0] for row in rows] == ["1", "2", "3", "Mean"]
+    # The file that the page saves is a row of a comparison.
+    browser.execute_script(
+        "URL.createObjectURL = (blob) => { blob.text().then((text) => { window.saved = text; }); return '#'; }"
+    )
+    button(browser, "#result .go .first")
+    scores = tmp_path / "scores.json"
+    scores.write_text(browser.execute_script("return window.saved"))
+    command = [
+        "compare",
+        "--scenario",
+        "mini",
+        "--seed",
+        "4",
+        "-n",
+        "3",
+        "--agents",
+        f"oracle,human:{scores}",
+        "--jobs",
+        "1",
+    ]
+    done = parkenv(*command, "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    human = json.loads((tmp_path / "out" / "summary.json").read_text())["rows"][1]
+    assert rows[-1][1] == f"{human['total_s']:.1f}"
+    assert make_agent(f"human:{scores}", make_scenario("mini")).totals.keys() == {w["seed"] for w in worlds}
+    assert browser.get_log("browser") == []
