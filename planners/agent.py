@@ -174,8 +174,8 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
         if options:
             raise InputError(f"agent {name!r} has no options; got {', '.join(options)}")
         if before == HUMAN:
-            human: Agent = import_module("planners.human").HumanAgent(scenario, after)
-            return human
+            recorded: Agent = import_module("planners.human").HumanAgent(scenario, after)
+            return recorded
         learned: Agent = import_module("planners.learned").LearnedAgent(scenario, before, after)
         return learned
     agent: Callable[..., Agent]

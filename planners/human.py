@@ -1,8 +1,7 @@
-"""A person's searches in a game of `parkenv play`, replayed as an agent."""
+"""A person's searches in a game of `parkenv play`, repeated by an agent."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator
 from typing import Annotated
 
@@ -18,14 +17,15 @@ from planners.agent import Observation, SearchAgent
 
 _FORMAT = JsonFormat("parkenv-scores", 1, "the scores of a game of parkenv play")
 _Seconds = Annotated[float, Field(ge=0.0, strict=False)]
+_Whole = Annotated[int, Field(ge=0)]
 
 
 class PlayedSearch(Spec):
     """A search of a person: seed of the world, how it begins, a digit for each action, and its time on the page."""
 
-    seed: int = Field(ge=0)
+    seed: _Whole
     arrival_s: _Seconds
-    entry: int = Field(ge=0)
+    entry: _Whole
     actions: str = Field(pattern="^[0-4]{1,2000}$")
     total_s: _Seconds
 
@@ -42,10 +42,6 @@ class HumanAgent(SearchAgent[Iterator[int]]):
 
     It recognises a world by what every agent observes at the reset: time and entry.
 
-    Args:
-        problem: the scenario of the game.
-        path: the file of scores that the game's page saved.
-
     Raises:
         InputError: the file is damaged, or from a game in another scenario.
 
@@ -53,17 +49,15 @@ class HumanAgent(SearchAgent[Iterator[int]]):
         totals: total time, s, by seed, as the page says.
     """
 
-    def __init__(self, problem: SearchProblem, path: str | os.PathLike[str]) -> None:
+    def __init__(self, problem: SearchProblem, path: str) -> None:
         super().__init__(problem)
         self.name = f"human:{path}"  # type: ignore[misc]
-        scores = Scores.parse(_FORMAT.read(path), str(path))
+        scores = Scores.parse(_FORMAT.read(path), path)
         name = getattr(problem, "name", scores.scenario)
         if scores.scenario != name:
             raise InputError(f"{path}: scenario is {scores.scenario!r:.60}, want {name!r}, which is searched")
         self.totals = {one.seed: one.total_s for one in scores.worlds}
-        self._actions = {
-            (np.float32(one.arrival_s), one.entry): tuple(map(int, one.actions)) for one in scores.worlds
-        }
+        self._actions = {(np.float32(one.arrival_s), one.entry): one.actions for one in scores.worlds}
         if not len(self._actions) == len(self.totals) == len(scores.worlds):
             raise InputError(f"{path}: worlds has a world twice, want each once")
 
@@ -75,7 +69,7 @@ class HumanAgent(SearchAgent[Iterator[int]]):
             raise InputError(
                 f"{self.name} has no search that begins at {start[0]:.2f} s at vertex {start[1]}"
             )
-        return iter(self._actions[start])
+        return map(int, self._actions[start])
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: Iterator[int]) -> int:
         """Return the next action."""

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import webbrowser
 from pathlib import Path
+from typing import Annotated
 
 from pydantic import Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, stages
-from parkenv.errors import InputError
-from parkenv.files.option import option
+from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fields import Agents, OneScenario, Seed
+from parkenv.studies.fields import TRAFFIC, Agents, OneScenario, Seed
 
 
 class Play(Command):
@@ -31,7 +31,7 @@ class Play(Command):
         parkenv compare -n 10 --agents belief,human:scores.json,oracle
         """
 
-    scenario: OneScenario = scenario_spec("campus")
+    scenario: Annotated[OneScenario, Inside(without=TRAFFIC)] = scenario_spec("campus")
     agents: Agents = Field(
         (AgentSpec(name="belief"), AgentSpec(name="oracle")), description="Whom you are compared with."
     )
@@ -54,5 +54,5 @@ class Play(Command):
         make_folder(self.out.parent)
         write_game(data, self.out)
         console.print(f"Written: {self.out}, {self.out.stat().st_size / 1e6:.1f} MB")
-        if not self.html and not webbrowser.open(self.out.absolute().as_uri()):
-            raise InputError(f"no browser can be opened here; open {self.out} in one, or add --html")
+        if not (self.html or webbrowser.open(self.out.absolute().as_uri())):
+            console.print("No browser can be opened here: open the page in one.")

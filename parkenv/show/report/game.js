@@ -242,7 +242,7 @@ function refresh() {
   const walk = slot === null ? "" : `${known(slot).split(",")[0]} · walk ${problem.walk_s[slot].toFixed(0)} s`;
   part("park").replaceChildren(slot === null ? "Park" : `Park in ${slotName(slot)}`, make("small", {}, walk || "beside a slot"));
   part("wait").disabled = waiting() === undefined;
-  part("wait").replaceChildren("Wait", make("small", {}, `${problem.seconds[5 * search.vertex + (waiting() ?? 0)].toFixed(0)} s`));
+  part("wait").replaceChildren("Wait", make("small", {}, waiting() === undefined ? "not here" : `${Number(seconds2(problem.seconds[5 * search.vertex + waiting()]))} s`));
   part("worlds").replaceChildren(
     ...worlds.map((_, i) => make("button", {
       type: "button", class: played[i] && "done", disabled: !played[i], "aria-label": `World ${i + 1}`,
@@ -376,7 +376,7 @@ function drawReplay(drivers, world, seconds) {
   inCars.forEach(({ its, track, k, parked }, i) => {
     const slot = parked && view.slots[its.vertex];
     const end = parked ? [slot.x, slot.y] : track.pose(Math.min(seconds, track.end), k);
-    view.drawLine([...track.search.vertex.slice(0, k + 1).map((v) => lot.vertices[v]), end.slice(0, 2)], colors()[i % 5], 3 + 4 * (inCars.length - 1 - i));
+    view.drawLine([...track.search.vertex.slice(0, k + 1).map((v) => lot.vertices[v]), end.slice(0, 2)], colors()[i % 5], 3 + 2.5 * (inCars.length - 1 - i));
     if (parked) view.drawLine([end, goal], colors()[i % 5], 2, [5, 4]);
   });
   view.drawGoal(...goal);
@@ -423,6 +423,8 @@ part("legend").append(
   keyed(box("var(--car)"), "you"), keyed(dot, "goal"), keyed(make("span", {}, "forecast free ", scale(0.5)), "taken"), keyed(box("#10907f"), "seen free"), keyed(box("var(--parked)"), "seen taken"),
 );
 new ResizeObserver(() => {
+  // The lot does not turn between a search and its results.
+  view.turns = !shown;
   view.resize();
   view.ground = null;
   redraw();

@@ -26,7 +26,7 @@ const WIDE_MARGIN = 5;
 class LotView {
   /** With fill, the lot fills the canvas, turned with east up if it is then larger; else the height follows from the lot. */
   constructor(canvas, lot, { fill = false } = {}) {
-    this.fill = fill;
+    this.fill = this.turns = fill;
     this.turned = false;
     this.canvas = canvas;
     this.context = canvas.getContext("2d");
@@ -50,7 +50,7 @@ class LotView {
     if (this.fill) {
       height = this.canvas.clientHeight;
       const scale = ([across, up]) => Math.min(width / across, height / up);
-      this.turned = scale(size) < scale([size[1], size[0]]);
+      if (this.turns) this.turned = scale(size) < scale([size[1], size[0]]);
     }
     const [across, up] = this.turned ? [size[1], size[0]] : size;
     this.ratio = Math.min(window.devicePixelRatio || 1, 3);
