@@ -216,6 +216,50 @@ def test_a_day_with_many_cars_is_played(browser, tmp_path):
     browser.get((tmp_path / "report.html").as_uri())
     assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
     assert len(every(browser, "#crowd .panel")) == 1
+    # A parked car stands out from its slot in the dark, too.
+    colors = [
+        browser.execute_script(CHANNELS, name) for name in ("--asphalt", "--other", "--resident", "--parked")
+    ]
+    assert all(abs(car - colors[0]) > 50 for car in colors[1:])
+    assert browser.get_log("browser") == []
+
+
+CHANNELS = """
+const hex = getComputedStyle(document.documentElement).getPropertyValue(arguments[0]).trim();
+return [1, 3, 5].reduce((sum, i) => sum + parseInt(hex.slice(i, i + 2), 16) / 3, 0);
+"""
+"""Brightness of a colour of the style sheet, 0 to 255."""
+
+
+@pytest.mark.slow
+def test_a_phone_shows_first_what_changes(browser, tmp_path):
+    wide = {"name": "wide", "lot": {"grid": {"rows": 2, "columns": 6}}, "arrivals": {"hours": "08:00-08:30"}}
+    (tmp_path / "wide.json").write_text(json.dumps(wide))
+    command = ["fleet", "--scenario", "mini,wide.json", "--hours", "08:00-08:30", "--arrivals-per-hour", "20",
+               "--knows", "own,reserve", "-n", "2", "--jobs", "1", "--report", "--out", "out"]  # fmt: skip
+    assert parkenv(*command, cwd=tmp_path).returncode == 0
+    (change, *_) = json.loads((tmp_path / "out" / "summary.json").read_text())["changes"]
+    screen(browser, 390, 844)
+    browser.get((tmp_path / "out" / "report.html").as_uri())
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    first = one(browser, ".headline")
+    assert first.rect["y"] + first.rect["height"] < 844
+    assert f"{abs(change['change_s']):.1f} s" in first.text
+    assert "wide instead of mini" in first.text
+    # Every number of a table can be read: a row is a card, its columns are labelled, and further ones unfold.
+    hidden = one(browser, 'table[data-table="rows"] td[data-key="clairvoyant_s"]')
+    assert not hidden.is_displayed()
+    button = one(browser, 'table[data-table="rows"] td.all button')
+    browser.execute_script("arguments[0].click()", button)
+    assert hidden.is_displayed()
+    for cell in every(browser, "table.rows td"):
+        assert cell.rect["x"] + cell.rect["width"] <= 390
+    screen(browser, 1280, 900)
+    browser.get((tmp_path / "out" / "report.html").as_uri())
+    assert [p.get_attribute("data-setting") for p in every(browser, "#crowd .panel")] == [
+        "mini, own",
+        "wide, own",
+    ]
     assert browser.get_log("browser") == []
 
 

@@ -17,7 +17,7 @@ from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 
 Row = dict[str, Any]
 
-KNOWLEDGE_COLORS = {"own": INK, "shared": "#e69f00", "reserve": "#0072b2", "full": "#009e73"}
+KNOWLEDGE_COLORS = {"own": INK, "shared": "#cc79a7", "reserve": "#0072b2", "full": "#009e73"}
 _STYLES: tuple[tuple[Any, str], ...] = (("-", "o"), ("--", "s"), (":", "^"), ("-.", "D"))
 _GREY, _SIMULATED = "#999999", "#cc79a7"
 _CLOSED_FORM = "slots looked at in random order"

@@ -228,7 +228,7 @@ class FleetView {
   cross(context, x, y, opacity) {
     const size = Math.max(2, this.view.px(5));
     context.globalAlpha = opacity;
-    context.strokeStyle = palette.failed;
+    context.strokeStyle = palette.ink;
     context.lineWidth = this.view.px(2.4);
     context.beginPath();
     context.moveTo(x - size, y - size);
@@ -246,6 +246,7 @@ class FleetReplay {
     this.data = data;
     const { fleets } = data;
     this.days = new Map();
+    this.several = new Set(fleets.map((its) => its.scenario)).size > 1;
     this.groups = [...new Set(fleets.map((its) => this.groupOf(its)))];
     this.groupChoice = make("select", { id: "demand" }, ...this.groups.map((name) => make("option", { value: name }, name)));
     this.groupChoice.addEventListener("change", () => this.open(this.groupChoice.value));
@@ -270,14 +271,14 @@ class FleetReplay {
 
   groupOf(its) {
     const rate = its.arrivals_per_hour;
-    return `${its.scenario} · ${typeof rate === "string" ? `demand ${rate}` : `${rate} cars an hour`} · day ${its.day}`;
+    return `${this.several ? "" : `${its.scenario} · `}${typeof rate === "string" ? `demand ${rate}` : `${rate} cars an hour`} · day ${its.day}`;
   }
 
   /** Name of a setting within its day. */
   nameOf(its) {
     const agents = new Set(this.data.fleets.map((other) => other.agents)).size > 1;
     const share = its.share > 0 && its.share < 1 ? `, ${written(100 * its.share, 0)} % members` : "";
-    return `${agents ? `${shortName(its.agents)}, ` : ""}${its.knows}${share}`;
+    return `${this.several ? `${its.scenario}, ` : ""}${agents ? `${shortName(its.agents)}, ` : ""}${its.knows}${share}`;
   }
 
   open(group) {
@@ -287,7 +288,7 @@ class FleetReplay {
     const kept = (this.chosen ?? []).filter((name) => names.includes(name));
     const wanted = window.innerWidth < 720 ? 1 : MOST_DAYS;
     const most = Math.max(...its.map(({ share }) => share));
-    const other = names.find((name, i) => i > 0 && its[i].knows === "reserve" && its[i].share === most) ?? names[1];
+    const other = this.several ? names[1] : names.find((name, i) => i > 0 && its[i].knows === "reserve" && its[i].share === most) ?? names[1];
     this.chosen = kept.length ? kept : [names[0], other].filter(Boolean).slice(0, wanted);
     this.chips.replaceChildren(...names.map((name) => make("button", { type: "button", class: "chip", "data-setting": name, onclick: () => this.toggle(name) }, name)));
     this.layOut();
@@ -408,7 +409,8 @@ class FleetReplay {
 function fleetLegend(fleets) {
   const body = (color, roof) => markSvg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: `fill: var(${color}); stroke: #1c2126; stroke-width: 1.2` }), makeSvg("rect", { x: 7, y: 5, width: 8, height: 6, style: `fill: var(${roof})` }));
   const parked = (color) => markSvg(26, makeSvg("rect", { x: 2, y: 3, width: 22, height: 10, rx: 3, style: `fill: var(${color})` }));
-  const cross = markSvg(16, makeSvg("path", { d: "M3 3l10 10M3 13l10-10", style: "stroke: var(--failed); stroke-width: 2.4" }));
+  const cross = markSvg(16, makeSvg("path", { d: "M3 3l10 10M3 13l10-10", style: "stroke: var(--ink); stroke-width: 2.4" }));
+  const goal = markSvg(16, makeSvg("circle", { cx: 8, cy: 8, r: 5, style: "fill: none; stroke: var(--goal); stroke-width: 4" }));
   const mixed = fleets.some((its) => its.share > 0);
   const queues = fleets.some((its) => its.tracks.some((track) => track.some((code, i) => i > 0 && i % 2 === 0 && (code & 3) === QUEUES)));
   const area = markSvg(24, makeSvg("rect", { x: 1, y: 5, width: 22, height: 9, style: "fill: var(--car)" }));
@@ -418,6 +420,6 @@ function fleetLegend(fleets) {
     keyed(body("--car", "--other"), "searching"), mixed ? keyed(body("--car", "--member"), "searching member") : null,
     keyed(body("--failed", "--other"), "failed attempt"), queues ? keyed(body("--queue", "--other"), "in a queue") : null,
     keyed(parked("--other"), "parked"), mixed ? keyed(parked("--member"), "parked member") : null, keyed(parked("--resident"), "resident"),
-    keyed(cross, "gave up"), keyed(area, "searching cars"), keyed(line, "slots taken, dashes 100 %"),
+    keyed(goal, "goal"), keyed(cross, "gave up"), keyed(area, "searching cars"), keyed(line, "slots taken, dashes 100 %"),
   );
 }

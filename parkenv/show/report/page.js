@@ -15,6 +15,8 @@ setTheme(dark.matches ? "dark" : "light");
 dark.addEventListener("change", () => setTheme(dark.matches ? "dark" : "light"));
 part("theme").addEventListener("click", () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
 
+part("headlines").hidden = data.run.headlines.length === 0;
+part("headlines").append(...data.run.headlines.map(headline));
 part("findings").append(...data.run.findings.slice(0, 8).map((finding) => make("li", {}, finding)));
 part("notes").append(...data.run.notes.map((note) => make("p", { class: "note", role: "note" }, note)));
 

@@ -43,6 +43,8 @@ _ORDER = (
     "searches", "session", "detections", "slots_found", "reach", "graph", "map", "learning_curve",
 )  # fmt: skip
 """The first figures of a page: prefixes of their file names."""
+_WIDE = 2.2
+"""Least ratio of width to height of a figure that has the page to itself, such as charts in a row."""
 _WHITE = 0.5
 """Least white share of a chart, which is inverted in dark mode; pictures of lots and photographs are not."""
 
@@ -53,6 +55,8 @@ class Page(NamedTuple):
     Attributes:
         title: heading of the page.
         findings: the results in sentences.
+        headlines: the main results, for large type: `label` and `value`, perhaps `where` and `interval`, and the shares
+            `better` and `worse`.
         tables: from `tables.table_of`.
         learning: from `learning.learning_panels`.
     """
@@ -61,6 +65,7 @@ class Page(NamedTuple):
     findings: Sequence[str] = ()
     tables: Sequence[Mapping[str, Any]] = ()
     learning: Sequence[Mapping[str, Any]] = ()
+    headlines: Sequence[Mapping[str, Any]] = ()
 
 
 def page_data(
@@ -95,6 +100,7 @@ def page_data(
             "kind": kind,
             "title": page.title,
             "findings": list(page.findings),
+            "headlines": list(page.headlines),
             "command": shlex.join(str(word) for word in summary["command"]),
             "parkenv": summary["version"],
             "seed": summary.get("seed"),
@@ -176,8 +182,9 @@ def _figure(path: Path) -> str:
         picture = picture.resize((MOST_WIDTH, round(picture.height * MOST_WIDTH / picture.width)))
     white = bool((np.asarray(picture).min(axis=2) > 250).mean() > _WHITE)
     source, (width, height) = _webp(picture, chart=white), picture.size
+    classes = " ".join(["plotted"] * white + ["wide"] * (width > _WIDE * height))
     return (
-        f'<figure{" class=plotted" * white}><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
+        f'<figure class="{classes}"><button type="button" class="enlarge" aria-label="Enlarge: {caption}">'
         f'<img src="{source}" width="{width}" height="{height}" alt="{caption}"></button>'
         f"<figcaption>{caption}</figcaption></figure>"
     )

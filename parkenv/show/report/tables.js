@@ -1,5 +1,7 @@
 // Tables: every number of the summary; click a heading, or press Enter on it, to sort.
 
+/** Columns of a row that a phone shows at once. */
+const AT_ONCE = 10;
 const SETTING = ["scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
 
 function sortValue(value) {
@@ -58,7 +60,7 @@ function factsTable(table) {
 function sortableTable(table) {
   const { columns, rows } = table;
   const body = make("tbody");
-  const classOf = (k) => [isWord[k] ? "word" : "", k === lead || k === agent ? "lead" : "", settings.includes(k) ? "setting" : "", k === agent ? "agent" : ""].join(" ").trim() || null;
+  const classOf = (k) => [isWord[k] ? "word" : "", k === lead || k === agent ? "lead" : "", settings.includes(k) ? "setting" : "", k === agent ? "agent" : "", k >= AT_ONCE && columns.length > AT_ONCE + 1 ? "minor" : ""].join(" ").trim() || null;
   const isWord = columns.map((_, i) => rows.every((row) => row[i] === null || typeof row[i] === "string"));
   const lead = columns.findIndex((column) => column.key === "total_s");
   const settings = columns.map((column, i) => (SETTING.includes(column.key) ? i : -1)).filter((i) => i >= 0);
@@ -68,12 +70,21 @@ function sortableTable(table) {
     const line = make("tr", { "data-row": i, class: table.leads?.includes(i) ? "leads" : null });
     columns.forEach((column, k) => {
       const value = column.key === "agent" || column.key === "model" ? shortName(String(row[k])) : row[k];
-      const cell = make("td", { class: classOf(k) });
+      const cell = make("td", { class: classOf(k), "data-label": column.label + (column.unit ? `, ${column.unit}` : "") });
       fillCell(cell, column, value);
       cell.dataset.value = JSON.stringify(row[k]);
       if (value !== row[k]) cell.title = row[k];
       line.append(cell);
     });
+    if (columns.length > AT_ONCE + 1) {
+      const [more, fewer] = [`All ${columns.length} columns`, "Fewer columns"];
+      const button = make("button", { type: "button", "aria-expanded": "false", onclick: () => {
+        const open = line.classList.toggle("open");
+        button.textContent = open ? fewer : more;
+        button.setAttribute("aria-expanded", String(open));
+      } }, more);
+      line.append(make("td", { class: "all" }, button));
+    }
     return line;
   });
   body.append(...lines);
@@ -102,7 +113,7 @@ function sortableTable(table) {
     });
     return heading;
   });
-  const element = make("table", { "data-table": table.name, "aria-label": table.title }, make("thead", {}, make("tr", {}, ...headings)), body);
+  const element = make("table", { class: "rows", "data-table": table.name, "aria-label": table.title }, make("thead", {}, make("tr", {}, ...headings)), body);
 
   const groups = [...new Set(rows.map(settingOf))];
   if (agent < 0 || groups.length < 2 || groups.length > 24) return [element, null];

@@ -45,6 +45,7 @@ _CAR_ERRORS = (
     Column("place_error_m", "position, median error", "m", 2),
     Column("heading_error_deg", "heading, median error", "°", 1),
 )
+_PAIRED = "After minus before, of the same cars on the same days"
 _KNOWN = {
     column.key: column
     for column in (
@@ -58,25 +59,25 @@ _KNOWN = {
         Column("courses", "drivers", digits=0),
         Column("forecast_error", "forecast error", digits=3, help="Brier score of P(taken) at the arrival"),
         Column("failure_cost_s", "failure cost", "s", 0, help="Time of a failed parking attempt"),
-        Column("v_walk_kmh", "walk", "km/h", 0),
-        Column("v_drive_kmh", "drive", "km/h", 0),
+        Column("v_walk_kmh", "walking speed", "km/h", 0),
+        Column("v_drive_kmh", "driving speed", "km/h", 0),
         Column("episodes", "searches", digits=0),
         Column("seed", "seed", digits=0),
         Column("total_s", "total time", "s", help=" + ".join(term.label for term in COST_TERMS).capitalize()),
-        Column("difference_s", "minus first agent", "s", signed=True, help="Paired by world; 95 % interval"),
-        Column("regret_s", "regret", "s", help="Difference to the clairvoyant lower bound"),
-        *(Column(term.field, term.label, "s", help=term.help) for term in COST_TERMS),
-        Column("bound_s", "bound", "s", help="Clairvoyant lower bound: least time with full knowledge of the future"),
+        Column("difference_s", "change from the first agent", "s", signed=True, help="Paired by world; 95 % interval"),
+        Column("regret_s", "regret (above the bound)", "s", help="Difference to the clairvoyant lower bound"),
+        *(Column(term.field, f"time: {term.label}", "s", help=term.help) for term in COST_TERMS),
+        Column("bound_s", "lower bound", "s", help="Least time if the whole future were known"),
         Column("parked_fraction", "parked", share=True, digits=0),
-        Column("failed_parks", "failed attempts", digits=2),
+        Column("failed_parks", "failed attempts, number", digits=2),
         Column("replans", "replans", help="How often the agent replanned in a search"),
-        Column("driven_m", "driven", "m", 0),
-        Column("walked_m", "walked", "m", 0),
+        Column("driven_m", "distance driven", "m", 0),
+        Column("walked_m", "distance walked", "m", 0),
         Column("slots_passed", "slots passed"),
-        Column("occupancy", "occupied", share=True, digits=0, help="Share of slots taken at the arrival"),
-        Column("decision_ms", "decision", "ms", 2, help="Median wall time of a decision"),
-        Column("decision_ms_p99", "p99", "ms", 2, help="99th percentile of the wall time of a decision"),
-        Column("gap_to_exact", "over exact", share=True, digits=2, signed=True),
+        Column("occupancy", "slots taken", share=True, digits=0, help="Share of slots taken at the arrival"),
+        Column("decision_ms", "a decision takes", "ms", 2, help="Median wall time of a decision"),
+        Column("decision_ms_p99", "99 % of decisions below", "ms", 2, help="99th percentile of their wall times"),
+        Column("gap_to_exact", "above the optimum", share=True, digits=2, signed=True),
         Column("steps", "decisions in training", digits=0),
         Column("steps_per_s", "decisions/s", digits=0),
         Column("model", "model"),
@@ -119,7 +120,7 @@ _KNOWN = {
         Column("found", "found", digits=0),
         Column("detections", "detections", digits=0),
         Column("right", "correct", digits=0),
-        Column("occupied_fraction", "occupied", share=True, digits=0),
+        Column("occupied_fraction", "slots taken", share=True, digits=0),
         Column("agents", "agents"),
         Column("knows", "members know"),
         Column("share", "members", share=True, digits=0),
@@ -128,23 +129,32 @@ _KNOWN = {
         Column("counted_occupancy", "as counted", share=True, digits=0, help="By the world's counts, log or process"),
         Column("excess", "minus counted", share=True, signed=True, help="Simulated minus counted occupancy"),
         Column("cars", "cars", digits=0),
-        Column("median_s", "median", "s", help="Median of the total times"),
+        Column("median_s", "median time", "s", help="Median of the total times"),
         Column("gave_up_fraction", "found no slot", share=True, help="Searches that gave up; charged the penalty"),
-        Column("p95_s", "95 % quantile", "s", 0),
-        Column("gini", "Gini", digits=3, help="Inequality of total times: 0 if all are equal"),
+        Column("p95_s", "95 % of cars below", "s", 0, help="95 % quantile of the total times of a day's cars"),
+        Column("gini", "inequality (Gini)", digits=3, help="Inequality of total times: 0 if all are equal"),
         Column("search_s", "search time", "s", help="From the entry to the end of the search"),
-        Column("queued_s", "in queues", "s", help="Behind cars that park, leave or stand; part of the search time"),
-        Column("failed_attempts", "failed attempts", digits=3),
-        Column("cruised_m", "cruised", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
-        Column("cruising_share", "traffic that cruises", share=True, digits=0),
+        Column("queued_s", "time in queues", "s", help="Behind cars that park, leave or stand; in the search time"),
+        Column("failed_attempts", "failed attempts a car", digits=3),
+        Column("cruised_m", "detour driven", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
+        Column("cruising_share", "traffic that cruises", share=True, digits=0, help="Detours in all metres driven"),
         Column("balked_fraction", "found no slot", share=True),
-        Column("members_s", "members", "s", help="Total time of members"),
-        Column("others_s", "others", "s", help="Total time of those who are no members"),
-        Column("members_difference_s", "members minus own", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
-        Column("others_difference_s", "others minus own", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
+        Column("members_s", "time of members", "s", help="Total time of members"),
+        Column("others_s", "time of the others", "s", help="Total time of those who are no members"),
+        Column("members_difference_s", "change, members", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
+        Column("others_difference_s", "change, the others", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
         Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),
         Column("clairvoyant_s", "clairvoyant bound", "s", help="Lower bound that knows all arrivals and stays"),
-        Column("price_over_bound", "over the bound", digits=3, help="Total time over the clairvoyant lower bound"),
+        Column("price_over_bound", "price over the bound", digits=3, help="Total time over the clairvoyant bound"),
+        Column("before", "instead of"),
+        Column("cars_a_day", "cars a day", digits=0),
+        Column("change_s", "change, all cars", "s", signed=True, help=_PAIRED),
+        Column("members_change_s", "change, members", "s", signed=True, help=f"{_PAIRED}: members after the change"),
+        Column("others_change_s", "change, the others", "s", signed=True, help=_PAIRED),
+        Column("search_change_s", "change, search time", "s", signed=True, help=_PAIRED),
+        Column("balked_change", "change, found no slot", share=True, signed=True, help=_PAIRED),
+        Column("better_off", "better off", share=True, digits=0, help="Cars that gain at least a second"),
+        Column("worse_off", "worse off", share=True, digits=0, help="Cars that lose at least a second"),
         Column("key", "drive"),
         Column("weather", "weather"),
         Column("rig", "rig"),
@@ -152,19 +162,29 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed", "total_s", "median_s",
-    "gave_up_fraction", "difference_s", "gap_to_exact",
+    "after", "before", "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed", "change_s",
+    "members_change_s", "others_change_s", "better_off", "worse_off", "total_s", "median_s", "gave_up_fraction",
+    "difference_s", "gap_to_exact",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
 OF_FLEETS = {
     column.key: column
     for column in (
-        Column("difference_s", "minus own", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
-        Column("median_s", "median", "s", help="Median of the total times of a day's cars"),
-        Column("bound_s", "alone", "s", help="Mean total time of a car alone in an empty lot that it knows"),
+        Column("difference_s", "change, all cars", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
+        Column("median_s", "median time", "s", help="Median of the total times of a day's cars"),
         Column(
-            "occupancy", "occupied", share=True, digits=0, help="Mean share of slots taken while cars arrive"
+            "bound_s",
+            "time if alone",
+            "s",
+            help="Mean total time of a car alone in an empty lot that it knows",
+        ),
+        Column(
+            "occupancy",
+            "slots taken",
+            share=True,
+            digits=0,
+            help="Mean share of slots taken while cars arrive",
         ),
     )
 }
@@ -227,7 +247,9 @@ def table_of(
         same = [
             k
             for k in same
-            if values[k][0] is None or k in _ORDER[:8] or k in ("episodes", "rig", "slots", *_OPTIONAL)
+            if values[k][0] is None
+            or k in _ORDER[:8]
+            or k in ("agents", "change", "days", "episodes", "rig", "slots", *_OPTIONAL)
         ]
     shown = [k for k in keys if k not in same]
     return {

@@ -39,6 +39,8 @@ def summarize_changes(settings: Sequence[list[Row]]) -> list[Row]:
         its = {name: days[0][name] for name in SETTING_COLUMNS}
         for what, before in (("scenario", {"scenario": first}), ("knows", {"knows": OWN, "share": 0.0})):
             earlier = by_setting.get(tuple((its | before)[name] for name in SETTING_COLUMNS), [])
+            if what == "scenario" and isinstance(its["arrivals_per_hour"], str):
+                continue  # a demand that follows counts has its own cars in every scenario
             if its[what] != before[what] and (pairs := paired_days(days, earlier)):
                 names = _words(what, its | before), _words(what, its)
                 changes = day_means([_change(*pair) for pair in pairs], CHANGES, CHANGES)
@@ -165,36 +167,29 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
         ]
     made = []
     for row in chosen[:most]:
-        ends, size = interval_of(row, "change_s"), f"{abs(row['change_s']):.1f} s"
-        way = "less" if row["change_s"] < 0.0 else "more"
-        made.append(
-            {
-                "label": f"{row['after']} instead of {row['before']}",
-                "where": ", ".join(where(row)),
-                "value": f"{size} {way} a car" if is_clear(row, "change_s") else "no clear difference",
-                "interval": ""
-                if ends is None
-                else f"{row['change_s']:+.1f} s [{ends[0]:+.1f}, {ends[1]:+.1f}]",
-            }
-            | (
-                {"better": row["better_off"], "worse": row["worse_off"]}
-                if is_known(row["better_off"])
-                else {}
-            )
-        )
+        value, interval, ends = "no clear difference", "no interval", interval_of(row, "change_s")
+        if ends:
+            interval = f"95 % interval {ends[0]:+.1f} to {ends[1]:+.1f} s"
+        if is_clear(row, "change_s"):
+            value = f"{abs(row['change_s']):.1f} s {'less' if row['change_s'] < 0.0 else 'more'} a car"
+            interval = "95 % interval {:.1f} to {:.1f} s".format(*sorted(map(abs, ends or ())))
+        one = {"label": f"{row['after']} instead of {row['before']}", "where": ", ".join(where(row))}
+        off = {"better": row["better_off"], "worse": row["worse_off"]} if is_known(row["better_off"]) else {}
+        made.append(one | {"value": value, "interval": interval} | off)
     return made
 
 
 def shown_changes(changes: Sequence[Row]) -> list[Row]:
-    """Return the changes that are told in sentences: of scenarios, then of guidance for as many cars as there are."""
-    scenarios = [row for row in changes if row["change"] == "scenario"]
+    """Return the changes that are told: without members or with as many as there are, one guidance for each demand."""
+    most = max((row["share"] for row in changes), default=0.0)
+    told = [row for row in changes if row["change"] == "scenario" and row["share"] in (0.0, most)]
     of_guidance: dict[tuple[Any, ...], list[Row]] = {}
     for row in changes:
         if row["change"] == "knows":
             key = row["scenario"], row["agents"], row["arrivals_per_hour"]
             of_guidance.setdefault(key, []).append(row)
-    # One for each demand: a choice by the result would be a winner of chance.
+    # A choice by the result would be a winner of chance.
     guided = [
         max(its, key=lambda row: (row["share"], row["knows"] == "reserve")) for its in of_guidance.values()
     ]
-    return sorted(scenarios, key=lambda row: row["knows"] != OWN) + guided
+    return sorted(told, key=lambda row: row["knows"] != OWN) + guided

@@ -401,7 +401,8 @@ class FleetStudy(Study):
         shown: dict[tuple[Any, ...], Row] = {}
         for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
             shown.setdefault((row["scenario"], row["agents"], row["arrivals_per_hour"]), row)
-        findings = [sentence(row) for row in shown_changes(summary["changes"])]
+        changes = shown_changes(summary["changes"])
+        findings = [sentence(row) for row in changes if row["change"] == "scenario"]
         for (scenario, agent, per_hour), row in shown.items():
             finding = (
                 f"{agent} on {scenario}, {rate_text(per_hour)}, {row['occupancy']:.0%} of the slots taken: "
@@ -416,15 +417,18 @@ class FleetStudy(Study):
                         "reserved for all"
                     )
             findings.append(f"{finding}.")
+        findings += [sentence(row) for row in changes if row["change"] == "knows"]
         return findings + departures(summary["hours"])
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`; some columns mean something else than in other tables."""
         from parkenv.show.report.tables import OF_FLEETS, tables_of
+        from parkenv.studies.fleet.changes import headlines
 
         tables = tables_of(summary, cls.table_titles, OF_FLEETS)
-        return super().page(summary, folder)._replace(tables=tables)
+        large = headlines(summary["rows"], summary["changes"])
+        return super().page(summary, folder)._replace(tables=tables, headlines=large)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
