@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
@@ -26,6 +27,9 @@ from parkenv.files.spec_file import Several, Spec
 from parkenv.world.lot import ACTIONS
 from planners.model_header import CARD_KEY, read_header
 from planners.names import ALGORITHMS
+
+if TYPE_CHECKING:
+    from parkenv.driving.vehicle import VehicleParameters
 
 SUFFIX = ".safetensors"
 OBSERVATION = "local-1"
@@ -128,6 +132,9 @@ class ModelCard(Spec):
     action_space: BoxSpace | Annotated[int, Field(ge=1, le=1_000)]
     scenarios: Several[str] = Field((), description="Trained on; for driving, lots.")
     held_out: Several[str] = Field((), description="Places never trained on, which it was evaluated in.")
+    vehicle: dict[str, float] | None = Field(
+        None, description="Of the training, for driving; None for the default."
+    )
     seed: int | None = Field(None, description="Of the training.")
     steps: int = Field(0, ge=0, description="Decisions of the training.")
     settings: dict[str, JsonValue] = Field({}, description="Of the algorithm.")
@@ -183,6 +190,7 @@ def save_model(
     *,
     scenarios: Sequence[str] = (),
     held_out: Sequence[str] = (),
+    vehicle: VehicleParameters | None = None,
     settings: Mapping[str, Any] | None = None,
     results: Mapping[str, float] | None = None,
     command: Sequence[str] = (),
@@ -195,6 +203,7 @@ def save_model(
         path: file to write; its name should end in `.safetensors`.
         scenarios: names of the training scenarios; for driving, of the lots.
         held_out: names of the places that it was evaluated in, and never trained on.
+        vehicle: car of the training, for driving; None for the default one.
         settings: settings of the algorithm, for the card.
         results: results of an evaluation, for the card.
         command: command line of the training, for the card.
@@ -217,6 +226,8 @@ def save_model(
         if not key.startswith("optimizer_")
     }
     action = model.action_space
+    if task == "drive":
+        vehicle = vehicle or import_module("parkenv.driving.vehicle").VehicleParameters()
     found = {key: None if value != value else float(value) for key, value in (results or {}).items()}
     card = ModelCard.parse(
         {
@@ -225,6 +236,7 @@ def save_model(
             "observation_space": {key: BoxSpace.of(space) for key, space in model.observation_space.items()},
             "action_space": int(action.n) if isinstance(action, spaces.Discrete) else BoxSpace.of(action),
             "scenarios": tuple(scenarios), "held_out": tuple(held_out), "seed": model.seed,
+            "vehicle": None if vehicle is None else asdict(vehicle),
             "steps": model.num_timesteps, "settings": to_jsonable_python(dict(settings or {})),
             "results": found, "command": tuple(command),
         },

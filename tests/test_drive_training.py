@@ -465,6 +465,9 @@ def test_models_of_another_task_are_refused(trained):
     other = "ppo" if algorithm != "ppo" else "sac"
     with pytest.raises(InputError, match=f"is a model of {algorithm}, not of {other}"):
         make_parking_agent(f"{other}:{folder / 'model.safetensors'}")
+    longer = VehicleParameters(length=4.9)
+    with pytest.raises(InputError, match=r"is made for a vehicle with length 4\.26, this one has 4\.9"):
+        make_parking_agent(f"{algorithm}:{folder / 'model.safetensors'}", longer)
     with pytest.raises(InputError, match="unknown agent 'mdp'; known: planner"):
         make_parking_agent("mdp")
 

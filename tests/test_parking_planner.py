@@ -267,6 +267,26 @@ def test_an_observation_without_the_map_is_refused():
         ParkingAgent().predict(observation)
 
 
+@pytest.mark.parametrize("change", [{"length": 4.9}, {"wheelbase": 2.9}, {"max_steering": 0.5}])
+def test_what_is_made_for_a_vehicle_refuses_another_one(change):
+    other = VehicleParameters(**change)
+    env = gym.make(
+        "parkenv/Drive-v1", lot="campus", kinds=("perpendicular",), vehicle=other, obstacle_map=True
+    )
+    observation, _ = env.reset(seed=0)
+    ((name, value),) = change.items()
+    refused = f"vehicle with {name} {getattr(VehicleParameters(), name):g}, this one has {value:g}"
+    with pytest.raises(InputError, match=refused):
+        ParkingAgent().predict(observation)
+    with pytest.raises(InputError, match=refused):
+        ParkingAgent().predict({key: np.stack([part, part]) for key, part in observation.items()})
+    path = ParkingAgent(other).plan(observation)
+    assert path is not None
+    PathTracker(other, path)
+    with pytest.raises(InputError, match=f"path is made for a vehicle with {name} {value:g}"):
+        PathTracker(VehicleParameters(), path)
+
+
 def test_where_no_path_is_the_car_stays_and_that_is_said():
     env = ParkingCase(packaged_lot("mini")).environment()
     no_room = ParkingAgent(search=SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0))

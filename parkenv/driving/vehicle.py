@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
@@ -90,20 +91,26 @@ class VehicleParameters:
     @cached_property
     def limits(self) -> FloatArray:
         """The limits as `advance` takes them, (8,) float64."""
-        limits = np.array(
-            [
-                self.wheelbase,
-                self.max_steering,
-                self.steering_rate,
-                self.max_speed,
-                self.max_reverse_speed,
-                self.max_acceleration,
-                self.max_braking,
-                self.acceleration_rate,
-            ]
-        )
+        # All fields but those of the footprint: length, width and rear overhang.
+        limits = np.delete(np.array(dataclasses.astuple(self), dtype=np.float64), [0, 1, 3])
         limits.flags.writeable = False
         return limits
+
+    @cached_property
+    def numbers(self) -> NDArray[np.float32]:
+        """All parameters in the order of the fields, (11,) float32, as observations show them."""
+        numbers = np.array(dataclasses.astuple(self), dtype=np.float32)
+        numbers.flags.writeable = False
+        return numbers
+
+    def require_same(self, numbers: ArrayLike, what: str) -> None:
+        """Raise an `InputError` unless `numbers`, (11,) or (n, 11), are this vehicle's, for which `what` is made."""
+        others = np.atleast_2d(np.asarray(numbers, dtype=np.float32))
+        for other, k in np.argwhere(others != self.numbers).tolist():
+            name = dataclasses.fields(self)[k].name
+            raise InputError(
+                f"{what} is made for a vehicle with {name} {self.numbers[k]:g}, this one has {others[other, k]:g}"
+            )
 
     def corners(self, pose: FloatArray) -> FloatArray:
         """Footprints, (..., 4, 2) m, counter-clockwise from the rear right, of rear-axle poses, (..., 3)."""

@@ -77,6 +77,7 @@ length and width over the car's |
     | `scan` | `Box(0, max_range, (n_beams,), float32)` | laser ranges, m; with `laser` |
     | `cars` | `Box(-1000, 1000, (160, 24, 2), float32)` | outlines of parked cars, m; with `obstacle_map` |
     | `lines` | `Box(-1000, 1000, (320, 2, 2), float32)` | kerbs and walls, m; with `obstacle_map` |
+    | `vehicle` | `Box(0, inf, (11,), float32)` | the car, `VehicleParameters.numbers`: constant; with `obstacle_map` |
     | `movers` | `Box(-1000, 1000, (n, 24, 2), float32)` | outlines of moving road users, m; with `obstacle_map` and \
 `traffic` |
 
@@ -128,7 +129,7 @@ length and width over the car's |
       starts with `starts="way-out"`, a small `distance` and a large `slack`.
     - `reward`: `sparse` or `dense`. `contact_cost`: s.
     - `laser`: True for the thesis's scanner (1081 beams over 270°), or a `LaserScanner`.
-    - `obstacle_map`: whether the observation has `cars` and `lines`.
+    - `obstacle_map`: whether the observation has `cars`, `lines` and `vehicle`.
     - `traffic`: e.g. `Traffic(cars=4, pedestrians=6)` adds moving cars and pedestrians. They wait for the car, but do
       not swerve if it drives into them.
     - `render_mode`: `rgb_array` (480, 640, 3), or `human` (needs the extra `human`).
@@ -409,6 +410,7 @@ length and width over the car's |
             observation["scan"] = np.minimum(scan, np.float32(self.laser.max_range))
         if self._maps:
             observation["cars"], observation["lines"] = self._map[0].copy(), self._map[1].copy()
+            observation["vehicle"] = self.vehicle.numbers.copy()
             if self._n_movers:
                 seen = np.array([np.r_[o, np.repeat(o[-1:], CORNERS - len(o), axis=0)] for o in outlines])
                 seen = np.clip(state.task.in_slot_frame(seen), -FAR, FAR)

@@ -32,7 +32,7 @@ def drive_observation_space(
         vehicle: defines the bounds of speed, steering and acceleration.
         laser: adds `scan`.
         n_movers: number of moving road users, rows of `movers`.
-        obstacle_map: whether to add `cars`, `lines` and, with traffic, `movers`.
+        obstacle_map: whether to add `cars`, `lines`, `vehicle` and, with traffic, `movers`.
     """
     fastest = max(vehicle.max_speed, vehicle.max_reverse_speed)
     goal = np.array([BOUND, BOUND, 1.0, 1.0, fastest, BOUND, BOUND], dtype=np.float32)
@@ -49,6 +49,7 @@ def drive_observation_space(
     if obstacle_map:
         shown["cars"] = spaces.Box(-FAR, FAR, (MOST_CARS, CORNERS, 2), np.float32)
         shown["lines"] = spaces.Box(-FAR, FAR, (MOST_LINES, 2, 2), np.float32)
+        shown["vehicle"] = spaces.Box(0.0, np.inf, vehicle.numbers.shape, np.float32)
         if n_movers:
             shown["movers"] = spaces.Box(-FAR, FAR, (n_movers, CORNERS, 2), np.float32)
     return spaces.Dict(shown)

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.vehicle import move_along
+from parkenv.driving.vehicle import VehicleParameters, move_along
 
 SHORTEST_ARC = 1e-6  # arcs shorter than this, m, are ignored
 
@@ -22,6 +22,7 @@ class CarPath:
     curvature: FloatArray  # (k,) 1/m, positive to the left
     expansions: int = 0  # nodes that the search expanded
     margin: float = 0.0  # clearance to obstacles, m
+    vehicle: VehicleParameters | None = None  # the car that it was planned for
 
     @property
     def driven_m(self) -> float:

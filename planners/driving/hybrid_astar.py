@@ -134,7 +134,7 @@ def plan_path(
         if len(lengths):
             lengths, curvatures = shorten_path(space, origin, lengths, curvatures, costs)
             # Planned from the target outward, driven in reverse.
-            return CarPath(np.array(start), -lengths[::-1], curvatures[::-1], expansions, margin)
+            return CarPath(np.array(start), -lengths[::-1], curvatures[::-1], expansions, margin, vehicle)
     return None
 
 

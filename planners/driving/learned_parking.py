@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -11,12 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STATE_SIZE, STEERING, YAW, VehicleParameters
-from parkenv.errors import InputError
 from planners.driving import policy_interface as interface
+from planners.driving.map_agent import MapAgent, Observation
 from planners.driving.policy_interface import Outlines, PolicyInterface
 from planners.model_file import load_model
-
-Observation = Mapping[str, Any]
 
 
 @dataclass
@@ -29,16 +26,16 @@ class LearnedParkingMemory:
     left: int = 0  # number of steps for which the action still holds
 
 
-class LearnedParkingAgent:
+class LearnedParkingAgent(MapAgent):
     """A trained model as a parking agent, on any lot.
 
     Args:
         algorithm: the algorithm of the model.
         path: the model file.
-        vehicle: the car; by default the one used in training.
+        vehicle: the car, which has to be that of the training; None for that.
 
     Raises:
-        InputError: the file is not a model, or is one of another algorithm, task or observation.
+        InputError: the file is not a model, or is one of another algorithm, task, observation or vehicle.
 
     Attributes:
         card: metadata of the model file.
@@ -50,48 +47,15 @@ class LearnedParkingAgent:
     ) -> None:
         self.name = f"{algorithm}:{path}"
         self.card, self.model = load_model(algorithm, path, "drive", interface.INTERFACE)
-        self.view = PolicyInterface(vehicle or VehicleParameters())
+        self.vehicle = VehicleParameters(**(self.card.vehicle or {}))
+        if vehicle is not None:
+            self.vehicle.require_same(vehicle.numbers, f"model {path}")
+        self.view = PolicyInterface(self.vehicle)
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Sequence[LearnedParkingMemory] | LearnedParkingMemory | None = None,
-        episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Sequence[LearnedParkingMemory] | LearnedParkingMemory]:
-        """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
-
-        Args:
-            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
-            state: returned by the previous call; None at the start.
-            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
-                `state` is None.
-            deterministic: whether to use the mode of the policy instead of a sample.
-
-        Returns:
-            The action, (2,) or (n_envs, 2) float32, and the state for the next call.
-
-        Raises:
-            InputError: an observation without the obstacle map.
-        """
-        for key in ("cars", "lines"):
-            if key not in observation:
-                raise InputError(
-                    f"the observation has no {key!r}: make the environment with obstacle_map=True"
-                )
-        if np.ndim(observation["achieved_goal"]) == 1:
-            start = None if episode_start is None else np.array([np.any(episode_start)])
-            several = {key: np.asarray(values)[None] for key, values in observation.items()}
-            before = None if state is None else [state]
-            actions, memories = self._decide(several, before, start, deterministic)
-            return actions[0], memories[0]
-        return self._decide(observation, state, episode_start, deterministic)
-
-    def _decide(
-        self, observation: Observation, state: Any, start: Any, deterministic: bool
+    def _decide_all(
+        self, observation: Observation, memories: list[Any], start: Any, deterministic: bool
     ) -> tuple[NDArray[np.float32], list[LearnedParkingMemory]]:
-        n = len(observation["achieved_goal"])
-        memories: list[Any] = [None] * n if state is None else list(state)
+        n = len(memories)
         for i in range(n):
             if memories[i] is None or (start is not None and start[i]):
                 memories[i] = LearnedParkingMemory(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,12 +13,10 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
 from parkenv.driving.vehicle import VehicleParameters
-from parkenv.errors import InputError
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path
+from planners.driving.map_agent import MapAgent, Observation
 from planners.driving.path_tracking import PathTracker, TrackingSettings
-
-Observation = Mapping[str, Any]
 
 MOST_PLANS = 12
 """Maximum number of plans per episode; after that the car stays where it is."""
@@ -55,7 +52,7 @@ class ParkingMemory:
     waited_s: float = 0.0
 
 
-class ParkingAgent:
+class ParkingAgent(MapAgent):
     """Parks in `parkenv/Drive-v1` with hybrid A*, Reeds-Shepp shots and a tracking controller.
 
     The agent knows the car and the observation: the poses of car and slot and, with `obstacle_map=True`, the outlines
@@ -79,46 +76,15 @@ class ParkingAgent:
         self.search = search or SearchSettings()
         self.tracking = tracking or TrackingSettings()
 
-    def predict(
-        self,
-        observation: Observation,
-        state: Sequence[ParkingMemory] | ParkingMemory | None = None,
-        episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
-        deterministic: bool = True,
-    ) -> tuple[NDArray[np.float32], Sequence[ParkingMemory] | ParkingMemory]:
-        """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
-
-        Args:
-            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
-            state: returned by the previous call; None at the start.
-            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
-                `state` is None.
-            deterministic: part of the interface; this agent is always deterministic.
-
-        Returns:
-            The action, (2,) or (n_envs, 2) float32, and the state for the next call.
-
-        Raises:
-            InputError: an observation without the obstacle map.
-        """
+    def _decide_all(
+        self, observation: Observation, memories: list[Any], start: Any, deterministic: bool
+    ) -> tuple[NDArray[np.float32], list[ParkingMemory]]:
         del deterministic
-        for key in ("cars", "lines"):
-            if key not in observation:
-                raise InputError(
-                    f"the observation has no {key!r}: make the environment with obstacle_map=True"
-                )
-        if np.ndim(observation["achieved_goal"]) == 1:
-            starts = state is None or (episode_start is not None and bool(np.any(episode_start)))
-            memory: ParkingMemory = ParkingMemory() if starts else state  # type: ignore[assignment]
-            return self._decide(observation, memory), memory
-        n = len(observation["achieved_goal"])
-        memories: list[Any] = [None] * n if state is None else list(state)  # type: ignore[arg-type]
-        actions = np.empty((n, 2), dtype=np.float32)
-        for i in range(n):
-            single = {key: values[i] for key, values in observation.items()}
-            if memories[i] is None or (episode_start is not None and episode_start[i]):
+        actions = np.empty((len(memories), 2), dtype=np.float32)
+        for i in range(len(memories)):
+            if memories[i] is None or (start is not None and start[i]):
                 memories[i] = ParkingMemory()
-            actions[i] = self._decide(single, memories[i])
+            actions[i] = self._decide({key: values[i] for key, values in observation.items()}, memories[i])
         return actions, memories
 
     def plan(self, observation: Observation, *, around_others: bool = False) -> CarPath | None:
@@ -132,6 +98,7 @@ class ParkingAgent:
         if around_others:
             cars = np.concatenate([cars, observation["movers"]])
         outlines, n_corners = _obstacles(cars, observation["lines"])
+        self.require_map(observation)
         start, target = (
             self.vehicle.at_rear_axle(_pose(observation[goal])) for goal in ("achieved_goal", "desired_goal")
         )

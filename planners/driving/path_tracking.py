@@ -70,6 +70,9 @@ class PathTracker:
         path: the path.
         settings: settings of the tracking.
 
+    Raises:
+        InputError: the path was planned for another vehicle.
+
     Attributes:
         done: whether the car has reached the end of the path.
         offset: latest lateral offset from the path, m, positive to the left.
@@ -79,6 +82,8 @@ class PathTracker:
     def __init__(
         self, vehicle: VehicleParameters, path: CarPath, settings: TrackingSettings | None = None
     ) -> None:
+        if path.vehicle is not None:
+            path.vehicle.require_same(vehicle.numbers, "path")
         self._vehicle = vehicle
         self._settings = settings = settings or TrackingSettings()
         self._segments = _segments(vehicle, path, settings)
