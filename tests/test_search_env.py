@@ -484,7 +484,7 @@ def test_wrong_use_is_refused():
     env = gym.make("parkenv/Search-v2", scenario="mini").unwrapped
     with pytest.raises(gym.error.ResetNeeded):
         env.step(0)
-    with pytest.raises(InputError, match="no options"):
+    with pytest.raises(InputError, match="option of reset is 'speed'"):
         env.reset(options={"speed": 3})
     env.reset(seed=0)
     for wrong in (7, -1, 3.0, None, [1, 2]):

@@ -1,5 +1,7 @@
 """The compiled batch of `parkenv/Search-v2`: mixed lots, resets, ends, bad input; see also the reference's tests."""
 
+import dataclasses
+
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -351,7 +353,7 @@ def test_a_lot_of_ten_thousand_slots_touches_only_what_is_near():
         ({"scenario": []}, "scenario is an empty sequence"),
         ({"scenario": ["mini", 3]}, "scenario is a int"),
         ({"scenario": "moon"}, "unknown scenario 'moon'"),
-        ({"render_mode": "rgb_array"}, "render_mode is 'rgb_array'"),
+        ({"render_mode": "human"}, "render_mode is 'human'"),
     ],
 )
 def test_wrong_arguments_are_refused_by_name(wrong, message):
@@ -359,11 +361,85 @@ def test_wrong_arguments_are_refused_by_name(wrong, message):
         ParkSearchVectorEnv(**({"scenario": "mini"} | wrong))
 
 
+STARTS = [
+    {"place": "street", "entry": 1, "arrival": "Tue 08:30"},
+    {"place": 0, "arrival": 86400.0 + 8.5 * 3600},
+    {"place": "log", "arrival": "wed 09:05"},
+    {"place": "mini"},
+    {},
+]
+
+
+@pytest.mark.parametrize("options", STARTS)
+def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environments_and_batches(options):
+    two_entries = dataclasses.replace(grid_lot(2, 8), entries=np.array([[0.0, 0.0], [30.0, 0.0]]))
+    street = Scenario(name="street", lot=two_entries, occupancy=make_scenario(two_entries).occupancy)
+    places = [make_scenario("mini"), street, recorded_scenario()]
+    env = gym.make("parkenv/Search-v2", scenario=places).unwrapped
+    envs = make_batch(3, places)
+    batch, _ = envs.reset(seed=7, options=options)
+    for i in range(3):
+        observation, info = env.reset(seed=7 + i, options=options)
+        if "place" in options:
+            assert info["place"] in (options["place"], "mini")
+        if "arrival" in options:
+            wanted = {"Tue 08:30": (1, 8.5), "wed 09:05": (2, 9 + 5 / 60)}.get(options["arrival"], (1, 8.5))
+            assert observation["time"][0] == pytest.approx(86400 * wanted[0] + 3600 * wanted[1], abs=0.1)
+        if "entry" in options:
+            assert env.state.vertex == two_entries.entry_vertices[1]
+        for key, value in observation.items():
+            np.testing.assert_array_equal(batch[key][i], value)
+    env.reset(seed=7, options=options)
+    later, plain = env.reset()[0], gym.make("parkenv/Search-v2", scenario=places)
+    plain.reset(seed=7)
+    np.testing.assert_array_equal(later["time"], plain.reset()[0]["time"], "the choice is for one episode")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"place": "moon"}, "option place is 'moon', want one of mini, street"),
+        ({"place": 2}, "option place is 2, want a whole number from 0 to 1"),
+        ({"entry": 0}, "option place is None, want one of mini, street"),
+        ({"place": 0, "entry": 9}, "option entry is 9, want a whole number from 0 to 0"),
+        (
+            {"place": 0, "arrival": "sun 10:00"},
+            "day of option arrival is 'sun', want one of mon, tue",
+        ),
+        ({"place": 0, "arrival": -1}, "option arrival is -1, want a finite number at least 0"),
+        ({"place": 0, "arrival": "Tue at 8"}, "want HH:MM"),
+    ],
+)
+def test_a_start_that_is_none_is_refused(options, message):
+    for env in (
+        make_batch(2, ["mini", "street"]),
+        gym.make("parkenv/Search-v2", scenario=["mini", "street"]),
+    ):
+        with pytest.raises(InputError, match=message):
+            env.reset(seed=0, options=options)
+
+
+def test_a_batch_draws_the_frames_of_its_single_environments():
+    options = {"scenario": "mini", "render_mode": "rgb_array"}
+    envs = gym.make_vec("parkenv/Search-v2", 2, vectorization_mode="vector_entry_point", **options)
+    singles = [gym.make("parkenv/Search-v2", **options) for _ in range(2)]
+    envs.reset(seed=3)
+    for i, env in enumerate(singles):
+        env.reset(seed=3 + i)
+    for _ in range(4):
+        envs.step(np.array([3, 3]))
+        frames = envs.render()
+        assert isinstance(frames, tuple)
+        for frame, env in zip(frames, singles, strict=True):
+            env.step(3)
+            np.testing.assert_array_equal(frame, env.render())
+
+
 def test_wrong_use_is_refused():
     envs = make_batch(2, "mini")
     with pytest.raises(gym.error.ResetNeeded):
         envs.step(np.zeros(2, dtype=int))
-    with pytest.raises(InputError, match="no option but reset_mask, got speed"):
+    with pytest.raises(InputError, match="option of reset is 'speed', want one of place, entry, arrival"):
         envs.reset(options={"speed": 1})
     with pytest.raises(InputError, match="seed holds 3 numbers, want 2"):
         envs.reset(seed=[1, 2, 3])

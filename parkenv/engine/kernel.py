@@ -265,12 +265,19 @@ def arrive(search: Any) -> None:
     """Begin a search in the place and the world of its seed and episode, without observations."""
     key = episode_key(search.seed_state, search.episode)
     search.place = int(keyed_uniform(key, PLACE_STREAM, 0, 0) * search.n_places)
+    if search.chosen_place > 0:
+        search.place = search.chosen_place - 1
     search.scenario = search.scenarios + search.place * SCENARIO_BYTES
     scenario = scenario_at(search.scenario, 0)
     day, second = worlds.draw_arrival(key, scenario.n_weekdays, scenario.window_start, scenario.window_end)
+    if search.chosen_day > 0:
+        day, second = search.chosen_day - 1, search.chosen_second
     midnight = int64s(scenario.weekdays)[day] * DAY_S
     arrival = midnight + second
     entry = int(keyed_uniform(key, ENTRY_STREAM, 0, 0) * scenario.n_entries)
+    if search.chosen_entry > 0:
+        entry = search.chosen_entry - 1
+    search.chosen_place = search.chosen_entry = search.chosen_day = 0
     enter(search, key, day, arrival, midnight, int64s(scenario.entries)[entry])
 
 

@@ -148,6 +148,11 @@ SEARCH = _with_costs(
         # The SCENARIO records, and from how many of them, the first ones, the place of an episode is drawn.
         ("scenarios", ADDRESS),
         ("n_places", np.int64),
+        # Place, entry and day of the next episode, counted from 1, or 0 to draw them; second of that day.
+        ("chosen_place", np.int64),
+        ("chosen_entry", np.int64),
+        ("chosen_day", np.int64),
+        ("chosen_second", np.float64),
         # Number of the car in its fleet, where slots are shared; (n_vertices,) uint8 moves to the target of its
         # compiled policy, the last one first; the slot that a guidance system has reserved for it, `NO_SLOT`, or
         # `UNGUIDED`.

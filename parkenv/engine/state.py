@@ -6,32 +6,36 @@ import numpy as np
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.kernel import read_belief_at
-from parkenv.engine.records import Searches, arrival_of
+from parkenv.engine.records import SEARCH, Searches, arrival_of
 from parkenv.world.occupancy.process import Arrival, World
 from parkenv.world.scenario import Scenario
 
 
 class SearchState:
-    """The current episode, including the hidden occupancy; a live view of the environment.
+    """The current episode of a search, including the hidden occupancy; a live view of the environment.
+
+    Args:
+        searches: the searches of the environment.
+        index: number of the search.
 
     Attributes:
         path: vertices where the car has stopped, in order.
     """
 
-    def __init__(self, searches: Searches) -> None:
-        self._searches = searches
-        self._record = searches.records[0]
+    def __init__(self, searches: Searches, index: int = 0) -> None:
+        self._searches, self._index = searches, index
+        self._record = searches.records[index]
         self.path: list[int] = []
         self._world: tuple[np.uint64, World] | None = None
 
     @property
     def scenario(self) -> Scenario:
         """Scenario of the episode."""
-        return self._searches.scenario_of(0)
+        return self._searches.scenario_of(self._index)
 
     def extend_path(self) -> None:
         """Add the car's vertex to the path if the car has moved."""
-        if self.path[-1] != self.vertex:
+        if not self.path or self.path[-1] != self.vertex:
             self.path.append(self.vertex)
 
     @property
@@ -59,7 +63,8 @@ class SearchState:
             forecast.p_occupied, forecast.decay_rate, (forecast.day_error.level, forecast.day_error.slope)
         )
         belief.time = self.time - self.arrival.time
-        read_belief_at(self._searches.address, belief.p_occupied, belief.p_observed, belief.observed_at)
+        address = self._searches.address + self._index * SEARCH.itemsize
+        read_belief_at(address, belief.p_occupied, belief.p_observed, belief.observed_at)
         return belief
 
     @property

@@ -26,6 +26,7 @@ from parkenv.engine.local_observation import (
 )
 from parkenv.engine.records import ScenarioRecords, Searches
 from parkenv.engine.spaces import action_number, space_of
+from parkenv.engine.starts import choose_start
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError, require_one_of
 from parkenv.scenarios.build import ScenarioSources, make_scenarios
@@ -123,6 +124,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     forecast; from then on the car observes slots from the vertex where each step ends.
     `reset(seed=s)` fixes arrival, entry and the state of every slot at every time, whatever the agent does; later
     `reset()` calls go through further worlds of the same seed.
+
+    `reset(options={"entry": 1, "arrival": "Tue 08:30", "place": "street"})`, or some of them, choose where and when
+    this episode begins: the entry by its index; the arrival as a time of the week, s since Monday 00:00 or a text, on a
+    weekday of the scenario's; the place by name or index, where there are several scenarios. The rest is drawn.
 
     ## Episode end
     - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
@@ -298,10 +303,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Start an episode; see the class for seeds. There are no options."""
+        """Start an episode; see the class for seeds and options."""
         super().reset(seed=seed)
-        if options:
-            raise InputError(f"reset takes no options, got {', '.join(options)}")
         if self.np_random_seed < 0:
             # `np_random` was set by hand: its seed is not known.
             super().reset(seed=int(self.np_random.integers(1 << 62)))
@@ -310,6 +313,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
+        if options:
+            choose_start(self.searches, 0, int(record["episode"]), options)
         begin_search_at(self._address)
         if self.searches.needs_python:
             self.searches.complete_arrival(0)
@@ -372,8 +377,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def _frame(self, state: SearchState) -> NDArray[np.uint8]:
         """Return the lot from above."""
         assert self._renderer is not None
-        everything = np.arange(self.scenario.lot.n_slots)
-        return self._renderer.frame(state, state.world.occupied(everything, state.time))
+        return self._renderer.frame(state)
 
     def get_keys_to_action(self) -> dict[tuple[int, ...], int]:
         """Keys of `gymnasium.utils.play`: w, s, a, d drive up, down, left, right; space parks."""

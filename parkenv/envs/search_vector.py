@@ -26,6 +26,8 @@ from parkenv.engine.batch import (
 )
 from parkenv.engine.local_observation import NEAR_SLOTS
 from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
+from parkenv.engine.starts import choose_start
+from parkenv.engine.state import SearchState
 from parkenv.envs.search import BELIEF_PARTS, OBSERVATIONS
 from parkenv.errors import InputError, require_whole
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios
@@ -35,6 +37,7 @@ from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.python_functions import raise_error
 
 if TYPE_CHECKING:
+    from parkenv.show.frames.search import SearchRenderer
     from sim_sensors.rig import SensorRig
 
 MAX_ENVS = 1_000_000
@@ -72,7 +75,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     ## Starting state
     As in `parkenv/Search-v2`. `reset(seed=s)` gives search i the seed s + i; a sequence gives one seed to each.
-    Without a seed, every search continues with the next world of its seed.
+    Without a seed, every search continues with the next world of its seed. The options `entry`, `arrival` and `place`
+    hold for every search that is reset.
 
     ## Places
     With several scenarios, each search draws the place of each of its episodes, also at automatic resets, as
@@ -101,6 +105,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
     - `copy`: False returns arrays that the next step overwrites, which saves copying them.
+    - `render_mode`: `rgb_array`: `render()` returns a tuple with a frame of each search, (480, 640, 3) uint8.
     - further keywords replace fields of the scenarios, e.g. `failure_s=90.0`.
 
     ```python
@@ -121,7 +126,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012 - Gymnasium declares it so
-        "render_modes": [],
+        "render_modes": ["rgb_array"],
+        "render_fps": 8,
         "autoreset_mode": AutoresetMode.NEXT_STEP,
     }
 
@@ -140,8 +146,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         _require_count("num_envs", num_envs, MAX_ENVS)
         if max_episode_steps is not None:
             _require_count("max_episode_steps", max_episode_steps, 2**31 - 1)
-        if render_mode is not None:
-            raise InputError(f"render_mode is {render_mode!r}, want None: a batch draws no pictures")
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f"render_mode is {render_mode!r}, want rgb_array or None")
         try:
             mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -164,6 +170,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self._limit = max_episode_steps or np.iinfo(np.int64).max
         self._mode, self._copy = mode, copy
         self._begun = False
+        self.render_mode = render_mode
+        self._states = [SearchState(self._searches, i) for i in range(n)] if render_mode else []
+        self._renderers: dict[str, SearchRenderer] = {}
         self._nobody = np.zeros(n, dtype=np.bool_)
         self._done = self._nobody
 
@@ -218,12 +227,13 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         Args:
             seed: seed of the first environment, counting up for the others; or a sequence of one per environment, where
                 None continues with the next world of the environment's seed; or None to continue all of them.
-            options: only `reset_mask`.
+            options: `reset_mask`, and those of `parkenv/Search-v2` for all searches that are reset.
 
         Raises:
             InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
-        which = self._chosen(options)
+        starts = dict(options or {})
+        which = self._chosen(starts.pop("reset_mask", None))
         if seed is not None and not isinstance(seed, (Sequence, np.ndarray)):
             require_whole("seed", seed)
         if seed is None or isinstance(seed, (int, np.integer)):
@@ -246,6 +256,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             one = seeds[i]
             if one is not None:
                 records[i]["seed_state"], records[i]["episode"] = seed_state(one), -1
+            if starts:
+                choose_start(self._searches, int(i), int(records[i]["episode"]) + 1, starts)
         self._begun = True
         if self._copy:
             self.observer.renew()
@@ -267,6 +279,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over."""
         self.observer.set_state(state)
         self._begun, self._done = True, self._nobody
+        for one in self._states:
+            one.path = [one.vertex]
 
     def step(
         self, actions: IntArray
@@ -317,11 +331,29 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.observer.step(actions, fresh, idle, self._limit, self._steps)
         if self._searches.needs_python:
             raise_error()
+        for state in self._states:
+            state.extend_path()
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Return a frame of each search, (480, 640, 3) uint8 RGB, as `parkenv/Search-v2` draws it."""
+        if self.render_mode is None:
+            gym.logger.warn("render() does nothing without render_mode='rgb_array'")
+            return None
+        if not self._begun:
+            raise gym.error.ResetNeeded("the environments have no episode yet: call reset() first")
+        from parkenv.show.frames.search import SearchRenderer
+
+        for scenario in {state.scenario.name: state.scenario for state in self._states}.values():
+            if scenario.name not in self._renderers:
+                self._renderers[scenario.name] = SearchRenderer(scenario)
+        return tuple(self._renderers[state.scenario.name].frame(state) for state in self._states)
 
     def _arrive(self, which: BoolArray) -> None:
         """Put the selected cars at the entries of their next worlds."""
         searches = self._searches
         arrive_all(self.observer.address, which)
+        for i in np.flatnonzero(which[: len(self._states)]):
+            self._states[i].path = []
         if not searches.needs_python:
             return
         for i in np.flatnonzero(which):
@@ -349,12 +381,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         metrics["place"] = self._names[self.place_of]
         return metrics | dict.fromkeys(_WHICH, done)
 
-    def _chosen(self, options: dict[str, Any] | None) -> BoolArray:
-        """Return the mask of environments to reset."""
-        rest = dict(options or {})
-        mask = np.asarray(rest.pop("reset_mask", np.ones(self.num_envs, dtype=np.bool_)))
-        if rest:
-            raise InputError(f"reset takes no option but reset_mask, got {', '.join(rest)}")
+    def _chosen(self, given: Any) -> BoolArray:
+        """Return the mask of environments to reset: all, unless a mask is given."""
+        mask = np.ones(self.num_envs, dtype=np.bool_) if given is None else np.asarray(given)
         if mask.shape != (self.num_envs,) or mask.dtype != np.bool_:
             raise InputError(
                 f"reset_mask has shape {mask.shape} and type {mask.dtype}, want ({self.num_envs},) bool"
