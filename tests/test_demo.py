@@ -7,7 +7,7 @@ from PIL import Image
 
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.compare.cases import Case
-from parkenv.studies.demo.study import AGENTS, Demo
+from parkenv.studies.demo.study import AGENTS, QUICK, Demo
 
 
 def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
@@ -15,14 +15,21 @@ def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     done = parkenv("demo", "--scenario", "mini", "--quick", "--jobs", 1, "--out", out)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
-    assert [row["agent"] for row in summary["rows"]] == list(AGENTS)
+    assert [row["agent"] for row in summary["rows"]] == 2 * list(AGENTS)
+    through_sensors, without_images = summary["rows"][: len(AGENTS)], summary["rows"][len(AGENTS) :]
+    assert {row["episodes"] for row in through_sensors} == {2}
+    assert {row["episodes"] for row in without_images} == {QUICK["more"]}
+    assert all(row["leads"] for row in through_sensors if row["agent"] != "oracle"), (
+        "two searches show nothing"
+    )
+    assert done.stdout.index(str(out / "lot.png")) < done.stdout.index("Compiling")
     assert {"belief", "oracle"} <= set(AGENTS)
     assert all(row["regret_s"] >= -1e-6 for row in summary["rows"])
-    for name in ("report.html", "search.gif"):
+    for name in ("lot.png", "report.html", "search.gif"):
         assert str(out / name) in done.stdout
     assert done.stdout.count("\n  parkenv ") == 3, "commands to try next"
     page = (out / "report.html").read_text()
-    assert page.count("<figure") == len(list(out.glob("*.png"))) == 5
+    assert page.count("<figure") == len(list(out.glob("*.png"))) == 6
     assert '"drives":[{' in page
     with Image.open(out / "search.gif") as film:
         assert film.n_frames > 10

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
 from parkenv import __version__
@@ -13,7 +15,7 @@ from parkenv.files.file_names import is_plain
 
 if TYPE_CHECKING:
     from rich.console import Console
-    from rich.progress import TaskID
+    from rich.progress import Progress, TaskID
     from rich.table import Table
 
 WIDE = 200
@@ -60,7 +62,7 @@ def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequen
 def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int], None]]:
     """Show a bar for each stage of a run during the block, or a line where nothing can be redrawn.
 
-    Yields a `parkenv.studies.study.Progress`.
+    While functions are compiled, another line says which. Yields a `parkenv.studies.study.Progress`.
     """
     from rich.progress import (
         BarColumn,
@@ -76,7 +78,7 @@ def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int
         TextColumn("{task.description}", markup=False),
         BarColumn(20),
         MofNCompleteColumn(),
-        TextColumn(unit),
+        TextColumn("{task.fields[unit]}"),
         TimeElapsedColumn(),
         TimeRemainingColumn(),
         console=console,
@@ -85,12 +87,28 @@ def stages(console: Console, unit: str = "") -> Iterator[Callable[[str, int, int
 
         def advance(doing: str, done: int, total: int) -> None:
             if doing not in bars:
-                bars[doing] = progress.add_task(doing)
+                bars[doing] = progress.add_task(doing, unit=unit)
                 if progress.disable:
-                    console.print(f"{doing} ...")
+                    console.print(doing if done == total > 0 else f"{doing} ...")
             progress.update(bars[doing], completed=done, total=total or None)
 
-        yield advance
+        ended = Event()
+        if not progress.disable:
+            Thread(target=_show_compiling, args=(progress, ended), daemon=True).start()
+        try:
+            yield advance
+        finally:
+            ended.set()
+
+
+def _show_compiling(progress: Progress, ended: Event) -> None:
+    """Show a line, until the event, while processes compile functions."""
+    from parkenv.compiled.activity import compiling_now
+
+    since_s, line = time.time(), progress.add_task("", total=None, visible=False, unit="")
+    while not ended.wait(0.5):
+        names = compiling_now(since_s)
+        progress.update(line, visible=bool(names), description=f"Compiling {', '.join(names[:3])}")
 
 
 @contextmanager

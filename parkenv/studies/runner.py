@@ -238,7 +238,8 @@ def _run_stage(stage: Stage, results: Results, workers: Workers, progress: Progr
     """
     doing, study, cells = stage
     finished = results.rows(study.table)
-    blocks: list[tuple[Any, Sequence[Any]]] = []
+    first: list[tuple[Any, Sequence[Any]]] = []
+    blocks = list(first)
     total = missing = 0
     for work, items in cells:
         left = []
@@ -248,7 +249,13 @@ def _run_stage(stage: Stage, results: Results, workers: Workers, progress: Progr
             if any(key not in finished for key in keys):
                 missing += len(keys)
                 left.append(item)
-        blocks += [(work, left[i : i + study.block]) for i in range(0, len(left), study.block)]
+        its: list[tuple[Any, Sequence[Any]]]
+        its = [(work, left[i : i + study.block]) for i in range(0, len(left), study.block)]
+        # One block of each cell first: workers then compile the functions of different agents at the same time.
+        n_first = 0 if study.keeps_order or workers.in_process else 1
+        first += its[:n_first]
+        blocks += its[n_first:]
+    blocks = first + blocks
     done = total - missing
     progress(doing, done, total)
     token = "" if workers.in_process else uuid4().hex

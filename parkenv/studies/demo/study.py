@@ -1,4 +1,4 @@
-"""The demo: a survey, and searches on other days that use only its map."""
+"""The demo: a survey, and searches on other days that use only its map: a few through sensors, many without images."""
 
 from __future__ import annotations
 
@@ -32,10 +32,12 @@ if TYPE_CHECKING:
 
 AGENTS = ("mdp", "belief", "first-free", "greedy-drive", "oracle")
 FILMED = "belief"
-FILM = "search.gif"
+FILM, LOT = "search.gif", "lot.png"
+WITHOUT_IMAGES = " without images"
+"""What is added to the name of the scenario in searches with the error rates of the sensors."""
 FIGURES = ("time_split", "time_distribution")
 """Names of figures of comparisons."""
-QUICK = {"sessions": 2, "episodes": 2, "every": 4.0}
+QUICK = {"sessions": 2, "episodes": 2, "more": 100, "every": 4.0}
 """Settings of a shorter demo."""
 RIG: RigName = "laser"
 _HOURS = ("08:00-09:30", "09:30-11:00", "11:00-12:30", "12:30-13:00")
@@ -46,7 +48,7 @@ _APART = 1_000_000  # offset between the seeds of survey and searches, so that t
 class _RecordedSurvey(SurveyStudy):
     """A survey whose first session is recorded for the report."""
 
-    doing: ClassVar = "1/4 survey drives"
+    doing: ClassVar = "1/3 survey drives"
 
     def drive(self, number: int) -> tuple[SessionResult, Any]:
         """See `SurveyStudy`."""
@@ -67,7 +69,15 @@ class Demo(CaseStudy):
     kind: Literal["demo"] = "demo"
     scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
     sessions: int = option(4, "Survey drives.", ge=1, le=100_000)
-    episodes: int = option(6, "Searches of each agent.", short="-n", ge=2, le=MAX_EPISODES)
+    episodes: int = option(
+        6, "Searches of each agent through the sensors.", short="-n", ge=2, le=MAX_EPISODES
+    )
+    more: int = option(
+        200,
+        "Further searches of each agent, enough to tell agents apart: with the sensors' error rates, not images.",
+        ge=0,
+        le=MAX_EPISODES,
+    )
     every: CaptureDistance = option(
         2.5, "Metres between captures, in the survey and in the searches.", takes="M", panel="Sensors"
     )
@@ -110,28 +120,43 @@ class Demo(CaseStudy):
 
     def prepare(self, results: Results, *, continues: bool) -> None:
         """See `Study`."""
+        from parkenv.show.figures.lot import save_lot_picture
+
         self.survey.prepare(results, continues=continues)
+        save_lot_picture(self.survey.built.lot, results.path / LOT)
+        results.progress(f"The lot: {results.path / LOT}", 1, 1)
 
     def stages(self, results: Results) -> Iterator[Stage]:
         """See `Study`."""
         yield from self.survey.stages(results)
-        yield Stage("2/4 searches through the sensors", self, self.cases_in(results.path))
+        yield Stage("2/3 searches through the sensors", self, self.cases_in(results.path))
+        yield Stage("3/3 searches without images", self, self.more_cases_in(results.path))
 
     def cases_in(self, folder: Path) -> list[Cell]:
         """Return the cases: every agent with the map in the folder and simulated sensors.
 
         The oracle knows which slots are taken, so it needs no sensors.
         """
+        return self._cases_of(folder, "", self.episodes, rig=RIG, detector=self.detector, every=self.every)
+
+    def more_cases_in(self, folder: Path) -> list[Cell]:
+        """Return the cases with the error rates of the sensors: every agent with the map in the folder."""
+        return self._cases_of(folder, WITHOUT_IMAGES, self.more)
+
+    def _cases_of(self, folder: Path, ending: str, episodes: int, **sensors: Any) -> list[Cell]:
+        """Return the cases in the scenario with the map in the folder, with an ending to its name."""
         from parkenv.mapping.learned_map import map_prior
         from parkenv.studies.compare.cases import Case
         from parkenv.world.sensor_model import SensorModel
 
         scenario = self.survey.built
         prior = map_prior(self._log(folder), (), scenario.lot.walk_m(scenario.goal))
-        known = scenario.replace(prior=prior, sensor_model=SensorModel.named(RIG))
-        seeds = range(self.seed + _APART, self.seed + _APART + self.episodes)
-        sensors: dict[str, Any] = {"rig": RIG, "detector": self.detector, "every": self.every}
-        return [Cell(Case(known, name, **({} if name == "oracle" else sensors)), seeds) for name in AGENTS]
+        known = scenario.replace(
+            name=scenario.name + ending, prior=prior, sensor_model=SensorModel.named(RIG)
+        )
+        begin = self.seed + _APART * (2 if ending else 1)
+        cases = [Case(known, name, **({} if name == "oracle" else sensors)) for name in AGENTS]
+        return [Cell(case, range(begin, begin + episodes)) for case in cases]
 
     def _log(self, folder: Path) -> SessionLog:
         from parkenv.mapping.store import MapStore
@@ -146,7 +171,9 @@ class Demo(CaseStudy):
         episodes = results.rows(EPISODES)
         surveyed = self.survey.summarise(results)["rows"]
         return {
-            "rows": table(self.cases_in(results.path), episodes) if episodes else [],
+            "rows": table([*self.cases_in(results.path), *self.more_cases_in(results.path)], episodes)
+            if episodes
+            else [],
             "survey": surveyed[0] if surveyed else None,
         }
 
@@ -159,7 +186,9 @@ class Demo(CaseStudy):
         folder, scenario = result.folder, self.survey.built
         cells = self.cases_in(folder)
         filmed = next(case for case, _ in cells if case.agent == FILMED)
-        data = ComparisonResults(cells, result.results.rows(EPISODES), result.rows)
+        drawn = self.more_cases_in(folder) if self.more else cells
+        shown = [row for row in result.rows if row["scenario"] == drawn[0].work.scenario.name]
+        data = ComparisonResults(drawn, result.results.rows(EPISODES), shown)
         tasks: list[Task[object]] = [
             partial(film_search, filmed, cells[0].items[0], folder / FILM),
             partial(_draw_map, scenario, self._log(folder), self.sessions, folder / "map.png"),
@@ -201,9 +230,12 @@ def _short_survey(settings: SurveySettings) -> None:
 
 def _short_searches() -> None:
     from parkenv.studies.compare.cases import Case
+    from parkenv.world.sensor_model import SensorModel
 
+    # With errors of the sensors, as in the searches of the demo: another function steps without them.
+    scenario = _small_scenario().replace(sensor_model=SensorModel.named(RIG))
     for name in AGENTS:
-        Case(_small_scenario(), name).run([0])
+        Case(scenario, name).run([0])
 
 
 def _small_scenario() -> Scenario:
