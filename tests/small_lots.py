@@ -12,7 +12,9 @@ SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
 PITCHES = (2.5, 6.0, 15.0)
 VIEWS = (0.0, 6.0)
 MEAN_FREE = (0.1, 0.3, 0.6)
-SLOT_COLUMNS = ("slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_parking_cost_s")
+SLOT_COLUMNS = (
+    "slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_parking_cost_s", "slot_zone",
+)  # fmt: skip
 
 
 def features(lot):

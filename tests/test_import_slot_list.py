@@ -268,19 +268,20 @@ def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
     assert given.lot().n_slots == guessed.lot().n_slots == 16
 
 
-def test_parking_costs_stay_with_their_slots(tmp_path):
+def test_parking_costs_and_zones_stay_with_their_slots(tmp_path):
     lot = grid_lot(2, 8)
-    cost = np.arange(16) * 10.0
+    cost, zone = np.arange(16) * 10.0, np.where(np.arange(16) < 5, "centre", "")
     order = np.random.default_rng(3).permutation(16)
-    lines = [f"{lot.slot_ids[i]},{lot.slot_xy[i, 0]},{lot.slot_xy[i, 1]},{cost[i]}" for i in order]
-    (tmp_path / "slots.csv").write_text("\n".join(["id,x,y,parking_cost_s", *lines]))
+    lines = [f"{lot.slot_ids[i]},{lot.slot_xy[i, 0]},{lot.slot_xy[i, 1]},{cost[i]},{zone[i]}" for i in order]
+    (tmp_path / "slots.csv").write_text("\n".join(["id,x,y,parking_cost_s,zone", *lines]))
     ends = {"entries": (tuple(lot.entries[0]),), "goals": (tuple(lot.goals[0]),)}
     west = ImportOptions(bounds=((-5.0, -20.0), (12.5, 20.0)), **ends)
     for options, n in ((ImportOptions(**ends), 16), (west, 10)):
         drawn = import_lot(tmp_path / "slots.csv", options).lot()
         assert drawn.n_slots == n
-        costs = dict(zip(lot.slot_ids, cost, strict=True))
-        assert drawn.slot_parking_cost_s.tolist() == [costs[name] for name in drawn.slot_ids]
+        for column, values in (("slot_parking_cost_s", cost), ("slot_zone", zone)):
+            listed = dict(zip(lot.slot_ids, values, strict=True))
+            assert getattr(drawn, column).tolist() == [listed[name] for name in drawn.slot_ids]
 
 
 # ---- faults ----

@@ -100,9 +100,10 @@ def test_unknown_packaged_lot_lists_the_known_ones():
     goal=points,
     walls=st.lists(st.lists(points, min_size=2, max_size=5), max_size=3),
     cost=st.just(0.0) | st.floats(0.0, 1e8),
+    zone=st.text(alphabet="centre, 1=ä", max_size=8),
 )
 def test_written_lots_are_read_back_to_the_bit(
-    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, cost
+    tmp_path, rows, columns, pitch, aisle, turn, shift, name, goal, walls, cost, zone
 ):
     grid = grid_lot(rows, columns, name=name, pitch=pitch, aisle=aisle)
     matrix = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
@@ -122,6 +123,7 @@ def test_written_lots_are_read_back_to_the_bit(
         goals=[goal],
         walls=tuple(map(np.array, walls)),
         slot_parking_cost_s=np.linspace(0.0, cost, grid.n_slots),
+        slot_zone=[zone, *[""] * (grid.n_slots - 1)],
     )
     path = tmp_path / "lot.geojson"
     write_lot(lot, path)

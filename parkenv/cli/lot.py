@@ -21,6 +21,7 @@ from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several
 from parkenv.show.plurals import plural
 from parkenv.studies.results import Row
+from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -47,7 +48,7 @@ Place = Annotated[
 
 
 class Show(Command):
-    """Slots with a parking cost are coloured by it. Guesses of an import are listed."""
+    """Slots are coloured by their zone or parking cost. Guesses of an import are listed."""
 
     examples = """
         parkenv lot show campus --graph --out campus.png
@@ -384,6 +385,9 @@ def _summary(lot: ParkingLot) -> str:
         plural(lot.n_vertices, "vertex", "vertices"),
         f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m",
     ]
+    if lot.zones != (NO_ZONE,):
+        counts = Counter(lot.zone_of_slot.tolist())
+        parts.append(f"zones {', '.join(f'{zone} ({counts[i]} slots)' for i, zone in enumerate(lot.zones))}")
     cost = lot.slot_parking_cost_s
     if cost.any():
         parts.append(

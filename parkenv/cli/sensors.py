@@ -13,10 +13,10 @@ from parkenv.files.known_names import WEATHERS, RigName, WeatherName
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.studies.fields import TRAFFIC, Detector, OneScenario, Scenarios, Seed, with_traffic
+from parkenv.studies.fields import PRICES, TRAFFIC, Detector, OneScenario, Scenarios, Seed, with_traffic
 from parkenv.studies.study import ExecutionSpec, counted
 
-_OBSERVATIONS = ("--sensor-model", "--view-range")
+_OBSERVATIONS = ("--sensor-model", "--view-range", *PRICES)
 
 
 class Preview(Command):

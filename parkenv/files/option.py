@@ -110,3 +110,12 @@ def numbers_in(text: str, count: int | None = None) -> list[float]:
         )
         raise InputError(f"is {text!r}, want {wanted}")
     return numbers
+
+
+def seconds_of_minutes(text: str) -> float:
+    """Convert minutes to s.
+
+    Raises:
+        InputError: the text is no number.
+    """
+    return 60.0 * numbers_in(text, 1)[0]

@@ -30,7 +30,7 @@ BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
 class Slots:
     """The columns of n slots: each field `name` is the column `slot_name` of `ParkingLot`.
 
-    An empty `parking_cost_s` means zeros.
+    An empty `parking_cost_s` means zeros, an empty `zone` none.
     """
 
     xy: FloatArray
@@ -39,10 +39,13 @@ class Slots:
     width: FloatArray
     mouth: NDArray[np.int8]
     parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    zone: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
 
     def __post_init__(self) -> None:
         if not len(self.parking_cost_s):
             object.__setattr__(self, "parking_cost_s", np.zeros(len(self.xy)))
+        if not len(self.zone):
+            object.__setattr__(self, "zone", np.zeros(len(self.xy), np.str_))
 
     def __len__(self) -> int:
         return len(self.xy)

@@ -31,6 +31,7 @@ from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.typical_week import attraction, typical_occupancy, with_event
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
+from parkenv.world.tariff import Tariff
 from parkenv.world.traffic import Traffic
 
 if TYPE_CHECKING:
@@ -145,6 +146,9 @@ def build(spec: ScenarioSpec) -> Scenario:
             failure_s=spec.costs.failure_s,
             wait_s=spec.costs.wait_s,
             give_up_s=spec.costs.give_up_s,
+            tariff=Tariff(spec.costs.prices),
+            stay_s=spec.costs.stay_s,
+            value_of_time=spec.costs.value_of_time,
             sensor_model=sensor_model(spec.sensor_model),
             occupancy=occupancy,
             prior=_prior(spec.forecast, occupancy, lot, goal),

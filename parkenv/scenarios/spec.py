@@ -27,11 +27,12 @@ from parkenv.files.known_names import (
     SensorModelName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.option import Option, numbers_in, option
+from parkenv.files.option import Option, numbers_in, option, seconds_of_minutes
 from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
+from parkenv.world.tariff import HOUR_S, NO_ZONE, VALUE_OF_TIME
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
@@ -370,12 +371,70 @@ class Speeds(Spec):
     v_walk_kmh: Speed = 4.0
 
 
+def _per_hour(text: str) -> float:
+    """Parse AMOUNT/h; the unit may be left out."""
+    try:
+        return float(text.removesuffix("/h"))
+    except ValueError:
+        raise InputError(f"is {text!r:.60}, want an amount an hour, such as 2/h") from None
+
+
+def _price(text: str) -> tuple[str, object]:
+    """Parse ZONE=AMOUNT/h."""
+    zone, equals, amount = text.rpartition("=")
+    if not (zone and equals):
+        raise InputError(f"is {text!r:.60}, want ZONE=AMOUNT/h, such as centre=2/h")
+    return zone, _per_hour(amount)
+
+
+def _prices(value: object) -> object:
+    """Make a table of what several options give."""
+    if not isinstance(value, tuple):
+        return value
+    zones = [zone for zone, _ in value]
+    if repeated := [zone for i, zone in enumerate(zones) if zone in zones[:i]]:
+        raise ValueError(f"one price for each zone, not two for {repeated[0]!r:.40}")
+    return dict(value)
+
+
 class Costs(Spec):
-    """Costs of a search, s."""
+    """Costs of a search, s, and the prices of parking."""
 
     failure_s: Cost = Field(10.0, description="Failed attempt to park; planners know it.")
     wait_s: float = Field(1.0, gt=0.0, le=86_400.0, description="Move that the drive graph does not have.")
     give_up_s: Cost = Field(1800.0, description="Give-up penalty: park elsewhere and walk.")
+    prices: Annotated[dict[str, Annotated[float, Field(ge=0.0, le=1e6)]], BeforeValidator(_prices)] = option(
+        {},
+        f"Price of an hour in a zone of the lot, in any currency; {NO_ZONE}: in slots without a zone. Once for each "
+        "zone.",
+        name="--price",
+        takes="ZONE=AMOUNT/h",
+        panel="Prices",
+        parse=_price,
+        repeat=True,
+        default="the scenario's, none",
+    )
+    value_of_time: float = option(
+        VALUE_OF_TIME,
+        "Value of an hour of the driver's time, in the same currency: an amount that is paid costs as much time.",
+        takes="AMOUNT/h",
+        panel="Prices",
+        parse=_per_hour,
+        default=f"the scenario's, {VALUE_OF_TIME:g}",
+        gt=0.0,
+        le=1e6,
+    )
+    stay_s: float = option(
+        HOUR_S,
+        "Expected stay, s, which the price is for; in a fleet each car knows its own.",
+        name="--stay-min",
+        takes="MINUTES",
+        panel="Prices",
+        parse=seconds_of_minutes,
+        default="the scenario's, 60",
+        ge=1.0,
+        le=1e7,
+    )
 
 
 def _sensor_tables(value: object) -> object:

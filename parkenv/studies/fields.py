@@ -14,7 +14,7 @@ from parkenv.files.known_names import (
     RigName,
 )
 from parkenv.files.limited_reading import is_there
-from parkenv.files.option import Inside, Option, numbers_in, words_in
+from parkenv.files.option import Inside, Option, seconds_of_minutes, words_in
 from parkenv.files.spec_file import Axis, DetectorName, OrText, Several
 from parkenv.scenarios.spec import (
     ScenarioSpec,
@@ -70,6 +70,8 @@ _LOT_ALONE = (
     "Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON, or a Dragon Lake "
     "map (.yml)."
 )
+PRICES = ("--price", "--value-of-time", "--stay-min")
+"""Options of what parking costs, which only matters where slots are chosen."""
 TRAFFIC = ("--cars", "--pedestrians")
 """Options of other road users, whom only simulated sensors and driven cars meet."""
 _NAMES = ", ".join(SCENARIO_NAMES)
@@ -155,15 +157,6 @@ Detector = Annotated[
     Option(takes="NAME|FILE|MODULE:CLASS", panel="Sensors", default="the scenario's, hog"),
 ]
 Figures = Annotated[bool, Field(description="Draw figures."), Option(panel="Results")]
-
-
-def seconds_of_minutes(text: str) -> float:
-    """Convert minutes to s.
-
-    Raises:
-        InputError: the text is no number.
-    """
-    return 60.0 * numbers_in(text, 1)[0]
 
 
 ArrivalRate = Annotated[float, Field(gt=0.0, le=1e6)]

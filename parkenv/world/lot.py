@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -13,6 +14,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
+from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -92,6 +94,7 @@ class ParkingLot:
         walls: polylines, (k, 2) m each; they block the view, not pedestrians.
         slot_parking_cost_s: (n_slots,) float64, s, at least 0: cost of parking in each slot, as time. A price is
             converted by the value of time: 2 € at 12 € per hour are 600 s. Empty: all 0.
+        slot_zone: (n_slots,) str, tariff zone of each slot; empty text: none. Empty: none has one.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
@@ -99,6 +102,8 @@ class ParkingLot:
         neighbors: (n_vertices, 4) int32, the vertex reached by up, down, left, right; -1 where there is none.
         edge_length: (n_vertices, 4) float64, m; 0 where there is no edge.
         entry_vertices: (n_entries,) int64, the vertex of each entry.
+        zones: names of the zones, sorted; `NO_ZONE` stands for slots without one.
+        zone_of_slot: (n_slots,) int64, index into `zones`.
 
     Raises:
         InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal.
@@ -125,12 +130,15 @@ class ParkingLot:
     goals: FloatArray
     walls: tuple[FloatArray, ...] = ()
     slot_parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    slot_zone: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
 
     vertex_xy: FloatArray = field(init=False)
     vertex_yaw: FloatArray = field(init=False)
     neighbors: NDArray[np.int32] = field(init=False)
     edge_length: FloatArray = field(init=False)
     entry_vertices: NDArray[np.int64] = field(init=False)
+    zones: tuple[str, ...] = field(init=False)
+    zone_of_slot: NDArray[np.int64] = field(init=False)
 
     def __post_init__(self) -> None:
         def set_field(name: str, value: object) -> None:
@@ -142,6 +150,7 @@ class ParkingLot:
         set_field("lanes", tuple(self.lanes))
         if np.size(self.slot_parking_cost_s) == 0:
             set_field("slot_parking_cost_s", np.zeros(n))
+        self._set_zones(set_field)
         for name, shape in (
             ("slot_xy", (n, 2)),
             ("slot_yaw", (n,)),
@@ -185,6 +194,23 @@ class ParkingLot:
             values = getattr(graph, name)
             values.flags.writeable = False
             set_field(name, values)
+
+    def _set_zones(self, set_field: Callable[[str, object], None]) -> None:
+        """Number the zones of the slots, and require printable names."""
+        n = len(self.slot_ids)
+        zone = np.array(self.slot_zone if np.size(self.slot_zone) else [""] * n, dtype=np.str_)
+        if zone.shape != (n,):
+            raise InputError(f"lot {self.name!r}: slot_zone has shape {zone.shape}, want ({n},)")
+        zone.flags.writeable = False
+        set_field("slot_zone", zone)
+        set_field("zones", tuple(sorted({name or NO_ZONE for name in zone.tolist()})))
+        order = {name: i for i, name in enumerate(self.zones)}
+        zone_of_slot = np.array([order[name or NO_ZONE] for name in zone.tolist()], np.int64)
+        zone_of_slot.flags.writeable = False
+        set_field("zone_of_slot", zone_of_slot)
+        for name in self.zones:
+            if not is_plain(name):
+                raise InputError(f"lot {self.name!r}: zone {name!a:.60} has control characters")
 
     def _require_names(self) -> None:
         """Require slots with different names, all of them printable."""

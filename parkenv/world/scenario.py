@@ -18,6 +18,7 @@ from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
+from parkenv.world.tariff import HOUR_S, VALUE_OF_TIME, Tariff
 from parkenv.world.traffic import Traffic
 
 KMH = 1 / 3.6  # 1 km/h in m/s
@@ -42,6 +43,9 @@ class SearchProblem:
         wait_s: cost of a move that the graph does not have, s (the thesis's Δt).
         give_up_s: give-up penalty, s: parking elsewhere and walking, once the lot is proven full.
         sensor_model: range and error rates of observations.
+        tariff: prices of the lot's zones.
+        stay_s: expected stay, s, which the price is for; in a fleet each car has its own.
+        value_of_time: value of an hour of the driver's time, in the currency of the prices.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -55,6 +59,9 @@ class SearchProblem:
     wait_s: float = 1.0
     give_up_s: float = 1800.0
     sensor_model: SensorModel = field(default_factory=SensorModel)
+    tariff: Tariff = field(default_factory=Tariff)
+    stay_s: float = HOUR_S
+    value_of_time: float = VALUE_OF_TIME
 
     def __post_init__(self) -> None:
         if not isinstance(self.lot, ParkingLot):
@@ -62,9 +69,12 @@ class SearchProblem:
         if not isinstance(self.sensor_model, SensorModel):
             raise InputError(f"sensor_model is a {type(self.sensor_model).__name__}, want a SensorModel")
         _require_index("goal", self.goal, len(self.lot.goals))
-        for name in ("v_drive", "v_walk", "wait_s"):
+        if not isinstance(self.tariff, Tariff):
+            raise InputError(f"tariff is a {type(self.tariff).__name__}, want a Tariff")
+        self.tariff.require_zones(self.lot.zones, self.lot.name)
+        for name in ("v_drive", "v_walk", "wait_s", "value_of_time"):
             require_number(name, getattr(self, name), above=0.0)
-        for name in ("failure_s", "give_up_s"):
+        for name in ("failure_s", "give_up_s", "stay_s"):
             require_number(name, getattr(self, name), least=0.0)
 
     @cached_property
@@ -77,10 +87,26 @@ class SearchProblem:
         """Cost of arriving in each slot, (n_slots,) s: walk plus parking cost."""
         return _read_only(self.walk_s + self.parking_cost_s)
 
-    @property
+    @cached_property
     def parking_cost_s(self) -> FloatArray:
-        """Parking cost of each slot as time, (n_slots,) s: price divided by the value of time."""
-        return self.lot.slot_parking_cost_s
+        """Parking cost of each slot as time, (n_slots,) s: that of the lot, and the price of the expected stay."""
+        zone_cost_s = self.zone_cost_s(self.stay_s)
+        return _read_only(self.lot.slot_parking_cost_s + zone_cost_s[self.lot.zone_of_slot])
+
+    def zone_cost_s(self, stay_s: FloatArray | float) -> FloatArray:
+        """Return what stays of the driver cost in each of the lot's zones, (..., n_zones) s.
+
+        That is the price divided by the value of time; agents plan on it, and the reward charges it.
+
+        Args:
+            stay_s: (...) s, lengths of the stays.
+        """
+        return self.tariff.amounts(self.lot.zones, stay_s) * (HOUR_S / self.value_of_time)
+
+    @property
+    def is_priced(self) -> bool:
+        """Whether slots have prices or parking costs."""
+        return bool(self.tariff) or bool(self.lot.slot_parking_cost_s.any())
 
     @cached_property
     def move_s(self) -> FloatArray:

@@ -8,8 +8,8 @@ to metres east and north of the centre of the features; metres without either ar
 
 | kind | geometry | properties |
 |---|---|---|
-| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; all or none of `center`, `yaw`, `length`, `width`, \
-`mouth` (rear, left, right) |
+| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; `zone`, none if absent; all or none of `center`, `yaw`, \
+`length`, `width`, `mouth` (rear, left, right) |
 | `lane` | LineString | `oneway`, false if absent |
 | `entry`, `goal` | Point | |
 | `wall` | LineString or Polygon | |
@@ -97,10 +97,10 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         (Mouth(mouth).name.lower() for mouth in lot.slot_mouth),
         strict=True,
     )
-    costs = lot.slot_parking_cost_s.tolist()
-    for slot_id, ring, shape, cost in zip(lot.slot_ids, rings, shapes, costs, strict=True):
+    costs, zones = lot.slot_parking_cost_s.tolist(), lot.slot_zone.tolist()
+    for slot_id, ring, shape, cost, zone in zip(lot.slot_ids, rings, shapes, costs, zones, strict=True):
         exact = dict(zip(SLOT_SHAPE, shape, strict=True))
-        priced = {"parking_cost_s": cost} if cost else {}
+        priced = ({"parking_cost_s": cost} if cost else {}) | ({"zone": zone} if zone else {})
         yield feature("Polygon", [ring], kind="slot", id=slot_id, **priced, **exact)
     for lane in lot.lanes:
         yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway)

@@ -55,6 +55,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
     ids: list[str] = []
     shapes: list[tuple[float, ...] | None] = []
     costs: list[float] = []
+    zones: list[str] = []
     for i, feature in enumerate(raw):
         try:
             slot_id = _slot_id(feature)
@@ -66,7 +67,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
             if not valid[i]:
                 reason = shapely.is_valid_reason(polygons[i])
                 raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
-            cost = _parking_cost(feature.properties, slot_id)
+            cost, zone = _parking_cost(feature.properties, slot_id), _zone(feature.properties, slot_id)
             shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
         except InputError as error:
             contents.error(feature.number, str(error))
@@ -74,6 +75,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
         valid_rows.append(i)
         ids.append(slot_id)
         costs.append(cost)
+        zones.append(zone)
 
     polygons = polygons[valid_rows]
     bare = np.array([shape is None for shape in shapes], dtype=bool)
@@ -100,7 +102,8 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
             f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
         )
     kept = np.flatnonzero(~disagrees & ~thin)
-    contents.slots = replace(slots, parking_cost_s=np.array(costs, dtype=np.float64))[kept]
+    cost_s, zone_names = np.array(costs, np.float64), np.array(zones, np.str_)
+    contents.slots = replace(slots, parking_cost_s=cost_s, zone=zone_names)[kept]
     contents.slot_ids = [ids[k] for k in kept]
     contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
 
@@ -125,6 +128,14 @@ def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
     if not is_coordinate(cost) or cost < 0.0:
         raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
     return float(cost)
+
+
+def _zone(properties: dict[str, Any], slot_id: str) -> str:
+    """Return the zone of a slot; empty text if not given."""
+    zone = properties.get("zone", "")
+    if not isinstance(zone, str) or not is_plain(zone) or ("zone" in properties and not zone):
+        raise InputError(f"slot {slot_id!r:.40}: zone is {zone!r:.40}, want a name")
+    return zone
 
 
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
+from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import csv_rows
 from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
 from parkenv.lots.generators import KERB_SIZE, NO_SLOTS, Slots
@@ -19,7 +21,7 @@ from parkenv.lots.infer.spaces import Spaces
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.lot import Mouth
 
-COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s")
+COLUMNS = ("x", "y", "lat", "lon", "yaw", "id", "parking_cost_s", "zone")
 SAME_PLACE = 0.1  # distance, m, within which two slot centres are one slot listed twice
 
 
@@ -31,21 +33,22 @@ class SlotList:
     xy: FloatArray  # (n_slots, 2) m
     yaw: FloatArray | None  # (n_slots,) rad, heading of a car parked nose-in; None without the column
     parking_cost_s: FloatArray  # (n_slots,) s, at least 0
+    zone: NDArray[np.str_]  # (n_slots,) tariff zones; empty texts for none
     frame: LocalFrame | None  # geographic frame of the lot; None for a file in metres
 
     def subset(self, index: IntArray) -> SlotList:
         """Return some of the slots."""
         ids = tuple(self.ids[i] for i in index.tolist())
         yaw = None if self.yaw is None else self.yaw[index]
-        return SlotList(ids, self.xy[index], yaw, self.parking_cost_s[index], self.frame)
+        return SlotList(ids, self.xy[index], yaw, self.parking_cost_s[index], self.zone[index], self.frame)
 
 
 def read_slot_list(path: str | Path) -> SlotList:
     """Read a CSV file of slot centres.
 
     The first line names the columns: `x,y` in metres east and north, or `lat,lon` in degrees; optional are `yaw`,
-    the heading in rad, counter-clockwise from east, of a car parked nose-in, `id` (by default the row number), and
-    `parking_cost_s`, the parking cost in seconds (by default 0).
+    the heading in rad, counter-clockwise from east, of a car parked nose-in, `id` (by default the row number),
+    `parking_cost_s`, the parking cost in seconds (by default 0), and `zone`, the tariff zone (by default none).
 
     Raises:
         InputError: the file cannot be read, a column is missing or unknown, a value is not a finite number or
@@ -58,13 +61,15 @@ def read_slot_list(path: str | Path) -> SlotList:
     pairs = [pair for pair in (("x", "y"), ("lat", "lon")) if set(pair) <= set(head)]
     if len(pairs) != 1 or unknown or len(set(head)) < len(head):
         raise InputError(
-            f"{path}: columns are {','.join(head)!r:.80}, want x,y or lat,lon, and perhaps yaw, id and parking_cost_s"
+            f"{path}: columns are {','.join(head)!r:.80}, want x,y or lat,lon, and perhaps yaw, id, "
+            "parking_cost_s and zone"
         )
     if len(rows) == 1:
         raise InputError(f"{path}: no slot below the line of columns")
 
     bounds = {"lat": 90.0, "lon": 180.0}
-    values: dict[str, list[float]] = {name: [] for name in head if name != "id"}
+    values: dict[str, list[float]] = {name: [] for name in head if name not in ("id", "zone")}
+    zones: list[str] = []
     ids: dict[str, int] = {}
     for number, row in enumerate(rows[1:], start=2):
         cells = dict(zip(head, (cell.strip() for cell in row), strict=True))
@@ -73,6 +78,9 @@ def read_slot_list(path: str | Path) -> SlotList:
             where = f"appears already in row {ids[name]}" if name else "is empty"
             raise InputError(f"{path}: row {number}: id {name!r:.40} {where}")
         ids[name] = number
+        zones.append(cells.get("zone", ""))
+        if not is_plain(zones[-1]):
+            raise InputError(f"{path}: row {number}: zone is {zones[-1]!a:.40}, want a name")
         for column in values:
             try:
                 value = float(cells[column])
@@ -94,7 +102,7 @@ def read_slot_list(path: str | Path) -> SlotList:
     _require_apart(path, points, names, tuple(ids.values()))
     yaw = np.array(values["yaw"]) if "yaw" in values else None
     cost = np.array(values.get("parking_cost_s", [0.0] * len(names)))
-    return SlotList(names, points, yaw, cost, frame)
+    return SlotList(names, points, yaw, cost, np.array(zones, np.str_), frame)
 
 
 def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple[int, ...]) -> None:
@@ -185,11 +193,12 @@ def _infer_along_rows(spaces: Spaces, entries: FloatArray) -> InferredLot:
 
 
 def _as_listed(slots: Slots, index: IntArray, listed: SlotList) -> Slots:
-    """Return inferred slots with the yaw and the parking costs of the list, kerbside ones with a car's usual length."""
+    """Return inferred slots with yaw, parking cost and zone of the list, kerbside ones with a car's usual length."""
     mouth = slots.mouth
     kerbside = mouth != Mouth.REAR
     yaw = slots.yaw if listed.yaw is None else listed.yaw[index]
     # A kerbside slot is inferred with its lane on the left; listed with the opposite yaw, it has it on the right.
     mouth = np.where(kerbside & (np.cos(yaw - slots.yaw) < 0.0), Mouth.RIGHT, mouth).astype(np.int8)
     length = np.where(kerbside, np.minimum(slots.length, KERB_SIZE[0]), slots.length)
-    return replace(slots, yaw=yaw, length=length, mouth=mouth, parking_cost_s=listed.parking_cost_s[index])
+    cost_s, zone = listed.parking_cost_s[index], listed.zone[index]
+    return replace(slots, yaw=yaw, length=length, mouth=mouth, parking_cost_s=cost_s, zone=zone)

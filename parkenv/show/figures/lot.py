@@ -11,8 +11,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.collections import EllipseCollection, PolyCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import LinearSegmentedColormap, Normalize, to_rgba_array
 from matplotlib.figure import Figure
+from matplotlib.patches import Patch
 from matplotlib.typing import ColorType
 from scipy.spatial import cKDTree
 
@@ -23,6 +24,7 @@ from parkenv.show.colors import BELIEF_ANCHORS, hex_color
 from parkenv.show.painters.axes import draw_scale_bar, paint, points_per_m
 from parkenv.show.scene import ARROWHEAD, DISC, STAR, Layer, Lines, LotScene, Marks, posed
 from parkenv.world.lot import ParkingLot
+from parkenv.world.tariff import NO_ZONE
 
 INK = "#333333"
 GROUND, ENTRY, GOAL = (hex_color(name) for name in ("ground", "entry", "goal"))
@@ -33,6 +35,9 @@ ENTRY_ARROW = np.array(
 """An arrow from the entry into the lot."""
 BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
 """Colours of beliefs, from free to taken."""
+ZONE_COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
+"""Colours of zones, distinguishable with any colour vision."""
+INK_PALE = "#b4b8bd"
 COST_MAP = "viridis"
 """Colour map of parking costs."""
 SMALLEST_DISC = 6.0
@@ -126,8 +131,8 @@ def save_lot_picture(
 ) -> None:
     """Draw a lot to a file in the format of its suffix (`.png`, `.pdf`, `.svg`).
 
-    Slots with a parking cost are filled with its colour, and a colour bar gives the scale. Guesses of an import are
-    marked and listed below the lot.
+    Slots are filled with the colour of their zone, which a legend names; in lots without zones with that of their
+    parking cost, of which a colour bar gives the scale. Guesses of an import are marked and listed below the lot.
 
     Raises:
         InputError: the format is unknown, or the file cannot be written.
@@ -139,7 +144,9 @@ def save_lot_picture(
     figure = Figure(figsize=(10.0, short) if x1 - x0 >= y1 - y0 else (short, 10.0))
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     cost = lot.slot_parking_cost_s
-    if cost.any():
+    if lot.zones != (NO_ZONE,):
+        draw_zones(lot, ax, show_graph=show_graph)
+    elif cost.any():
         scale = ScalarMappable(Normalize(0.0, float(cost.max())), COST_MAP)
         colors = scale.to_rgba(cost)
         colors[cost == 0.0, 3] = 0.0
@@ -157,6 +164,21 @@ def save_lot_picture(
         figure.savefig(
             beside, format=path.suffix.removeprefix("."), dpi=160, bbox_inches="tight", pad_inches=0.0
         )
+
+
+def draw_zones(lot: ParkingLot, ax: Axes, *, show_graph: bool = False) -> None:
+    """Draw a lot with its slots in the colours of their zones, and a legend."""
+    colors = zone_colors(lot)
+    draw_lot(lot, ax, slot_color=to_rgba_array(colors)[lot.zone_of_slot], show_graph=show_graph)
+    handles = [Patch(color=color, label=zone) for zone, color in zip(lot.zones, colors, strict=True)]
+    ax.legend(handles=handles, title="zone", loc="upper left", framealpha=0.9).set_zorder(6.0)
+
+
+def zone_colors(lot: ParkingLot) -> list[str]:
+    """Return the colour of each zone; slots without a zone are grey."""
+    return [
+        INK_PALE if zone == NO_ZONE else ZONE_COLORS[i % len(ZONE_COLORS)] for i, zone in enumerate(lot.zones)
+    ]
 
 
 def _draw_guesses(lot: ParkingLot, ax: Axes, guesses: Sequence[str]) -> None:

@@ -15,7 +15,7 @@ from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import Hours, scenario_spec
 from parkenv.show.plurals import plural
-from parkenv.studies.fields import CaptureDistance, Detector, OneScenario, Seed, with_traffic
+from parkenv.studies.fields import PRICES, CaptureDistance, Detector, OneScenario, Seed, with_traffic
 from parkenv.studies.results import Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.study import Cell, Study
@@ -49,7 +49,7 @@ class SurveyStudy(Study):
 
     kind: Literal["survey"] = "survey"
     scenario: Annotated[
-        OneScenario, AfterValidator(with_traffic), Inside(without=("--sensor-model", "--view-range"))
+        OneScenario, AfterValidator(with_traffic), Inside(without=("--sensor-model", "--view-range", *PRICES))
     ] = Field(scenario_spec("campus"), validate_default=True)
     sessions: int = option(6, "Survey drives; the thesis made 21.", ge=1, le=100_000)
     rig: RigName | None = option(
