@@ -16,6 +16,7 @@ import parkenv
 import planners
 import sim_sensors
 from parkenv.compiled import code_files, source_key
+from parkenv.compiled.activity import compiling_now
 from parkenv.compiled.clock import seconds_spent
 from parkenv.compiled.code_files import cache_folder
 from parkenv.compiled.jit import compiled
@@ -243,3 +244,14 @@ def test_no_compiled_function_gives_python_a_named_tuple():
         returned = typing.get_type_hints(function.py_func).get("return")
         for kind in (returned, *typing.get_args(returned)):
             assert function.__name__.startswith("_") or not hasattr(kind, "_fields"), function
+
+
+def test_what_is_compiled_now_is_seen_from_outside(tmp_path, monkeypatch):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder = tmp_path / "parkenv.engine.kernel-0123456789abcdef"
+    folder.mkdir()
+    for name in ("killed-0000.lock", "_observe-0001.lock", "arrive-0002.nbc", "enter-0003.nbc"):
+        (folder / name).touch()
+    os.utime(folder / "killed-0000.lock", (1.0, 1.0))
+    names, n_finished = compiling_now(since_s=2.0)
+    assert (names, n_finished) == (["observe"], 2)

@@ -42,6 +42,7 @@ class Demo(StudyCommand):
 
     3. Searches on other days, with camera, laser and detector: the thesis's planner, the planner in belief space and
     two heuristic baselines, all with the same map, in the same worlds; and an oracle that knows every slot's future.
+    Many more follow without images, with the error rates of the sensors: enough to tell agents apart.
 
     4. A report with replays, and a film of one search.
     """

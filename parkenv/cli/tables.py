@@ -105,10 +105,11 @@ def _show_compiling(progress: Progress, ended: Event) -> None:
     """Show a line, until the event, while processes compile functions."""
     from parkenv.compiled.activity import compiling_now
 
-    since_s, line = time.time(), progress.add_task("", total=None, visible=False, unit="")
+    since_s, line = time.time(), progress.add_task("", total=None, visible=False, unit="functions")
     while not ended.wait(0.5):
-        names = compiling_now(since_s)
-        progress.update(line, visible=bool(names), description=f"Compiling {', '.join(names[:3])}")
+        names, n_finished = compiling_now(since_s)
+        said = f"Compiling {', '.join(names[:3])}"
+        progress.update(line, visible=bool(names), description=said, completed=n_finished)
 
 
 @contextmanager

@@ -7,9 +7,12 @@ from contextlib import suppress
 from parkenv.compiled.code_files import cache_folder
 
 
-def compiling_now(since_s: float) -> list[str]:
-    """Return the functions that are being compiled, of those begun after a time of `time.time`."""
-    locks = cache_folder().glob("*/*.lock")
-    with suppress(OSError):  # one is deleted meanwhile
-        return [path.stem.rpartition("-")[0].strip("_") for path in locks if path.stat().st_mtime > since_s]
-    return []
+def compiling_now(since_s: float) -> tuple[list[str], int]:
+    """Return the functions that are being compiled, and how many are finished, since a time of `time.time`."""
+    names, n_finished = [], 0
+    for path in cache_folder().glob("*/*"):
+        with suppress(OSError):  # deleted meanwhile
+            if path.stat().st_mtime > since_s:
+                names += [path.stem.rpartition("-")[0].strip("_")] if path.suffix == ".lock" else []
+                n_finished += path.suffix == ".nbc"
+    return names, n_finished
