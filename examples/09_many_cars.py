@@ -4,15 +4,15 @@ import sys
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
 
 from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.show.figures.picture_files import save_film
 from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.agent import make_agent
 from planners.heuristics import POLICIES
 
-FILM_S, FRAMES_PER_S = 120, 15
+FILM_S, FRAMES_PER_S = 90, 15
 
 # From nine o'clock on, a car arrives every twelve seconds, on average. It stays for half an hour; if it has found no
 # slot after a quarter of an hour, it goes elsewhere.
@@ -46,8 +46,6 @@ if len(sys.argv) > 1:  # the name of a film, such as fleet.gif
     frames = []
     for second in np.arange(600.0, 600.0 + FILM_S, 0.5):
         fleet.run(agents, until=fleet.begin + second)
-        frames.append(Image.fromarray(renderer.frame()).quantize(48, dither=Image.Dither.NONE))
-    frames[0].save(
-        film, save_all=True, append_images=frames[1:], duration=1000 // FRAMES_PER_S, loop=0, optimize=True
-    )
+        frames.append(renderer.frame())
+    save_film(frames, film, fps=FRAMES_PER_S, colors=48)
     print(film)

@@ -1,5 +1,6 @@
 """Commands, code and numbers in README, documentation and contributing guide are correct."""
 
+import importlib.util
 import os
 import re
 import shlex
@@ -38,17 +39,41 @@ def commands():
                         yield pytest.param(words[1:], id=f"{name}: {' '.join(words[1:])}")
 
 
-def test_the_ten_lines_run_as_printed(tmp_path):
-    (_, program), (_, more) = blocks(README, "python")
+def test_the_ten_lines_run_as_printed_and_are_the_same_everywhere():
+    ((_, program),) = blocks(README, "python")
     assert len([line for line in program.splitlines() if line.strip()]) == 10
+    for name in ("docs/index.md", "docs/api/index.md"):
+        assert program in PAGES[name], name
     done = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, timeout=600, check=True
     )
     assert re.fullmatch(r"\d+ s, of which \d+ s on foot\n", done.stdout)
-    shorter = more.replace("300_000", "4_096")
-    assert shorter != more
-    subprocess.run([sys.executable, "-c", shorter], timeout=600, check=True, cwd=tmp_path)
-    assert (tmp_path / "mine.safetensors").exists()
+
+
+def script(name):
+    """Import a script of the documentation."""
+    spec = importlib.util.spec_from_file_location(name, ROOT / "docs" / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_pages_of_environments_are_their_docstrings():
+    environments = script("environments")
+    for name in environments.PAGES:
+        made, there = environments.page(name), PAGES[f"docs/environments/{name}.md"]
+        assert made == there, "run: python docs/environments.py"
+        film = re.search(r"\.\./pictures/(\S+\.gif)", there)[1]
+        assert (ROOT / "docs" / "pictures" / film).stat().st_size < 1e6, film
+
+
+def test_every_picture_and_table_of_results_names_its_command():
+    found = list(script("figures").figures())
+    assert len(found) > 60
+    assert not [figure for figure in found if not figure.command]
+    shown = {figure.what for figure in found}
+    pictures = {f"pictures/{path.name}" for path in (ROOT / "docs" / "pictures").glob("[!.]*")}
+    assert pictures <= shown, "a picture on no page"
 
 
 def program_of(page):
