@@ -9,6 +9,11 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from parkenv.files.early_signals import end_on_signals, is_command
+
+if is_command():
+    end_on_signals()  # before everything that takes time
+
 from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:

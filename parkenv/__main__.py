@@ -1,12 +1,11 @@
 """The command `parkenv`, and `python -m parkenv`."""
 
-import signal
+from parkenv.files.early_signals import end_on_signals
 
 
 def main() -> None:
-    """Entry point: Ctrl-C ends the command without a traceback, also while it imports its modules."""
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+    """Entry point: signals end the command without a traceback, also while it imports its modules."""
+    end_on_signals()
     from parkenv.files.working_folder import distrust_working_folder
 
     distrust_working_folder()

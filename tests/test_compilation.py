@@ -3,6 +3,7 @@
 import importlib
 import logging
 import os
+import pickle
 import pkgutil
 import subprocess
 import sys
@@ -196,6 +197,37 @@ def test_damaged_files_are_compiled_again(caller, tmp_path):
         file.write_bytes(content)
     del sys.modules["callee"]
     assert importlib.reload(caller).g(1.0) == 4.0
+
+
+class Planted:
+    """An object that leaves a mark when it is unpickled."""
+
+    def __init__(self, mark):
+        self.mark = mark
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.mark),)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no owners and modes of POSIX")
+@pytest.mark.parametrize("mode", [0o644, 0o666, 0o664, "link"])
+def test_code_that_others_can_have_written_is_not_read(caller, tmp_path, mode, caplog):
+    code_files._warn_of_unsafe_cache.cache_clear()
+    assert caller.g(1.0) == 4.0
+    for number, file in enumerate(tmp_path.rglob("*.nbc")):
+        assert file.stat().st_mode & 0o777 == 0o644
+        data = pickle.dumps(Planted(tmp_path / f"ran{number}"))
+        file.write_bytes(code_files._digest(file, data) + data)
+        if mode == "link":
+            file.symlink_to(file.rename(tmp_path / f"theirs{number}"))
+        else:
+            file.chmod(mode)
+    del sys.modules["callee"]
+    with caplog.at_level(logging.WARNING, logger="parkenv"):
+        assert importlib.reload(caller).g(1.0) == 4.0
+    is_safe = mode == 0o644
+    assert bool(list(tmp_path.glob("ran*"))) == is_safe, "what this user alone can write is read"
+    assert ("others can write" in caplog.text) == (mode in (0o666, 0o664))
 
 
 def test_a_module_that_is_edited_and_imported_again_runs_its_new_code(caller, own):

@@ -1,10 +1,18 @@
 """Tables of run folders: a wrong value is refused in a line with file, line, column, value, and what was wanted."""
 
+import csv
+import io
+import tempfile
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
+from hypothesis import example, given
+from hypothesis import strategies as st
 
 from parkenv import InputError
+from parkenv.files import csv_tables
+from parkenv.files.csv_tables import TEXT, csv_text, typed_records
 from parkenv.studies.results import EPISODES
 from parkenv.studies.sensing.sessions import ERROR_COLUMNS, SESSIONS
 from parkenv.studies.sensing.surveys import detection_by_distance
@@ -87,3 +95,20 @@ def test_tables_of_other_versions_are_refused(tmp_path):
     for read, good in ((read_sessions, SESSION), (read_rows, EPISODE)):
         with pytest.raises(InputError, match="not written by this version of parkenv; use another folder"):
             read(write(tmp_path / "table.csv", good | {"more": "1"}))
+
+
+@given(st.lists(st.text(st.characters(blacklist_categories=["Cs"], blacklist_characters="\0")), min_size=1))
+@example(["=1+1", "'=1+1", "''=1", "+A1", "-cmd", "@x", "-5", "+1e3", "'quoted'", "", "\tx", "\rx", "a=1"])
+def test_texts_are_no_formulas_in_spreadsheets_and_are_read_as_they_were(texts):
+    table = csv_text(["text", "number"], [{"text": text, "number": -1.5} for text in texts], header=True)
+    for cell, number in list(csv.reader(io.StringIO(table, newline="")))[1:]:
+        assert number == "-1.5"
+        if cell.startswith(("=", "+", "-", "@", "\t", "\r")):
+            float(cell)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "table.csv"
+        file.write_bytes(table.encode())
+        kinds = {"text": TEXT, "number": csv_tables.NUMBER}
+        rows = [row for _, row in typed_records(file, kinds.__getitem__, whole_lines=True)]
+    assert [row["text"] for row in rows] == texts
+    assert all(row["number"] == -1.5 for row in rows)

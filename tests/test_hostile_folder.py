@@ -1,8 +1,10 @@
 """Nothing that lies in the working folder runs, or sets how the command works."""
 
 import os
+import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 from command_line import PARKENV
@@ -46,6 +48,61 @@ def test_a_comparison_with_workers_and_figures_takes_nothing_from_the_folder(fol
     assert (folder / "out" / "report.html").is_file()
     assert not (folder / "ran").exists()
     assert not (folder / "theirs").exists()
+
+
+PATIENT = """
+import numpy as np
+from parkenv.world.lot import PARK
+from planners.agent import SearchAgent
+
+
+class Patient(SearchAgent):
+    name = "patient"
+
+    def begin(self, observation, belief):
+        return np.random.default_rng(0)
+
+    def decide(self, observation, belief, memory):
+        return int(memory.choice(np.nonzero(observation["action_mask"])[0]))
+"""
+
+
+@pytest.mark.slow
+def test_a_users_class_is_found_by_workers_and_no_other_module_beside_it(folder):
+    for name in ("matplotlib", "typing_extensions", "my_agents"):
+        (folder / f"{name}.py").write_text(f"open({str(folder / 'ran')!r}, 'a').write({name!r})\n")
+    (folder / "my_agents.py").write_text(PATIENT)
+    arguments = ["--scenario", "mini", "--agents", "my_agents:Patient", "-n", "2", "--jobs", "2"]
+    done = run(folder, "compare", *arguments, "--out", "out")
+    assert done.returncode == 0, done.stderr
+    assert ",patient," in (folder / "out" / "episodes.csv").read_text()
+    assert not (folder / "ran").exists()
+
+
+def test_a_users_class_is_found_after_everything_else(folder):
+    (folder / "mine.py").write_text("import colorsys\nclass A:\n    def predict(self): ...\n")
+    (folder / "colorsys.py").write_text(f"open({str(folder / 'ran')!r}, 'a').write('colorsys')")
+    code = (
+        "from parkenv.files.user_class import load_class as load; print(load('mine:A', 'agent', 'predict'))"
+    )
+    done = subprocess.run([sys.executable, "-P", "-c", code], cwd=folder, capture_output=True, text=True)
+    assert done.stdout == "<class 'mine.A'>\n", done.stderr
+    assert not (folder / "ran").exists()
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize("command", [["-m", "parkenv"], ["parkenv"]])
+def test_a_signal_before_anything_is_imported_ends_the_command(tmp_path, command, number, code):
+    (tmp_path / "gymnasium.py").write_text(
+        f"import os, time\nos.kill(os.getpid(), {number:d})\ntime.sleep(9)\n"
+    )
+    (tmp_path / "parkenv").write_text("from parkenv.__main__ import main\nmain()\n")
+    path = os.pathsep.join([str(tmp_path), str(Path(__file__).parents[1])])
+    done = subprocess.run(
+        [sys.executable, *command, "--version"],
+        cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path},
+    )  # fmt: skip
+    assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
 def test_compiled_code_is_kept_where_the_environment_says_and_nowhere_else(folder, tmp_path):

@@ -266,6 +266,50 @@ def test_the_header_is_read_without_a_runtime():
     assert read.metadata["names"].startswith("{0: 'Car'")
 
 
+def elsewhere(name="w"):
+    """A tensor whose numbers are in another file."""
+    tensor = TensorProto(name=name, data_type=TensorProto.FLOAT, dims=[1])
+    tensor.external_data.add(key="location", value="/etc/passwd")
+    return tensor
+
+
+@pytest.mark.parametrize(
+    "hide",
+    [
+        lambda model, tensor: model.graph.initializer.append(tensor),
+        lambda model, tensor: model.graph.node[0].attribute.add(name="a").t.CopyFrom(tensor),
+        lambda model, tensor: model.graph.node[0].attribute.add(name="a").tensors.append(tensor),
+        lambda model, tensor: model.graph.node[0].attribute.add(name="a").g.initializer.append(tensor),
+        lambda model, tensor: model.graph.node[0].attribute.add().graphs.add().initializer.append(tensor),
+        lambda model, tensor: model.graph.node[0].attribute.add().sparse_tensor.values.CopyFrom(tensor),
+        lambda model, tensor: model.graph.sparse_initializer.add().indices.CopyFrom(tensor),
+        lambda model, tensor: model.functions.add().node.add().attribute.add().t.CopyFrom(tensor),
+    ],
+)
+def test_no_tensor_has_its_numbers_in_another_file(monkeypatch, hide):
+    model = Tiny("yolo", names=NAMES).model()
+    hide(model, elsewhere())
+    for most in (1 << 20, 0):
+        monkeypatch.setattr("parkenv.files.onnx_file.MAX_HERE", most)
+        with pytest.raises(InputError, match="keeps its weights in other files"):
+            parse_onnx(model.SerializeToString(), "x")
+
+
+def test_a_network_is_run_without_what_our_reader_does_not_understand(monkeypatch):
+    """Field 14 of a tensor is the place of its numbers, and has no value 77; field 100 does not exist."""
+    model = Tiny("yolo", names=NAMES).model()
+    plain = model.SerializeToString()
+    assert parse_onnx(plain, "x").data == plain
+    tensor = TensorProto(name="w", data_type=TensorProto.FLOAT, dims=[1], float_data=[1.0])
+    model.graph.initializer.append(tensor)
+    whole = model.SerializeToString()
+    model.graph.initializer[-1].MergeFromString(bytes([14 << 3, 77]) + bytes([100 << 3 & 127 | 128, 6, 1]))
+    assert model.SerializeToString() != whole
+    for most in (1 << 20, 0):
+        monkeypatch.setattr("parkenv.files.onnx_file.MAX_HERE", most)
+        assert parse_onnx(model.SerializeToString(), "x").data == whole
+
+
 def test_another_packaged_network_needs_its_file_and_its_name(tmp_path, monkeypatch):
     Tiny("yolo", names=NAMES).save(tmp_path / "net.onnx")
     monkeypatch.setattr(detector_registry, "MODELS", tmp_path)

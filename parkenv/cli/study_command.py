@@ -97,7 +97,8 @@ class StudyCommand(RunCommand):
             if isinstance(stopped, Interrupted):
                 self.show(console, stopped.result)
             rest = f" What was finished is in {self.out}; parkenv run {self.out} --resume goes on."
-            console.print(f"Interrupted.{rest if self.out else ''}", soft_wrap=True)
+            has_begun = self.out is not None and (self.out / SPEC_FILE).exists()
+            console.print(f"Interrupted.{rest if has_begun else ''}", soft_wrap=True)
             raise
         self.show(console, result)
         if self.out is not None:

@@ -1,7 +1,7 @@
 """Files of compiled code: one for each function and combination of argument types, shared by all processes.
 
-A file is a pickle, and reading one can run code of whoever wrote it. So the folder is the user's own, and
-`NUMBA_CACHE_DIR` should not name one that others can write.
+A file is a pickle, and reading one can run code of whoever wrote it. So only files that nobody but this user and the
+administrator can have written are read, wherever `NUMBA_CACHE_DIR` is.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ import logging
 import os
 import pickle
 import shutil
+import sys
 import time
 import warnings
 from collections.abc import Iterator
@@ -87,16 +88,22 @@ class CodeFiles:
                 lock.release()
 
     def load_overload(self, types: tuple[Any, ...], context: Any) -> Any:
-        """Return numba's `CompileResult` for the types, or None if there is no file, or a damaged one."""
+        """Return numba's `CompileResult` for the types, or None if there is no file, or a damaged or unsafe one."""
         try:
-            content = self._path(types).read_bytes()
+            content = _read_own(self._path(types))
         except OSError:
             return None
         data = content[_DIGEST_BYTES:]
-        if content[:_DIGEST_BYTES] != hashlib.sha256(data).digest():
+        if content[:_DIGEST_BYTES] != _digest(self._path(types), data):
             return None
         context.refresh()  # numba's own functions
-        return CompileResult._rebuild(context, *pickle.loads(data))
+        try:
+            return CompileResult._rebuild(context, *pickle.loads(data))
+        except SystemError:  # Ctrl-C, as numba passes it on
+            raise
+        except Exception as error:
+            _LOGGER.debug("%s is compiled again: %s", self._name, error)
+            return None
 
     def save_overload(self, types: tuple[Any, ...], code: Any) -> None:
         """Write a `CompileResult`; warn once per process if that is not possible."""
@@ -108,7 +115,9 @@ class CodeFiles:
         try:
             self._make_folder()
             data = dumps(code._reduce())
-            beside.write_bytes(hashlib.sha256(data).digest() + data)
+            # New, so that it is no link of somebody else's; and readable for all, writable for this user.
+            with os.fdopen(os.open(beside, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644), "wb") as file:
+                file.write(_digest(path, data) + data)
             beside.replace(path)
         except OSError as error:
             _warn_of_unwritable_cache(error.strerror or str(error))
@@ -120,6 +129,35 @@ class CodeFiles:
         if not self._folder.exists():
             _delete_old_versions(self._folder)
             self._folder.mkdir(parents=True, exist_ok=True)
+
+
+def _digest(path: Path, data: bytes) -> bytes:
+    """Return what a file begins with; it is another if the file had another name."""
+    return hashlib.sha256("/".join(path.parts[-2:]).encode() + data).digest()
+
+
+def _read_own(path: Path) -> bytes:
+    """Return the content of a file that nobody but this user and the administrator can have written.
+
+    Raises:
+        OSError: there is none, or others can have written it.
+    """
+    # A link may lead to a file that the user has from elsewhere, and opening a pipe would wait.
+    flags = os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    with os.fdopen(os.open(path, flags), "rb") as file:
+        status = os.fstat(file.fileno())
+        if sys.platform != "win32" and (status.st_uid not in (0, os.getuid()) or status.st_mode & 0o022):
+            _warn_of_unsafe_cache(path.parent.parent)
+            raise PermissionError(path)
+        return file.read()
+
+
+@functools.cache
+def _warn_of_unsafe_cache(folder: Path) -> None:
+    """Warn once per process that code in the cache is not used."""
+    _LOGGER.warning(
+        "compiled functions in %s are not read: others can write them; they are compiled again", folder
+    )
 
 
 @functools.cache

@@ -15,6 +15,8 @@ from parkenv.files.limited_reading import csv_records
 MAX_NUMBER = 1e12
 """Maximum absolute value of a number; sums and squares of larger ones could overflow."""
 _MAX_DIGITS = 15
+_FORMULA = ("=", "+", "-", "@", "\t", "\r")
+"""Texts that begin with one of these run as formulas in spreadsheets; an apostrophe before it prevents that."""
 
 
 class Kind(NamedTuple):
@@ -108,7 +110,7 @@ def typed_records(
         for name, text in record.items():
             kind = kind_of(name)
             try:
-                row[name] = kind.parse(text)
+                row[name] = kind.parse(text[1:] if _is_formula(text[1:]) and text[0] == "'" else text)
             except ValueError as error:
                 raise InputError(
                     f"{path}: line {line}: {name:.80} is {text!r:.80}, want {kind.wanted}"
@@ -117,13 +119,41 @@ def typed_records(
 
 
 def csv_text(columns: Sequence[str], rows: Iterable[Mapping[str, Any]], *, header: bool = False) -> str:
-    """Return rows as CSV text, below a header if wanted; values that a row lacks are empty."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, columns, lineterminator="\n")
+    """Return rows as CSV text, below a header if wanted; values that a row lacks are empty.
+
+    A text that a spreadsheet would run as a formula gets an apostrophe before it, which `typed_records` removes.
+    """
+    text = _Lines()
+    writer = csv.DictWriter(text, columns, lineterminator="\r\n")  # so both are quoted within texts
     if header:
         writer.writeheader()
-    writer.writerows(rows)
+    writer.writerows({name: _harmless(value) for name, value in row.items()} for row in rows)
     return text.getvalue()
+
+
+class _Lines(io.StringIO):
+    """Lines of a table, which end with a line feed alone."""
+
+    def write(self, line: str) -> int:
+        """Append a line."""
+        return super().write(line.removesuffix("\r\n") + "\n")
+
+
+def _harmless(value: Any) -> Any:
+    """Return a cell with an apostrophe before what would be a formula, or would be read as a formula's text."""
+    return f"'{value}" if isinstance(value, str) and _is_formula(value) else value
+
+
+def _is_formula(text: str) -> bool:
+    """Whether a text, or what follows its apostrophes, begins as a formula, and is no number."""
+    bare = text.lstrip("'")
+    if not bare.startswith(_FORMULA):
+        return False
+    try:
+        float(text)
+    except ValueError:
+        return True
+    return False
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:

@@ -6,7 +6,6 @@ Every file that a user names is read through this module, `parkenv.files.archive
 from __future__ import annotations
 
 import csv
-import errno
 import gzip
 import io
 import json
@@ -36,16 +35,18 @@ _LONG_NUMBER = re.compile(rb"[0-9]{301,}")
 _DEEP_KEY = re.compile(r"(?:\.[ \t]*[\w\"'-]+[ \t]*){100}")
 
 
-class _Counted(io.RawIOBase):
+class Counted(io.RawIOBase):
     """A stream that fails after `most` bytes, such as an unpacked one of unknown size."""
 
     def __init__(self, stream: io.BufferedIOBase, most: int, name: object) -> None:
         self._stream, self._left, self._most, self._name = stream, most, most, name
 
     def readable(self) -> bool:
+        """Return True."""
         return True
 
     def readinto(self, buffer: Any) -> int:
+        """Read at most as many bytes as the buffer has; return their number."""
         data = self._stream.read(min(len(buffer), self._left + 1))
         self._left -= len(data)
         if self._left < 0:
@@ -62,6 +63,23 @@ def is_there(path: str | Path) -> bool:
         return False
 
 
+def require_file(path: str | Path) -> None:
+    """Check that a path can be opened at once: that it is a file or a folder.
+
+    Raises:
+        InputError: there is none, or it is a pipe or a device: opening a pipe would wait for its writer, reading a
+            terminal for its user.
+    """
+    try:
+        kind = Path(path).stat().st_mode
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise InputError(f"{str(path)!a}: is not a file's name") from error
+    if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
+        raise InputError(f"{path}: is a pipe or a device, want a file")
+
+
 @contextmanager
 def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]:
     """Open a file for reading at most `most` bytes; a name that ends in `.gz` is unpacked.
@@ -72,22 +90,17 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
     Raises:
         InputError: the file cannot be read or unpacked, or more bytes were asked for; the message names it.
     """
+    require_file(path)
     try:
-        kind = Path(path).stat().st_mode
-        if not (stat.S_ISREG(kind) or stat.S_ISDIR(kind)):
-            # Opening a pipe would wait for its writer, reading a terminal for its user.
-            raise OSError(errno.EINVAL, "is a pipe or a device, want a file")
         file = Path(path).open("rb")  # noqa: SIM115  # its own errors are caught here, those of reading below
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
-    except ValueError as error:
-        raise InputError(f"{str(path)!a}: is not a file's name") from error
     with file:
         try:
             packed = str(path).endswith((".gz", ".tgz"))
             stored: io.BufferedIOBase = file if os.fstat(file.fileno()).st_size else io.BytesIO()
             stream = gzip.GzipFile(fileobj=stored) if packed else stored
-            yield io.BufferedReader(_Counted(stream, most, path), 1 << 20)
+            yield io.BufferedReader(Counted(stream, most, path), 1 << 20)
         except (EOFError, gzip.BadGzipFile, zlib.error) as error:
             raise InputError(f"{path}: not a whole gzip file ({error})") from error
         except OSError as error:
@@ -217,7 +230,7 @@ def csv_rows(
     width = 0
     with open_limited(path, most) as file:
         text = io.TextIOWrapper(file, encoding="utf-8-sig", newline="")
-        lines = (line for line in text if line.endswith("\n")) if whole_lines else text
+        lines = (line for line in text if line.endswith(("\n", "\r"))) if whole_lines else text
         reader = csv.reader(lines)
         try:
             for row in reader:

@@ -2,22 +2,42 @@
 
 from __future__ import annotations
 
+import bz2
+import functools
+import io
+import os
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import import_module
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError
 from parkenv.files.images import decode_image
+from parkenv.files.limited_reading import Counted, read_yaml, require_file
 from parkenv.files.videos import USUAL_FPS, VideoFrame
+
+_COMPUTED = """
+SELECT of.name, "column".name FROM sqlite_master AS of, pragma_table_xinfo(of.name) AS "column"
+WHERE of.type = 'table' AND "column".hidden
+"""
+"""Selects columns that take no room in the file, whatever they hold: generated ones, and those of virtual tables."""
 
 Messages = Callable[[set[str]], Iterator[tuple[str, int, Any]]]
 
 SUFFIXES = (".mcap", ".db3", ".bag")
+MAX_PART_BYTES = 256_000_000
+"""Maximum size of a chunk or a message, unpacked."""
+MAX_MERGED_BYTES = 1_000_000_000
+"""Maximum size, unpacked, of chunks that overlap in time, which are read at the same time."""
+MAX_GROWTH = 100
+"""Maximum size of a packed file of a rosbag, unpacked, as a multiple of its own size, beside 1 MB."""
 IMAGE, COMPRESSED_IMAGE = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 
 
@@ -54,8 +74,12 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
     from rosbags.rosbag2 import Reader as Reader2
     from rosbags.typesys import Stores, get_typestore
 
-    if not path.exists():
-        raise InputError(f"{path}: No such file or directory")
+    _limit_library()
+    require_file(path)
+    if path.is_dir():
+        for file in path.iterdir():
+            require_file(file)
+        read_yaml(path / "metadata.yaml")
     is_ros1 = path.suffix == ".bag"
     # Types are those of ROS, not what the file says they are.
     store = get_typestore(Stores.ROS1_NOETIC if is_ros1 else Stores.ROS2_HUMBLE)
@@ -65,6 +89,9 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
         reader: Any = (Reader1 if is_ros1 else Reader2)(path)
         reader.open()
     try:
+        if not is_ros1:
+            for storage in getattr(reader.storage, "storages", [reader.storage]):
+                _require_few_overlaps(path, getattr(storage, "chunks", ()))
 
         def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
             chosen = [c for c in reader.connections if c.topic in topics]
@@ -94,6 +121,70 @@ def _in_words(path: Path) -> Iterator[None]:
         raise InputError(
             f"{path}: is not a complete recording ({reason:.200}); want {', '.join(SUFFIXES)} or a rosbag's folder"
         ) from error
+
+
+@functools.cache
+def _limit_library() -> None:
+    """Let the library, wherever it unpacks, do so within limits, and read plain tables of databases only."""
+    apsw, lz4 = import_module("apsw"), import_module("lz4.frame")
+    folders: Any = import_module("rosbags.rosbag2.reader")
+    mcap, bags = import_module("rosbags.rosbag2.storage_mcap"), import_module("rosbags.rosbag1.reader")
+    zstd = folders.zstd
+    makers = {"zstd": zstd.ZstdDecompressor, "lz4": lz4.LZ4FrameDecompressor, "bz2": bz2.BZ2Decompressor}
+    for unpackers in (mcap.DECOMPRESSORS, bags.decompressors):
+        for name in unpackers.keys() - {"", "none"}:
+            unpackers[name] = functools.partial(_unpacked, makers[name])
+
+    def open_packed(file: BinaryIO, mode: str) -> io.RawIOBase:
+        most = 1_000_000 + MAX_GROWTH * os.fstat(file.fileno()).st_size
+        return Counted(zstd.open(file, mode), most, file.name)
+
+    folders.zstd = SimpleNamespace(
+        open=open_packed, decompress=functools.partial(_unpacked, zstd.ZstdDecompressor)
+    )
+
+    def limit_database(connection: Any) -> None:
+        connection.limit(apsw.SQLITE_LIMIT_LENGTH, MAX_PART_BYTES)
+        for table, column in connection.execute(_COMPUTED):
+            raise ValueError(f"column {column!r:.40} of {table!r:.40} is computed, want stored values")
+
+    apsw.connection_hooks.append(limit_database)
+
+
+def _unpacked(make: Callable[[], Any], data: bytes, most: int = MAX_PART_BYTES) -> bytes:
+    """Return the content of compressed data, one or more frames.
+
+    Raises:
+        ValueError: it is not whole, or larger than `most` or `MAX_PART_BYTES`.
+    """
+    most = min(most, MAX_PART_BYTES)
+    content = b""
+    while data:
+        unpacker = make()
+        content += unpacker.decompress(data, most - len(content) + 1)
+        if len(content) > most:
+            raise ValueError(f"a chunk or message unpacks to more than {most:,} bytes")
+        if not unpacker.eof:
+            raise ValueError("a chunk or message ends too soon")
+        data = unpacker.unused_data or b""
+    return content
+
+
+def _require_few_overlaps(path: Path, chunks: Any) -> None:
+    """Check that chunks of an MCAP file that overlap in time, of which the library holds all, fit into memory.
+
+    Raises:
+        InputError: they do not, or a chunk is listed twice.
+    """
+    if len({chunk.chunk_start_offset for chunk in chunks}) < len(chunks):
+        raise InputError(f"{path}: lists a chunk twice")
+    changes = [(chunk.message_start_time, chunk.uncompressed_size) for chunk in chunks]
+    changes += [(chunk.message_end_time + 1, -chunk.uncompressed_size) for chunk in chunks]
+    held = max(accumulate(size for _, size in sorted(changes)), default=0)
+    if held > MAX_MERGED_BYTES:
+        raise InputError(
+            f"{path}: has chunks of {held:,} bytes that overlap in time, want at most {MAX_MERGED_BYTES:,}"
+        )
 
 
 def stamp_of(message: Any, recorded: int) -> int:

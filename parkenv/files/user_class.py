@@ -25,12 +25,12 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
         InputError: the module or class does not exist, or the class lacks the method.
     """
     module, _, class_name = name.partition(":")
-    here = str(Path.cwd())
-    # Search the working directory, as `python -m` does; an installed command would search its own folder instead.
-    if here not in sys.path:
-        sys.path.insert(0, here)
     if not all(part.isidentifier() for part in (*module.split("."), class_name)):
         raise InputError(f"{kind} {name!r}: want MODULE:CLASS{alternatives}")
+    here = str(Path.cwd())
+    # Last, so that no other module there replaces one of Python's own or of a library.
+    if here not in sys.path:
+        sys.path.append(here)
     try:
         found = getattr(import_module(module), class_name)
     except ModuleNotFoundError as error:
@@ -43,7 +43,8 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
         ) from None
     except Exception as error:
         if isinstance(error, AttributeError) and module in sys.modules:
-            raise InputError(f"{kind} {name!r}: module {module!r} has no {class_name!r}") from None
+            file = sys.modules[module].__file__
+            raise InputError(f"{kind} {name!r}: module {module!r} ({file}) has no {class_name!r}") from None
         at = traceback.extract_tb(error.__traceback__)[-1]
         # Syntax errors say where they are.
         where = "" if isinstance(error, SyntaxError) else f" ({at.filename}, line {at.lineno})"
@@ -57,7 +58,7 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
 
 def find_module(name: str) -> str | None:
     """Return where the module of `MODULE:CLASS` would be imported from, without importing it; None if nowhere."""
-    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [str(Path.cwd()), *sys.path])
+    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, str(Path.cwd())])
     return None if found is None else found.origin
 
 

@@ -129,6 +129,7 @@ class MapStore:
         # The journal of a writer that was killed is rolled back before reading, which takes writing.
         mode = "rwc" if create else "rw" if journal.exists() else "ro"
         address = f"{path.absolute().as_uri()}?mode={mode}"
+        is_new = not path.exists()
         with self._errors_in_words():
             self._db = sqlite3.connect(address, timeout=_PATIENCE_S, isolation_level=None, uri=True)
             try:
@@ -137,6 +138,8 @@ class MapStore:
                 self._open(create)
             except BaseException:
                 self._db.close()
+                if is_new and path.exists() and not path.stat().st_size:
+                    path.unlink()  # nothing could be written, or somebody else writes it
                 raise
 
     def __enter__(self) -> Self:
@@ -409,4 +412,6 @@ def _reason(error: sqlite3.DatabaseError) -> str:
         return "cannot be written; want a file in a folder that you may write to"
     if "locked" in text:
         return f"is in use by others for more than {_PATIENCE_S:g} s"
+    if "disk I/O" in text or "is full" in text:
+        return f"cannot be written: {text}; is the disk full, or the size of files limited?"
     return f"cannot be used as a map file: {text}"

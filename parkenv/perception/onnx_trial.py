@@ -4,22 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import subprocess
-import sys
 
 from parkenv.errors import InputError
+from parkenv.files.onnx_file import LONGEST_S, last_words, run_apart
 
-TRIAL_S = 120
-"""Maximum time for reading a network and running it once, s."""
-TRIAL_BYTES = 8 << 30
-"""Maximum address space of the process that does it."""
-_CODE = f"""
+_CODE = """
 import sys
-try:
-    import resource
-    resource.setrlimit(resource.RLIMIT_AS, ({TRIAL_BYTES}, {TRIAL_BYTES}))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-except (ImportError, OSError, ValueError):
-    pass
 import cv2, numpy
 shape = [int(word) for word in sys.argv[1:]]
 cv2.setNumThreads(1)
@@ -44,16 +34,12 @@ def require_runs(data: bytes, name: str, shape: tuple[int, ...]) -> None:
     key = hashlib.sha256(data).hexdigest(), shape
     if key in _passed:
         return
-    command = [sys.executable, "-I", "-c", _CODE, *map(str, shape)]
     try:
-        done = subprocess.run(command, input=data, capture_output=True, timeout=TRIAL_S, check=False)
+        done = run_apart(_CODE, data, *shape)
     except subprocess.TimeoutExpired as error:
-        raise InputError(f"{name}: takes more than {TRIAL_S} s for an image of shape {shape}") from error
+        raise InputError(f"{name}: takes more than {LONGEST_S} s for an image of shape {shape}") from error
     if done.returncode:
-        said = done.stderr.decode(errors="replace").strip().splitlines()
-        # An exception ends with 1, a crash with a signal.
-        reason = said[-1] if said and done.returncode == 1 else "it crashes; is the file whole?"
         raise InputError(
-            f"{name}: OpenCV cannot run this network with an input of shape {shape}: {reason:.300}"
+            f"{name}: OpenCV cannot run this network with an input of shape {shape}: {last_words(done):.300}"
         )
     _passed.add(key)
