@@ -53,7 +53,7 @@ class SearchRenderer:
         self._key = strip_with_key()
         self.window = Window(f"parkenv: {scenario.name}")
 
-    def frame(self, state: SearchState) -> Image:
+    def frame(self, state: SearchState, occupied: NDArray[np.bool_] | None = None) -> Image:
         """Render the current state, (480, 640, 3) uint8 RGB.
 
         A slot's colour shows the belief, pale until the slot has been observed. Parked cars show the true occupancy,
@@ -61,9 +61,11 @@ class SearchRenderer:
 
         Args:
             state: state of an environment with the renderer's scenario.
+            occupied: (n_slots,) bool, the cars to show; None for the true occupancy.
         """
         lot, belief = self.scenario.lot, state.belief
-        occupied = state.world.occupied(np.arange(lot.n_slots), state.time)
+        if occupied is None:
+            occupied = state.world.occupied(np.arange(lot.n_slots), state.time)
         here = lot.vertex_xy[state.vertex]
         image = self.frames.slots(here, belief_colors(belief.p_occupied, belief.observed), occupied)
         view, pose = self.frames.still(here).view, car_pose(self.scenario, state.path, parked=state.parked)
