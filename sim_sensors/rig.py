@@ -31,7 +31,7 @@ class Sensed(Drawable, Protocol):
         """Footprints and walls at knee height."""
 
 
-RIG_NAMES = ("laser", "stereo", "both_sides")  # names of rigs for `SensorRig.named`
+RIG_NAMES = ("laser", "stereo", "both_sides", "camera")  # names of rigs for `SensorRig.named`
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,9 @@ class SensorRig:
         """
         if name not in RIG_NAMES:
             raise SensorError(f"rig is {name!r}, want one of {', '.join(RIG_NAMES)}")
-        return {"laser": cls.thesis, "stereo": cls.stereo, "both_sides": cls.both_sides}[name]()
+        return {
+            "laser": cls.thesis, "stereo": cls.stereo, "both_sides": cls.both_sides, "camera": cls.camera,
+        }[name]()  # fmt: skip
 
     @classmethod
     def thesis(cls) -> SensorRig:
@@ -149,6 +151,11 @@ class SensorRig:
     def stereo(cls) -> SensorRig:
         """Return a rig with a stereo camera to the right and no laser."""
         return cls(stereo_cameras=(("right", StereoCamera(WIDE), Mount(z=EYE_M, yaw=RIGHT)),))
+
+    @classmethod
+    def camera(cls) -> SensorRig:
+        """Return a rig with a camera to the right, and nothing that measures distances."""
+        return cls(cameras=cls.thesis().cameras)
 
     @classmethod
     def both_sides(cls) -> SensorRig:

@@ -314,8 +314,8 @@ def test_damaged_recordings_are_refused_in_a_line(tmp_path):
             RecordedDrive(path, given)
     with pytest.raises(InputError, match=r"/camera: image 1 is 64×48 px, want 96×48 as calibrated"):
         list(RecordedDrive(file, calibrated(tmp_path, CALIBRATION.replace("64", "96"))).captures())
-    with pytest.raises(InputError, match=r"car\.toml: has no camera, or nothing to measure distances"):
-        RecordedDrive(file, calibrated(tmp_path, CALIBRATION.partition("[[lasers]]")[0]))
+    with pytest.raises(InputError, match=r"car\.toml: has no camera"):
+        RecordedDrive(file, calibrated(tmp_path, CALIBRATION.partition("[[cameras]]")[0]))
     with pytest.raises(InputError, match=r"car\.toml: cameras\.0\.fx is -1\.0, want a number above 0"):
         calibrated(tmp_path, CALIBRATION.replace("fx = 32.0", "fx = -1.0"))
     done = parkenv("survey", "--scenario", "mini", "--record", tmp_path / "x.bag", "--out", tmp_path / "s")

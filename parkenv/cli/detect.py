@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated, Self, get_args
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -238,7 +238,12 @@ class EvaluateDetector(Command, ExecutionSpec):
     seed: Annotated[Seed, Option(panel=_PICTURES)] = Field(0, description="Seed of cars, light and noise.")
     sessions: int = option(0, "Survey drives for each rig; 0: only pictures.", panel=_DRIVES, ge=0)
     rigs: Axis[RigName] | None = option(
-        None, "laser, stereo, both_sides.", name="--rig", takes="NAME[,...]", panel=_DRIVES, default="laser"
+        None,
+        f"{', '.join(get_args(RigName))}.",
+        name="--rig",
+        takes="NAME[,...]",
+        panel=_DRIVES,
+        default="laser",
     )
     every: CaptureDistance = option(2.5, "Metres between captures.", takes="M", panel=_DRIVES)
     misses: int = option(

@@ -84,7 +84,7 @@ class Fleet(AgentStudyCommand):
         parkenv fleet --scenario campus --arrivals-per-hour 60,120 --out crowd
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
-        parkenv fleet --scenario before.geojson,after.geojson --hours 08:00-12:00 --report
+        parkenv fleet --scenario old.geojson,new.geojson --hours 08:00-12:00 --report
         parkenv fleet --manoeuvre 15 --leaving-soon 10
         parkenv fleet --resume --episodes 20
         """

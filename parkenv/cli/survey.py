@@ -11,6 +11,7 @@ from parkenv.cli.tables import make_console, make_table, print_recorded, save_su
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import LocaliserName
 from parkenv.files.option import Inside, option
+from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.plurals import plural
 from parkenv.studies.fields import Detector, OneScenario
@@ -96,6 +97,9 @@ class Survey(StudyCommand):
                 ),
                 ("seconds_per_frame", f"{row['seconds_per_frame']:.4f}"),
             ]
+            if "range_within_std" in row:
+                one, two = row["range_within_std"]
+                figures.append(("errors within 1, 2 stated deviations", f"{one:.1%}, {two:.1%}"))
             if pose["odometry"] > 0.0 or row["localise"] != "none":
                 text = (
                     f"{pose['estimated']:.2f}, at most {pose['max']:.2f} (odometry: {pose['odometry']:.2f})"
@@ -111,17 +115,23 @@ class Survey(StudyCommand):
 
 
 class MapDrive(Command):
-    """A recording of `parkenv survey --record` says which sensors it has; for any other a calibration file says so."""
+    """A recording of `parkenv survey --record` says which sensors it has; for any other a calibration file says so.
+
+    Of photographs or a film, with poses beside, distances follow from the boxes: from the ground and a car's size.
+    """
 
     examples = """
         parkenv survey --scenario mini --sessions 1 --record drive.mcap
         parkenv map-drive drive.mcap --scenario mini --out results/drive
         parkenv map-drive bag.mcap --lot lot.geojson --calibration car.toml
+        parkenv map-drive photos/ --lot lot.geojson --fov 68 --detector net
+        parkenv map-drive drive.mp4 --poses track.gpx --lot lot.geojson --fov 90
         """
 
     recording: Path = option(
         ...,
-        "An MCAP file, or a rosbag of ROS 2 (folder, .db3) or of ROS 1 (.bag); extra bags.",
+        "A folder of photographs, or a film; or (extra bags) an MCAP file, or a rosbag of ROS 2 (folder, .db3) or "
+        "ROS 1 (.bag).",
         takes="FILE|DIR",
         argument=True,
     )
@@ -132,9 +142,10 @@ class MapDrive(Command):
     every: float = option(0.0, "Least distance between captures, m.", takes="M", ge=0.0)
     detector: Detector = None
     localise: LocaliserName = option("none", "scan-matching: the poses are odometry that drifts; correct it.")
+    photos: PhotoOptions = PhotoOptions()
     out: Path = option(
         Path("results/drive"),
-        "Folder for map.sqlite, to which the session is added, map.png and summary.json.",
+        "Folder for map.sqlite, to which the session is added, map.png, cars.csv and summary.json.",
         short="-o",
     )
 
@@ -150,13 +161,14 @@ class MapDrive(Command):
         with stages(console, "captures") as progress:
             row = add_recording(
                 self.recording, its, self.out, calibration=calibration, detector=self.detector or its.detector,
-                every=self.every, localise=self.localise, progress=progress,
+                every=self.every, localise=self.localise, photos=self.photos, lot_file=self.scenario.lot.file,
+                progress=progress,
             )  # fmt: skip
         save_summary(self.out, None, [row])
         console.print(
             make_table(None, ["figure", "value"], ((name, str(value)) for name, value in row.items()))
         )
-        console.print(f"Written: {self.out / 'map.sqlite'}, map.png, summary.json")
+        console.print(f"Written: {self.out / 'map.sqlite'}, map.png, cars.csv, summary.json")
 
 
 class Map(Command):

@@ -6,6 +6,8 @@ import io
 import re
 import struct
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -36,18 +38,24 @@ def decode_image(data: bytes, name: str) -> Image:
         InputError: not a whole image, more than 8 bits per channel, or over 100 million pixels; the message starts
             with `name`.
     """
+    with _opened(data, name) as image:
+        width, height = image.size
+        if width * height > MAX_PIXELS:
+            raise PillowImage.DecompressionBombError(f"{width}×{height} px")
+        if image.mode.startswith(("I", "F")):
+            raise InputError(f"{name}: has more than 8 bits a channel")
+        # Palettes, transparency and other colour spaces become RGB.
+        return np.array(image.convert("L" if image.mode in ("1", "L") else "RGB"))
+
+
+@contextmanager
+def _opened(data: bytes, name: str) -> Iterator[PillowImage.Image]:
     try:
         with (
             warnings.catch_warnings(action="ignore"),
             PillowImage.open(io.BytesIO(data), formats=_FORMATS) as image,
         ):
-            width, height = image.size
-            if width * height > MAX_PIXELS:
-                raise PillowImage.DecompressionBombError(f"{width}×{height} px")
-            if image.mode.startswith(("I", "F")):
-                raise InputError(f"{name}: has more than 8 bits a channel")
-            # Palettes, transparency and other colour spaces become RGB.
-            return np.array(image.convert("L" if image.mode in ("1", "L") else "RGB"))
+            yield image
     except InputError:
         raise
     except PillowImage.DecompressionBombError as error:
@@ -55,6 +63,15 @@ def decode_image(data: bytes, name: str) -> Image:
     # Pillow raises these for damaged files.
     except (OSError, SyntaxError, ValueError, LookupError, ArithmeticError, TypeError, struct.error) as error:
         raise InputError(f"{name}: is not a complete image, want {', '.join(SUFFIXES)}") from error
+
+
+def image_time(path: Path) -> str | None:
+    """Return when a photograph was taken by its Exif data, a date with the zone if it has one; or None."""
+    with _opened(read_bytes(path), str(path)) as image:
+        exif = image.getexif().get_ifd(0x8769)
+    taken, fraction, zone = (str(exif.get(tag, "")).strip(" \0") for tag in (36867, 37521, 36881))
+    date = taken[:10].replace(":", "-") + taken[10:]
+    return f"{date}.{f'{fraction:0<6}'[:6]}{zone}" if taken else None
 
 
 def image_text(path: Path, key: str) -> str | None:

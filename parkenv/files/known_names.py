@@ -12,7 +12,7 @@ LOT_SUFFIXES = (".geojson", ".json", ".yml", ".yaml")
 """Suffixes of lot files."""
 SensorModelName = Literal["perfect", "blind", "laser", "stereo"]
 SENSOR_MODELS: tuple[SensorModelName, ...] = get_args(SensorModelName)
-RigName = Literal["laser", "stereo", "both_sides"]
+RigName = Literal["laser", "stereo", "both_sides", "camera"]
 DETECTORS = ("hog", "net", "side", "front")
 """Packaged detectors: hog has both HOG models, side and front; net is a network in parkenv/perception/models."""
 DETECTOR_SUFFIXES = (".npz", ".onnx")

@@ -18,10 +18,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
+from xml.etree import ElementTree
 
 from pydantic_core import from_json
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, naming
 
 MAX_BYTES = 64_000_000
 """Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory."""
@@ -212,6 +213,35 @@ def read_yaml(path: str | Path) -> Any:
         raise InputError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
     _require_shallow(content, str(path), plain=True)
     return content
+
+
+class _PlainTree(ElementTree.TreeBuilder):
+    """Refuses a document type before its entities are read, so that they cannot grow or fetch other files."""
+
+    def doctype(self, name: str, public_id: str | None, system: str | None) -> None:
+        del public_id, system
+        raise InputError(f"declares the document type {name!r:.40}, want none: entities are not read")
+
+
+def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> ElementTree.Element:
+    """Return the root of an XML file without document type.
+
+    Args:
+        path: the file.
+        root: name of the root, without namespace.
+        most: maximum size, bytes; a tree takes some twenty times as much.
+
+    Raises:
+        InputError: the file cannot be read, is too large, declares a document type, or is no XML with this root.
+    """
+    with naming(path):
+        try:
+            tree = ElementTree.fromstring(read_bytes(path, most), ElementTree.XMLParser(target=_PlainTree()))
+        except ElementTree.ParseError as error:
+            raise InputError(f"not XML: {error}") from error
+        if tree.tag.rpartition("}")[2] != root:
+            raise InputError(f"root is <{tree.tag:.60}>, want <{root}>")
+    return tree
 
 
 def csv_rows(

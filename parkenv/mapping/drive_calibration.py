@@ -59,7 +59,7 @@ class CameraSpec(Lens):
     """A camera and its topic."""
 
     name: Name
-    topic: Topic
+    topic: Topic = Field("/pictures", description="Of its images; photographs and films have none.")
 
 
 class StereoSpec(Lens):
@@ -104,12 +104,10 @@ class DriveCalibration(Spec):
             lasers: the scanner of each laser, by name.
 
         Raises:
-            InputError: there is no camera, or no sensor that measures distances.
+            InputError: there is no camera.
         """
-        if not (self.cameras or self.stereo_cameras) or not (self.lasers or self.stereo_cameras):
-            raise InputError(
-                "has no camera, or nothing to measure distances; want cameras and lasers, or stereo_cameras"
-            )
+        if not (self.cameras or self.stereo_cameras):
+            raise InputError("has no camera, want cameras or stereo_cameras")
         return SensorRig(
             tuple((c.name, c.camera(), c.mount.mount()) for c in self.cameras),
             tuple(

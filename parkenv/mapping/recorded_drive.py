@@ -13,7 +13,7 @@ import math
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -29,6 +29,7 @@ from parkenv.files.limited_reading import parse_json
 from parkenv.files.recordings import (
     COMPRESSED_IMAGE,
     IMAGE,
+    Messages,
     open_recording,
     picture_in,
     require_rosbags,
@@ -36,10 +37,11 @@ from parkenv.files.recordings import (
 )
 from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, LaserSpec, Lens, StereoSpec
 from parkenv.mapping.grid import OccupancyGrid
+from parkenv.mapping.photographs import Photographs
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey import SessionMap, Survey
 from parkenv.perception.detector import Detector
-from parkenv.perception.pipeline import PerceptionPipeline
+from parkenv.perception.pipeline import CameraView, PerceptionPipeline
 from parkenv.perception.slot_filter import SlotStates
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import DAY_S
@@ -87,6 +89,7 @@ class MappedDrive:
     grid: OccupancyGrid  # the occupancy grid
     frames: int  # captures that were used
     corrected_m: float  # m, greatest distance between a recorded pose and what it was corrected to
+    cars: list[dict[str, Any]]  # each located car: time, place, distance and slot, with standard deviations
 
 
 class DriveWriter:
@@ -177,6 +180,7 @@ class RecordedDrive:
     Args:
         path: the file or folder.
         calibration: sensors and topics; None for a recording of `parkenv survey --record`.
+        photographs: what takes the place of a recording; its calibration counts.
 
     Raises:
         InputError: the recording cannot be read whole; a topic is missing or of another type; stamps go back in time;
@@ -185,6 +189,7 @@ class RecordedDrive:
 
     path: Path
     calibration: DriveCalibration | None = None
+    photographs: Photographs | None = None
     rig: SensorRig = field(init=False)
     head: Head | None = field(init=False, default=None)
     poses: FloatArray = field(init=False)  # (n, 3) x, y, yaw in the lot
@@ -197,7 +202,9 @@ class RecordedDrive:
         self._scans: dict[str, list[NDArray[np.float32]]] = {}
         self._scanners: dict[str, LaserScanner] = {}
         poses: list[tuple[float, float, float]] = []
-        with open_recording(self.path) as (topics, messages):
+        if self.photographs is not None:
+            self.calibration = self.photographs.calibration
+        with self._open() as (topics, messages):
             self._plan(topics)
             wanted = {stream.topic: key for key, stream in self._streams.items()}
             self._stamps = {key: [] for key in self._streams}
@@ -245,7 +252,7 @@ class RecordedDrive:
         count = dict.fromkeys(self._streams, -1)
         cameras = {s.topic: key for key, s in self._streams.items() if key.startswith("image:")}
         done = 0
-        with open_recording(self.path) as (_, messages):
+        with self._open() as (_, messages):
             for topic, _, message in messages(set(cameras)):
                 key = cameras[topic]
                 count[key] += 1
@@ -255,6 +262,9 @@ class RecordedDrive:
                     yield self._capture(plan[done], images[done])
                     images[done] = {}
                     done += 1
+
+    def _open(self) -> AbstractContextManager[tuple[dict[str, str], Messages]]:
+        return open_recording(self.path) if self.photographs is None else self.photographs.open()
 
     def _plan(self, topics: dict[str, str]) -> None:
         """Set the streams: from the calibration, or those of `recording`."""
@@ -481,16 +491,33 @@ def map_drive(
     Raises:
         InputError: an unknown localiser; see also `RecordedDrive` and `make_detector`.
     """
-    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector), lot, localise)
-    shifts = []
+    if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
+        raise InputError(f"localise is {localise!r}, want none: {drive.path} has no laser nor stereo camera")
+    errors = drive.photographs.errors if drive.photographs else None
+    mapped = SessionMap(PerceptionPipeline(drive.rig, lot, detector, errors), lot, localise)
+    shifts, cars = [], []
     for captured, recorded in drive.captures(every):
-        shifts.append(np.hypot(*(mapped.add(captured, recorded).vehicle - recorded)[:2]))
+        result = mapped.add(captured, recorded)
+        shifts.append(np.hypot(*(result.vehicle - recorded)[:2]))
+        cars += [row for view in result.views for row in _car_rows(captured.time, view, lot)]
         on_frame()
     rig, weather = (drive.head.rig, drive.head.weather) if drive.head else ("recorded", "unknown")
     session = mapped.session(drive.key, drive.start, rig, weather)
     return MappedDrive(
-        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0))
+        session, mapped.slots.states(), mapped.grid, len(shifts), float(max(shifts, default=0.0)), cars
     )
+
+
+def _car_rows(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[str, Any]]:
+    cars = view.cars
+    for k, (x, y, yaw) in enumerate(cars.poses.tolist()):
+        place = {"time_s": time, "camera": view.name, "x_m": x, "y_m": y, "yaw_rad": yaw}
+        slot = int(view.slots[k])
+        place |= {"distance_m": float(cars.distance[k]), "slot": lot.slot_ids[slot] if slot >= 0 else ""}
+        if cars.distance_std is not None and cars.covariance is not None:
+            spread = math.sqrt(np.trace(cars.covariance[k]) / 2.0)
+            place |= {"distance_std_m": float(cars.distance_std[k]), "position_std_m": spread}
+        yield {name: round(value, 3) if isinstance(value, float) else value for name, value in place.items()}
 
 
 def record_drive(survey: Survey, number: int, path: Path) -> None:

@@ -21,6 +21,7 @@ from parkenv.mapping.route import SurveyRoute, survey_route
 from parkenv.mapping.store import Session
 from parkenv.mapping.survey_score import SurveyScore, TrueBoxes, true_boxes
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
+from parkenv.perception.monocular import RangingErrors
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
 from parkenv.perception.slot_filter import SlotFilter, SlotStates
 from parkenv.world.lot import ParkingLot
@@ -63,6 +64,8 @@ class SurveySettings:
         if self.weather is not None:
             require_one_of("weather", self.weather, PRESETS)
         require_one_of("localise", self.localise, LOCALISERS)
+        if self.rig == "camera":
+            require_one_of("localise of a rig without ranges", self.localise, LOCALISERS[:1])
         if not self.windows:
             raise InputError("windows is empty, want at least one")
         if self.picture_width is not None:
@@ -129,7 +132,10 @@ class Survey:
         rig = SensorRig.named(self.settings.rig)
         if self.settings.picture_width is not None:
             rig = rig.resized(self.settings.picture_width)
-        self.pipeline = PerceptionPipeline(rig, scenario.lot, self.settings.detector)
+        noise = self.settings.pose_noise
+        self.pipeline = PerceptionPipeline(
+            rig, scenario.lot, self.settings.detector, RangingErrors.of_poses(noise.position, noise.heading)
+        )
         self.route: SurveyRoute = survey_route(scenario.lot, both_sides=self.settings.rig == "both_sides")
         self._slots = slot_lot(scenario.lot)
 

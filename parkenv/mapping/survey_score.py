@@ -77,6 +77,7 @@ class SurveyScore:
         self.detections = self.right = 0
         self.in_frame = np.zeros((len(DISTANCE_ENDS), 2), dtype=np.int64)
         self._errors: dict[str, list[tuple[float, float, float]]] = {method: [] for method in METHODS}
+        self._distance_std: list[float] = []
         self._sightings: list[NDArray[np.void]] = []
 
     @property
@@ -90,6 +91,15 @@ class SurveyScore:
         Distances are compared with the median of the noise-free beams that end on the car.
         """
         return np.array(self._errors[method]).reshape(-1, 3)
+
+    @property
+    def within_std(self) -> tuple[float, float]:
+        """Fractions of distances with an error of at most one and two of their stated standard deviations, or NaN."""
+        std = np.array(self._distance_std)
+        if not len(std):
+            return math.nan, math.nan
+        off = self.errors("fitted")[:, 0] / std
+        return float((off <= 1.0).mean()), float((off <= 2.0).mean())
 
     def add(
         self,
@@ -146,6 +156,8 @@ class SurveyScore:
             if not 0 < car <= scene.n_vehicles or on_it.sum() < _LEAST_BEAMS:
                 continue
             x, y, yaw = scene.vehicle_pose[car - 1]
+            if cars.distance_std is not None:
+                self._distance_std.append(float(cars.distance_std[k]))
             turned = (cars.yaw[k] - yaw + math.pi / 2) % math.pi - math.pi / 2
             self._errors[method].append(
                 (

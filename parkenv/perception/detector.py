@@ -15,8 +15,10 @@ Float32Array = NDArray[np.float32]
 Float = TypeVar("Float", np.float32, np.float64)
 
 LEAST_PROBABILITY = 0.08
-"""Least probability of the boxes that a detector should return. The pipeline keeps a box below 0.25 only if the range
-measurements in it fit a car on the ground."""
+"""Least probability of the boxes that a detector should return. The pipeline keeps a box below `PROBABILITY` only if
+the range measurements in it fit a car on the ground."""
+PROBABILITY = 0.25
+"""Least probability of a detection that no range measurements confirm."""
 
 
 class Detections:
@@ -93,8 +95,33 @@ class Detections:
         )  # fmt: skip
 
 
+class DetectorErrors(NamedTuple):
+    """How often a detector misses a car, and how its boxes differ from a car's outline: left, top, right, bottom.
+
+    By default those of a network, as measured with `net` in simulated drives.
+    """
+
+    missed: float = 0.05  # fraction of cars that are whole in a picture and hidden by no box
+    shift: tuple[float, float, float, float] = (
+        0.0,
+        0.0,
+        0.0,
+        0.0,
+    )  # mean, fractions of the car's height in the image
+    std: tuple[float, float, float, float] = (0.06, 0.04, 0.06, 0.045)  # standard deviations, the same
+
+    def corrected(self, boxes: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Return boxes, (n, 4), without their mean error."""
+        shift = np.array(self.shift)
+        height = (boxes[:, 3] - boxes[:, 1]) / (1.0 + shift[3] - shift[1])
+        return np.asarray(boxes - height[:, None] * shift, dtype=np.float64)
+
+
 class Detector(Protocol):
     """Finds cars in camera images.
+
+    A detector that misses more cars than a network, or whose boxes are less tight, has an attribute `errors`
+    (`DetectorErrors`), which mapping from pictures alone uses.
 
     A custom detector is a class with this method and a constructor without arguments. Its name is `MODULE:CLASS`
     wherever a detector is expected: `parkenv survey --detector my_detectors:Mine`,

@@ -16,8 +16,16 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError
-from parkenv.perception.detector import BandDetector, Detections, Detector, GroundBand
+from parkenv.perception.detector import (
+    PROBABILITY,
+    BandDetector,
+    Detections,
+    Detector,
+    DetectorErrors,
+    GroundBand,
+)
 from parkenv.perception.detector_registry import make_detector
+from parkenv.perception.monocular import GroundView, RangingErrors, localize_boxes
 from parkenv.perception.range_scan import RangeScan, disparity, scan_from_laser, scan_from_stereo
 from parkenv.perception.ranging import (
     CAR_HEIGHT,
@@ -32,8 +40,6 @@ from parkenv.world.lot import ParkingLot
 from sim_sensors.camera.models import PinholeCamera, StereoCamera
 from sim_sensors.rig import Capture, Mount, SensorRig, TimedCapture
 
-PROBABILITY = 0.25  # least probability of a detection; a located one needs only `LEAST_PROBABILITY`
-
 
 @dataclass(frozen=True, eq=False)
 class CameraView:
@@ -44,7 +50,7 @@ class CameraView:
         camera, mount: its model, and its pose on the vehicle.
         image: (h, w, 3) uint8, RGB.
         detections: the cars in the image.
-        scan: the ranges used to locate them.
+        scan: the ranges used to locate them; without a beam where there is no ranging sensor.
         stereo: without a laser, the stereo camera and its disparity, (h, w) float32 px; else None.
         cars: the detections that could be located.
         slots: (n,) int64, the slot that each of `cars` stands in; -1 for none.
@@ -86,25 +92,33 @@ class PerceptionResult:
 class PerceptionPipeline:
     """Detects cars, measures their distance, and estimates which slots are taken, with the sensors of one rig.
 
-    A laser measures the distances for all cameras; in a rig without a laser each stereo camera measures its own.
+    A laser measures the distances for all cameras; in a rig without a laser each stereo camera measures its own; and
+    without any, distances follow from the boxes alone (`parkenv.perception.monocular`).
 
     Args:
-        rig: with at least one camera or stereo camera, and a laser or stereo camera.
+        rig: with at least one camera or stereo camera.
         lot: the lot with the slots.
         detector: a detector, or its name (see `make_detector`); None: the packaged HOG detector.
+        errors: of poses and mount, where distances follow from boxes; those of the boxes are the detector's own.
 
     Raises:
-        InputError: a rig without a camera or without a ranging sensor, or an unknown detector.
+        InputError: a rig without a camera, or an unknown detector.
     """
 
-    def __init__(self, rig: SensorRig, lot: ParkingLot, detector: str | Detector | None = None) -> None:
-        if not (rig.lasers or rig.stereo_cameras) or not (rig.cameras or rig.stereo_cameras):
-            raise InputError(
-                "the rig has no camera, or no ranging sensor; want a camera and a laser, or stereo"
-            )
+    def __init__(
+        self,
+        rig: SensorRig,
+        lot: ParkingLot,
+        detector: str | Detector | None = None,
+        errors: RangingErrors | None = None,
+    ) -> None:
+        if not (rig.cameras or rig.stereo_cameras):
+            raise InputError("the rig has no camera, want at least one")
         self.rig = rig
         self.lot = lot
         self.detector = make_detector(detector)
+        own = getattr(self.detector, "errors", DetectorErrors())
+        self.errors = (errors or RangingErrors())._replace(detector=own)
         # Only these promise that they may be called in several threads.
         self._concurrent = isinstance(self.detector, BandDetector)
 
@@ -143,9 +157,16 @@ class PerceptionPipeline:
         for scan in scans.values():
             slots.update_from_scan(scan)  # T §3.3.2, from beams
         for name, camera, mount, image in self._images(captured.capture):
-            scan = scans[self._ranging_sensor(name)]
             found = seen.detections[name]
-            cars = localize_cars(found, scan, camera, mount, vehicle)  # eq. 3.2
+            if scans:
+                scan = scans[self._ranging_sensor(name)]
+                cars = localize_cars(found, scan, camera, mount, vehicle)  # eq. 3.2
+            else:
+                x, y, _ = mount.in_world(vehicle)
+                scan, ground = RangeScan(x, y, np.empty(0), np.empty(0), 0.0), GroundView(camera, mount)
+                cars = localize_boxes(found, ground, vehicle, self.errors, slots.headings_near)
+                boxes = self.errors.detector.corrected(found.boxes)
+                slots.update_from_picture(ground, vehicle, boxes, self.errors)
             found, cars = _confirmed(found, cars)
             placed = slots.update_from_cars(cars)  # T §3.3.2, from detections
             stereo = None if self.rig.lasers else disparities.get(name)

@@ -33,7 +33,8 @@ WHOLE_END = 1.2  # m; a visible edge of this length is the front or rear of a ca
 OFF_GROUND = 0.7  # m; tolerance of the height of a box's lower edge above or below the ground
 CAR_HEIGHT = (0.8, 3.2)  # m; range of the height of a box's upper edge
 _LEAST_BEAMS = 3
-_MARGIN = 0.02  # of an image's width; boxes that come this close to its border count as clipped by it
+MARGIN = 0.02
+"""Of a picture's size; boxes that come this close to its border count as clipped by it."""
 _EXPLAINED = 0.5  # fraction of a box's beams from which they belong to the nearer car of another box
 _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
@@ -53,12 +54,17 @@ class LocatedCars:
     probability: Float32Array  # (n,) float32, of the detection
     # (n,) int64, index of the detection of each car; detections that could not be located have no row
     detection: NDArray[np.int64]
+    # of cars whose place is uncertain, from one picture; None where a sensor has measured the distance
+    distance_std: FloatArray | None = None  # (n,) float64, m, standard deviation of the distance
+    covariance: FloatArray | None = None  # (n, 2, 2) float64, m², of the centres
 
     def __post_init__(self) -> None:
         n = len(self.yaw)
-        shapes = {"xy": (n, 2), "size": (n, 2)} | dict.fromkeys(
+        shapes: dict[str, tuple[int, ...]] = {"xy": (n, 2), "size": (n, 2)} | dict.fromkeys(
             ("yaw", "distance", "probability", "detection"), (n,)
         )
+        if self.covariance is not None:
+            shapes |= {"distance_std": (n,), "covariance": (n, 2, 2)}
         for name, want in shapes.items():
             value = getattr(self, name)
             if value.shape != want or not np.isfinite(value).all():
@@ -183,8 +189,8 @@ def localize_cars(
         left, right = margins[i]
         # Counter-clockwise, the box's right margin comes first.
         clipped = (
-            bool(detections.boxes[i, 2] >= (1.0 - _MARGIN) * camera.width),
-            bool(detections.boxes[i, 0] <= _MARGIN * camera.width),
+            bool(detections.boxes[i, 2] >= (1.0 - MARGIN) * camera.width),
+            bool(detections.boxes[i, 0] <= MARGIN * camera.width),
         )
         beams, cut = car_beams(scan, beams_between(scan, left, right), clipped)
         if not len(beams) or explained[beams].mean() >= _EXPLAINED:
@@ -283,7 +289,7 @@ def _is_on_ground(box: Float32Array, distance: float, camera: PinholeCamera, mou
         mount.z + depth * math.tan(mount.pitch - math.atan((row - camera.cy) / camera.fy))
         for row in (bottom, top)
     )
-    at_margin = bottom >= (1.0 - _MARGIN) * camera.height
+    at_margin = bottom >= (1.0 - MARGIN) * camera.height
     return (at_margin or abs(low) <= OFF_GROUND) and CAR_HEIGHT[0] <= high <= CAR_HEIGHT[1]
 
 

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import erf
+from shapely import LineString, STRtree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
+from parkenv.perception.monocular import GroundView, RangingErrors, corners_of_cars
 from parkenv.perception.range_scan import RangeScan
 from parkenv.perception.ranging import LocatedCars
 from parkenv.world.lot import Mouth, ParkingLot
@@ -25,6 +29,18 @@ SCAN_LOG_ODDS = 1.2
 """Evidence of one scan that crosses the core of a slot (negative) or ends within the slot (positive)."""
 MOST_LOG_ODDS = 4.0
 """Bound of the log-odds of a slot, so that the filter notices a car that arrives or leaves during the drive."""
+PARKED = (0.35, 0.2)
+"""Standard deviation of a parked car's place along and across its slot, m."""
+ELSEWHERE = 0.01
+"""Density of cars outside slots, 1/m²: traffic, and boxes without a car."""
+LEAST_SHARE = 0.5
+"""Probability that an observation is of a slot, from which it counts."""
+VIEW_REACH = 12.0
+"""m, up to which a slot without a car in the picture is held to be free."""
+_CANDIDATES = 8  # slots that a car may stand in
+_KNOWN_FREE = 0.5  # log-odds
+_WHOLE = 0.85  # of a car's height that a picture must show
+_COVERED = 0.15  # of a place, from which a box hides it
 _LEAST_BEAMS = 4
 _CLEAR = 0.6
 
@@ -83,23 +99,52 @@ class SlotFilter:
         self._visual = np.zeros(lot.n_slots)
 
     def slots_of(self, cars: LocatedCars) -> IntArray:
-        """Return the slot of each car, (n,) int64; -1 for cars outside all slots."""
+        """Return the slot of each car, (n,) int64; -1 for cars outside all slots, or likely so."""
+        return self._attributed(cars)[0]
+
+    def headings_near(self, xy: FloatArray) -> FloatArray:
+        """Return the heading of cars parked near points, (n,) rad; NaN farther than a slot's length from all slots."""
+        away, nearest = self._tree.query(xy)
+        return np.where(away <= 2.0 * self._size[nearest, 0], self.lot.slot_yaw[nearest], np.nan)
+
+    def _attributed(self, cars: LocatedCars) -> tuple[IntArray, FloatArray]:
+        """Return the slot of each car as `slots_of`, and the probability that it is the right one, (n,)."""
         if not len(cars):
-            return np.empty(0, dtype=np.int64)
-        nearest = np.asarray(self._tree.query(cars.xy)[1], dtype=np.int64)
-        local = self._in_slot(cars.xy, nearest)
-        inside = (np.abs(local) <= self._size[nearest] + MARGIN).all(axis=1)
-        return np.where(inside, nearest, -1).astype(np.int64)
+            return np.empty(0, dtype=np.int64), np.empty(0)
+        if cars.covariance is None:
+            nearest = np.asarray(self._tree.query(cars.xy)[1], dtype=np.int64)
+            local = self._in_slot(cars.xy, nearest)
+            inside = (np.abs(local) <= self._size[nearest] + MARGIN).all(axis=1)
+            return np.where(inside, nearest, -1).astype(np.int64), np.ones(len(cars))
+        ranks = list(range(1, min(_CANDIDATES, self.lot.n_slots) + 1))
+        near = np.asarray(self._tree.query(cars.xy, k=ranks)[1], dtype=np.int64)
+        yaw, away = self.lot.slot_yaw[near], self.lot.slot_xy[near] - cars.xy[:, None]
+        axes = np.stack([np.cos(yaw), -np.sin(yaw), np.sin(yaw), np.cos(yaw)], axis=-1) * np.array(PARKED * 2)
+        axes = axes.reshape(*near.shape, 2, 2)
+        spread = cars.covariance[:, None] + axes @ axes.swapaxes(-1, -2)
+        off = (away * np.linalg.solve(spread, away[..., None])[..., 0]).sum(axis=-1)
+        density = np.exp(-0.5 * off) / (2.0 * math.pi * np.sqrt(np.linalg.det(spread)))
+        share = density / (density.sum(axis=1, keepdims=True) + ELSEWHERE)
+        best = np.arange(len(cars)), share.argmax(axis=1)
+        likely = share[best] * cars.probability.astype(np.float64)
+        return np.where(likely > LEAST_SHARE, near[best], -1).astype(np.int64), likely
 
     def update_from_cars(self, cars: LocatedCars) -> IntArray:
-        """Update the slots of the cars in one image; return `slots_of(cars)`."""
-        slots = self.slots_of(cars)
+        """Update the slots of the cars in one image; return `slots_of(cars)`.
+
+        A car that stands in its slot with a probability only is that much less evidence.
+        """
+        slots, likely = self._attributed(cars)
         if len(cars):
             _, nearest = self._tree.query(cars.xy)
             np.add.at(self._visual, nearest, _logit(P_OCCUPIED))
         there = slots[slots >= 0]
         # One image is one observation, even if a car has several boxes.
-        self.log_odds[np.unique(there)] += _logit(P_OCCUPIED)
+        sure = np.zeros(self.lot.n_slots)
+        np.maximum.at(sure, there, likely[slots >= 0])
+        there = np.unique(there)
+        doubted = _logits(P_PRIOR + sure[there] * (P_OCCUPIED - P_PRIOR))
+        self.log_odds[there] += _logit(P_OCCUPIED) if cars.covariance is None else doubted
         self.in_view[there] = self.updated[there] = True
         self._clip()
         return slots
@@ -121,6 +166,71 @@ class SlotFilter:
         self.in_view[near] |= change != 0.0
         self.updated[near] |= change != 0.0
         self._clip()
+
+    def update_from_picture(
+        self, ground: GroundView, vehicle: FloatArray, boxes: FloatArray, errors: RangingErrors
+    ) -> None:
+        """Update the slots where a picture would show a car, and the detector has found none.
+
+        A slot counts if a car of usual size in it would be whole in the picture; no wall stands before it, nor a slot
+        that is not known to be free; and no box at its distance or nearer covers more than a little of the place. Then
+        it is free, unless the detector missed the car or the picture shows another slot, as far as position and heading
+        are uncertain.
+
+        Args:
+            ground: the camera above the ground.
+            vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
+            boxes: (n, 4) px, all that the detector has found.
+            errors: standard deviations of position and heading.
+        """
+        x, y, yaw = ground.mount.in_world(vehicle)
+        near = np.array(sorted(self._tree.query_ball_point([x, y], VIEW_REACH)), dtype=np.int64)
+        if not len(near):
+            return
+        # Corners of a usual car in each slot, ahead and to the right of the camera.
+        to_x, to_y = (self.lot.slot_xy[near] - [x, y]).T
+        along, across = corners_of_cars(self.lot.slot_yaw[near] - yaw)
+        ahead = (math.cos(yaw) * to_x + math.sin(yaw) * to_y)[:, None] + along
+        aside = (math.sin(yaw) * to_x - math.cos(yaw) * to_y)[:, None] + across
+        in_front = ahead.min(axis=1) > 0.5
+        near, ahead, aside = near[in_front], ahead[in_front], aside[in_front]
+        tall = np.full_like(ahead, 1.45)
+        corners = np.concatenate(
+            [ground.pixels(ahead, aside, z) for z in (np.zeros_like(tall), tall)], axis=1
+        )
+        low, high = corners.min(axis=1), corners.max(axis=1)
+        size = np.array([ground.camera.width, ground.camera.height])
+        inside = (np.minimum(high, size) - np.maximum(low, 0.0)) / (high - low)
+        others = np.concatenate(
+            [boxes, np.concatenate([low, high], axis=1)[self.log_odds[near] > -_KNOWN_FREE]]
+        )
+        common = np.minimum(high[:, None], others[:, 2:]) - np.maximum(low[:, None], others[:, :2])
+        covered = common.clip(0.0).prod(axis=2) / (high - low).prod(axis=1)[:, None]
+        # A box with its lower edge above the ground at the slot's far end shows a car behind; a nearer slot's is lower.
+        end = np.repeat(corners[:, :4, 1].min(axis=1)[:, None], len(others), axis=1)
+        end[:, len(boxes) :] = high[:, 1, None] + 1.0
+        hidden = ((covered > _COVERED) & (others[:, 3] >= end)).any(axis=1)
+        hidden |= np.array([self._is_walled((x, y), self.lot.slot_xy[slot]) for slot in near], dtype=np.bool_)
+        clear = (inside >= [1.0, _WHOLE]).all(axis=1) & ~hidden
+        near, away = near[clear], np.hypot(*(self.lot.slot_xy[near[clear]] - [x, y]).T)
+        shift = np.hypot(errors.position, errors.heading * away)
+        sure = erf(self._size[near, 1] / np.maximum(math.sqrt(2.0) * shift, 1e-9))
+        change = -_logits(P_PRIOR + sure * (1.0 / (1.0 + errors.detector.missed) - P_PRIOR)) * (
+            sure > LEAST_SHARE
+        )
+        self.log_odds[near] += change
+        self.in_view[near] |= change != 0.0
+        self.updated[near] |= change != 0.0
+        self._clip()
+
+    @cached_property
+    def _walls(self) -> STRtree:
+        return STRtree([LineString(wall) for wall in self.lot.walls])
+
+    def _is_walled(self, eye: tuple[float, float], point: FloatArray) -> bool:
+        """Return whether a wall crosses the line between two points."""
+        line = LineString(np.array([eye, point]))
+        return bool(len(self._walls.query(line, predicate="intersects")))
 
     def states(self) -> SlotStates:
         """Return the current estimate."""
@@ -154,6 +264,10 @@ class SlotFilter:
 
 def _logit(p: float) -> float:
     return math.log(p / (1.0 - p))
+
+
+def _logits(p: FloatArray) -> FloatArray:
+    return np.asarray(np.log(p / (1.0 - p)))
 
 
 @compiled

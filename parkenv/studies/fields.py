@@ -143,7 +143,7 @@ Rig = Annotated[
     Field(
         description="Observe slots through simulated sensors, detector and all, instead of the sensor model: about a "
         "second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and a camera to "
-        "each side."
+        "each side; camera: a camera alone."
     ),
     Option(panel="Sensors"),
 ]

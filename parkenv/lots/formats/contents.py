@@ -10,6 +10,7 @@ import shapely
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import NO_SLOTS, Slots
+from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.lot import Lane
 
@@ -42,6 +43,7 @@ class LotContents:
 
     name: str
     found: str = ""  # what was recognised of the positions
+    frame: LocalFrame | None = None  # where the lot is, of a file in degrees
     slot_ids: list[str] = field(default_factory=list)
     slots: Slots = NO_SLOTS
     lanes: list[Lane] = field(default_factory=list)

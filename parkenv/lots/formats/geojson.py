@@ -156,7 +156,9 @@ def read_contents(path: Path) -> LotContents:
                 'for metres, the file needs the member "frame": "local", for a map grid "crs"',
             )
             return contents
-        xy = LocalFrame.around(xy).to_xy(xy) if len(xy) else xy
+        if len(xy):
+            contents.frame = LocalFrame.around(xy)
+            xy = contents.frame.to_xy(xy)
 
     for feature in raw:
         if feature.kind != "slot":

@@ -6,7 +6,7 @@ import itertools
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from pydantic import Field
 
@@ -40,7 +40,7 @@ class DetectorStudy(Study):
 
     kind: Literal["detectors"] = "detectors"
     scenario: ScenarioItem = scenario_spec("campus")
-    rigs: Axis[RigName] = Field(("laser",), description="Rigs: laser, stereo, both_sides.")
+    rigs: Axis[RigName] = Field(("laser",), description=f"Rigs: {', '.join(get_args(RigName))}.")
     detectors: Axis[DetectorName] = Field(
         ("hog", "net"), description="hog, side, front, net, a file (.npz, .onnx) or MODULE:CLASS."
     )

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
+from parkenv.files.csv_tables import write_csv
 from parkenv.files.known_names import LocaliserName
+from parkenv.lots.formats.geojson import read_contents
+from parkenv.lots.lot_files import LotFormat, lot_format
 from parkenv.mapping.drive_calibration import DriveCalibration
 from parkenv.mapping.inference import predict
+from parkenv.mapping.photo_options import PhotoOptions
+from parkenv.mapping.photographs import Photographs, is_photographs
 from parkenv.mapping.recorded_drive import RecordedDrive, map_drive
 from parkenv.mapping.store import MapStore
 from parkenv.perception.detector_registry import make_detector
@@ -16,7 +23,13 @@ from parkenv.show.figures.survey import save_map
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.sessions import MAP_FILE
 from parkenv.studies.study import Progress, counted
+from parkenv.world.occupancy.arrival_window import DAY_NAMES
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import DAY_S
+
+CAR_COLUMNS = (
+    "time_s", "camera", "x_m", "y_m", "yaw_rad", "distance_m", "distance_std_m", "position_std_m", "slot",
+)  # fmt: skip
 
 
 def add_recording(
@@ -28,18 +41,22 @@ def add_recording(
     detector: str = "hog",
     every: float = 0.0,
     localise: LocaliserName = "none",
+    photos: PhotoOptions | None = None,
+    lot_file: Path | None = None,
     progress: Progress = lambda *_: None,
 ) -> Row:
-    """Add a recorded drive to the map in a folder, and draw the map.
+    """Add a recorded drive to the map in a folder, draw the map, and list the located cars (`cars.csv`).
 
     Args:
-        recording: an MCAP file or a rosbag.
+        recording: an MCAP file, a rosbag, a folder of photographs or a film.
         scenario: the lot that was driven through.
         folder: holds the map, and gets the picture.
         calibration: sensors, mounts and topics; None for those of the recording.
         detector: what looks at the images.
         every: least distance between captures, m.
         localise: what corrects the poses.
+        photos: of photographs or a film, where the poses are, and what the camera is.
+        lot_file: of the lot; one in degrees says where poses in degrees are.
         progress: called as captures are mapped; how many there will be is not known.
 
     Returns:
@@ -50,7 +67,14 @@ def add_recording(
     """
     finder = make_detector(detector)
     progress("Reading", 0, 0)
-    drive = RecordedDrive(recording, calibration)
+    photos, taken = photos or PhotoOptions(), None
+    if is_photographs(recording):
+        is_geographic = lot_file is not None and lot_format(lot_file) is LotFormat.GEOJSON
+        frame = read_contents(lot_file).frame if lot_file is not None and is_geographic else None
+        taken = Photographs(recording, photos, calibration, frame)
+    elif photos != PhotoOptions():
+        raise InputError(f"{recording}: has poses of its own, want no options of photographs")
+    drive = RecordedDrive(recording, calibration, taken)
     make_folder(folder)
     with MapStore(folder / MAP_FILE, scenario.lot) as store:
         if store.has(drive.key):
@@ -65,14 +89,18 @@ def add_recording(
         f"{scenario.name}: {drive.key}",
         folder / "map.png",
     )
-    states = found.states
+    write_csv(folder / "cars.csv", CAR_COLUMNS, found.cars)
+    states, std = found.states, [car["distance_std_m"] for car in found.cars if "distance_std_m" in car]
+    day, second = divmod(round(found.session.time), DAY_S)
     return {
         "recording": str(recording),
         "key": drive.key,
+        "begins": f"{DAY_NAMES[int(day) % 7]} {int(second) // 3600:02d}:{int(second) // 60 % 60:02d}",
         "captures": found.frames,
         "slots": scenario.lot.n_slots,
         "seen": int(states.in_view.sum()),
         "taken": int((states.occupied & states.in_view).sum()),
         "cars_located": len(found.session.cars),
         "corrected_m": round(found.corrected_m, 3),
+        **({"distance_std_m": round(float(np.median(std)), 3)} if std else {}),
     }

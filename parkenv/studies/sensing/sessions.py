@@ -18,6 +18,7 @@ SESSION_COLUMNS = (
     *ERROR_COLUMNS, *(f"thesis_{name}" for name in ERROR_COLUMNS),
     "slot_accuracy", "slot_accuracy_seen", "unknown_fraction", "occupied_fraction", "seconds_per_frame",
     "cars_in_frame", "cars_detected", "odometry_error_m", "pose_error_m", "pose_error_max_m",
+    "within_1_std", "within_2_std",
 )  # fmt: skip
 
 

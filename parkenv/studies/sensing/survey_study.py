@@ -55,7 +55,7 @@ class SurveyStudy(Study):
     rig: RigName | None = option(
         None,
         "laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a laser and a camera "
-        "to each side.",
+        "to each side; camera: a camera alone.",
         panel="Sensors",
         default="the scenario's, laser",
     )

@@ -39,7 +39,7 @@ def session_row(result: SessionResult) -> Row:
                 result.slot_accuracy, result.slot_accuracy_seen, float(1.0 - result.states.in_view.mean()),
                 float(result.truth.mean()), float(np.median(result.frame_s)),
                 *(" ".join(map(str, counts.tolist())) for counts in score.in_frame.T),
-                *_pose_errors(result),
+                *_pose_errors(result), *score.within_std,
             ),
             strict=True,
         )
@@ -73,7 +73,7 @@ def summarize(scenario: Scenario, settings: SurveySettings, rows: Sequence[Row],
         log = store.log()
         found = score_discovery(slots_found(store, len(log.time)), scenario.lot)
     error, expected = map_error(scenario, settings.windows, log)
-    parked = sum(r["parked"] for r in rows)
+    parked, within = sum(r["parked"] for r in rows), [_mean(rows, f"within_{k}_std") for k in (1, 2)]
     detections = sum(r["detections"] for r in rows)
     return {
         "scenario": scenario.name,
@@ -88,6 +88,8 @@ def summarize(scenario: Scenario, settings: SurveySettings, rows: Sequence[Row],
             "median": _mean(rows, "range_error_m"),
             "p95": _mean(rows, "range_error_p95_m"),
         },
+        # Of distances from single pictures, how many have the error that is stated.
+        **({"range_within_std": within} if math.isfinite(within[0]) else {}),
         "car_pose": {
             name: {c: _mean(rows, prefix + c) for c in ERROR_COLUMNS}
             for name, prefix in (("fitted", ""), ("thesis", "thesis_"))

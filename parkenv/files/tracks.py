@@ -1,0 +1,136 @@
+"""Read the poses of a drive: a CSV table, or the track of a GPX file."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.errors import InputError
+from parkenv.files.csv_tables import NUMBER, TEXT, Kind, typed_records
+from parkenv.files.limited_reading import read_xml
+
+MONDAY_S = 4 * 86_400
+"""1970-01-05, the first Monday of Unix time, s."""
+_LEAST_UNIX_S = 1e8  # smaller times are seconds since Monday 00:00
+_STEP_M = 1.0  # between the positions of which a heading is made
+_WANT = "want columns time or file, x and y (m) or lat and lon (degrees), and yaw (rad) or heading (degrees) if known"
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The poses of a drive, in order.
+
+    Attributes:
+        stamps: (n,) ns of Unix time, rising; seconds after seconds where the file has no times.
+        files: (n,) names of the pictures; empty if it has none.
+        positions: (n, 2) m in the lot, or degrees, longitude first.
+        in_degrees: which of the two.
+        yaw: (n,) rad, counter-clockwise from east; NaN where it is not given.
+    """
+
+    stamps: IntArray
+    files: tuple[str, ...]
+    positions: FloatArray
+    in_degrees: bool
+    yaw: FloatArray
+
+    def headings(self, xy: FloatArray) -> FloatArray:
+        """Return the headings, (n,) rad: as given, else the direction of the way along positions, (n, 2) m; forwards.
+
+        Raises:
+            InputError: headings are missing, and the way is shorter than 2 m.
+        """
+        if not np.isnan(self.yaw).any():
+            return self.yaw
+        kept = [0]
+        for k in range(1, len(xy)):
+            if math.dist(xy[k], xy[kept[-1]]) >= _STEP_M:
+                kept.append(k)
+        if len(kept) < 3:
+            raise InputError("has no headings, and its way of less than 2 m shows none")
+        step, middle = np.diff(xy[kept], axis=0), 0.5 * (np.array(kept[1:]) + kept[:-1])
+        along = np.interp(np.arange(len(xy)), middle, np.unwrap(np.arctan2(step[:, 1], step[:, 0])))
+        return np.where(np.isnan(self.yaw), along, self.yaw)
+
+
+def read_track(path: Path, timezone_s: float = 0.0) -> Track:
+    """Read a GPX file (`.gpx`), or a CSV table.
+
+    A table has `time` (a date, Unix time, or seconds since Monday 00:00) or `file` (a picture's name), or both; `x` and
+    `y` (m in the lot) or `lat` and `lon` (degrees); and, if they are known, `yaw` (rad, counter-clockwise from x) or
+    `heading` (degrees, clockwise from north). Other columns are skipped.
+
+    Args:
+        path: the file.
+        timezone_s: time of the place minus UTC; dates without zone are of the place.
+
+    Raises:
+        InputError: the file cannot be read, or lacks something; the message is one line.
+    """
+    time = Kind("a date such as 2026-05-04T09:00:00Z, or seconds", lambda text: stamp_in(text, timezone_s))
+    kinds = dict.fromkeys(("x", "y", "lat", "lon", "heading"), NUMBER) | {"time": time}
+    kinds["yaw"] = Kind("radians, -6.3 to 6.3", _angle)
+    if path.suffix.lower() == ".gpx":
+        points = read_xml(path, "gpx").iterfind(".//{*}trkpt")
+        texts = [p.attrib | {"time": (p.findtext("{*}time") or "").strip()} for p in points]
+        rows = []
+        for number, point in enumerate(texts, 1):
+            try:
+                rows.append({name: kinds[name].parse(point.get(name, "")) for name in ("time", "lat", "lon")})
+            except ValueError as error:
+                raise InputError(
+                    f"{path}: track point {number} is {str(point)[:120]}, want lat, lon and time"
+                ) from error
+    elif not path.is_file():
+        raise InputError(f"{path}: no such file")
+    else:
+        rows = [row for _, row in typed_records(path, lambda name: kinds.get(name, TEXT))]
+    has = rows[0].keys() if rows else set()
+    pair = ("x", "y") if "x" in has else ("lon", "lat")
+    if not has >= set(pair) or not has & {"time", "file"}:
+        raise InputError(f"{path}: has {', '.join(has) or 'no poses'}; {_WANT}")
+    if path.suffix.lower() == ".gpx":  # receivers repeat points within a second
+        rows = [row for k, row in enumerate(rows) if k == 0 or row["time"] != rows[k - 1]["time"]]
+    stamps = np.array([row.get("time", (MONDAY_S + k) * 10**9) for k, row in enumerate(rows)], np.int64)
+    if (fall := np.flatnonzero(np.diff(stamps) <= 0)).size:
+        one, two = stamps[fall[0] : fall[0] + 2] / 1e9
+        raise InputError(
+            f"{path}: time goes from {one:.3f} to {two:.3f} s at pose {fall[0] + 2}, want it to rise"
+        )
+    at = np.array([[row[name] for name in pair] for row in rows])
+    if pair[0] == "lon" and (off := np.flatnonzero((np.abs(at) > (180.0, 90.0)).any(axis=1))).size:
+        raise InputError(
+            f"{path}: pose {off[0] + 1} is lon, lat {at[off[0]].tolist()}, want a place on the globe"
+        )
+    turned = [row.get("yaw", math.pi / 2 - math.radians(row.get("heading", math.nan))) for row in rows]
+    return Track(
+        stamps, tuple(row["file"] for row in rows if "file" in has), at, pair[0] == "lon", np.array(turned)
+    )
+
+
+def stamp_in(text: str, timezone_s: float) -> int:
+    """Return a time, ns of Unix time; see `read_track`.
+
+    Raises:
+        ValueError: it is none.
+    """
+    try:
+        seconds: float = NUMBER.parse(text)
+    except ValueError:
+        date = datetime.fromisoformat(text)
+        shift = timezone_s if date.tzinfo is None else 0.0
+        date = date.replace(tzinfo=date.tzinfo or UTC)
+        return round((date.replace(microsecond=0).timestamp() - shift) * 1e9) + date.microsecond * 1000
+    return round((seconds + (MONDAY_S - timezone_s if abs(seconds) < _LEAST_UNIX_S else 0.0)) * 1e9)
+
+
+def _angle(text: str) -> float:
+    value: float = NUMBER.parse(text)
+    if abs(value) > 2.0 * math.pi + 0.02:
+        raise ValueError(text)
+    return value

@@ -1,0 +1,178 @@
+"""Photographs or a film, and poses, as a recording: `RecordedDrive` reads them as it reads the messages of one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.errors import InputError, naming
+from parkenv.files.images import image_time, images_in, read_image
+from parkenv.files.limited_reading import read_bytes
+from parkenv.files.recordings import IMAGE, Messages
+from parkenv.files.tracks import Track, read_track, stamp_in
+from parkenv.files.videos import VIDEO_SUFFIXES, Video
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.mapping.drive_calibration import CameraSpec, DriveCalibration, MountSpec
+from parkenv.mapping.photo_options import PhotoOptions
+from parkenv.perception.monocular import RangingErrors
+from sim_sensors.camera.models import PinholeCamera
+
+POSES = "poses.csv"
+"""The poses beside the pictures, if no others are named."""
+_POSE = "geometry_msgs/msg/Pose2D"
+_GNSS_M, _TRACK_YAW = 3.0, math.radians(3.0)
+
+
+def is_photographs(path: Path) -> bool:
+    """Whether a path is named like a film, or is a folder that is no rosbag."""
+    return path.suffix.lower() in VIDEO_SUFFIXES or (path.is_dir() and not (path / "metadata.yaml").is_file())
+
+
+@dataclass(frozen=True)
+class _File:
+    """A message with a picture that is read when it is wanted."""
+
+    path: Path
+    format: str = "file"
+
+    @property
+    def data(self) -> bytes:
+        return read_bytes(self.path)
+
+
+class Photographs:
+    """A folder of photographs or a film, with poses.
+
+    Args:
+        path: the folder or the film.
+        options: where the poses are, and what the camera is.
+        calibration: of one camera; None for `options.fov`.
+        frame: of the lot, where its file has degrees.
+
+    Attributes:
+        calibration: the camera, with a topic for the pictures.
+        errors: of the poses.
+
+    Raises:
+        InputError: a file cannot be read, or something is missing; the message says what is wanted.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        options: PhotoOptions,
+        calibration: DriveCalibration | None = None,
+        frame: LocalFrame | None = None,
+    ) -> None:
+        self.path, self._options = path, options
+        self._film = None if path.is_dir() else Video.of(path)
+        self._files = images_in(path) if path.is_dir() else []
+        if calibration is None:
+            calibration = DriveCalibration(cameras=(self._usual_camera(),))
+        if len(calibration.cameras) != 1 or calibration.stereo_cameras or calibration.lasers:
+            raise InputError(f"{calibration._file or path}: want one camera, which took the pictures")
+        self.calibration = calibration
+        self._zone_s = 3600.0 * calibration.timezone_h
+        poses = options.poses or (path if path.is_dir() else path.parent) / POSES
+        self.track = read_track(poses, self._zone_s)
+        with naming(poses):
+            xy = self._in_metres(self.track, frame)
+            self._poses = np.column_stack([xy, self.track.headings(xy)])
+        usual = _GNSS_M if self.track.in_degrees else 0.0
+        self.errors = RangingErrors.of_poses(
+            usual if options.pose_error is None else options.pose_error,
+            _TRACK_YAW if np.isnan(self.track.yaw).any() else 0.0,
+        )
+        self._stamps = self._times() if self._film is None else None
+
+    @contextmanager
+    def open(self) -> Iterator[tuple[dict[str, str], Messages]]:
+        """Yield topics and messages, as `open_recording`."""
+        pose, picture = self.calibration.pose, self.calibration.cameras[0].topic
+
+        def messages(topics: set[str]) -> Iterator[tuple[str, int, Any]]:
+            if pose in topics:
+                for stamp, (x, y, yaw) in zip(self.track.stamps.tolist(), self._poses.tolist(), strict=True):
+                    yield pose, stamp, SimpleNamespace(x=x, y=y, theta=yaw)
+            if picture in topics:
+                for stamp, message in self._pictures():
+                    yield picture, stamp, message
+
+        yield {pose: _POSE, picture: IMAGE}, messages
+
+    def _pictures(self) -> Iterator[tuple[int, Any]]:
+        if self._stamps is not None:
+            for k in np.argsort(self._stamps, kind="stable").tolist():
+                yield int(self._stamps[k]), _File(self._files[k])
+            return
+        begin, fps = int(self.track.stamps[0]), self._options.fps
+        for frame in self._film.read() if self._film is not None else ():
+            late = (frame.time if fps is None else frame.number / fps) + self._options.clock_offset
+            height, width = frame.image.shape[:2]
+            yield (
+                begin + round(late * 1e9),
+                SimpleNamespace(
+                    encoding="rgb8", height=height, width=width, step=3 * width, data=frame.image
+                ),
+            )
+
+    def _times(self) -> IntArray:
+        """Return the stamps of the photographs; those that the table of poses does not name are left out."""
+        late = self._options.clock_offset
+        if self.track.files:
+            stamp_of = dict(zip(self.track.files, self.track.stamps.tolist(), strict=True))
+            if len(stamp_of) < len(self.track.files):
+                raise InputError(f"{self.path}: a picture has two poses, want one")
+            names = {file: file.relative_to(self.path).as_posix() for file in self._files}
+            self._files = [file for file in self._files if names[file] in stamp_of]
+            if len(self._files) < len(stamp_of):
+                lost = sorted(stamp_of.keys() - names.values())[0]
+                raise InputError(f"{self.path}: has no picture {lost!r:.80}, of which there is a pose")
+            return np.array([stamp_of[names[file]] for file in self._files], np.int64)
+        if self._options.fps is not None:
+            each = np.arange(len(self._files)) / self._options.fps + late
+            return np.asarray(self.track.stamps[0] + np.round(each * 1e9).astype(np.int64))
+        taken = []
+        for file in self._files:
+            try:
+                taken.append(stamp_in(image_time(file) or "", self._zone_s) + round(late * 1e9))
+            except ValueError as error:
+                raise InputError(
+                    f"{file}: has no Exif time; want one, poses with a column file, or --fps"
+                ) from error
+        return np.array(taken, np.int64)
+
+    def _usual_camera(self) -> CameraSpec:
+        """Return a camera without distortion, with the field of view and mount of the options."""
+        if self._options.fov is None:
+            raise InputError(f"{self.path}: nothing says what the camera is; want --calibration or --fov")
+        if self._film is None:
+            height, width = read_image(self._files[0]).shape[:2]
+        else:
+            height, width = self._film.height, self._film.width
+        made = PinholeCamera.from_field_of_view(width, height, math.radians(self._options.fov))
+        numbers = {name: getattr(made, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+        mount = dict(zip(("z", "yaw", "pitch"), self._options.mount, strict=True))
+        return CameraSpec(
+            name="camera", mount=MountSpec.parse(mount, dict.fromkeys(mount, "--mount")), **numbers
+        )
+
+    def _in_metres(self, track: Track, frame: LocalFrame | None) -> FloatArray:
+        if not track.in_degrees:
+            return track.positions
+        if self._options.origin is not None:
+            lat, lon = self._options.origin
+            frame = LocalFrame(lon, lat)
+        if frame is None:
+            raise InputError(
+                "is in degrees, and the lot in metres; want --origin LAT,LON of the lot's x = y = 0"
+            )
+        return frame.to_xy(track.positions)

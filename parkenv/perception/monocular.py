@@ -1,0 +1,229 @@
+"""Distance of detected cars from one picture alone: from the ground below a box, and from a car's usual size.
+
+Three measurements of how far ahead a car's nearest side is:
+
+1. the lower edge of its box is on the ground, which the camera sees from a known height under a known pitch;
+2. from the lower to the upper edge the box spans a car's usual height;
+3. from the left to the right edge it spans the usual width of the view: end, oblique or side.
+
+They share errors, as that of the lower edge, so their covariance comes from the errors of edges, mount and sizes by
+linear propagation, and the fused distance is the best linear unbiased estimate with it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.perception.box_fit import CAR_LENGTH, CAR_WIDTH
+from parkenv.perception.detector import PROBABILITY, Detections, DetectorErrors
+from parkenv.perception.ranging import MARGIN, LocatedCars
+from sim_sensors.camera.models import PinholeCamera
+from sim_sensors.ground_truth import View
+from sim_sensors.rig import Mount
+
+HEIGHT, HEIGHT_STD = 1.54, 0.12
+"""Height of a car, m, and its standard deviation."""
+USUAL = np.array(
+    [
+        [0.55, 0.25, 1.2, 1.95, 0.9, 0.25],  # end
+        [0.0, 0.25, 0.6, 3.4, 1.1, 1.0],  # oblique
+        [0.1, 0.2, 0.4, 4.1, 0.7, 0.1],  # side
+    ]
+)
+"""By `View`, m, over simulated drives: how far behind its nearest side (where a laser's beams end, in the middle) a
+car's tyres stand, on which its box ends, and the standard deviation of that; how far the edge of its roof is; how wide
+its box is, as if it stood at that side, and the standard deviation; and how far its nearest corner is before it."""
+REACH = 15.0
+"""m, from which a car is not located: by then the distance is worth little."""
+_NEAREST = 0.5  # m
+_CUT = 0.8  # m, further standard deviation of a distance where the picture's border cuts the car beside
+_EDGE = 0.5  # px, standard deviation of the edge of the smallest box
+_LENGTH_STD = 0.3  # m, of a centre behind the nearest side
+_MIDDLE = 0.05  # of a box's width, between its middle and that of the car
+_UNKNOWN = 1e6  # m², variance of a measurement that the picture's border prevents
+_AGREE = 3.0  # standard deviations up to which height and ground may differ
+_HIDDEN = 0.5  # fraction of a lower edge behind nearer boxes from which it is not the car's own
+
+
+class RangingErrors(NamedTuple):
+    """Standard deviations of what a single picture is measured with."""
+
+    detector: DetectorErrors = DetectorErrors()
+    pitch: float = math.radians(0.5)  # rad, of the camera
+    heading: float = math.radians(0.5)  # rad, of the vehicle and of the mount
+    position: float = 0.1  # m, of the vehicle, in x and in y
+
+    @classmethod
+    def of_poses(cls, position: float, heading: float) -> RangingErrors:
+        """Return the errors of poses beside those of mount and map, which remain: m and rad."""
+        usual = cls()
+        return cls(position=math.hypot(position, usual.position), heading=math.hypot(heading, usual.heading))
+
+
+class GroundView(NamedTuple):
+    """The ground plane as a camera without roll sees it."""
+
+    camera: PinholeCamera
+    mount: Mount
+
+    def slope(self, row: FloatArray) -> FloatArray:
+        """Return how much the rays of rows, px, rise for each metre ahead; negative below the horizon."""
+        return np.asarray(np.tan(self.mount.pitch - np.arctan((row - self.camera.cy) / self.camera.fy)))
+
+    def aside(self, column: FloatArray, row: FloatArray) -> FloatArray:
+        """Return how far to the right the rays of pixels are for each metre ahead."""
+        across = (column - self.camera.cx) / self.camera.fx
+        down = (row - self.camera.cy) / self.camera.fy
+        return np.asarray(across / (math.cos(self.mount.pitch) + down * math.sin(self.mount.pitch)))
+
+    def pixels(self, ahead: FloatArray, aside: FloatArray, height: FloatArray) -> FloatArray:
+        """Return the pixels, (..., 2), of points ahead of the camera, to its right, and above the ground, m."""
+        c, s, up = math.cos(self.mount.pitch), math.sin(self.mount.pitch), height - self.mount.z
+        depth = ahead * c + up * s
+        u = self.camera.cx + self.camera.fx * aside / depth
+        return np.stack([u, self.camera.cy + self.camera.fy * (ahead * s - up * c) / depth], axis=-1)
+
+
+def distances_ahead(
+    boxes: FloatArray, view: NDArray[np.int8], ground: GroundView, errors: RangingErrors
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Return how far ahead of the camera the nearest sides of cars are.
+
+    Args:
+        boxes: (n, 4) px.
+        view: (n,) a `View` each.
+        ground: the camera above the ground.
+        errors: standard deviations.
+
+    Returns:
+        (n,) m; their standard deviations, (n,) m; and whether ground and height agree, (n,) bool.
+    """
+    camera, mount = ground.camera, ground.mount
+    foot, foot_std, roof, width, width_std, _ = USUAL[view].T
+    rows = boxes[:, [3, 1]]
+    low, high = np.minimum(ground.slope(boxes[:, 3]), -1e-3), ground.slope(boxes[:, 1])
+    across = ground.aside(boxes[:, 2], boxes[:, 3]) - ground.aside(boxes[:, 0], boxes[:, 3])
+    # span = mount.z / (tall + foot) + (HEIGHT - mount.z) / (tall + roof), for the tyres and for the roof.
+    span, over = np.maximum(high - low, 1e-3), HEIGHT - mount.z
+    half = 0.5 * (span * (foot + roof) - HEIGHT)
+    root = np.sqrt(np.maximum(half**2 - span * (span * foot * roof - mount.z * roof - over * foot), 1e-9))
+    far, tall, wide = -mount.z / low - foot, (root - half) / span, width / across
+    # Derivatives of the three by the sources of error: lower and upper edge, the others, pitch, foot, height, width.
+    edge = np.hypot((boxes[:, 3] - boxes[:, 1])[:, None] * errors.detector.std, _EDGE)
+    per_px = (1.0 + np.stack([low, high], 1) ** 2) / (1.0 + ((rows - camera.cy) / camera.fy) ** 2) / camera.fy
+    by_span = -(tall + foot) * (tall + roof) / (2.0 * root)
+    by = np.zeros((len(boxes), 3, 8))
+    by[:, 0, 0] = (far + foot) / low * per_px[:, 0] * edge[:, 3]
+    by[:, 1, 0], by[:, 1, 1] = by_span * per_px[:, 0] * edge[:, 3], -by_span * per_px[:, 1] * edge[:, 1]
+    by[:, 2, 2], by[:, 2, 3] = (wide / across / camera.fx * edge[:, side] for side in (0, 2))
+    by[:, 0, 4] = -(far + foot) / low * (1.0 + low**2) * errors.pitch
+    by[:, 1, 4] = by_span * (high**2 - low**2) * errors.pitch
+    by[:, 0, 5], by[:, 1, 5] = -foot_std, -(span * (tall + roof) - over) / (2.0 * root) * foot_std
+    by[:, 1, 6] = (tall + foot) / (2.0 * root) * HEIGHT_STD
+    by[:, 2, 7] = wide * width_std / width
+    below = boxes[:, 3] >= (1.0 - MARGIN) * camera.height
+    above = boxes[:, 1] <= MARGIN * camera.height
+    beside = (boxes[:, 0] <= MARGIN * camera.width) | (boxes[:, 2] >= (1.0 - MARGIN) * camera.width)
+    unknown = np.stack([below, below | above, beside], axis=1) * _UNKNOWN + 1e-8
+    covariance = by @ by.transpose(0, 2, 1) + unknown[:, :, None] * np.eye(3)
+    weight = np.linalg.inv(covariance).sum(axis=2)
+    variance = 1.0 / weight.sum(axis=1)
+    estimates = np.stack([far, tall, wide], axis=1)
+    apart = covariance[:, 0, 0] + covariance[:, 1, 1] - 2.0 * covariance[:, 0, 1]
+    agree = np.abs(far - tall) <= _AGREE * np.sqrt(apart)
+    return variance * (weight * estimates).sum(axis=1), np.sqrt(variance), agree
+
+
+def localize_boxes(
+    detections: Detections,
+    ground: GroundView,
+    vehicle: FloatArray,
+    errors: RangingErrors,
+    heading_near: Callable[[FloatArray], FloatArray] | None = None,
+) -> LocatedCars:
+    """Locate the detected cars from their boxes alone, with the covariance of each.
+
+    Dropped are boxes that reach from the picture's left border to the right one, those of which nearer ones hide the
+    lower edge, and those whose height and lower edge do not agree: what is there is no car on the ground.
+
+    Args:
+        detections: detections in the camera's image.
+        ground: the camera above the ground.
+        vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
+        errors: standard deviations.
+        heading_near: returns the heading, rad, that a car parked near each of (n, 2) points has, NaN for none; None
+            takes that of the view, along or across the line of sight.
+    """
+    boxes, camera = errors.detector.corrected(detections.boxes), ground.camera
+    if not len(boxes):
+        return LocatedCars.none()
+    ahead, std, agree = distances_ahead(boxes, detections.view, ground, errors)
+    sure = detections.probability >= PROBABILITY
+    margin = MARGIN * camera.width + 2.0 * errors.detector.std[0] * (boxes[:, 3] - boxes[:, 1])
+    cut_left, cut_right = boxes[:, 0] <= margin, boxes[:, 2] >= camera.width - margin
+    sure &= ~(cut_left & cut_right)
+    rows = np.flatnonzero(sure & agree & (ahead > _NEAREST) & (ahead < REACH) & ~_is_hidden(boxes))
+    boxes, ahead, std, view = boxes[rows], ahead[rows], std[rows], detections.view[rows]
+    left, right = (ground.aside(boxes[:, side], boxes[:, 3]) for side in (0, 2))
+    # A car that the picture's border cuts goes on there to its usual width.
+    width, width_std = USUAL[view, 3], USUAL[view, 4]
+    left = np.where(cut_left[rows], np.minimum(left, right - width / ahead), left)
+    right = np.where(cut_right[rows], np.maximum(right, left + width / ahead), right)
+    cut, aside = (cut_left | cut_right)[rows], 0.5 * (left + right)
+    std = np.hypot(std, _CUT * cut)
+    x, y, yaw = ground.mount.in_world(vehicle)
+    bearing = yaw - np.arctan(aside)
+
+    def centres(heading: FloatArray) -> FloatArray:
+        """Return the centres, (n, 2), of cars whose nearest corner is so far ahead and which fill the boxes' middle."""
+        along, across = corners_of_cars(heading - yaw)
+        depth = ahead - USUAL[view, 5] - along.min(axis=1)
+        shift = aside * depth
+        for _ in range(5):
+            slope = (shift[:, None] + across) / np.maximum(depth[:, None] + along, _NEAREST)
+            shift += (aside - 0.5 * (slope.min(axis=1) + slope.max(axis=1))) * ahead
+        c, s = math.cos(yaw), math.sin(yaw)
+        return np.stack([x + depth * c + shift * s, y + depth * s - shift * c], axis=1)
+
+    heading = np.where(view == View.END, bearing, bearing + math.pi / 2)
+    if heading_near is not None:
+        parked = heading_near(centres(heading))
+        heading = np.where(np.isnan(parked), heading, parked)
+    xy, stretch = centres(heading), np.hypot(1.0, aside)
+    along = np.hypot(std * stretch, _LENGTH_STD)
+    edges = 0.5 * math.hypot(errors.detector.std[0], errors.detector.std[2]) * (boxes[:, 3] - boxes[:, 1])
+    sideways = np.hypot(edges, _MIDDLE * (boxes[:, 2] - boxes[:, 0])) / camera.fx
+    across = np.hypot(np.hypot(*(xy - [x, y]).T) * np.hypot(sideways, errors.heading), 0.8 * width_std * cut)
+    c, s = np.cos(bearing), np.sin(bearing)
+    scaled = np.stack([c * along, -s * across, s * along, c * across], axis=1).reshape(-1, 2, 2)
+    return LocatedCars(
+        xy, heading % math.pi, np.tile([CAR_LENGTH, CAR_WIDTH], (len(rows), 1)), ahead * stretch,
+        detections.probability[rows], rows.astype(np.int64), std * stretch,
+        scaled @ scaled.transpose(0, 2, 1) + errors.position**2 * np.eye(2),
+    )  # fmt: skip
+
+
+def corners_of_cars(heading: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how far the corners of usual cars, (n, 4), are ahead of their centres and to the right of them, m.
+
+    Args:
+        heading: (n,) rad, counter-clockwise from ahead.
+    """
+    c, s = np.cos(heading)[:, None], np.sin(heading)[:, None]
+    length, width = 0.5 * CAR_LENGTH * np.array([1, 1, -1, -1]), 0.5 * CAR_WIDTH * np.array([1, -1, 1, -1])
+    return c * length - s * width, -s * length - c * width
+
+
+def _is_hidden(boxes: FloatArray) -> BoolArray:
+    """Return which boxes, (n, 4), have most of their lower edge within a box that reaches further down, (n,)."""
+    common = np.minimum(boxes[:, None, 2], boxes[:, 2]) - np.maximum(boxes[:, None, 0], boxes[:, 0])
+    lower = boxes[:, 3] > boxes[:, None, 3]
+    above = boxes[:, 1] < boxes[:, None, 3]
+    hidden = np.where(lower & above, common, 0.0).max(axis=1)
+    return np.asarray(hidden > _HIDDEN * (boxes[:, 2] - boxes[:, 0]))
