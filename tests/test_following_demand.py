@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from parkenv.engine.fleet import Fleet
-from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.fleet.setting import rate_of
 from parkenv.studies.fleet.tables import departures
@@ -56,10 +55,10 @@ def test_the_course_of_a_process_is_the_mean_of_its_worlds():
     process = process.with_day_error(DayError(0.7))
     arrival = Arrival(TIMES[0])
     exact, sampled = (
-        kind.course(process, arrival, TIMES[::12], 500) for kind in (OccupancyProcess, OccupancyModel)
+        kind.course(process, arrival, TIMES[::12]) for kind in (OccupancyProcess, OccupancyModel)
     )
     assert exact.residents[0] == exact.occupied[0]
-    np.testing.assert_allclose(sampled, exact, atol=0.02)
+    np.testing.assert_allclose(sampled, exact, atol=0.05)
 
 
 @settings(max_examples=12)
@@ -106,8 +105,6 @@ def test_each_recorded_day_is_followed_for_itself():
     np.testing.assert_allclose(course.occupied, recorded)
     assert course.residents[0] == course.occupied[0]
     assert (np.diff(course.residents) <= 0.0).all()
-    with pytest.raises(InputError, match="want the arrivals of a day"):
-        Demand(follows).draw(np.uint64(1), 0.0, 1)
 
 
 def test_worlds_of_a_key_have_the_same_cars_and_more_come_if_more_are_wanted():

@@ -62,7 +62,7 @@ from parkenv.engine.spaces import action_number, space_of
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
-from parkenv.world.demand import CarPlans, Demand
+from parkenv.world.demand import Demand
 from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, draw_arrival
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.python_functions import raise_error
@@ -324,8 +324,7 @@ class Fleet:
         days = occupancy.arrival_days(window)
         day, arrival_s = draw_arrival(key, len(days), float(window.start_s), float(window.end_s))
         self.day, midnight = days[day], days[day].weekday * DAY_S
-        demand = self.demand.on(self.day)
-        begin_s = demand.arrivals.begin_s(arrival_s)
+        begin_s = self.demand.arrivals.begin_s(arrival_s)
         begin = midnight + begin_s
         _, hour, second = hour_of_week(begin)
         record["key"], record["day"], record["midnight"], record["arrival"] = key, day, midnight, begin
@@ -334,12 +333,13 @@ class Fleet:
         if not self._world:
             self._made = occupancy.world(key, Arrival(begin, self.day.date))
             record["world"] = self._made.address
-        self._write_cars(demand.draw(key, arrival_s, len(self._entries)), midnight)
+        self._write_cars(key, midnight, arrival_s)
         self._memory.clear()
         begin_world_at(self._address)
         raise_error()
 
-    def _write_cars(self, plans: CarPlans, midnight: float) -> None:
+    def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
+        plans = self.demand.draw(key, arrival_s, len(self._entries), self.day)
         n = len(plans.arrival_s)
         cars = np.zeros(n, CAR)
         cars["arrival"] = midnight + plans.arrival_s

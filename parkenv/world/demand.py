@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -152,8 +152,8 @@ class Arrivals(Protocol):
     def begin_s(self, arrival_s: float) -> float:
         """Return when the world begins, s of the day; `arrival_s` is the arrival drawn from the scenario's window."""
 
-    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
-        """Draw the arrivals of the world with this key, (n,) ascending s of the day, at least one."""
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
+        """Draw the arrivals of the world with this key on a day, (n,) ascending s of the day, at least one."""
 
 
 @dataclass(frozen=True)
@@ -181,8 +181,9 @@ class Headways:
         """Return the first car's arrival."""
         return arrival_s
 
-    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
         """Draw the arrivals; see `Arrivals`."""
+        del day
         gaps = _gaps(key, self.cars) * self.mean_s
         gaps[0] = 0.0
         return arrival_s + np.cumsum(gaps)
@@ -238,9 +239,9 @@ class PoissonArrivals:
         del arrival_s
         return self.start_s
 
-    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
         """Draw the arrivals; see `Arrivals`. A world in which nobody would arrive has one car, at the end."""
-        del arrival_s
+        del arrival_s, day
         times, expected = self._times()
         arrivals = np.cumsum(_gaps(key, self.most))
         arrivals = arrivals[arrivals < expected[-1]]
@@ -289,9 +290,9 @@ class FollowingArrivals:
         del arrival_s
         return self.window.start_s
 
-    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
-        """Draw nothing: arrivals depend on the day."""
-        raise InputError(f"FollowingArrivals.draw({key}, {arrival_s}): want the arrivals of a day, see `on`")
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
+        """Draw the arrivals of a day; see `Arrivals`."""
+        return self.on(day).draw(key, arrival_s, day)
 
     def on(self, day: ArrivalDay) -> PoissonArrivals:
         """Return the arrivals of one of the days."""
@@ -339,9 +340,9 @@ class ListedArrivals:
         del arrival_s
         return self.times_s[0]
 
-    def draw(self, key: np.uint64, arrival_s: float) -> FloatArray:
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
         """Return the arrivals; they are the same in every world."""
-        del key, arrival_s
+        del key, arrival_s, day
         return np.array(self.times_s)
 
 
@@ -397,21 +398,16 @@ class Demand:
         for name in ("entry_weights", "goal_weights"):
             object.__setattr__(self, name, _weights(f"Demand.{name}", getattr(self, name)))
 
-    def on(self, day: ArrivalDay) -> Demand:
-        """Return the demand of a day, with arrivals that can be drawn."""
-        if isinstance(self.arrivals, FollowingArrivals):
-            return replace(self, arrivals=self.arrivals.on(day))
-        return self
-
-    def draw(self, key: np.uint64, arrival_s: float, n_entries: int) -> CarPlans:
+    def draw(self, key: np.uint64, arrival_s: float, n_entries: int, day: ArrivalDay) -> CarPlans:
         """Draw the cars of the world with this key.
 
         Args:
             key: key of the world.
             arrival_s: arrival drawn from the scenario's window, s of the day.
             n_entries: number of entries among which cars choose if there are no `entry_weights`.
+            day: day of the world.
         """
-        arrival = self.arrivals.draw(key, arrival_s)
+        arrival = self.arrivals.draw(key, arrival_s, day)
         n = len(arrival)
         entries = self.entry_weights or (1.0,) * n_entries
         return CarPlans(

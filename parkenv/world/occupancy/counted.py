@@ -113,9 +113,9 @@ class CountedOccupancy(OccupancyModel):
             self._worlds[day] = process_of_curve(self.attraction, curve, self.mean_stay_s)
         return self._worlds[day]
 
-    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 100) -> Course:
+    def course(self, arrival: Arrival, times: ArrayLike) -> Course:
         """Return the expected course of the occupancy on the arrival's day, as counted; see `OccupancyModel`."""
-        return self.process_of(arrival.day).course(arrival, times, worlds)
+        return self.process_of(arrival.day).course(arrival, times)
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast: the mean over the days that are possible, and by how much their level differs."""

@@ -165,9 +165,11 @@ class OccupancyModel(PriorModel):
 
     Attributes:
         recorded: whether worlds replay dated days, see `days_in`.
+        averaged: number of worlds whose mean is the expectation of a day.
     """
 
     recorded: ClassVar[bool] = False
+    averaged: ClassVar[int] = 100
 
     @abstractmethod
     def world(self, key: np.uint64, arrival: Arrival) -> World:
@@ -183,21 +185,20 @@ class OccupancyModel(PriorModel):
             return [ArrivalDay(weekday_of(day), day) for day in self.days_in(window)]
         return [ArrivalDay(weekday) for weekday in window.weekdays]
 
-    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 100) -> Course:
-        """Return the expected course of the occupancy on a day: by default the mean over some worlds.
+    def course(self, arrival: Arrival, times: ArrayLike) -> Course:
+        """Return the expected course of the occupancy on a day: by default the mean over `averaged` worlds.
 
         Args:
             arrival: moment from which on residents are followed, and its day.
             times: (k,) s since Monday 00:00, ascending, not before the arrival.
-            worlds: number of worlds.
         """
         slots, times = np.arange(self.n_slots), np.asarray(times, np.float64)
         occupied, residents = np.zeros((2, times.size))
-        for number in range(worlds):
+        for number in range(self.averaged):
             world = self.world(world_key(0, number), arrival)
             residents += (world.next_free(slots, arrival.time)[:, None] > times).mean(axis=0)
             occupied += [world.occupied(slots, float(time)).mean() for time in times]
-        return Course(occupied / worlds, residents / worlds)
+        return Course(occupied / self.averaged, residents / self.averaged)
 
     def draw_arrival(self, window: ArrivalWindow, key: np.uint64) -> Arrival:
         """Draw the day and the time of day at which the search with this key begins, both uniform."""
@@ -522,9 +523,8 @@ class OccupancyProcess(OccupancyModel):
         _marginals(self.address, hour, second, marginals)
         return marginals
 
-    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 100) -> Course:
+    def course(self, arrival: Arrival, times: ArrayLike) -> Course:
         """Return the expected course of the occupancy, see `OccupancyModel`, in closed form."""
-        del worlds
         times = np.asarray(times, np.float64)
         week, second = np.divmod(np.append(times, arrival.time), WEEK_S)
         # The departure rate of a slot with factor 1, integrated over time.

@@ -37,7 +37,7 @@ from parkenv.world.occupancy.kernel import (
     recorded_index,
 )
 from parkenv.world.occupancy.log import OccupancyLog, csv_columns, day_class, weekday_of
-from parkenv.world.occupancy.process import Arrival, CompiledModel, Course, Forecast, OccupancyModel, World
+from parkenv.world.occupancy.process import Arrival, CompiledModel, Forecast, OccupancyModel, World
 from parkenv.world.week import DAY_S
 
 
@@ -205,6 +205,7 @@ class RecordedOccupancy(OccupancyModel):
 
     kind: ClassVar[int] = LOG_KIND
     recorded: ClassVar[bool] = True
+    averaged: ClassVar[int] = 1
     log: OccupancyLog
     walk_m: FloatArray
     mapping: IntArray | None = None
@@ -270,10 +271,6 @@ class RecordedOccupancy(OccupancyModel):
         """Return the replay of the arrival's day."""
         self._second(arrival)
         return RecordedWorld(self, arrival)
-
-    def course(self, arrival: Arrival, times: ArrayLike, worlds: int = 1) -> Course:
-        """Return the recorded course of the occupancy on the arrival's day; see `OccupancyModel`."""
-        return super().course(arrival, times, worlds)
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """Forecast the occupancy at the arrival by `parkenv.forecast.slot_days`, clipped to [0.001, 0.999].
