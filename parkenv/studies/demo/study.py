@@ -106,7 +106,7 @@ class Demo(CaseStudy):
         from parkenv.perception.detector_registry import detector_version
         from parkenv.studies.fingerprints import fingerprints, flat_tables
 
-        varied = {"jobs", "backend", "address", "episodes"}
+        varied = {"jobs", "backend", "address", "episodes", "more"}
         return {
             "version": __version__,
             **flat_tables(self.model_dump(mode="json", exclude=varied)),
