@@ -85,13 +85,16 @@ def test_changes_are_paired_by_day_and_by_car(days):
 
 @pytest.mark.parametrize("ends", [(-3.0, 1.0), (-1.0, 0.0), (math.nan, math.nan)])
 def test_nobody_wins_where_the_interval_includes_nothing(days, ends):
-    row = summarize_changes(list(days.values()))[0]
+    row = summarize_changes(list(days.values()))[0] | {"days": 10}
     for name in CHANGES:
         row = {**row, f"{name}_ci95": list(ends)}
-    said = sentence(without_nan(row))
-    assert "saves" not in said
-    assert "loses" not in said
-    assert headlines([], [without_nan(row)])[0]["value"] == "no clear difference"
+    clear = {**row, "change_s": -2.0, "change_s_ci95": [-3.0, -1.0]}
+    assert "saves 2.0 s [1.0, 3.0]" in sentence(without_nan(clear))
+    for unclear in (row, clear | {"days": 4}):
+        said = sentence(without_nan(unclear))
+        assert "saves" not in said
+        assert "loses" not in said
+        assert "a car" not in headlines([], [without_nan(unclear)])[0]["value"]
 
 
 def test_only_equal_hours_have_the_same_cars():

@@ -15,6 +15,8 @@ from parkenv.studies.results import Row
 
 NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
+LEAST_DAYS = 5
+"""Days below which nothing is called better or worse: a bootstrap of so few is narrower than 95 %."""
 CHANGES = (
     "change_s", "members_change_s", "others_change_s", "search_change_s", "balked_change", "better_off", "worse_off",
 )  # fmt: skip
@@ -125,23 +127,22 @@ def off_in_words(row: Row) -> str:
 
 
 def is_clear(row: Row, name: str) -> bool:
-    """Return whether a column has an interval, and it does not include 0."""
+    """Return whether a column has an interval of enough days, and it does not include 0."""
     low, high = interval_of(row, name) or (0.0, 0.0)
-    return low * high > 0.0
+    return row["days"] >= LEAST_DAYS and low * high > 0.0
 
 
 def _gain(row: Row, name: str, saves: str, loses: str, who: str) -> str:
     value, ends = row[name], interval_of(row, name)
-    if ends is None:
-        return f"{who}: {value:+.1f} s on {plural(row['days'], 'day')}, too few for an interval"
-    low, high = ends
-    if low <= 0.0 <= high:
-        if low == high:
-            return f"{who}: no difference"
-        return f"{who}: no clear difference, {value:+.1f} s [{low:+.1f}, {high:+.1f}]"
-    if high < 0.0:
-        return f"{saves} {-value:.1f} s [{-high:.1f}, {-low:.1f}]"
-    return f"{loses} {value:.1f} s [{low:.1f}, {high:.1f}]"
+    if is_clear(row, name):
+        low, high = sorted(map(abs, ends or ()))
+        return f"{saves if value < 0.0 else loses} {abs(value):.1f} s [{low:.1f}, {high:.1f}]"
+    if ends == (0.0, 0.0):
+        return f"{who}: no difference"
+    shown = f"{value:+.1f} s" + (f" [{ends[0]:+.1f}, {ends[1]:+.1f}]" if ends else "")
+    if row["days"] < LEAST_DAYS:
+        return f"{who}: {shown} on {plural(row['days'], 'day')}, too few to tell"
+    return f"{who}: no clear difference, {shown}"
 
 
 def is_known(value: float | None) -> bool:
@@ -167,7 +168,8 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
         ]
     made = []
     for row in chosen[:most]:
-        value, interval, ends = "no clear difference", "no interval", interval_of(row, "change_s")
+        value = "no clear difference" if row["days"] >= LEAST_DAYS else "too few days to tell"
+        interval, ends = "no interval", interval_of(row, "change_s")
         if ends:
             interval = f"95 % interval {ends[0]:+.1f} to {ends[1]:+.1f} s"
         if is_clear(row, "change_s"):
