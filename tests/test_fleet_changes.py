@@ -6,8 +6,12 @@ import math
 import numpy as np
 import pytest
 from command_line import parkenv
+from small_lots import features
 
+from parkenv import ParkingLot
 from parkenv.errors import InputError
+from parkenv.lots.formats.geojson import write_lot
+from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.fleet.changes import CHANGES, headlines, sentence, summarize_changes
 from parkenv.studies.fleet.study import FleetStudy
@@ -119,3 +123,31 @@ def test_the_command_compares_lots_and_goes_on_with_another(tmp_path):
     first, second = summary["rows"]
     assert change["change_s"] == pytest.approx(second["total_s"] - first["total_s"])
     assert "after instead of before" in done.stdout
+
+
+def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
+    lot = make_scenario("campus").lot
+    zone = np.where(lot.walk_m() <= np.median(lot.walk_m()), "near", "far")
+    write_lot(ParkingLot(**features(lot) | {"slot_zone": zone}), tmp_path / "zoned.geojson")
+    specs = [
+        {"name": name, "lot": str(tmp_path / "zoned.geojson"), "costs": {"prices": {"near": near, "far": 1.0}}, **HOURS}
+        for name, near in (("before", 1.0), ("after", 1.2))
+    ]  # fmt: skip
+    its = study(*specs, agents=("greedy-goal",), knows=("own",), arrivals_per_hour=(60.0,), days=5)
+    before, after = days = [[its.run_day(one, day) for day in range(5)] for one in its.fleet_settings]
+    rows = summarize_changes(days, {name: built.lot.zones for name, built in its.built.items()})
+    assert [row["zone"] for row in rows] == [None, "far", "near"]
+    whole, *by_zone = rows
+    paid = [np.array(day["paid_cents"].split(), float).mean() / 100.0 for day in (before[0], after[0])]
+    fleet, _ = its.fleet(its.fleet_settings[0])
+    fleet.reset(its.seed, 0)
+    assert paid[0] == pytest.approx(fleet.cars["stay_s"].mean() / 3600.0, abs=0.01), "one price everywhere"
+    assert paid[1] > paid[0]
+    changes = [
+        np.subtract(*(np.array(day["paid_cents"].split(), float) for day in pair)).mean() / 100.0
+        for pair in zip(after, before, strict=True)
+    ]
+    assert whole["paid_change"] == pytest.approx(np.mean(changes))
+    assert sum(row["cars_a_day"] for row in by_zone) == pytest.approx(whole["cars_a_day"])
+    assert "with prices as time" in sentence(without_nan(whole))
+    assert not [row for row in headlines([], without_nan(rows)) if "zone" in row["where"]]

@@ -111,11 +111,21 @@ class Fleet(AgentStudyCommand):
         changes = without_nan(result.summary["changes"])
         if changes:
             groups = ["members s [95 %]", "others s [95 %]"] if mixed else []
-            headings = ["after", "before", *setting, "all cars s [95 %]", *groups, "better off", "worse off"]
+            zone = ["zone before"] if any(row["zone"] for row in changes) else []
+            paid = ["paid a car"] if any(is_known(row["paid_change"]) for row in changes) else []
+            headings = [
+                "after", "before", *zone, *setting, "all cars s [95 %]", *groups, *paid, "better off", "worse off"
+            ]  # fmt: skip
             cells = [
-                [row["after"], row["before"], *(row[name] for name in several), *_changed(row, mixed=mixed)]
+                [
+                    row["after"], row["before"], *([row["zone"] or "all"] if zone else []),
+                    *(row[name] for name in several), *_setting(row), _interval(row, "change_s", "+.1f"),
+                    *(_interval(row, f"{group.split()[0]}_change_s", "+.1f") for group in groups),
+                    *(_interval(row, "paid_change", "+.2f") for _ in paid),
+                    *(_number(row[name], ".0%") for name in ("better_off", "worse_off")),
+                ]
                 for row in changes
-            ]
+            ]  # fmt: skip
             title = "What changes for whom: time after minus before, of the same cars on the same days"
             console.print(make_table(title, headings, cells))
         for row in shown_changes(changes):
@@ -145,12 +155,6 @@ def _cells(row: Row, *, mixed: bool) -> list[str]:
         _interval(row, "price_of_anarchy", ".3f"),
         f"{row['price_over_bound']:.3f}",
     ]
-
-
-def _changed(row: Row, *, mixed: bool) -> list[str]:
-    columns = ("change_s", "members_change_s", "others_change_s") if mixed else ("change_s",)
-    shares = [_number(row[name], ".0%") for name in ("better_off", "worse_off")]
-    return [*_setting(row), *(_interval(row, name, "+.1f") for name in columns), *shares]
 
 
 def _number(value: float | None, digits: str) -> str:

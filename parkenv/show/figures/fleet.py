@@ -69,7 +69,7 @@ def save_fleet_figure(
             for agent, (line, marker) in zip(agents, _cycled(agents), strict=True)
         ]
         handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
-        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 3 + len(panels)))
+        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels)))
         figure.suptitle(title, x=0.01, ha="left")
         save_picture(figure, path, f"{title}: search time, price of anarchy, members and others.")
 

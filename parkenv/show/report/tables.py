@@ -147,12 +147,14 @@ _KNOWN = {
         Column("clairvoyant_s", "clairvoyant bound", "s", help="Lower bound that knows all arrivals and stays"),
         Column("price_over_bound", "price over the bound", digits=3, help="Total time over the clairvoyant bound"),
         Column("before", "instead of"),
+        Column("zone", "zone before", help="Zone in which the cars parked before the change; – for all cars"),
         Column("cars_a_day", "cars a day", digits=0),
         Column("change_s", "change, all cars", "s", signed=True, help=_PAIRED),
         Column("members_change_s", "change, members", "s", signed=True, help=f"{_PAIRED}: members after the change"),
         Column("others_change_s", "change, the others", "s", signed=True, help=_PAIRED),
         Column("search_change_s", "change, search time", "s", signed=True, help=_PAIRED),
         Column("balked_change", "change, found no slot", share=True, signed=True, help=_PAIRED),
+        Column("paid_change", "change, paid a car", digits=2, signed=True, help=f"{_PAIRED}; in the prices' currency"),
         Column("better_off", "better off", share=True, digits=0, help="Cars that gain at least a second"),
         Column("worse_off", "worse off", share=True, digits=0, help="Cars that lose at least a second"),
         Column("key", "drive"),
@@ -162,9 +164,9 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "after", "before", "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed", "change_s",
-    "members_change_s", "others_change_s", "better_off", "worse_off", "total_s", "median_s", "gave_up_fraction",
-    "difference_s", "gap_to_exact",
+    "after", "before", "zone", "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed", "change_s",
+    "members_change_s", "others_change_s", "paid_change", "better_off", "worse_off", "total_s", "median_s",
+    "gave_up_fraction", "difference_s", "gap_to_exact",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""
@@ -278,7 +280,8 @@ def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
                 made |= _flat(value, f"{name}.")
         elif key.endswith("_ci95"):
             base = name.removesuffix("_ci95")
-            made[base] = [made.get(base), *value]  # type: ignore[list-item]
+            known = made.get(base) is not None or value != [None, None]
+            made[base] = [made.get(base), *value] if known else None  # type: ignore[list-item]
         elif isinstance(value, (list, tuple)):
             if len(value) == 2 and not any(isinstance(v, (Mapping, list)) for v in value):
                 made[name] = f"{value[0]:g} to {value[1]:g}"

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.show.plurals import plural
@@ -18,7 +20,8 @@ NOTICED_S = 1.0
 LEAST_DAYS = 5
 """Days below which nothing is called better or worse: a bootstrap of so few is narrower than 95 %."""
 CHANGES = (
-    "change_s", "members_change_s", "others_change_s", "search_change_s", "balked_change", "better_off", "worse_off",
+    "change_s", "members_change_s", "others_change_s", "search_change_s", "balked_change", "paid_change",
+    "better_off", "worse_off",
 )  # fmt: skip
 """Columns of a change: each has a 95 % interval over the days of both."""
 GUIDANCE = {
@@ -27,12 +30,19 @@ GUIDANCE = {
 """What members know, in sentences."""
 
 
-def summarize_changes(settings: Sequence[list[Row]]) -> list[Row]:
+def summarize_changes(
+    settings: Sequence[list[Row]], zones: Mapping[str, Sequence[str]] = MappingProxyType({})
+) -> list[Row]:
     """Return a row for each change between two settings, from the days of each setting, at least one.
 
     A scenario is compared with the first one, and guidance with nobody knowing more than what it observes; everything
     else is equal. Days are paired, and on each of them the cars: members, and others, are the same cars before and
-    after. Times after are subtracted by those before, so that negative ones are gains.
+    after. Differences are those after minus those before, so that negative times are gains. Where a lot has several
+    zones, further rows are about the cars that parked in each `zone` before; None for all cars.
+
+    Args:
+        settings: the days of each setting.
+        zones: names of the zones of the lot of each scenario.
     """
     by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
     first = settings[0][0]["scenario"] if settings else ""
@@ -45,10 +55,11 @@ def summarize_changes(settings: Sequence[list[Row]]) -> list[Row]:
                 continue  # a demand that follows counts has its own cars in every scenario
             if its[what] != before[what] and (pairs := paired_days(days, earlier)):
                 names = _words(what, its | before), _words(what, its)
-                changes = day_means([_change(*pair) for pair in pairs], CHANGES, CHANGES)
-                cars = float(np.mean([after["cars"] for after, _ in pairs]))
-                head = {"change": what, "before": names[0], "after": names[1], **its}
-                rows.append(head | {"days": len(pairs), "cars_a_day": cars} | changes)
+                head = {"change": what, "before": names[0], "after": names[1], **its, "days": len(pairs)}
+                named = zones.get(str((its | before)["scenario"]), ())
+                for number, zone in enumerate((None, *named) if len(named) > 1 else (None,)):
+                    changes = [_change(*pair, number) for pair in pairs]
+                    rows.append(head | {"zone": zone} | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
     return sorted(rows, key=lambda row: row["change"] != "scenario")
 
 
@@ -65,24 +76,41 @@ def _words(what: str, setting: Row) -> str:
     return f"{GUIDANCE[setting['knows']]} for {members}"
 
 
-def _change(after: Row, before: Row) -> Row:
-    """Return what changes on a day; NaN for groups without cars, and for cars whose lists are lost or left out."""
-    row = {
-        "change_s": after["total_s"] - before["total_s"],
-        "search_change_s": after["search_s"] - before["search_s"],
-        "balked_change": after["balked_fraction"] - before["balked_fraction"],
-        **dict.fromkeys(("members_change_s", "others_change_s", "better_off", "worse_off"), float("nan")),
-    }
+def _change(after: Row, before: Row, zone: int) -> Row:
+    """Return what changes on a day for the cars that parked in a zone before, 0 for all; NaN where it is not known."""
+    row = dict.fromkeys(("cars_a_day", *CHANGES), float("nan"))
+    if not zone:
+        row |= {
+            "cars_a_day": after["cars"],
+            "change_s": after["total_s"] - before["total_s"],
+            "search_change_s": after["search_s"] - before["search_s"],
+            "balked_change": after["balked_fraction"] - before["balked_fraction"],
+        }
     times, earlier, member = (
-        _numbers(day, name) for day, name in ((after, "total_cs"), (before, "total_cs"), (after, "member"))
+        _numbers(after, "total_cs"),
+        _numbers(before, "total_cs"),
+        _numbers(after, "member"),
     )
     if not len(times) == len(earlier) == len(member) > 0:
         return row
+    its = _numbers(before, "zone") == zone if zone else np.ones(len(times), bool)
     gained = (times - earlier) / 100.0
-    for group, its in (("members", gained[member == 1.0]), ("others", gained[member == 0.0])):
-        row |= {f"{group}_change_s": float(its.mean())} if len(its) else {}
-    off = {"better_off": gained <= -NOTICED_S, "worse_off": gained >= NOTICED_S}
-    return row | {name: float(cars.mean()) for name, cars in off.items()}
+    paid = _numbers(after, "paid_cents"), _numbers(before, "paid_cents")
+    if len(paid[0]) or len(paid[1]):
+        row["paid_change"] = _mean(
+            np.subtract(*(cents if len(cents) else 0.0 * times for cents in paid))[its] / 100.0
+        )
+    row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])} if zone else {}
+    return row | {
+        "members_change_s": _mean(gained[its & (member == 1.0)]),
+        "others_change_s": _mean(gained[its & (member == 0.0)]),
+        "better_off": _mean((gained <= -NOTICED_S)[its]),
+        "worse_off": _mean((gained >= NOTICED_S)[its]),
+    }
+
+
+def _mean(values: NDArray[Any]) -> float:
+    return float(values.mean()) if len(values) else float("nan")
 
 
 def _numbers(day: Mapping[str, Any], name: str) -> FloatArray:
@@ -95,6 +123,8 @@ def _numbers(day: Mapping[str, Any], name: str) -> FloatArray:
 def sentence(row: Row) -> str:
     """Return a change in a sentence; it calls nothing better or worse whose interval includes 0."""
     said = [_gain(row, "change_s", "a car saves", "a car loses", "a car")]
+    if is_known(row["paid_change"]):
+        said[0] += " with prices as time"
     minutes = abs(row["change_s"]) * row["cars_a_day"] / 60.0
     if is_clear(row, "change_s") and minutes >= 1.0:
         said[0] += f", all cars of a day together {minutes:,.0f} min"
@@ -103,6 +133,10 @@ def sentence(row: Row) -> str:
         said.append(_gain(row, "others_change_s", "the others save", "the others lose", "the others"))
     if is_known(row["better_off"]):
         said.append(off_in_words(row))
+    if is_clear(row, "paid_change"):
+        way = "less" if row["paid_change"] < 0.0 else "more"
+        low, high = sorted(map(abs, row["paid_change_ci95"]))
+        said.append(f"a car pays {abs(row['paid_change']):.2f} {way} [{low:.2f}, {high:.2f}]")
     if is_clear(row, "balked_change"):
         way = "falls" if row["balked_change"] < 0.0 else "rises"
         said.append(
@@ -117,7 +151,8 @@ def where(row: Row) -> list[str]:
     equal = [row["agents"], rate_text(row["arrivals_per_hour"])]
     if row["change"] == "knows":
         return [f"{row['agents']} on {row['scenario']}", *equal[1:]]
-    return equal if row["knows"] == OWN else [*equal, _words("knows", row)]
+    equal += [] if row["knows"] == OWN else [_words("knows", row)]
+    return [*equal, f"cars that parked in zone {row['zone']} before"] if row["zone"] else equal
 
 
 def off_in_words(row: Row) -> str:
@@ -161,7 +196,7 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
 
     Each has a `label`, a `value` in words, and for a change the shares `better` and `worse`, if they are known.
     """
-    if not (chosen := shown_changes(changes)):
+    if not (chosen := [row for row in shown_changes(changes) if not row["zone"]]):
         return [
             {"label": ", ".join(where(row | {"change": "knows"})), "value": f"{row['total_s']:.1f} s a car"}
             for row in rows[:most]
@@ -184,10 +219,13 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
 def shown_changes(changes: Sequence[Row]) -> list[Row]:
     """Return the changes that are told: without members or with as many as there are, one guidance for each demand."""
     most = max((row["share"] for row in changes), default=0.0)
-    told = [row for row in changes if row["change"] == "scenario" and row["share"] in (0.0, most)]
+    told = [
+        row for row in changes
+        if row["change"] == "scenario" and row["share"] in (0.0, most) and not (row["zone"] and row["share"])
+    ]  # fmt: skip
     of_guidance: dict[tuple[Any, ...], list[Row]] = {}
     for row in changes:
-        if row["change"] == "knows":
+        if row["change"] == "knows" and not row["zone"]:
             key = row["scenario"], row["agents"], row["arrivals_per_hour"]
             of_guidance.setdefault(key, []).append(row)
     # A choice by the result would be a winner of chance.

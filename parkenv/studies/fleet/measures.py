@@ -120,8 +120,13 @@ def day_measures(
 
 def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     """Return `CAR_LISTS` of a day whose searches are all over, as texts."""
-    lists = {"total_cs": np.rint(100.0 * fleet.cars["total_s"]).astype(int), "member": members.astype(int)}
-    return {name: " ".join(map(str, values.tolist())) for name, values in lists.items()}
+    cars, lot, tariff = fleet.cars, fleet.scenario.lot, fleet.scenario.tariff
+    lists = {"total_cs": 100.0 * cars["total_s"], "member": members}
+    if len(lot.zones) > 1 or tariff:
+        zone = np.where(cars["slot"] >= 0, 1 + lot.zone_of_slot[cars["slot"]], 0)
+        amounts = tariff.amounts(("", *lot.zones), cars["stay_s"])  # nothing is paid elsewhere
+        lists |= {"zone": zone, "paid_cents": 100.0 * amounts[np.arange(len(cars)), zone]}
+    return {name: " ".join(map(str, np.rint(values).astype(int).tolist())) for name, values in lists.items()}
 
 
 def filling(times: FloatArray, taken: FloatArray, counted: FloatArray) -> dict[str, Any]:

@@ -22,8 +22,9 @@ MEASURES = (
     "bound_s", "clairvoyant_s",
 )  # fmt: skip
 """Measures of a day, of which a summary has the mean over days."""
-CAR_LISTS = ("total_cs", "member")
-"""Lists over the cars of a day, in the order of their arrivals: total time in centiseconds, and 1 for members."""
+CAR_LISTS = ("total_cs", "member", "zone", "paid_cents")
+"""Lists over the cars of a day, in the order of their arrivals: total time in centiseconds; 1 for members; and in lots
+with zones or prices, number of the zone that a car parks in, from 1, or 0, and what it pays for its stay."""
 BY_HOUR = ("occupancy_by_hour", "counted_by_hour")
 """Columns with the mean share of taken slots in each hour of the day's arrivals, simulated and as counted."""
 _WANTED = f"a number above 0 and at most {MAX_PER_HOUR:g}, {COUNTED}, or so many times that, such as 1.2x"

@@ -361,7 +361,7 @@ class FleetStudy(Study):
             "manoeuvre_s": self.blocked_s,
             **options,
             "rows": summarize_days(days),
-            "changes": summarize_changes(days),
+            "changes": summarize_changes(days, {name: its.lot.zones for name, its in self.built.items()}),
             "hours": summarize_hours(days, int(first)),
         }
 
