@@ -261,12 +261,13 @@ class Import(Command):
         console.print(f"Wrote {self.out}. {_summary(lot)}")
 
     def _import_town(self) -> None:
+        from parkenv.files.atomic_write import write_together
         from parkenv.studies.lots.town_import import import_town_lots
 
         console = make_console(soft_wrap=True)
-        with stages(console) as progress:
-            town = import_town_lots(self.place, self.out, self._options, self.least, progress)
-        save_summary(self.out, None, town.rows)
+        with stages(console) as progress, write_together(self.out) as folder:
+            town = import_town_lots(self.place, folder, self._options, self.least, progress)
+            save_summary(folder, None, town.rows)
         headings = ("car park", "spaces", "slots", "lanes", "p(error)", "result", "reason")
         cells = (
             (
@@ -280,7 +281,9 @@ class Import(Command):
         results = Counter(row["result"] for row in town.rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
         lots = plural(len(town.rows) - results["refused"], "lot")
-        pictures = f" Pictures: {', '.join(map(str, town.pictures))}" if town.pictures else ""
+        pictures = (
+            f" Pictures: {', '.join(str(self.out / p.name) for p in town.pictures)}" if town.pictures else ""
+        )
         console.print(
             f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}.{pictures}"
         )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -30,6 +32,26 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     finally:
         with suppress(OSError):  # also where there is no such file, on a file system that is read-only
             beside.unlink()
+
+
+@contextmanager
+def write_together(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder in `folder`, whose files move there at the end of the block, or are deleted on failure.
+
+    Raises:
+        InputError: a file cannot be written; the message names it.
+    """
+    beside = Path(tempfile.mkdtemp(prefix=".parts-", dir=folder))
+    try:
+        yield beside
+        for file in sorted(beside.iterdir()):
+            file.replace(folder / file.name)
+    except InputError as error:
+        raise InputError(str(error).replace(str(beside), str(folder))) from error
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be written: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(beside, ignore_errors=True)
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
