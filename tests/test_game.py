@@ -14,13 +14,14 @@ from command_line import parkenv
 from selenium.webdriver.common.action_chains import ActionChains
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
+from test_search_reference import SENSORS, random_scenario
+from timetable_world import Timetable
 
 from parkenv import InputError, make_scenario
 from parkenv.show.report import page as pages
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.play import game_data
 from parkenv.world.occupancy.process import World
-from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent
 
 pytestmark = SOCKETS
@@ -70,9 +71,9 @@ def saved(scores, folder):
     return f"human:{folder / 'scores.json'}"
 
 
-def random_search(scenario, seed, rng, avoids_free):
+def random_search(scenario, seed, rng, avoids_free, limit):
     """A search by random actions, some of them waits: the actions, and what Python says of its end."""
-    env = gym.make("parkenv/Search-v2", scenario=scenario, disable_env_checker=True)
+    env = gym.make("parkenv/Search-v2", scenario=scenario, max_episode_steps=limit, disable_env_checker=True)
     observation, _ = env.reset(seed=seed)
     state, actions, over = env.unwrapped.state, "", False
     while not over:
@@ -87,10 +88,10 @@ def random_search(scenario, seed, rng, avoids_free):
     return actions, total_s, state.vertex, observation["p_occupied"]
 
 
-def random_searches(scenario, seeds):
+def random_searches(scenario, seeds, limit=2_000):
     rng = np.random.default_rng(7)
     return [
-        (w, random_search(scenario, seed, rng, many))
+        (w, random_search(scenario, seed, rng, many, limit))
         for w, seed in enumerate(seeds)
         for many in (False, True)
     ]
@@ -104,37 +105,46 @@ def require_equal(searches, found):
 
 
 @pytest.mark.skipif(NODE is None, reason="node is not installed")
-@pytest.mark.parametrize("sensor", ["perfect", "laser"])
-@pytest.mark.parametrize("name", ["mini", "street", pytest.param("campus", marks=pytest.mark.slow)])
-def test_the_search_of_the_page_is_that_of_python(name, sensor, tmp_path):
-    """Random searches: parked, given up in a full lot, and ended by the limit of steps."""
-    scenario = make_scenario(name, failure_s=12.5)
-    if sensor != "perfect":
-        scenario = scenario.replace(sensor_model=SensorModel.named(sensor))
-    seeds = (11, 2**31)
-    searches = random_searches(scenario, seeds)
+@pytest.mark.parametrize(
+    "kind", ["process", "days", pytest.param("log", marks=pytest.mark.slow), "timetable"]
+)
+def test_the_search_of_the_page_is_that_of_python(kind, tmp_path, monkeypatch):
+    """In random scenarios of all kinds of worlds and sensors: parked, given up in a full lot, and out of steps."""
+    limit, seeds, games = 120, (11, 2**31), []
+    monkeypatch.setattr("parkenv.studies.play.STEP_LIMIT", limit)
+    rng = np.random.default_rng(len(kind))
+    for sensor in SENSORS:
+        scenario = random_scenario(rng, kind, sensor)
+        if kind == "timetable":
+            scenario = scenario.replace(occupancy=Timetable(scenario.lot), prior=None)
+        games.append(
+            (game_data(scenario, [AgentSpec(name="oracle")], seeds), random_searches(scenario, seeds, limit))
+        )
     program = "\n".join((SCRIPTS / script).read_text() for script in ("search_track.js", "game_search.js"))
     program += f"""
-    const data = {json.dumps(game_data(scenario, [AgentSpec(name="oracle")], seeds))};
-    unpackGame(data);
-    console.log(JSON.stringify({json.dumps([(w, its[0]) for w, its in searches])}.map(
-      ([w, actions]) => new GameSearch(data.problem, data.worlds[w], data.terms).take(actions).state)));
+    const games = {json.dumps([(data, [(w, its[0]) for w, its in searches]) for data, searches in games])};
+    console.log(JSON.stringify(games.flatMap(([data, searches]) => {{
+      unpackGame(data);
+      const search = (w) => new GameSearch(data.problem, data.worlds[w], data.terms);
+      return searches.map(([w, actions]) => search(w).take(actions).state);
+    }})));
     """
     (tmp_path / "game.js").write_text(program)
     done = subprocess.run([NODE, tmp_path / "game.js"], capture_output=True, text=True, check=True)
-    require_equal(searches, json.loads(done.stdout))
+    require_equal([search for _, searches in games for search in searches], json.loads(done.stdout))
 
 
-def test_changes_are_found_for_every_kind_of_world():
-    """By bisection as by the process's own sojourns, to the last bit."""
-    scenario = make_scenario("mini")
+@pytest.mark.parametrize("kind", ["process", "days", pytest.param("log", marks=pytest.mark.slow)])
+def test_the_next_changes_of_slots_are_found_to_the_last_bit(kind):
+    """As by bisection, which finds them in a world of any kind."""
+    scenario = random_scenario(np.random.default_rng(1), kind, "exact")
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     env.reset(seed=3)
     world, begin = env.unwrapped.state.world, env.unwrapped.state.time
     slots = np.arange(scenario.lot.n_slots)
-    exact = world.next_change(slots, begin, begin + 7_200.0)
-    assert np.isfinite(exact).any()
-    assert np.array_equal(World.next_change(world, slots, begin, begin + 7_200.0), exact)
+    found = world.next_change(slots, begin, begin + 7_200.0)
+    assert np.isfinite(found).any()
+    assert np.array_equal(found, World.next_change(world, slots, begin, begin + 7_200.0))
 
 
 def test_scores_are_a_row_of_a_comparison(scores, tmp_path):

@@ -228,8 +228,12 @@ function draw() {
   const marked = route && isSlot(aim) ? aim : near;
   if (marked !== null) view.outline(view.slots[marked], palette.ink, 3);
   view.drawCar(...here, heading);
-  const named = hovered >= 0 && hovered !== null ? hovered : marked;
-  if (named !== null) view.drawName(view.slots[named], `${slotName(named)} · ${known(named)}`);
+  const named = hovered !== null && hovered >= 0 ? hovered : marked;
+  // The name stands above the slot and the car beside it.
+  const top = (place) => view.toPixels([place.x, place.y])[1];
+  const car0 = { x: here[0], y: here[1] };
+  if (named !== null) view.drawName(named === near && top(car0) < top(view.slots[named]) ? car0 : view.slots[named], `${slotName(named)} · ${known(named)}`);
+  part("say").classList.toggle("low", top(car0) < view.height / 2);
 }
 
 /** Show the state of the game: the lot, the keys, the worlds. */

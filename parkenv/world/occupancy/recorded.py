@@ -89,15 +89,15 @@ def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) ->
 
 
 @kernel
-def _next_free(days: int, slots: IntArray, second: float, free_from: FloatArray) -> None:
-    """Write the first second >= `second` at which each slot is free; inf if never."""
+def _next_state(days: int, slots: IntArray, second: float, taken: BoolArray, since: FloatArray) -> None:
+    """Write the first second >= `second` at which each slot is taken or not, as `taken` says; inf if never."""
     day = recorded_day_at(days, 0)
     for i in range(slots.size):
         k, end = recorded_index(day, slots[i], second), int64s(day.first)[int64s(day.record)[slots[i]] + 1]
-        free_from[i] = second
-        while k < end and uint8s(day.occupied)[k] != 0:
+        since[i] = second
+        while k < end and (uint8s(day.occupied)[k] != 0) != taken[i]:
             k += 1
-            free_from[i] = float64s(day.from_s)[k] if k < end else np.inf
+            since[i] = float64s(day.from_s)[k] if k < end else np.inf
 
 
 @kernel
@@ -138,8 +138,21 @@ class RecordedWorld(World):
         """(k,) float64, s: the earliest time >= `time` at which each slot is free; inf if never."""
         slots, second = self._checked(slots), self._second(time)
         free_from = np.empty(slots.size)
-        _next_free(address_of(self._day, RECORDED_DAY), slots, second, free_from)
+        _next_state(
+            address_of(self._day, RECORDED_DAY), slots, second, np.zeros(slots.size, np.bool_), free_from
+        )
         return np.maximum(free_from + self._midnight, time)
+
+    def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
+        """(k,) float64, s: the first time in (`time`, `until`] of another sojourn of each slot; inf if none."""
+        slots, second = self._checked(slots), self._second(time)
+        since = np.empty(slots.size)
+        _next_state(address_of(self._day, RECORDED_DAY), slots, second, ~self.occupied(slots, time), since)
+        changes = since + self._midnight
+        # Rounding: the first float64 whose second of the day is not before the change.
+        for near in (np.nextafter(changes, np.inf), changes, np.nextafter(changes, -np.inf)):
+            changes = np.where(near - self._midnight >= since, near, changes)
+        return np.where(changes <= until, changes, np.inf)
 
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
         """(k,) int64, how often the state of each slot has changed since its first observation of the day."""
