@@ -388,7 +388,7 @@ def test_words_for_sight_are_checked(tmp_path):
             "--sensor-model is 'keen', want perfect, blind, laser, stereo or a file (.json)",
         ),
         (("--sensor-model", tmp_path / "odd.json"), "odd.json: want a sighting model, a JSON object"),
-        (("--rig", "radar"), "--rig is 'radar', want 'laser', 'stereo' or 'both_sides'"),
+        (("--rig", "radar"), "--rig is 'radar', want 'laser', 'stereo', 'both_sides' or 'camera'"),
         (("--agents", "mdp(solver=guess)"), "solver is 'guess', want one of"),
         (("--agents", "belief(budget_ms=-1)"), "budget_ms is -1"),
     ):

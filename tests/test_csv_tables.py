@@ -25,6 +25,7 @@ SESSION = {
     "unknown_fraction": "0.0", "occupied_fraction": "0.5", "seconds_per_frame": "0.05",
     "cars_in_frame": "2 1 0 0 0 0", "cars_detected": "2 0 0 0 0 0",
     "odometry_error_m": "1.5", "pose_error_m": "0.1", "pose_error_max_m": "0.2",
+    "within_1_std": "0.7", "within_2_std": "nan",
 }  # fmt: skip
 EPISODE = {
     "scenario": "mini", "occupancy_level": "", "agent": "mdp", "failure_cost_s": "10.0", "v_walk_kmh": "4.0",

@@ -123,7 +123,7 @@ def test_detectors_on_the_command_line(tmp_path):
         (["--uiuc", "x", "--sessions", 2], "--sessions goes with --drives"),
         (
             ["--drives", "mini", "--sessions", 1, "--rig", "sonar"],
-            "--rig is 'sonar', want 'laser', 'stereo' or",
+            "--rig is 'sonar', want 'laser', 'stereo', 'both_sides' or",
         ),
         (["--drives", "mini", "--sessions", 1, "--detector", "hog,none.onnx"], "none.onnx"),
         (["--drives", "nowhere", "--sessions", 1], "unknown scenario 'nowhere'"),

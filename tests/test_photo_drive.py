@@ -199,6 +199,8 @@ BOMB = (
         ("p.csv", "time,x\n0,1\n", "want columns time or file"),
         ("p.csv", "x,y\n0,1\n", "want columns time or file"),
         ("p.csv", "time,x,y\nnoon,1,2\n", "time is 'noon'"),
+        ("p.csv", "time,x,y\n1e12,1,2\n", "time is '1e12'"),
+        ("p.csv", "time,x,y\n9999-12-31T23:59:59Z,1,2\n", "time is '9999"),
     ],
 )  # fmt: skip
 def test_bad_poses_are_refused_in_a_line(tmp_path, name, text, names):

@@ -17,6 +17,7 @@ from parkenv.files.limited_reading import read_xml
 MONDAY_S = 4 * 86_400
 """1970-01-05, the first Monday of Unix time, s."""
 _LEAST_UNIX_S = 1e8  # smaller times are seconds since Monday 00:00
+_MOST_UNIX_S = 9e9  # in the year 2255; nanoseconds fit 64 bits
 _STEP_M = 1.0  # between the positions of which a heading is made
 _WANT = "want columns time or file, x and y (m) or lat and lon (degrees), and yaw (rad) or heading (degrees) if known"
 
@@ -121,12 +122,14 @@ def stamp_in(text: str, timezone_s: float) -> int:
     """
     try:
         seconds: float = NUMBER.parse(text)
+        fraction, shift = 0, timezone_s - MONDAY_S if abs(seconds) < _LEAST_UNIX_S else 0.0
     except ValueError:
         date = datetime.fromisoformat(text)
-        shift = timezone_s if date.tzinfo is None else 0.0
-        date = date.replace(tzinfo=date.tzinfo or UTC)
-        return round((date.replace(microsecond=0).timestamp() - shift) * 1e9) + date.microsecond * 1000
-    return round((seconds + (MONDAY_S - timezone_s if abs(seconds) < _LEAST_UNIX_S else 0.0)) * 1e9)
+        fraction, shift = date.microsecond * 1000, timezone_s if date.tzinfo is None else 0.0
+        seconds = date.replace(microsecond=0, tzinfo=date.tzinfo or UTC).timestamp()
+    if abs(seconds) > _MOST_UNIX_S:
+        raise ValueError(text)
+    return round((seconds - shift) * 1e9) + fraction
 
 
 def _angle(text: str) -> float:

@@ -14,24 +14,15 @@ class PhotoOptions(Spec):
     """What photographs or a film do not say of themselves."""
 
     poses: Path | None = option(
-        None,
-        "Poses: a table (.csv) or a track (.gpx).",
-        takes="FILE",
-        default="poses.csv beside them",
-        **_PANEL,
-    )
+        None, "Poses: a table (.csv) or a track (.gpx).", takes="FILE", default="poses.csv beside them", **_PANEL
+    )  # fmt: skip
     fov: float | None = option(
-        None,
-        "Horizontal field of view of the camera.",
-        takes="DEG",
-        gt=1.0,
-        lt=170.0,
-        default="that of --calibration",
+        None, "Horizontal field of view of the camera.", takes="DEG", default="that of --calibration", gt=1.0, lt=170.0,
         **_PANEL,
-    )
+    )  # fmt: skip
     mount: tuple[float, float, float] = option(
         (1.3, -90.0, 0.0), "With --fov: the camera's height, m, yaw (-90: to the right) and pitch, degrees.",
-        takes="M,DEG,DEG", parse=lambda text: tuple(numbers_in(text, 3)), default="1.3,-90,0", strict=False, **_PANEL,
+        takes="M,DEG,DEG", default="1.3,-90,0", parse=lambda text: tuple(numbers_in(text, 3)), strict=False, **_PANEL,
     )  # fmt: skip
     origin: tuple[float, float] | None = option(
         None, "The lot's origin, for poses in degrees.", takes="LAT,LON", default="as the lot file's degrees say",
@@ -39,15 +30,9 @@ class PhotoOptions(Spec):
     )  # fmt: skip
     clock_offset: float = option(0.0, "Seconds to add to the pictures' times.", takes="S", **_PANEL)
     fps: float | None = option(
-        None, "Pictures a second, the first at the first pose.", takes="N", gt=0.0, le=1000.0,
-        default="Exif times; a film's own", **_PANEL,
+        None, "Pictures a second, the first at the first pose.", takes="N", default="Exif times; a film's own",
+        gt=0.0, le=1000.0, **_PANEL,
     )  # fmt: skip
     pose_error: float | None = option(
-        None,
-        "Standard deviation of poses, m.",
-        takes="M",
-        ge=0.0,
-        le=1e3,
-        default="0; of degrees 3",
-        **_PANEL,
-    )
+        None, "Standard deviation of poses, m.", takes="M", default="0; of degrees 3", ge=0.0, le=1e3, **_PANEL
+    )  # fmt: skip

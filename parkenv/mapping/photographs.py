@@ -116,13 +116,9 @@ class Photographs:
         begin, fps = int(self.track.stamps[0]), self._options.fps
         for frame in self._film.read() if self._film is not None else ():
             late = (frame.time if fps is None else frame.number / fps) + self._options.clock_offset
-            height, width = frame.image.shape[:2]
-            yield (
-                begin + round(late * 1e9),
-                SimpleNamespace(
-                    encoding="rgb8", height=height, width=width, step=3 * width, data=frame.image
-                ),
-            )
+            h, w = frame.image.shape[:2]
+            image = SimpleNamespace(encoding="rgb8", height=h, width=w, step=3 * w, data=frame.image)
+            yield begin + round(late * 1e9), image
 
     def _times(self) -> IntArray:
         """Return the stamps of the photographs; those that the table of poses does not name are left out."""
@@ -145,9 +141,7 @@ class Photographs:
             try:
                 taken.append(stamp_in(image_time(file) or "", self._zone_s) + round(late * 1e9))
             except ValueError as error:
-                raise InputError(
-                    f"{file}: has no Exif time; want one, poses with a column file, or --fps"
-                ) from error
+                raise InputError(f"{file}: has no Exif time, want one, a column file, or --fps") from error
         return np.array(taken, np.int64)
 
     def _usual_camera(self) -> CameraSpec:
@@ -172,7 +166,5 @@ class Photographs:
             lat, lon = self._options.origin
             frame = LocalFrame(lon, lat)
         if frame is None:
-            raise InputError(
-                "is in degrees, and the lot in metres; want --origin LAT,LON of the lot's x = y = 0"
-            )
+            raise InputError("is in degrees, and the lot in metres; want --origin LAT,LON of its x = y = 0")
         return frame.to_xy(track.positions)

@@ -130,9 +130,7 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         cars = result.session.cars
         paint(axes[1], [headings(cars, CAR_COLOR)], 3.0)
         axes[1].set_title(f"{plural(len(cars), 'detection')} of cars, frame by frame")
-        heading = Line2D(
-            [], [], color=CAR_COLOR, linewidth=2.0, label="a car's middle and heading, from the laser"
-        )
+        heading = Line2D([], [], color=CAR_COLOR, linewidth=2.0, label="a car's middle and heading")
         _draw_key(axes[1], [heading])
         _draw_states(lot, result, axes[2])
         save_picture(
