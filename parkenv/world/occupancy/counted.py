@@ -114,8 +114,13 @@ class CountedOccupancy(OccupancyModel):
         return self._worlds[day]
 
     def course(self, arrival: Arrival, times: ArrayLike) -> Course:
-        """Return the expected course of the occupancy on the arrival's day, as counted; see `OccupancyModel`."""
-        return self.process_of(arrival.day).course(arrival, times)
+        """Return the course of the occupancy on the arrival's day, linear between the counts; see `OccupancyModel`."""
+        process = self.process_of(arrival.day)
+        hours = arrival.time // DAY_S * DAY_S + np.arange(DAY_HOURS + 1) * HOUR_S
+        counted = process.course(arrival, hours).occupied
+        return process.course(arrival, times)._replace(
+            occupied=np.interp(np.asarray(times, np.float64), hours, counted)
+        )
 
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast: the mean over the days that are possible, and by how much their level differs."""
