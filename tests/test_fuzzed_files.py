@@ -275,6 +275,12 @@ FLEET_SUMMARY = {
         }
         for knows, price in (("own", 1.1), ("shared", None))
     ],
+    "hours": [
+        {
+            "scenario": "mini", "agents": "random", "knows": "own", "share": 0.0, "arrivals_per_hour": 20.0, "hour": 8,
+            "occupancy": 0.5, "counted_occupancy": 0.75, "excess": -0.25, "excess_ci95": [-0.3, -0.2],
+        }
+    ],
     "changes": [
         {
             "change": "knows", "before": "own observations", "after": "a live map for 50 %", "zone": None,
