@@ -9,6 +9,7 @@ AGENTS: dict[str, tuple[str, str]] = {
     "mdp-static": ("planners.thesis.replanning", "StaticAgent"),
     "greedy-goal": ("planners.heuristics.agents", "GreedyGoalAgent"),
     "greedy-drive": ("planners.heuristics.agents", "GreedyDriveAgent"),
+    "greedy-total": ("planners.heuristics.agents", "GreedyTotalAgent"),
     "first-free": ("planners.heuristics.agents", "FirstFreeAgent"),
     "random": ("planners.heuristics.agents", "RandomAgent"),
     "oracle": ("planners.bounds.oracle", "OracleAgent"),
@@ -36,7 +37,7 @@ HUMAN = "human"
 """The agent that repeats what a person did in a game of `parkenv play`: `human:FILE`."""
 FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)
 """Names before the colon of `NAME:FILE`."""
-WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "first-free", "random", "oracle")
+WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "greedy-total", "first-free", "random", "oracle")
 """Agents that make no use of an occupancy forecast."""
 SMALL_LOTS_ONLY = ("exact",)
 """Agents for small lots and sensors without errors only."""

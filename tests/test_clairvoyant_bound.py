@@ -31,7 +31,8 @@ def in_order_s(day, slot, cars):
         parks_at = max(free_from, day.arrival[car] + day.drive_s[day.entry[car], slot])
         if parks_at > day.arrival[car] + day.patience_s[car]:
             return math.inf
-        total += parks_at - day.arrival[car] + day.cost_s[slot]
+        price_s = day.zone_cost_s[car, day.zone[slot]]
+        total += parks_at - day.arrival[car] + day.cost_s[slot] + price_s
         free_from = parks_at + day.stay_s[car]
     return total
 
@@ -51,6 +52,8 @@ def random_day(rng):
         drive_s=drive_s,
         cost_s=rng.uniform(5.0, 120.0, n_slots),
         free_from=free_from,
+        zone=rng.integers(0, 2, n_slots),
+        zone_cost_s=rng.uniform(0.0, 200.0, (n_cars, 2)) * rng.choice([0.0, 1.0]),
         give_up_s=float(rng.choice([200.0, 1800.0])),
     )
 
@@ -74,7 +77,8 @@ def test_without_competition_it_is_the_time_of_each_car_alone():
     day = ParkingDay(
         arrival=np.array([0.0, 10_000.0]), stay_s=np.full(2, 600.0), patience_s=np.full(2, math.inf),
         entry=np.array([0, 1]), drive_s=np.array([[10.0, 20.0], [20.0, 10.0]]), cost_s=np.array([30.0, 30.0]),
-        free_from=np.full(2, -math.inf), give_up_s=900.0,
+        free_from=np.full(2, -math.inf), zone=np.zeros(2, np.int64), zone_cost_s=np.zeros((2, 1)),
+        give_up_s=900.0,
     )  # fmt: skip
     assert clairvoyant_bound_s(day) == pytest.approx(80.0)
     assert clairvoyant_bound_s(later(day, 5e5)) == pytest.approx(80.0)
@@ -85,7 +89,7 @@ def test_a_stay_for_ever_may_end_after_the_day():
     day = ParkingDay(
         arrival=np.array([0.0, 5.0]), stay_s=np.array([math.inf, math.inf]), patience_s=np.full(2, 600.0),
         entry=np.zeros(2, np.int64), drive_s=np.array([[10.0]]), cost_s=np.array([20.0]),
-        free_from=np.array([-math.inf]), give_up_s=900.0,
+        free_from=np.array([-math.inf]), zone=np.zeros(1, np.int64), zone_cost_s=np.zeros((2, 1)), give_up_s=900.0,
     )  # fmt: skip
     assert 60.0 < clairvoyant_bound_s(day) <= best_schedule_s(day) == 930.0
 
@@ -94,6 +98,7 @@ def test_a_stay_for_ever_may_end_after_the_day():
 def test_no_fleet_is_below_it(knows):
     (scenario,) = scenario_specs("mini")
     scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
+    scenario = scenario.changed(costs={"prices": {} if knows == "own" else {"other": 1.0}})
     spec = FleetStudy().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
     its = spec
     (scenario,) = its.built.values()

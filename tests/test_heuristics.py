@@ -19,7 +19,7 @@ from planners.agent import make_agent
 from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
 
-NAMES = ("greedy-goal", "greedy-drive", "first-free")
+NAMES = ("greedy-goal", "greedy-drive", "greedy-total", "first-free")
 NOISY = SensorModel(
     15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
 )
@@ -38,6 +38,8 @@ def reference_target(name, problem, routes, belief, vertex, previous):
     candidates = (state != OBSERVED_TAKEN) & reachable
     good = (state == OBSERVED_FREE) & (cost_s <= np.median(cost_s)) & reachable
     kept = previous >= 0 and state[previous] != OBSERVED_TAKEN
+    if name == "greedy-total" and candidates.any() and not (kept and state[previous] == OBSERVED_FREE):
+        return first(candidates, np.where(state == OBSERVED_FREE, 1.0, 3.0) * seconds + cost_s)
     if name == "first-free" and good.any() and not (kept and state[previous] == OBSERVED_FREE):
         return first(good, seconds)
     if kept:

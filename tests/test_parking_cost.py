@@ -49,7 +49,18 @@ def parked_at(agent, scenario):
 
 
 @pytest.mark.parametrize(
-    "name", ["mdp", "mdp-static", "mdp-tuned", "belief", "exact", "oracle", "greedy-goal", "first-free"]
+    "name",
+    [
+        "mdp",
+        "mdp-static",
+        "mdp-tuned",
+        "belief",
+        "exact",
+        "oracle",
+        "greedy-goal",
+        "greedy-total",
+        "first-free",
+    ],
 )
 def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")

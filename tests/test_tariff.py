@@ -1,5 +1,6 @@
 """Prices of zones: what parking costs a driver, in single searches and in fleets, and what a city reads of it."""
 
+import csv
 import pickle
 from dataclasses import replace
 
@@ -7,10 +8,19 @@ import numpy as np
 import pytest
 from small_lots import features
 
-from parkenv import InputError, ParkingLot, make_scenario
-from parkenv.lots import grid_lot
+from parkenv import InputError, ParkingLot, fleet, make_scenario
+from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.episodes import EpisodeRunner
+from parkenv.studies.fleet.drivers import AgentsByStay, policy_of
+from parkenv.world.cost_terms import COST_FIELDS
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
+from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.tariff import NO_ZONE, Tariff
+from planners import make_agent
+from planners.heuristics import POLICIES
 
 
 def zoned(lot, **columns):
@@ -71,3 +81,120 @@ def test_a_price_of_a_zone_that_the_lot_lacks_is_refused_in_python_too():
         Tariff({"centre": np.nan})
     with pytest.raises(InputError, match="control characters"):
         replace(lot, slot_zone=["a\x1b"] * 4)
+
+
+# ---- fleets: each car pays for its own stay
+
+
+def cars_of(scenario, policy="greedy-total", cars=12):
+    its = Fleet(
+        scenario,
+        Demand(Headways(cars, mean_s=30.0), ExponentialTime(2400.0)),
+        drivers=[DriverKind(policy=POLICIES[policy])],
+        background="none",
+    )
+    its.reset(seed=1)
+    return its
+
+
+@pytest.mark.parametrize("policy", ["greedy-total", "greedy-goal", "greedy-drive", "first-free"])
+def test_a_car_pays_for_its_own_stay_whoever_drives(scenario, policy):
+    fleet, lot = cars_of(scenario, policy), scenario.lot
+    fleet.run()
+    cars = fleet.cars
+    parked = cars[cars["slot"] >= 0]
+    price = np.where(lot.slot_zone == "centre", 3.0, 0.0)[parked["slot"]]
+    paid_s = price * parked["stay_s"] / 10.0
+    np.testing.assert_allclose(parked["parking_cost_s"], lot.slot_parking_cost_s[parked["slot"]] + paid_s)
+    np.testing.assert_allclose(sum(cars[name] for name in COST_FIELDS), cars["total_s"])
+
+
+def test_a_fleet_of_one_car_with_the_expected_stay_is_the_search(scenario):
+    demand = Demand(Headways(1), ConstantTime(scenario.stay_s))
+    fleet = Fleet(
+        scenario, demand, background="process", drivers=[DriverKind(policy=POLICIES["greedy-total"])]
+    )
+    fleet.reset(seed=4)
+    fleet.run()
+    row = EpisodeRunner(scenario, "greedy-total", make_agent("greedy-total", scenario)).run(4).row
+    assert {name: float(fleet.cars[name][0]) for name in COST_FIELDS} == {
+        name: row[name] for name in COST_FIELDS
+    }
+
+
+def test_who_stays_long_drives_to_where_it_is_free():
+    """Between a near zone and a free one far away, the indifferent stay is that whose price is worth the walk."""
+    lot = grid_lot(1, 20)
+    walk = lot.walk_m()
+    lot = ParkingLot(**features(lot) | {"slot_zone": np.where(walk <= np.median(walk), "centre", "far")})
+    nobody = OccupancyProcess.from_demand(np.full(lot.n_slots, -50.0), np.zeros(168))
+    scenario = make_scenario(lot, occupancy=nobody, tariff=Tariff({"centre": 2.0}), value_of_time=12.0)
+    drive_s = drive_times(scenario, int(lot.entry_vertices[0]))
+    way_s, centre = drive_s + scenario.walk_s, lot.slot_zone == "centre"
+    worth_s = way_s[~centre].min() - way_s[centre].min()
+    assert worth_s > 0.0
+    indifferent_s = worth_s * 12.0 / 2.0
+    for stay_s, zone in ((0.98 * indifferent_s, "centre"), (1.02 * indifferent_s, "far")):
+        fleet = Fleet(
+            scenario,
+            Demand(Headways(1), ConstantTime(stay_s)),
+            background="none",
+            drivers=[DriverKind(policy=POLICIES["greedy-total"], knows="full")],
+        )
+        fleet.reset(seed=0)
+        fleet.run()
+        assert lot.slot_zone[fleet.cars["slot"][0]] == zone
+        # The same indifference in the value of time, for a fixed stay.
+        dear = scenario.replace(stay_s=indifferent_s, value_of_time=12.0 * indifferent_s / stay_s)
+        slot = EpisodeRunner(dear, "oracle", make_agent("oracle", dear)).run(0).row["slot"]
+        assert lot.slot_zone[lot.slot_ids.index(slot)] == zone
+
+
+def test_revenue_is_price_times_stay_of_the_parked_cars(tmp_path):
+    file = tmp_path / "zones.geojson"
+    write_lot(zoned(packaged_lot("mini")), file)
+    found = fleet(
+        scenarios=[{"lot": str(file), "costs": {"prices": {"centre": 3.0}}, "arrivals": {"hours": "08:00-09:00"}}],
+        arrivals_per_hour=(12.0,), knows=("own",), days=2, folder=tmp_path / "run",
+    )  # fmt: skip
+    (row,), study = found.rows, found.study
+    assert row["agents"] == "greedy-total"
+    assert sum(row[name] for name in COST_FIELDS) == pytest.approx(row["total_s"])
+    (setting,), revenue, cars_in, days = study.fleet_settings, [], [], []
+    for day in range(2):
+        its, agents = study.fleet(setting)
+        its.reset(study.seed, day)
+        its.run(agents)
+        days.append(its.cars)
+        parked = its.cars[its.cars["slot"] >= 0]
+        inside = study.built["zones"].lot.slot_zone[parked["slot"]] == "centre"
+        revenue.append(3.0 * parked["stay_s"][inside].sum() / 3600.0)
+        cars_in.append([inside.sum(), (~inside).sum()])
+    centre, other = found.summary["zones"]
+    assert (centre["zone"], centre["slots"], other["zone"], other["paid_a_day"]) == (
+        "centre",
+        5,
+        NO_ZONE,
+        0.0,
+    )
+    assert centre["paid_a_day"] == pytest.approx(np.mean(revenue))
+    assert [centre["parked_a_day"], other["parked_a_day"]] == np.mean(cars_in, axis=0).tolist()
+    of_cars = [paid / len(its) for paid, its in zip(revenue, days, strict=True)]
+    assert row["paid"] == pytest.approx(np.mean(of_cars))
+    rows = list(csv.DictReader((tmp_path / "run" / "zones.csv").open()))
+    assert sum(float(line["paid"]) for line in rows) == pytest.approx(sum(revenue))
+
+
+def test_agents_in_python_know_their_own_stay(scenario):
+    """A car whose driver decides in Python drives as the compiled one does."""
+    policy, agent = policy_of(AgentSpec.of("greedy-total"), scenario)
+    assert agent is None
+    python = AgentsByStay(AgentSpec.of("greedy-total"), scenario, {})
+    demand = Demand(Headways(8, mean_s=30.0), ExponentialTime(2400.0))
+    slots = []
+    for kind, agents in ((DriverKind(policy=policy), None), (DriverKind(), [python])):
+        its = Fleet(scenario, demand, drivers=[kind], background="none")
+        its.reset(seed=3)
+        its.run(agents)
+        slots.append(its.cars["slot"].tolist())
+    assert slots[0] == slots[1]

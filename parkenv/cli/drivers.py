@@ -14,6 +14,7 @@ from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import departures
 from parkenv.studies.results import Row, without_nan
+from parkenv.world.cost_terms import COST_TERMS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -85,13 +86,16 @@ class Fleet(AgentStudyCommand):
         parkenv fleet --agents belief,greedy-drive --knows own,reserve -n 5
         parkenv fleet --knows own,shared --share 0.1,0.25,0.5,1 --delay 60
         parkenv fleet --scenario old.geojson,new.geojson --hours 08:00-12:00 --report
+        parkenv fleet --lot zones.geojson --price centre=2/h --value-of-time 12/h
         parkenv fleet --manoeuvre 15 --leaving-soon 10
         parkenv fleet --resume --episodes 20
         """
 
     study: FleetStudy = FleetStudy()
     out: Path = option(
-        Path("results/fleet"), "Folder for experiment.json, days.csv, summary.json and fleet.png.", short="-o"
+        Path("results/fleet"),
+        "Folder for experiment.json, days.csv, zones.csv, summary.json and figures.",
+        short="-o",
     )
 
     def show(self, console: Console, result: Result) -> None:
@@ -108,6 +112,7 @@ class Fleet(AgentStudyCommand):
         cells = [[*(row[name] for name in several), *_cells(row, mixed=mixed)] for row in result.rows]
         agents = "" if "agents" in several else f", {result.rows[0]['agents']}"
         console.print(make_table(f"{self.study.title}{agents}", headings, cells))
+        self._show_money(console, result, several)
         changes = without_nan(result.summary["changes"])
         if changes:
             groups = ["members s [95 %]", "others s [95 %]"] if mixed else []
@@ -133,6 +138,51 @@ class Fleet(AgentStudyCommand):
                 console.print(sentence(row), soft_wrap=True)
         for line in departures(result.summary["hours"]):
             console.print(line, soft_wrap=True)
+
+    def _show_money(self, console: Console, result: Result, several: list[str]) -> None:
+        """Print what the total time is made of, and who pays where."""
+        terms = [
+            term for term in COST_TERMS if not term.optional or any(row[term.field] for row in result.rows)
+        ]
+        fields = [*(term.field for term in terms), "queued_s"]
+        headings = [
+            *several,
+            "members know",
+            "members",
+            "cars/h",
+            *(term.label for term in terms),
+            "of it in queues",
+        ]
+        cells = [
+            [*(row[name] for name in several), *_setting(row), *(f"{row[name]:.1f}" for name in fields)]
+            for row in result.rows
+        ]
+        zones = result.summary["zones"]
+        if zones:
+            headings += ["paid a car", "cars that pay"]
+            money = [[f"{row['paid']:.2f}", f"{row['paying_share']:.0%}"] for row in result.rows]
+            cells = [row + more for row, more in zip(cells, money, strict=True)]
+        console.print(make_table("What the total time is made of, s a car", headings, cells))
+        if zones:
+            headings = [
+                *several, "members know", "members", "cars/h", "zone", "slots", "price/h", "slots taken", "cars a day",
+                "of all", "paid a day [95 %]", "paid a car",
+            ]  # fmt: skip
+            cells = [[*(row[name] for name in several), *_setting(row), *_zone_cells(row)] for row in zones]
+            console.print(make_table("Zones", headings, cells))
+
+
+def _zone_cells(row: Row) -> list[str]:
+    return [
+        row["zone"],
+        str(row["slots"]),
+        f"{row['price']:g}",
+        f"{row['occupancy']:.0%}",
+        f"{row['parked_a_day']:.0f}",
+        f"{row['share_parked']:.0%}",
+        _interval(row, "paid_a_day", ".2f"),
+        _number(row["paid_a_car"], ".2f"),
+    ]
 
 
 def _setting(row: Row) -> list[str]:

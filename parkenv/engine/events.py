@@ -252,6 +252,9 @@ def _arrive(fleet: Any) -> int:
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
     search.place, search.car = car.place, number
+    search.zone_cost_s = fleet.zone_cost_s
+    if fleet.zone_cost_s != 0:
+        search.zone_cost_s += 8 * fleet.n_zones * number
     car.vertex, car.stands, car.holds = car.entry, False, NO_CAR
     search.scenario = fleet.scenarios + car.place * SCENARIO_BYTES
     enter(search, car_key(fleet.key, number), fleet.day, car.arrival, fleet.midnight, car.entry)

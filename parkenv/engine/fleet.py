@@ -162,6 +162,7 @@ class Fleet:
     | `reserved` | `Box(-1, 1, (n_slots,), int8)` | 1: reserved for this car; -1: it knows of none | `reserve` |
     | `leaving` | `Box(0, 1, (n_slots,), int8)` | slots in view whose cars leave soon | `leaving_soon_s` |
     | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
+    | `stay_s` | `Box(0, inf, (1,), float32)` | the car's own stay, s, which it pays for | prices |
 
     With one car, `Demand(Headways(1))` and the background `process`, the fleet is `parkenv/Search-v2` to the last bit.
 
@@ -362,6 +363,14 @@ class Fleet:
         self._cars = cars
         capacity = max(n, sum(len(one.records) for one in self._pool))
         self._record["n_cars"], self._record["n_free"] = n, 0
+        if self.scenario.tariff:
+            zone_cost_s = self.scenario.zone_cost_s(cars["stay_s"])
+            if not np.isfinite(zone_cost_s).all():
+                raise InputError(
+                    "Demand.stays: a stay is infinite, want finite ones where parking has a price"
+                )
+            self._keep({"zone_cost_s": zone_cost_s})
+            self._record["n_zones"] = zone_cost_s.shape[1]
         self._keep(
             {
                 "cars": cars,
@@ -541,8 +550,12 @@ class Fleet:
         vertex = int(record["vertex"])
         if vertex not in self._drive_s:
             self._drive_s[vertex] = drive_times(self.scenario, vertex)
-        arrival_cost_s = self.scenarios[self._cars["place"][car]].arrival_cost_s
-        return np.asarray(record["time"] - self.time + self._drive_s[vertex] + arrival_cost_s)
+        return np.asarray(record["time"] - self.time + self._drive_s[vertex] + self.arrival_cost_s(car))
+
+    def arrival_cost_s(self, car: int) -> NDArray[np.float64]:
+        """Return what arriving in each slot costs a car, (n_slots,) s: walk, and parking for its own stay."""
+        problem = self.scenarios[self._cars["place"][car]]
+        return np.asarray(problem.walk_s + problem.parking_cost_of(self._cars["stay_s"][car]))
 
     # ---- what is known of cars and slots
 
@@ -555,6 +568,8 @@ class Fleet:
             further["reserved"] = spaces.Box(-1, 1, (lot.n_slots,), np.int8)
         if self.leaving_soon_s > 0.0:
             further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
+        if self.scenario.tariff:
+            further["stay_s"] = spaces.Box(0.0, np.inf, (1,), np.float32)
         if self.sees_cars:
             further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
         return spaces.Dict(dict(space.items()) | further)
@@ -579,6 +594,8 @@ class Fleet:
             observation["reserved"] = mine.astype(np.int8) - np.int8(record["reserved"] == UNGUIDED)
         if self.leaving_soon_s > 0.0:
             observation["leaving"] = self._leaving_in_view(int(vertex))
+        if self.scenario.tariff:
+            observation["stay_s"] = np.float32(self._cars["stay_s"][[car]])
         if self.sees_cars:
             observation["cars"] = self._cars_in_view(car, int(vertex))
         return observation

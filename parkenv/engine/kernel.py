@@ -372,11 +372,21 @@ def drive_or_park(search: Any, action: int) -> None:
         else:
             search.parked = True
             search.step_walk_s = float64s(scenario.walk_s)[vertex]
-            search.step_parking_cost_s = float64s(scenario.parking_cost_s)[vertex]
+            search.step_parking_cost_s = parking_cost_s(search, vertex)
             search.walked_m = float64s(scenario.walk_m)[vertex]
         observe_attempt(search, column, taken)
     search.time += search.step_drive_s + search.step_failed_s
     search.n_steps += 1
+
+
+@inlined
+def parking_cost_s(search: Any, slot: int) -> float:
+    """Return what parking in a slot costs the driver, s: what the lot says, and the price of the stay."""
+    scenario = scenario_at(search.scenario, 0)
+    if search.zone_cost_s == 0:
+        return float(float64s(scenario.parking_cost_s)[slot])
+    zone = int64s(scenario.zone_of_slot)[slot]
+    return float(float64s(scenario.lot_cost_s)[slot] + float64s(search.zone_cost_s)[zone])
 
 
 @inlined

@@ -23,8 +23,8 @@ from parkenv.belief.slot_belief import (
     observed_state,
 )
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
-from parkenv.compiled.memory import address_of, call_address, int32s, int64s, uint8s
-from parkenv.engine.kernel import belief_now
+from parkenv.compiled.memory import address_of, call_address, float64s, int32s, int64s, uint8s
+from parkenv.engine.kernel import belief_now, parking_cost_s
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -139,6 +139,18 @@ def is_allowed(search: Any, action: int) -> bool:
 def draw_uniform(search: Any) -> float:
     """Return a random number from [0, 1) that depends on the world, the car and its step alone."""
     return float(keyed_uniform(search.key, POLICY_STREAM, 0, search.n_steps))
+
+
+@inlined
+def has_own_price(search: Any) -> bool:
+    """Return whether slots have prices, which a car pays for its own stay."""
+    return bool(search.zone_cost_s != 0)
+
+
+@inlined
+def arrival_cost_s(search: Any, slot: int) -> float:
+    """Return what arriving in a slot costs the car, s: walk, and parking for its own stay."""
+    return float(float64s(scenario_at(search.scenario, 0).walk_s)[slot] + parking_cost_s(search, slot))
 
 
 # ---- what was observed

@@ -45,10 +45,13 @@ SCENARIO = np.dtype(
         ("edges", ADDRESS),
         # (n_vertices, 5) uint8, mask of the actions that the graph has.
         ("action_masks", ADDRESS),
-        # (n_slots,) float64: walk to the goal, s and m; parking cost, s.
+        # (n_slots,) float64: walk to the goal, s and m; parking cost for the expected stay, s, and without prices.
         ("walk_s", ADDRESS),
         ("walk_m", ADDRESS),
         ("parking_cost_s", ADDRESS),
+        ("lot_cost_s", ADDRESS),
+        # (n_slots,) int64 tariff zone of each slot.
+        ("zone_of_slot", ADDRESS),
         # Slots in view of vertex v are viewed[view_starts[v]] to viewed[view_starts[v + 1]], excluded; int64 both.
         ("view_starts", ADDRESS),
         ("viewed", ADDRESS),
@@ -159,6 +162,8 @@ SEARCH = _with_costs(
         ("car", np.int64),
         ("moves", ADDRESS),
         ("reserved", np.int64),
+        # (n_zones,) float64, s, what the car's own stay costs in each zone; 0: that of the scenario's expected stay.
+        ("zone_cost_s", ADDRESS),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; the
         # record of the world: PROCESS, RECORDED_DAY, FUNCTIONS or SHARED_WORLD.
@@ -360,6 +365,9 @@ FLEET = np.dtype(
         ("n_cars", np.int64),
         ("cars", ADDRESS),
         ("next_car", np.int64),
+        # (n_cars, n_zones) float64, s, what each car's stay costs in each zone; 0 without prices.
+        ("zone_cost_s", ADDRESS),
+        ("n_zones", np.int64),
         # Cars to decide, in order: a ring of n_cars int64.
         ("ready", ADDRESS),
         ("first_ready", np.int64),
@@ -485,6 +493,8 @@ class ScenarioRecords:
             "walk_s": self._keep(scenario.walk_s),
             "walk_m": self._keep(lot.walk_m(scenario.goal)),
             "parking_cost_s": self._keep(scenario.parking_cost_s),
+            "lot_cost_s": self._keep(lot.slot_parking_cost_s),
+            "zone_of_slot": self._keep(lot.zone_of_slot, np.int64),
             "view_starts": self._keep(starts, np.int64),
             "viewed": self._keep(viewed, np.int64),
             "seen_rate": self._keep(rates.seen),

@@ -83,9 +83,14 @@ class SearchState:
         return float(self._record["walk_s"])
 
     @property
-    def gave_up_s(self) -> float:
-        """Give-up penalty, s; 0 unless the search gave up."""
-        return float(self._record["gave_up_s"])
+    def parking_cost_s(self) -> float:
+        """Parking cost, s; 0 before the car is parked."""
+        return float(self._record["parking_cost_s"])
+
+    @property
+    def total_s(self) -> float:
+        """Total time so far, s: the sum of all costs."""
+        return float(self._record["costs"].sum())
 
     @property
     def driven_m(self) -> float:

@@ -26,7 +26,7 @@ def search_settings(spec: Any, *fields: str) -> Row:
     from parkenv.perception.detector_registry import detector_version
 
     scenarios = spec.scenarios if hasattr(spec, "scenarios") else (spec.scenario,)
-    agents = spec.agents if hasattr(spec, "agents") else (spec.agent,)
+    agents = (spec.agents or ()) if hasattr(spec, "agents") else (spec.agent,)
     detector = getattr(spec, "detector", None)
     return {
         "version": __version__,

@@ -90,8 +90,11 @@ class SearchProblem:
     @cached_property
     def parking_cost_s(self) -> FloatArray:
         """Parking cost of each slot as time, (n_slots,) s: that of the lot, and the price of the expected stay."""
-        zone_cost_s = self.zone_cost_s(self.stay_s)
-        return _read_only(self.lot.slot_parking_cost_s + zone_cost_s[self.lot.zone_of_slot])
+        return _read_only(self.parking_cost_of(self.stay_s))
+
+    def parking_cost_of(self, stay_s: FloatArray | float) -> FloatArray:
+        """Return what stays of the driver cost in each slot, (..., n_slots) s: that of the lot, and the price."""
+        return self.lot.slot_parking_cost_s + self.zone_cost_s(stay_s)[..., self.lot.zone_of_slot]
 
     def zone_cost_s(self, stay_s: FloatArray | float) -> FloatArray:
         """Return what stays of the driver cost in each of the lot's zones, (..., n_zones) s.

@@ -59,7 +59,9 @@ class Tariff:
             stay_s: (...) s, lengths of the stays.
         """
         per_hour = np.array([self.per_hour.get(zone, 0.0) for zone in zones])
-        return np.asarray(np.multiply.outer(np.asarray(stay_s) / HOUR_S, per_hour))
+        # A stay for ever is free where an hour is.
+        with np.errstate(invalid="ignore"):
+            return np.where(per_hour > 0.0, np.multiply.outer(np.asarray(stay_s) / HOUR_S, per_hour), 0.0)
 
     def require_zones(self, zones: Sequence[str], lot: str) -> None:
         """Check that a lot has every zone with a price.

@@ -20,6 +20,7 @@ from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,
     GREEDY_GOAL,
+    GREEDY_TOTAL,
     NO_SLOT,
     choose_route,
     heuristic_tables,
@@ -108,6 +109,17 @@ class GreedyDriveAgent(TargetAgent):
 
     name: ClassVar[str] = "greedy-drive"
     heuristic = GREEDY_DRIVE
+
+
+class GreedyTotalAgent(TargetAgent):
+    """`greedy-total`: drives to the candidate with the least total time to drive, walk and pay, and minds prices.
+
+    The drive to a slot that it has not observed counts three times: the slot may be taken, and one that it knows to be
+    free lies behind it.
+    """
+
+    name: ClassVar[str] = "greedy-total"
+    heuristic = GREEDY_TOTAL
 
 
 class FirstFreeAgent(TargetAgent):

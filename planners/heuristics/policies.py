@@ -24,6 +24,7 @@ from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,
     GREEDY_GOAL,
+    GREEDY_TOTAL,
     NO_SLOT,
     choose_route,
     heuristic_tables,
@@ -57,7 +58,7 @@ class TargetPolicy(CompiledPolicy):
 
     Args:
         name: for tables.
-        heuristic: `GREEDY_GOAL`, `GREEDY_DRIVE` or `FIRST_FREE`.
+        heuristic: a rule of `planners.heuristics.rules`, such as `GREEDY_GOAL`.
         within_m: option of `first-free`.
     """
 
@@ -94,6 +95,7 @@ POLICIES = {
     for policy in (
         TargetPolicy("greedy-goal", GREEDY_GOAL),
         TargetPolicy("greedy-drive", GREEDY_DRIVE),
+        TargetPolicy("greedy-total", GREEDY_TOTAL),
         TargetPolicy("first-free", FIRST_FREE),
         CompiledPolicy("random", decide_random),
     )

@@ -4,7 +4,8 @@ Each rule is written here once. Agents (`planners.heuristics.agents`) and compil
 (`planners.heuristics.policies`) call it, so they decide alike in every situation.
 
 A slot is a candidate unless it was recently observed taken. Slots are ranked by the drive, or by arrival cost
-(`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one.
+(`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one. In a fleet it is that of the car's own
+stay.
 
 Rules ask for the states of few slots. In a fleet they are computed from the tables of the search when they are asked
 for; an agent writes those of its observation into its `TABLES`.
@@ -30,12 +31,28 @@ from parkenv.compiled.memory import (
     record_at,
     uint8s,
 )
-from parkenv.engine.policy import PolicyData, known_slot, p_occupied, recent_state, search_of
+from parkenv.engine.policy import (
+    PolicyData,
+    arrival_cost_s,
+    has_own_price,
+    known_slot,
+    p_occupied,
+    recent_state,
+    search_of,
+)
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
 
-GREEDY_GOAL, GREEDY_DRIVE, FIRST_FREE = range(3)
+GREEDY_GOAL, GREEDY_DRIVE, FIRST_FREE, GREEDY_TOTAL = range(4)
 NO_SLOT = -1
+UNOBSERVED_DETOUR = 3.0
+"""How many times `GREEDY_TOTAL` counts the drive to a slot that was not observed, which may be taken.
+
+Where one slot in two is free, the drive to a slot with arrival cost c pays off against one that is known to be free,
+and takes t in all, if drive + c / 2 + (drive + t) / 2 < t, since it may have to drive back: if c + 3 drive < t.
+"""
+BY_DRIVE, BY_DRIVE_THEN_COST, BY_TOTAL = range(3)
+"""What `_nearest` ranks slots by: the drive; then the arrival cost; the sum of both."""
 _N_MOVES = len(MOVES)
 
 rule = compiled(error_model="numpy", _nrt=False)
@@ -53,6 +70,8 @@ TABLES = np.dtype(
         # slot at once, s.
         ("arrival_cost_s", ADDRESS),
         ("near_s", ADDRESS),
+        # A slot with the lowest parking cost.
+        ("least_price", np.int64),
         # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken).
         ("states", ADDRESS),
         ("p_occupied", ADDRESS),
@@ -76,7 +95,7 @@ def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m
     """Return the tables of a heuristic.
 
     Args:
-        heuristic: `GREEDY_GOAL`, `GREEDY_DRIVE` or `FIRST_FREE`.
+        heuristic: such as `GREEDY_GOAL`.
         problems: the problem of each place, all in one lot.
         within_m: distance from the goal up to which `FIRST_FREE` takes a free slot at once, m; None: the median's.
     """
@@ -86,7 +105,8 @@ def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m
         np.median(cost_s) if within_m is None else within_m / one.v_walk
         for one, cost_s in zip(problems, costs_s, strict=True)
     ]
-    numbers = {"heuristic": heuristic, "n_slots": lot.n_slots, "n_vertices": n}
+    least_price = int(problems[0].parking_cost_s.argmin())
+    numbers = {"heuristic": heuristic, "n_slots": lot.n_slots, "n_vertices": n, "least_price": least_price}
     arrays: dict[str, NDArray[Any]] = {
         "neighbors": lot.neighbors.astype(np.int32),
         "move_s": np.array(problems[0].move_cost_s, np.float64),
@@ -108,13 +128,13 @@ def keeps_target(heuristic: int, target: int, state: int) -> bool:
     """Return whether the target is kept whatever was observed of other slots.
 
     Args:
-        heuristic: `GREEDY_GOAL`, `GREEDY_DRIVE` or `FIRST_FREE`.
+        heuristic: such as `GREEDY_GOAL`.
         target: the slot to drive to, or `NO_SLOT`.
         state: its recent state, see `SlotBelief.recent_state`.
     """
     if target == NO_SLOT or state == OBSERVED_TAKEN:
         return False
-    return heuristic != FIRST_FREE or state == OBSERVED_FREE
+    return heuristic not in (FIRST_FREE, GREEDY_TOTAL) or state == OBSERVED_FREE
 
 
 @rule
@@ -176,8 +196,28 @@ def _known_slot(search: int, i: int) -> int:
 
 
 @inlined_rule
-def _arrival_cost_s(tables: Any, place: int) -> Any:
-    return float64s(tables.arrival_cost_s + 8 * tables.n_slots * place)
+def _expected_cost_s(tables: Any, place: int, slot: int) -> float:
+    """Return the arrival cost of a slot for the expected stay, s."""
+    return float(float64s(tables.arrival_cost_s)[tables.n_slots * place + slot])
+
+
+@inlined_rule
+def _cost_s(tables: Any, place: int, search: int, slot: int) -> float:
+    """Return the arrival cost of a slot for the car's own stay, s."""
+    if search and has_own_price(search_of(search)):
+        return float(arrival_cost_s(search_of(search), slot))
+    return float(_expected_cost_s(tables, place, slot))
+
+
+@inlined_rule
+def _near_s(tables: Any, place: int, search: int) -> float:
+    """Return the arrival cost up to which `FIRST_FREE` takes a free slot at once, s.
+
+    For a car's own stay it rises by what the lowest price does.
+    """
+    slot = np.int64(tables.least_price)
+    more_s = _cost_s(tables, place, search, slot) - _expected_cost_s(tables, place, slot)
+    return float(float64s(tables.near_s)[place] + more_s)
 
 
 # ---- the choice
@@ -187,20 +227,23 @@ def _arrival_cost_s(tables: Any, place: int) -> Any:
 def _choose_target(tables: Any, place: int, search: int, vertex: int, previous: int) -> int:
     """Return the slot to drive to; `NO_SLOT` if every slot in reach was observed taken."""
     if tables.heuristic == FIRST_FREE:
-        near_s, cost_s = float64s(tables.near_s)[place], _arrival_cost_s(tables, place)
+        near_s = _near_s(tables, place, search)
         for i in range(_n_known(tables, search)):
             slot = _known_slot(search, i)
-            if cost_s[slot] <= near_s and _state(tables, search, slot) == OBSERVED_FREE:
-                found = _nearest(tables, place, search, vertex, True, near_s, False)
+            is_near = _cost_s(tables, place, search, slot) <= near_s
+            if is_near and _state(tables, search, slot) == OBSERVED_FREE:
+                found = _nearest(tables, place, search, vertex, True, near_s, BY_DRIVE)
                 if found != NO_SLOT:
                     return int(found)
                 break
         if previous != NO_SLOT and _state(tables, search, previous) != OBSERVED_TAKEN:
             return previous
     if tables.heuristic == GREEDY_DRIVE:
-        return int(_nearest(tables, place, search, vertex, False, np.inf, True))
+        return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE_THEN_COST))
+    if tables.heuristic == GREEDY_TOTAL:
+        return int(_nearest(tables, place, search, vertex, False, np.inf, BY_TOTAL))
     if tables.heuristic == FIRST_FREE and previous != NO_SLOT:
-        return int(_nearest(tables, place, search, vertex, False, np.inf, False))
+        return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE))
     return int(_cheapest(tables, place, search, vertex))
 
 
@@ -225,33 +268,35 @@ def _likeliest_target(tables: Any, place: int, search: int, vertex: int) -> int:
 @rule
 def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
     """Return the candidate with the lowest arrival cost; among equals, the one with the shortest drive."""
-    seconds, cost_s, least = float64s(tables.seconds), _arrival_cost_s(tables, place), np.inf
+    seconds, least, lowest = float64s(tables.seconds), np.inf, np.inf
     for slot in range(tables.n_slots):
-        if cost_s[slot] < least and _state(tables, search, slot) != OBSERVED_TAKEN:
-            least = cost_s[slot]
-    found = int(_nearest(tables, place, search, vertex, False, least, False))
+        cost_s = _cost_s(tables, place, search, slot)
+        if cost_s < least and _state(tables, search, slot) != OBSERVED_TAKEN:
+            least = cost_s
+    found = int(_nearest(tables, place, search, vertex, False, least, BY_DRIVE))
     if found == NO_SLOT and least < np.inf:
         # It cannot be reached: among those that can.
         _search_everywhere(tables, place, search, vertex)
         for slot in range(tables.n_slots):
             if seconds[slot] == np.inf or _state(tables, search, slot) == OBSERVED_TAKEN:
                 continue
-            if found == NO_SLOT or (cost_s[slot], seconds[slot]) < (cost_s[found], seconds[found]):
-                found = slot
+            cost_s = _cost_s(tables, place, search, slot)
+            if found == NO_SLOT or (cost_s, seconds[slot]) < (lowest, seconds[found]):
+                found, lowest = slot, cost_s
     return found
 
 
 @rule
 def _search_everywhere(tables: Any, place: int, search: int, vertex: int) -> None:
     """Compute the drive times from a vertex to all others."""
-    _nearest(tables, place, search, vertex, False, -np.inf, False)
+    _nearest(tables, place, search, vertex, False, -np.inf, BY_DRIVE)
 
 
 @rule
 def _nearest(
-    tables: Any, place: int, search: int, vertex: int, only_free: bool, limit_s: float, by_cost: bool
+    tables: Any, place: int, search: int, vertex: int, only_free: bool, limit_s: float, order: int
 ) -> int:
-    """Return the nearest of some slots (Dijkstra's algorithm); among equals, the first one; `NO_SLOT` if there is none.
+    """Return the first of some slots (Dijkstra's algorithm); among equals, that of the lowest number, or `NO_SLOT`.
 
     Args:
         tables: the TABLES record; drive times are exact up to the slot afterwards, upper bounds beyond.
@@ -260,18 +305,17 @@ def _nearest(
         vertex: where the car is.
         only_free: whether only slots observed free count, not all candidates.
         limit_s: arrival cost up to which slots count, s.
-        by_cost: whether that with the lowest arrival cost comes first among equals.
+        order: what slots are ranked by, such as `BY_DRIVE`.
     """
     seconds, reached, last_edge = float64s(tables.seconds), int32s(tables.reached), int32s(tables.last_edge)
     neighbors, move_s = int32s(tables.neighbors), float64s(tables.move_s)
     room = _N_MOVES * tables.n_vertices + 1
     keys, vertices = float64_array(tables.keys, (room,)), int32_array(tables.vertices, (room,))
-    cost_s = _arrival_cost_s(tables, place)
     for i in range(1, reached[0] + 1):
         seconds[reached[i]] = np.inf
     seconds[vertex], reached[0], reached[1] = 0.0, 1, vertex
     size = push(keys, vertices, 0, 0.0, vertex)
-    best, best_s = NO_SLOT, np.inf
+    best, best_s, best_cost_s = NO_SLOT, np.inf, np.inf
     while size > 0:
         far, v = keys[0], np.int64(vertices[0])
         if far > best_s:
@@ -279,11 +323,16 @@ def _nearest(
         size = pop(keys, vertices, size)
         if far > seconds[v]:
             continue
-        if v < tables.n_slots and cost_s[v] <= limit_s:
+        cost_s = _cost_s(tables, place, search, v) if v < tables.n_slots else np.inf
+        if v < tables.n_slots and cost_s <= limit_s:
             state = _state(tables, search, v)
+            value = far
+            if order == BY_TOTAL:
+                value = cost_s + (far if state == OBSERVED_FREE else UNOBSERVED_DETOUR * far)
+            first = v < best if order != BY_DRIVE_THEN_COST or cost_s == best_cost_s else cost_s < best_cost_s
             counts = state == OBSERVED_FREE or not (only_free or state == OBSERVED_TAKEN)
-            if counts and (best == NO_SLOT or _comes_first(v, best, cost_s, by_cost)):
-                best, best_s = int(v), far
+            if counts and (value < best_s or (value == best_s and first)):
+                best, best_s, best_cost_s = int(v), value, cost_s
         for edge in range(v * _N_MOVES, (v + 1) * _N_MOVES):
             u, after = np.int64(neighbors[edge]), far + move_s[edge]
             if u >= 0 and after < seconds[u]:
@@ -293,11 +342,3 @@ def _nearest(
                 seconds[u], last_edge[u] = after, edge
                 size = push(keys, vertices, size, after, u)
     return best
-
-
-@inlined_rule
-def _comes_first(slot: int, other: int, cost_s: Any, by_cost: bool) -> bool:
-    """Return whether of two slots at the same drive time the first one is chosen."""
-    if by_cost and cost_s[slot] != cost_s[other]:
-        return bool(cost_s[slot] < cost_s[other])
-    return slot < other

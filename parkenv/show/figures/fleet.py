@@ -13,7 +13,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.show.figures.lot import draw_zones, zone_colors
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.world.lot import ParkingLot
 
 Row = dict[str, Any]
 
@@ -178,3 +180,42 @@ def _draw_hours(ax: Axes, rows: Sequence[Row]) -> None:
         ax.plot(hour + 0.5, 100.0 * simulated, label=f"simulated, {_demand(demand)}", **style)
     ax.set(xlabel="hour of the day", ylabel="%", ylim=(0.0, 100.0), title="Occupancy")
     ax.legend()
+
+
+def save_zones_figure(lot: ParkingLot, zones: Sequence[Row], hours: Sequence[Row], path: str | Path) -> None:
+    """Draw the zones of a lot: where they are, how full they are by hour, and what is paid in them.
+
+    Hours are means over the days of one setting: the last one where nobody knows more than it observes, if any.
+
+    Args:
+        lot: the lot.
+        zones: of `summarize_zones`.
+        hours: rows of `zones.csv`.
+        path: file to write.
+
+    Raises:
+        InputError: the file cannot be written.
+    """
+    names = ("agents", "knows", "share", "arrivals_per_hour")
+    first = max(reversed(zones), key=lambda row: row["knows"] == "own")
+    its = [row for row in hours if all(row[name] == first[name] for name in names)]
+    days = len({row["day"] for row in its})
+    title = f"{first['scenario']}: zones, {first['agents']}, {_demand(first['arrivals_per_hour'])}"
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=(11.0, 3.4), layout="constrained")
+        left, middle, right = figure.subplots(1, 3, width_ratios=(2.2, 1.0, 1.0))
+        draw_zones(lot, left)
+        for zone, color in zip(lot.zones, zone_colors(lot), strict=True):
+            for ax, column, scale in ((middle, "occupancy", 100.0), (right, "paid", 1.0)):
+                sums: dict[int, float] = {}
+                for row in its:
+                    if row["zone"] == zone:
+                        sums[row["hour"]] = sums.get(row["hour"], 0.0) + scale * row[column] / days
+                at = [hour + 0.5 for hour in sorted(sums)]
+                ax.plot(at, [sums[hour] for hour in sorted(sums)], color=color, marker="o", markersize=4)
+        middle.set(xlabel="hour of the day", ylabel="%", ylim=(0.0, 100.0), title="Slots taken")
+        right.set(xlabel="hour of the day", title="Paid an hour, when cars park", ylim=(0.0, None))
+        for ax in (middle, right):
+            ax.grid(visible=True)
+        figure.suptitle(title, x=0.01, ha="left")
+        save_picture(figure, path, f"{title}: map, slots taken and revenue by hour.")

@@ -171,7 +171,7 @@ def draw_zones(lot: ParkingLot, ax: Axes, *, show_graph: bool = False) -> None:
     colors = zone_colors(lot)
     draw_lot(lot, ax, slot_color=to_rgba_array(colors)[lot.zone_of_slot], show_graph=show_graph)
     handles = [Patch(color=color, label=zone) for zone, color in zip(lot.zones, colors, strict=True)]
-    ax.legend(handles=handles, title="zone", loc="upper left", framealpha=0.9).set_zorder(6.0)
+    ax.legend(handles=handles, title="zone", loc="upper left", frameon=True, framealpha=0.9).set_zorder(6.0)
 
 
 def zone_colors(lot: ParkingLot) -> list[str]:

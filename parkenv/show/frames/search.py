@@ -84,12 +84,17 @@ class SearchRenderer:
         image = self._key.copy()
         parts = (
             clock(state.time),
-            f"{state.time - state.arrival.time + state.walk_s + state.gave_up_s:.0f} s",
+            f"{state.total_s:.0f} s",
             f"{state.failed_parks} failed",
         )
         if state.parked:
             place = f"parked in {self.scenario.lot.slot_ids[state.vertex]}"
-            verdicts = (f"{place}, {state.walk_s:.0f} s to walk", place, "parked")
+            verdicts = (
+                f"{place}, {_price_and_walk(state)}",
+                f"{place}, {state.walk_s:.0f} s to walk",
+                place,
+                "parked",
+            )
             write_line(image, parts, verdicts, room=KEY_WIDTH)
         else:
             write_line(image, parts, ("lot is full",) * bool(state.over), "warning", KEY_WIDTH)
@@ -118,7 +123,7 @@ class SearchRenderer:
     def _place(self, state: SearchState) -> str:
         lot, vertex = self.scenario.lot, state.vertex
         if state.parked:
-            return f"parked in slot {lot.slot_ids[vertex]}, {state.walk_s:.0f} s to walk"
+            return f"parked in slot {lot.slot_ids[vertex]}, {_price_and_walk(state)}"
         if state.over:
             return "every slot is taken, parking elsewhere"
         return f"at slot {lot.slot_ids[vertex]}" if vertex < lot.n_slots else f"at junction {vertex}"
@@ -148,6 +153,12 @@ class SearchRenderer:
         quarter = round(float(view.yaw(pose[2])) / (np.pi / 2)) % 4
         put(pose[None, :2], np.array([">v<^"[quarter]]))
         return ["".join(row).rstrip() for row in rows]
+
+
+def _price_and_walk(state: SearchState) -> str:
+    """Return what parking costs, where it costs something, and the walk."""
+    price = f"price {state.parking_cost_s:.0f} s, " if state.parking_cost_s else ""
+    return f"{price}{state.walk_s:.0f} s to walk"
 
 
 def strip_with_key() -> Image:

@@ -8,7 +8,7 @@ best one, which knows all arrivals and stays, bounds theirs.
 The best schedule is hard to find; its Lagrangian relaxation is not. If a second in slot j at time t has the rent
 π_j(t) ≥ 0, then
 
-    Σ_i min(give-up penalty, min over j and p of p - a_i + cost_j + ∫_p^{p+stay_i} π_j) - Σ_j ∫ π_j, where free
+    Σ_i min(give-up penalty, min over j and p of p - a_i + cost_ij + ∫_p^{p+stay_i} π_j) - Σ_j ∫ π_j, where free
 
 is a lower bound whatever the rents (weak duality): in a schedule, cars pay at most the rents of all seconds. Here p is
 the time at which car i, which arrived at a_i, parks. Rents are constant within bins, so each minimum is exact: it lies
@@ -51,8 +51,10 @@ class ParkingDay(NamedTuple):
     patience_s: FloatArray  # (n_cars,) float64, s, a car that parks does so within this time
     entry: IntArray  # (n_cars,) int64, row of `drive_s`
     drive_s: FloatArray  # (n_entries, n_slots) float64, s, shortest drives
-    cost_s: FloatArray  # (n_slots,) float64, s, walk and parking cost
+    cost_s: FloatArray  # (n_slots,) float64, s, walk and parking cost without prices
     free_from: FloatArray  # (n_slots,) float64, s, when the resident has left; -inf without one, inf if it never does
+    zone: IntArray  # (n_slots,) int64, column of `zone_cost_s`
+    zone_cost_s: FloatArray  # (n_cars, n_zones) float64, s, price of each car's stay, at least 0
     give_up_s: float  # s, penalty of going elsewhere
 
 
@@ -66,7 +68,8 @@ def clairvoyant_bound_s(day: ParkingDay) -> float:
 
         >>> day = ParkingDay(
         ...     np.zeros(2), np.full(2, 600.0), np.full(2, 300.0), np.zeros(2, np.int64),
-        ...     np.array([[10.0]]), np.array([20.0]), np.array([-np.inf]), 100.0,
+        ...     np.array([[10.0]]), np.array([20.0]), np.array([-np.inf]),
+        ...     np.zeros(1, np.int64), np.zeros((2, 1)), 100.0,
         ... )
         >>> 100.0 < clairvoyant_bound_s(day) <= 130.0
         True
@@ -124,7 +127,7 @@ def _schedule_in_order(day: ParkingDay) -> float:
         best, chosen, parks_at = day.give_up_s, -1, 0.0
         for j in range(len(day.cost_s)):
             at = max(day.arrival[i] + day.drive_s[day.entry[i], j], free_from[j])
-            value = at - day.arrival[i] + day.cost_s[j]
+            value = at - day.arrival[i] + day.cost_s[j] + day.zone_cost_s[i, day.zone[j]]
             if value < best and at <= day.arrival[i] + day.patience_s[i]:
                 best, chosen, parks_at = value, j, at
         total_s += best
@@ -141,7 +144,7 @@ def _raise_rents(
 
     Args:
         day: the day.
-        order: (n_entries, n_slots) slots, soonest at the goal first.
+        order: (n_entries, n_slots) slots, soonest at the goal first if they were without prices.
         part: (n_slots,) part of each slot.
         rents: (n_parts, n_bins) first rents, s per s; changed.
         target_s: s, total time of a schedule, at which the steps aim (Polyak).
@@ -202,9 +205,9 @@ def _best_place(
     arrival, stay_s, entry = day.arrival[car], day.stay_s[car], day.entry[car]
     best, chosen, parks_at, work = day.give_up_s, -1, 0.0, 0
     for j in order[entry]:
-        cost_s, g = day.cost_s[j], part[j]
-        if day.drive_s[entry, j] + cost_s >= best:
+        if day.drive_s[entry, j] + day.cost_s[j] >= best:
             break
+        cost_s, g = day.cost_s[j] + day.zone_cost_s[car, day.zone[j]], part[j]
         # Not later than pays off without a rent
         last = arrival + min(day.patience_s[car], best - cost_s)
         at = max(arrival + day.drive_s[entry, j], day.free_from[j])

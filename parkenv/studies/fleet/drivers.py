@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -58,7 +59,32 @@ def policy_of(
 
             sampled = agent.card.algorithm != "dqn"
             return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
-    return None, agent
+    # Learned agents observe costs themselves.
+    return None, AgentsByStay(spec, scenario, known) if scenario.tariff and not isinstance(
+        agent, LearnedAgent
+    ) else agent
+
+
+class AgentsByStay:
+    """An agent in Python for each car of a fleet, which plans with what the car's own stay costs.
+
+    Args:
+        spec: the agent.
+        scenario: what all cars have in common.
+        known: further options.
+    """
+
+    def __init__(self, spec: AgentSpec, scenario: Scenario, known: Mapping[str, Any]) -> None:
+        self._spec, self._scenario, self._options = spec, scenario, {**known, **spec.options}
+
+    def predict(self, observation: Any, state: Any = None) -> tuple[Any, Any]:
+        """Return the action of the car's agent, which is made at its first decision, and the next state."""
+        if state is None:
+            own = self._scenario.replace(stay_s=float(observation["stay_s"][0]))
+            state = make_agent(self._spec.name, own, **self._options), None
+        agent, memory = state
+        action, memory = agent.predict(observation, memory)
+        return action, (agent, memory)
 
 
 def demand_in(scenario: Scenario, per_hour: float | str, stay_s: float, patience_s: float) -> Demand:

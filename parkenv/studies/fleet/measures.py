@@ -12,6 +12,8 @@ from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.engine.fleet import Fleet
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
 from parkenv.studies.fleet.setting import BY_HOUR
+from parkenv.studies.fleet.zones import has_zones, paid
+from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import HOUR_S
 
@@ -32,12 +34,11 @@ class Roads:
         metres = dijkstra(lot.drive_matrix(), indices=entries)[:, : lot.n_slots]
         self._metres = dict(zip(map(int, entries), metres, strict=True))
         self._entries, self._drive_s = entries, metres / problem.v_drive
-        self._cost_s, self._give_up_s = problem.arrival_cost_s, problem.give_up_s
+        self._problem, self._cost_s = problem, problem.walk_s + lot.slot_parking_cost_s
         self.first_slot_m = float(metres.min(axis=1).mean())
-        self._alone_s = {
-            entry: float((row / problem.v_drive + problem.arrival_cost_s).min())
-            for entry, row in self._metres.items()
-        }
+        free_s, zones = self._drive_s + self._cost_s, range(len(lot.zones))
+        # By entry and zone, without prices.
+        self._alone_s = np.stack([free_s[:, lot.zone_of_slot == zone].min(axis=1) for zone in zones], axis=1)
 
     def metres(self, cars: NDArray[np.void]) -> FloatArray:
         """Return the shortest drive of parked cars from entry to slot, (n,) m."""
@@ -47,7 +48,8 @@ class Roads:
 
     def alone_s(self, cars: NDArray[np.void]) -> FloatArray:
         """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster."""
-        return np.array([self._alone_s[int(entry)] for entry in cars["entry"]])
+        rows = np.searchsorted(self._entries, cars["entry"])
+        return np.asarray((self._alone_s[rows] + self._problem.zone_cost_s(cars["stay_s"])).min(axis=1))
 
     def parking_day(self, fleet: Fleet) -> ParkingDay:
         """Return the day of a fleet that has been reset: its cars to come, and when its residents leave."""
@@ -61,7 +63,9 @@ class Roads:
             drive_s=self._drive_s,
             cost_s=np.asarray(self._cost_s, np.float64),
             free_from=leaves_at.astype(np.float64),
-            give_up_s=float(self._give_up_s),
+            zone=np.array(self._problem.lot.zone_of_slot),
+            zone_cost_s=self._problem.zone_cost_s(cars["stay_s"]),
+            give_up_s=float(self._problem.give_up_s),
         )
 
 
@@ -91,7 +95,7 @@ def day_measures(
         filled: of `filling`, while cars arrived.
         clairvoyant_s: lower bound on the total time of all cars together, s.
     """
-    cars = fleet.cars
+    cars, amounts = fleet.cars, paid(fleet)
     times, parked = cars["total_s"], cars["slot"] >= 0
     direct_m = np.zeros(len(cars))
     direct_m[parked] = roads.metres(cars[parked])
@@ -115,17 +119,19 @@ def day_measures(
         "others_s": _mean(times[~members]),
         "bound_s": float(roads.alone_s(cars).mean()),
         "clairvoyant_s": clairvoyant_s / len(cars),
+        **{name: float(cars[name].mean()) for name in COST_FIELDS},
+        "paid": float(amounts.mean()),
+        "paying_share": float((amounts > 0.0).mean()),
     }
 
 
 def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     """Return `CAR_LISTS` of a day whose searches are all over, as texts."""
-    cars, lot, tariff = fleet.cars, fleet.scenario.lot, fleet.scenario.tariff
+    cars, lot = fleet.cars, fleet.scenario.lot
     lists = {"total_cs": 100.0 * cars["total_s"], "member": members}
-    if len(lot.zones) > 1 or tariff:
+    if has_zones(fleet.scenario):
         zone = np.where(cars["slot"] >= 0, 1 + lot.zone_of_slot[cars["slot"]], 0)
-        amounts = tariff.amounts(("", *lot.zones), cars["stay_s"])  # nothing is paid elsewhere
-        lists |= {"zone": zone, "paid_cents": 100.0 * amounts[np.arange(len(cars)), zone]}
+        lists |= {"zone": zone, "paid_cents": 100.0 * paid(fleet)}
     return {name: " ".join(map(str, np.rint(values).astype(int).tolist())) for name, values in lists.items()}
 
 

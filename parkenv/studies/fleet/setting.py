@@ -10,6 +10,7 @@ from pydantic import BeforeValidator, WithJsonSchema
 from parkenv.files.csv_tables import NUMBER_OR_NAN, NUMBERS, TEXT, WHOLE, Kind, wholes
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.results import Row
+from parkenv.world.cost_terms import COST_FIELDS
 
 OWN = "own"
 COUNTED = "counted"
@@ -19,7 +20,7 @@ SETTING_COLUMNS = ("scenario", "agents", "knows", "share", "arrivals_per_hour")
 MEASURES = (
     "total_s", "median_s", "p95_s", "gini", "search_s", "queued_s", "failed_attempts", "driven_m", "cruised_m",
     "cruising_share", "balked_fraction", "occupancy", "counted_occupancy", "members_s", "others_s",
-    "bound_s", "clairvoyant_s",
+    "bound_s", "clairvoyant_s", *COST_FIELDS, "paid", "paying_share",
 )  # fmt: skip
 """Measures of a day, of which a summary has the mean over days."""
 CAR_LISTS = ("total_cs", "member", "zone", "paid_cents")

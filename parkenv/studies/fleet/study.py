@@ -9,12 +9,12 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE, KnowledgeName
-from parkenv.files.option import Option, option, words_in
+from parkenv.files.option import option, words_in
 from parkenv.files.spec_file import Axis, FilePath
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec, split_agents
@@ -43,7 +43,7 @@ from parkenv.studies.fleet.setting import (
     rate_text,
     times_counted,
 )
-from parkenv.studies.results import CsvTable, Results, Row
+from parkenv.studies.results import CsvTable, Results, Row, Table
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
@@ -62,6 +62,8 @@ SAMPLE_S = 300.0
 """Time between two samples of the occupancy, s."""
 MOST_LISTED = 8_000_000
 """Cars that are expected in all settings up to which `cars.csv` has a list of them for each day."""
+USUAL, MINDS_PRICES = "greedy-drive", "greedy-total"
+"""Default agents."""
 OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
 """Fields of the specification that all settings have in common."""
 PICTURE = "fleet.png"
@@ -84,14 +86,18 @@ class FleetStudy(Study):
     table_titles: ClassVar = {
         "changes": "What changes for whom",
         "rows": "Results",
+        "zones": "Zones, a day",
         "hours": "Occupancy by hour, simulated and as counted",
     }
 
     kind: Literal["fleet"] = "fleet"
-    agents: Annotated[Agents, Option(takes="NAME[,...]", parse=split_agents)] = Field(
-        (AgentSpec(name="greedy-drive"),),
-        description="Agents, each of which drives all cars in turn, with any options in brackets. greedy-drive, "
-        "first-free and random are compiled; any other agent decides in Python.",
+    agents: Agents | None = option(
+        None,
+        "Agents, each of which drives all cars in turn, with any options in brackets. The heuristics are compiled; any "
+        "other agent decides in Python.",
+        takes="NAME[,...]",
+        parse=split_agents,
+        default=f"{USUAL}; where parking has a price, {MINDS_PRICES}",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
     knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = option(
@@ -170,14 +176,14 @@ class FleetStudy(Study):
 
     @model_validator(mode="after")
     def _bounded(self) -> Self:
-        require_distinct_names(self.agents, self.scenarios)
+        require_distinct_names(self.agents or (), self.scenarios)
         if self.decision_limit_s is not None and self.backend == "dask":
             raise PydanticCustomError(
                 "whole",
                 "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
             )
         axes = "scenarios x agents x knows x shares x arrivals_per_hour"
-        lengths = map(len, (self.scenarios, self.agents, self.knows, self.shares, self.demands))
+        lengths = map(len, (self.scenarios, self.agents or (USUAL,), self.knows, self.shares, self.demands))
         settings = math.prod(lengths)
         require_at_most(settings, axes, "settings", MAX_SETTINGS)
         require_at_most(settings * self.days, f"{axes} x days", "days")
@@ -194,8 +200,14 @@ class FleetStudy(Study):
         """Lot, residents, hours of arrival, speeds and costs of each scenario, by its name."""
         from parkenv.scenarios.build import build
 
-        built = [build(spec) for spec in self.scenarios]
+        built = [build(spec).replace(stay_s=self.stay_s) for spec in self.scenarios]
         return {one.name: one if self.calibration is None else self.calibration.applied(one) for one in built}
+
+    @property
+    def drivers(self) -> tuple[AgentSpec, ...]:
+        """The agents; by default one that minds prices, where there are any."""
+        is_priced = any(scenario.is_priced for scenario in self.built.values())
+        return self.agents or (AgentSpec(name=MINDS_PRICES if is_priced else USUAL),)
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -230,11 +242,11 @@ class FleetStudy(Study):
         made = dict.fromkeys(
             (per_hour, number, OWN if share == 0.0 else knows, 0.0 if knows == OWN else share)
             for per_hour, number, knows, share in itertools.product(
-                self.demands, range(len(self.agents)), self.knows, self.shares
+                self.demands, range(len(self.drivers)), self.knows, self.shares
             )
         )
         return [
-            Setting(name, self.agents[number], knows, share, per_hour)
+            Setting(name, self.drivers[number], knows, share, per_hour)
             for per_hour, number, knows, share in made
             for name in self.built
         ]
@@ -283,6 +295,7 @@ class FleetStudy(Study):
 
         from parkenv.studies.fleet.clairvoyant_bound import clairvoyant_bound_s
         from parkenv.studies.fleet.measures import car_lists, day_measures, filling
+        from parkenv.studies.fleet.zones import ZONES, has_zones, zone_rows
         from parkenv.world.occupancy.process import Arrival
 
         fleet, agents = self.fleet(setting)
@@ -295,7 +308,7 @@ class FleetStudy(Study):
         try:
             for time in times:
                 fleet.run(agents, until=float(time))
-                taken.append(fleet.taken().mean())
+                taken.append(fleet.taken())
             fleet.run(agents)
         except InputError as error:
             raise InputError(f"{setting}, day {day}, {error}") from error
@@ -303,10 +316,12 @@ class FleetStudy(Study):
         if occupancy.recorded or isinstance(setting.arrivals_per_hour, str):
             counted = occupancy.course(Arrival(fleet.begin, fleet.day.date), times).occupied
         members = fleet.cars["kind"] == 0
-        filled = filling(times, np.array(taken), counted)
+        filled = filling(times, np.array([looked_at.mean() for looked_at in taken]), counted)
         measured = day_measures(fleet, roads, members, filled, bound_s)
         lists = car_lists(fleet, members) if self._lists_cars else {}
-        return {**setting.columns, "day": day, **measured, **lists}
+        row = {**setting.columns, "day": day}
+        zones = zone_rows(fleet, times, np.array(taken)) if has_zones(fleet.scenario) else []
+        return {**row, **measured, **lists, ZONES.file: [row | zone for zone in zones]}
 
     @property
     def _lists_cars(self) -> bool:
@@ -345,6 +360,22 @@ class FleetStudy(Study):
         """See `Study`."""
         return [self.run_day(work, day) for day in items]
 
+    @property
+    def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
+        """See `Study`: what happens in zones, too, if there are any."""
+        from parkenv.studies.fleet.zones import ZONES, has_zones
+
+        return (self.table, ZONES) if any(map(has_zones, self.built.values())) else (self.table,)
+
+    def keep(self, work: Setting, rows: Sequence[Row], results: Results) -> None:
+        """See `Study`: what happened in zones."""
+        from parkenv.studies.fleet.zones import ZONES
+
+        del work
+        for row in rows:
+            if zones := row.pop(ZONES.file):
+                results.add(zones, ZONES, sync=False)
+
     def label(self, work: Setting) -> str:
         """See `Study`."""
         return work.agent.label
@@ -363,7 +394,21 @@ class FleetStudy(Study):
             "rows": summarize_days(days),
             "changes": summarize_changes(days, {name: its.lot.zones for name, its in self.built.items()}),
             "hours": summarize_hours(days, int(first)),
+            "zones": self._zones(results),
         }
+
+    def _zones(self, results: Results) -> list[Row]:
+        """Put the rows of zones, if there are any, in the order of settings and days, and summarise them."""
+        from parkenv.studies.fleet.zones import ZONES, summarize_zones
+
+        if ZONES not in self.all_tables:
+            return []
+        rows = results.rows(ZONES)
+        days = (key for work, items in self.cells() for item in items for key in self.keys(work, item))
+        order = {key: number for number, key in enumerate(days)}
+        keys = sorted((key for key in rows if key[:-2] in order), key=lambda key: order[key[:-2]])
+        results.put_in_order(keys, ZONES)
+        return summarize_zones([rows[key] for key in keys])
 
     @property
     def title(self) -> str:
@@ -376,11 +421,12 @@ class FleetStudy(Study):
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: a picture of each scenario."""
         from parkenv.files.file_names import file_name
-        from parkenv.show.figures.fleet import save_fleet_figure
+        from parkenv.show.figures.fleet import save_fleet_figure, save_zones_figure
         from parkenv.show.plurals import plural
         from parkenv.studies.fleet.measures import looks_s
+        from parkenv.studies.fleet.zones import ZONES
 
-        return [
+        tasks: list[Task[object]] = [
             partial(
                 save_fleet_figure,
                 [row for row in result.rows if row["scenario"] == name],
@@ -391,6 +437,13 @@ class FleetStudy(Study):
             )
             for name, scenario in self.built.items()
         ]
+        for name, scenario in self.built.items():
+            zones = [row for row in result.summary["zones"] if row["scenario"] == name]
+            if zones:
+                hours = [row for row in result.results.rows(ZONES).values() if row["scenario"] == name]
+                file = file_name("zones" if len(self.built) == 1 else f"zones_{name}", ".png")
+                tasks.append(partial(save_zones_figure, scenario.lot, zones, hours, result.folder / file))
+        return tasks
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
