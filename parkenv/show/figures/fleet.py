@@ -177,7 +177,7 @@ def _draw_hours(ax: Axes, rows: Sequence[Row]) -> None:
             ax.plot(hour + 0.5, 100.0 * counted, "--", color=INK, label="as counted")
         line, marker = _STYLES[number % len(_STYLES)]
         style = {"color": _SIMULATED, "linestyle": line, "marker": marker, "markersize": 4}
-        ax.plot(hour + 0.5, 100.0 * simulated, label=f"simulated, {_demand(demand)}", **style)
+        ax.plot(hour + 0.5, 100.0 * simulated, label=f"simulated, arrivals {_demand(demand)}", **style)
     ax.set(xlabel="hour of the day", ylabel="%", ylim=(0.0, 100.0), title="Occupancy")
     ax.legend()
 
