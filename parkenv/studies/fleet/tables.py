@@ -98,7 +98,7 @@ def departures(hours: Sequence[Row]) -> list[str]:
         meant = first and (rate == COUNTED or not isinstance(rate, str))
         if meant and abs(row["excess"]) > FAR and (low or 0.0) * (high or 0.0) > 0.0:
             worst[row["agents"], rate] = row
-    why = "shorter stays (--stay-min) can follow", "it is full at times, and cars go elsewhere"
+    why = "shorter stays (--stay-min) may follow better", "it is full at times, and cars go elsewhere"
     return [
         f"{agent}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
         f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}; "
