@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -34,7 +35,7 @@ class CropScore:
         auc: area under the curve of true against false positives.
         recall: fraction of the cars found at each false-positive rate of `FALSE_POSITIVES`.
         n_cars, n_others: number of crops.
-        equal_error: equal-error rate on photographs made of them, with cars of many sizes.
+        equal_error: equal-error rate on photographs made of them, with cars of many sizes; nan without any.
     """
 
     auc: float
@@ -44,7 +45,7 @@ class CropScore:
     equal_error: float
 
 
-def score_on_crops(model: CarModel, crops: Crops, seed: int = 0) -> CropScore:
+def score_on_crops(model: CarModel, crops: Crops, seed: int = 0, n_photos: int = MADE_PHOTOS) -> CropScore:
     """Score a model on crops, each resized to its window, and on photographs made of them with this seed."""
     from sklearn.metrics import roc_auc_score
 
@@ -55,7 +56,7 @@ def score_on_crops(model: CarModel, crops: Crops, seed: int = 0) -> CropScore:
         tuple(recall_at(rate, scores[0], scores[1]) for rate in FALSE_POSITIVES),
         len(scores[0]),
         len(scores[1]),
-        score_on_made_photos(model, crops, MADE_PHOTOS, seed).equal_error,
+        score_on_made_photos(model, crops, n_photos, seed).equal_error if n_photos else math.nan,
     )
 
 
@@ -89,6 +90,7 @@ def cross_validated(
     *,
     folds: int = 5,
     seed: int = 0,
+    n_photos: int = MADE_PHOTOS,
     progress: Callable[[str], None] = lambda _: None,
     **training: Any,
 ) -> list[CropScore]:
@@ -98,6 +100,7 @@ def cross_validated(
         crops: crops of cars and of others.
         folds: number of models to train.
         seed: seed of the assignment of blocks to folds.
+        n_photos: number of photographs made of the crops of each fold, which take longer to search than the crops.
         progress: called with a line for each fold.
         **training: arguments of `train`.
 
@@ -123,7 +126,7 @@ def cross_validated(
             positives=_part(crops.positives, fold_of, fold, True),
             negatives=_part(crops.negatives, fold_of, fold, True),
         )
-        scores.append(score_on_crops(model, held_out, seed + fold))
+        scores.append(score_on_crops(model, held_out, seed + fold, n_photos))
     return scores
 
 
