@@ -206,7 +206,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
     The world ends when all cars' searches are over. A parked car stays in its slot for its stay, then leaves.
 
     ## Arguments
-    - `scenario`: as of `parkenv/Search-v2`: a name, a file, a lot, a `Scenario`.
+    - `scenario`: as in `parkenv/Search-v2`: a name, a file, a lot, a `Scenario`.
     - `cars`: number of cars. The first arrives at a time in the scenario's arrival window, the others after it, 10 s
       apart on average; they stay for an hour on average (both exponentially distributed).
     - `demand`: a `parkenv.world.demand.Demand` instead of `cars`: Poisson or listed arrivals, stays, patience, entries,
@@ -317,7 +317,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
     (terminated), and all leave them after `max_cycles` ticks (truncated).
 
     Args:
-        scenario: as of `LotEnv`.
+        scenario: see `LotEnv`.
         cars: number of cars.
         tick_s: length of a tick, s.
         options: further options of `LotEnv`; `max_cycles` is the number of ticks after which all cars are truncated.
@@ -437,15 +437,15 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
 
 
 def raw_env(**options: Any) -> LotEnv:
-    """Make the AEC form without wrappers; options as of `LotEnv`."""
+    """Make the AEC form without wrappers; options see `LotEnv`."""
     return LotEnv(**options)
 
 
 def env(**options: Any) -> wrappers.OrderEnforcingWrapper[str, Observation, Any]:
-    """Make the AEC form with PettingZoo's checks of actions and of the order of calls; options as of `LotEnv`."""
+    """Make the AEC form with PettingZoo's checks of actions and of the order of calls; options see `LotEnv`."""
     return wrappers.OrderEnforcingWrapper(wrappers.AssertOutOfBoundsWrapper(raw_env(**options)))
 
 
 def parallel_env(**options: Any) -> LotParallelEnv:
-    """Make the parallel form; options as of `LotParallelEnv`."""
+    """Make the parallel form; options see `LotParallelEnv`."""
     return LotParallelEnv(**options)

@@ -168,7 +168,7 @@ def test_every_car_park_is_a_scenario(tmp_path):
     [
         (["--car-park", "P9", "--replay-from", "2024-01-29"], "has no car park 'P9'"),
         (["--car-park", "P0", "--replay-from", "2024-01-03"], "want one from 2024-01-08 to 2024-02-09"),
-        (["--car-park", "P0"], "--car-park goes with"),
+        (["--car-park", "P0"], "--car-park requires"),
         (
             ["--car-park", "P0", "--replay-from", "2024-01-29", "--forecast-from", "others"],
             "rolling or past together with counts",

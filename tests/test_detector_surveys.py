@@ -120,7 +120,7 @@ def test_detectors_on_the_command_line(tmp_path):
     ("words", "message"),
     [
         (["--drives", "mini", "--rig", "stereo"], "--rig and --misses go with --sessions"),
-        (["--uiuc", "x", "--sessions", 2], "--sessions goes with --drives"),
+        (["--uiuc", "x", "--sessions", 2], "--sessions requires --drives"),
         (
             ["--drives", "mini", "--sessions", 1, "--rig", "sonar"],
             "--rig is 'sonar', want 'laser', 'stereo', 'both_sides' or",

@@ -129,7 +129,7 @@ def test_an_interruption_is_one_whatever_it_is_wrapped_in():
     ("arguments", "wanted"),
     [
         ((1, "slurm"), "backend is 'slurm', want one of loky, ray, dask"),
-        ((1, "loky", "localhost:1"), "address goes with the backend ray or dask"),
+        ((1, "loky", "localhost:1"), "address requires the backend ray or dask"),
         ((0,), "jobs is 0, want at least 1"),
     ],
 )
@@ -141,8 +141,8 @@ def test_what_does_not_go_together_is_refused(arguments, wanted):
 @pytest.mark.parametrize(
     ("backend", "address", "wanted"),
     [
-        ("ray", "127.0.0.1:9", "nobody listens there"),
-        ("dask", "tcp://127.0.0.1:9", "nobody listens there"),
+        ("ray", "127.0.0.1:9", "no cluster answers"),
+        ("dask", "tcp://127.0.0.1:9", "no cluster answers"),
         ("dask", "tcp://somewhere", "want HOST:PORT"),
         ("ray", "127.0.0.1:notaport", "want HOST:PORT"),
     ],
@@ -158,7 +158,7 @@ def test_the_command_says_so_before_it_writes_anything(tmp_path):
     out, address = tmp_path / "out", "tcp://127.0.0.1:9"
     done = parkenv("compare", "--scenario", "mini", "--out", out, "--backend", "dask", "--address", address)
     assert done.returncode == 2
-    assert "nobody listens there" in " ".join(done.stderr.split())
+    assert "no cluster answers" in " ".join(done.stderr.split())
     assert not (out / "episodes.csv").exists()
 
 

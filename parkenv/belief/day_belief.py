@@ -229,7 +229,7 @@ def _update(
                 leaving = decay_rate[s] * (1.0 - forecast[s])
                 p = decay_to_prior(p, leaving / (1.0 - p), p_then[s, h], gap)
             likelihood = if_taken * p + if_free * (1.0 - p)
-            # What a hypothesis excludes has been observed all the same.
+            # Zero likelihood under this hypothesis: keep the observed state.
             p_then[s, h] = if_taken * p / likelihood if likelihood > 0.0 else np.float64(taken[i])
             log_weight[h] += math.log(max(likelihood, 1e-300))
         observed_at[s] = time[i]

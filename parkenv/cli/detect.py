@@ -263,9 +263,9 @@ class EvaluateDetector(Command, ExecutionSpec):
         if not self.sessions and (self.rigs is not None or self.misses):
             raise PydanticCustomError("whole", "--rig and --misses go with --sessions")
         if self.sessions and self.drives is None:
-            raise PydanticCustomError("whole", "--sessions goes with --drives")
+            raise PydanticCustomError("whole", "--sessions requires --drives")
         if self.drives is None and len(self.detectors or ()) > 1:
-            raise PydanticCustomError("whole", "--detector names several, which goes with --drives")
+            raise PydanticCustomError("whole", "--detector names several, which requires --drives")
         return self
 
     def run(self) -> None:

@@ -256,7 +256,7 @@ _COUNTS = (_CAR_PARK, ("occupancy",), ("occupancy", "replay_from"))
 def _by_car_park(scenario: ScenarioSpec, values: _Values) -> list[ScenarioSpec]:
     """Return a scenario for each of the car parks of a file of counts."""
     if not all(path in values for path in _COUNTS):
-        raise InputError("--car-park goes with --occupancy FILE.csv and --replay-from DATE")
+        raise InputError("--car-park requires --occupancy FILE.csv and --replay-from DATE")
     from parkenv.scenarios.build import car_parks
 
     names, file, replay_from = (str(values[path][1]) for path in _COUNTS)

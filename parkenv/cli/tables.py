@@ -143,5 +143,5 @@ def save_summary(folder: Path, seed: int | None, rows: Any, **more: Any) -> None
 
 
 def print_recorded(console: Console, path: Path) -> None:
-    """Tell where a recording is, and how to look at it."""
+    """Print the recording's path and the command that opens it."""
     console.print(f"Recorded: {path}; look at it with: rerun {path}")

@@ -60,7 +60,7 @@ class Train(StudyCommand):
         inner = {option.name for option in field_options(TrainingSpec)}
         study = made(TrainingSpec, {name: value for name, value in given.items() if name in inner})
         if "--day-error" in given and study.scenarios is None:
-            raise InputError("--day-error goes with --scenario or --lot")
+            raise InputError("--day-error requires --scenario or --lot")
         base = cls(study=study, out=Path("results") / study.training.folder)
         return made(cls, {name: value for name, value in given.items() if name not in inner}, base)
 

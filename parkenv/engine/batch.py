@@ -137,7 +137,7 @@ class BeliefObserver(Observer):
     """The observations of `parkenv/Search-v2`.
 
     Args:
-        tables, n: as of `Observer`.
+        tables, n: see `Observer`.
         without: names of observations to leave out.
     """
 

@@ -120,7 +120,7 @@ class StepOutcome(NamedTuple):
     reward: float
     parked: bool
     over: bool  # whether the search is over, but for the limit of steps
-    info: dict[str, Any]  # as of `parkenv/Search-v2`
+    info: dict[str, Any]  # see `parkenv/Search-v2`
 
 
 class CarPoses(NamedTuple):
@@ -167,7 +167,7 @@ class Fleet:
     With one car, `Demand(Headways(1))` and the background `process`, the fleet is `parkenv/Search-v2` to the last bit.
 
     Args:
-        scenario: as of `parkenv.make_scenario`.
+        scenario: see `parkenv.make_scenario`.
         demand: when cars arrive, how long they stay; by default one car.
         background: who else takes slots: `residents`, cars that stand there when the world begins, drawn from the
             scenario's occupancy, and leave once; `process`, the scenario's occupancy all day; `none`, nobody: the lot
@@ -475,7 +475,7 @@ class Fleet:
             self.help(status)
 
     def help(self, status: int) -> None:
-        """Do what only Python can do, after `advance_at` returned a negative status; then call that again."""
+        """Handle a request of the compiled engine, a negative status of `advance_at`; then call that again."""
         if status == WRONG_ACTION:
             raise InputError("a compiled policy chose an action that does not exist")
         {

@@ -172,7 +172,7 @@ class FollowedSearch:
         k: number of slots described.
 
     Raises:
-        InputError: as of `Surroundings.of`.
+        InputError: see `Surroundings.of`.
     """
 
     def __init__(self, problems: Sequence[SearchProblem], k: int) -> None:

@@ -63,7 +63,7 @@ class FleetVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]])
 
     Args:
         num_envs: number of worlds.
-        scenario: a scenario, as of `parkenv.make_scenario`.
+        scenario: a scenario, see `parkenv.make_scenario`.
         demand: when cars arrive, how long they stay and search.
         drivers: the kinds of drivers; the first one learns, and has no policy; the others have compiled ones.
         k: number of slots in the `local` observation.

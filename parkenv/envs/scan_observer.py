@@ -375,11 +375,11 @@ class ScansObserver(LaserObserver):
     """The last k scans, as `parkenv.envs.scan_observation.ScanObservation` observes them: one for each decision.
 
     Args:
-        tables, n: as of `LaserObserver`.
+        tables, n: see `LaserObserver`.
         k: number of scans.
 
     Raises:
-        InputError: as of `LaserObserver`.
+        InputError: see `LaserObserver`.
     """
 
     def __init__(self, tables: ScenarioRecords, n: int, k: int = SCANS) -> None:

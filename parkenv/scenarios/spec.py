@@ -277,7 +277,9 @@ class OccupancySpec(Spec):
         _require_one(self, ("typical", "real_week", "process", "log", "counts"), least=0)
         recorded = self.log is not None or self.counts is not None
         if self.day_error is not None and recorded:
-            raise ValueError("day_error only without a log or counts: recorded days differ as they did")
+            raise ValueError(
+                "day_error cannot be combined with a log or counts, whose days differ by themselves"
+            )
         if self.mapping is not None and self.log is None:
             raise ValueError("mapping only together with a log")
         if self.replay_from is not None and not recorded:
@@ -289,7 +291,7 @@ class OccupancySpec(Spec):
         if self.forecast_from not in (None, "others") and self.replay_from is None:
             raise ValueError("forecast_from only together with replay_from")
         if self.event is not None and recorded:
-            raise ValueError("event only without a log or counts: a recorded day is as full as it was")
+            raise ValueError("event cannot be combined with a log or counts, whose days have their events")
         return self
 
 

@@ -66,7 +66,7 @@ class Workers:
         if backend not in BACKENDS:
             raise InputError(f"backend is {backend!r}, want one of {', '.join(BACKENDS)}")
         if address is not None and backend == "loky":
-            raise InputError("address goes with the backend ray or dask; loky works on this machine alone")
+            raise InputError("address requires the backend ray or dask; loky works on this machine alone")
         if jobs is not None and jobs < 1:
             raise InputError(f"jobs is {jobs}, want at least 1, or None for all cores")
         self.jobs, self.backend, self.address = min(jobs or cpu_count(), cpu_count()), backend, address
@@ -335,7 +335,7 @@ def _require_listener(address: str) -> None:
         socket.create_connection((host, port), timeout=CONNECT_S).close()
     except OSError as error:
         raise InputError(
-            f"--address {address}: nobody listens there ({error}); is the cluster's head up, and the port right?"
+            f"--address {address}: no cluster answers ({error}); is the cluster's head up, and the port right?"
         ) from error
 
 

@@ -86,7 +86,7 @@ def read_labels(path: Path, images: Path | None = None, classes: Sequence[str] =
     """
     if path.is_dir() and images is not None:
         raise InputError(
-            f"{path}: is a folder in YOLO's format, which has its pictures; --images goes with COCO"
+            f"{path}: is a folder in YOLO's format, which has its pictures; --images is for COCO"
         )
     photos = read_yolo(path, classes) if path.is_dir() else read_coco(path, images or path.parent, classes)
     if not any(len(photo.single) for photo in photos):

@@ -122,7 +122,7 @@ class MixedFleet:
     Args:
         scenario: lot, residents, speeds and costs.
         demand: when cars arrive, how long they stay and search.
-        knows: what members know, as of `DriverKind`; the others know their own observations.
+        knows: what members know, see `DriverKind`; the others know their own observations.
         share: share of the members.
         among: agent that drives the others; None if all are members.
         max_steps: limit of a car's decisions.

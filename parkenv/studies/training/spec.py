@@ -178,7 +178,7 @@ class TrainingSpec(Study):
             if kinds and name not in cls.model_fields:
                 raise PydanticCustomError(
                     "whole",
-                    "{name} goes with {kinds}, not with {own}",
+                    "{name} requires {kinds}, not {own}",
                     {"name": str(name), "kinds": " or ".join(kinds), "own": cls.chosen_by},
                 )
         return tables
@@ -435,7 +435,7 @@ class SearchTrainingSpec(PlacesTrainingSpec):
     @model_validator(mode="after")
     def _cloned(self) -> Self:
         if self.demonstrations is not None and self.clone is None:
-            raise PydanticCustomError("whole", "demonstrations goes with clone")
+            raise PydanticCustomError("whole", "demonstrations requires clone")
         return self
 
 
@@ -543,7 +543,7 @@ class FleetTrainingSpec(TrainingSpec):
     @model_validator(mode="after")
     def _among_others(self) -> Self:
         if self.learners is not None and self.among is None:
-            raise PydanticCustomError("whole", "learners goes with among")
+            raise PydanticCustomError("whole", "learners requires among")
         return self
 
 

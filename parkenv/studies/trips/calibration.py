@@ -45,7 +45,7 @@ def trip_of_row(row: Row) -> Row:
     """Return a row of `trip_row` that was read from a file.
 
     Raises:
-        ValueError, KeyError: it is no trip.
+        ValueError, KeyError: it is not a trip record.
     """
     fields = dict(row)
     slots = fields.pop("slots")
