@@ -20,28 +20,33 @@ from parkenv.studies.statistics import summarize
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS, METRICS, REWARD_TERMS
 from parkenv.world.demand import Demand, Headways, PoissonArrivals
+from parkenv.world.tariff import Tariff
 from planners import make_agent
 from planners.heuristics import POLICIES
 
-PRICE_S = 45.0
+SLOT_S, ZONE_S = 15.0, 30.0  # of parking: of the slot itself, and of an hour in its zone
+PRICE_S = SLOT_S + ZONE_S  # of a search, which is for the expected stay of an hour
 LIMIT = 60
 
 
 @pytest.fixture(scope="module")
 def scenario():
-    """A lot where every slot has a price, and where a failed attempt is likely."""
+    """A lot where every slot has a cost, its zone a price, and where a failed attempt is likely."""
     plain = make_scenario("mini")
-    lot = ParkingLot(**features(plain.lot) | {"slot_parking_cost_s": np.full(plain.lot.n_slots, PRICE_S)})
-    return replace(plain, lot=lot, failure_s=7.0)
+    lot = ParkingLot(**features(plain.lot) | {"slot_parking_cost_s": np.full(plain.lot.n_slots, SLOT_S)})
+    tariff = Tariff({"other": 12.0 * ZONE_S / 3600.0})
+    return replace(plain, lot=lot, failure_s=7.0, tariff=tariff, value_of_time=12.0)
 
 
-def check_sums(info, parked=True):
-    """The terms of an episode, as `info` names them, are its total."""
+def check_sums(info, parked=True, of_many=False):
+    """The terms of an episode, as `info` names them, are its total; of many cars each pays for its own stay."""
     assert set(METRICS) <= set(info)
     assert sum(info[name] for name in COST_FIELDS) == pytest.approx(info["total_s"])
     if parked:
         assert info["parked"]
-        assert info["parking_cost_s"] == PRICE_S
+        assert (
+            info["parking_cost_s"] > SLOT_S if of_many else info["parking_cost_s"] == pytest.approx(PRICE_S)
+        )
 
 
 def check_step(reward, info):
@@ -118,7 +123,7 @@ def test_stable_baselines3(scenario, of_many):
         actions = np.array([tries(mask, rng) for mask in venv.action_masks()])
         _, _, done, infos = venv.step(actions)
         for i in np.flatnonzero(done):
-            check_sums(infos[i], parked=infos[i]["parked"])
+            check_sums(infos[i], parked=infos[i]["parked"], of_many=of_many)
             charged_later = (
                 0.0 if not of_many or not infos[i]["TimeLimit.truncated"] else infos[i]["gave_up_s"]
             )
@@ -136,7 +141,7 @@ def test_many_cars_as_agents(scenario):
         observation, _, terminated, truncated, info = env.last()
         if "reward_terms" in info:
             returns[car] = returns.get(car, 0.0) + sum(info["reward_terms"].values())
-            check_sums(info, parked=info["parked"])
+            check_sums(info, parked=info["parked"], of_many=True)
         if terminated or truncated:
             assert info["total_s"] == pytest.approx(-returns[car])
             parked += int(info["parked"])
@@ -152,13 +157,14 @@ def test_cars_of_compiled_drivers(scenario):
     fleet.run()
     cars = fleet.cars
     np.testing.assert_allclose(sum(cars[name] for name in COST_FIELDS), cars["total_s"])
-    assert set(cars["parking_cost_s"][cars["slot"] >= 0]) == {PRICE_S}
+    parked = cars[cars["slot"] >= 0]
+    np.testing.assert_allclose(parked["parking_cost_s"], SLOT_S + ZONE_S * parked["stay_s"] / 3600.0)
 
 
 def test_driven_trips(scenario):
     trip = DrivenSearch(scenario).run(seed=1)
     assert trip.parked
-    assert trip.costs["parking_cost_s"] == PRICE_S
+    assert trip.costs["parking_cost_s"] == pytest.approx(PRICE_S)
     assert set(trip.costs) == set(COST_FIELDS) - {"drive_s"}
     assert trip.total_s == pytest.approx(trip.lanes_s + trip.manoeuvre_s + sum(trip.costs.values()))
 
