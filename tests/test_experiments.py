@@ -186,7 +186,7 @@ def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
     axis = list(range(1, 1001))
     speeds = f"v_walk_kmh = {[v / 10 for v in axis]}\nv_drive_kmh = {[v / 5 for v in axis]}"
     text = f"episodes = 1\n[grid]\nfailure_s = {axis}\n{speeds}"
-    assert "is 9000000000 searches, want at most 10000000" in refusal(tmp_path, text)
+    assert "is 8000000000 searches, want at most 10000000" in refusal(tmp_path, text)
     assert "bad.toml: No such file" in parkenv("run", tmp_path / "none" / "bad.toml").stderr
 
 

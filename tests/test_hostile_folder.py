@@ -101,6 +101,8 @@ def test_a_signal_before_anything_is_imported_ends_the_command(tmp_path, command
     done = subprocess.run(
         [sys.executable, *command, "--version"],
         cwd=tmp_path, capture_output=True, text=True, env={**os.environ, "PYTHONPATH": path},
+        # The tests themselves may run where Ctrl-C is ignored, such as in the background.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.default_int_handler),
     )  # fmt: skip
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 

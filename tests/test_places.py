@@ -272,7 +272,7 @@ def test_all_searches_share_the_tables_and_memory_is_told():
     assert many.memory_bytes - many.table_bytes == pytest.approx(
         32 * (few.memory_bytes - few.table_bytes), rel=0.01
     )
-    assert repr(many) == f"ParkSearchVectorEnv(64 searches, 6 places, {many.memory_bytes / 1e6:.1f} MB)"
+    assert repr(many) == f"ParkSearchVectorEnv(64 searches, 6 scenarios, {many.memory_bytes / 1e6:.1f} MB)"
     alone = [ParkSearchVectorEnv(2, one, observation="local").table_bytes for one in PLACES]
     assert few.table_bytes < 1.1 * sum(alone)
 

@@ -77,7 +77,7 @@ length and width over the car's |
     | `scan` | `Box(0, max_range, (n_beams,), float32)` | laser ranges, m; with `laser` |
     | `cars` | `Box(-1000, 1000, (160, 24, 2), float32)` | outlines of parked cars, m; with `obstacle_map` |
     | `lines` | `Box(-1000, 1000, (320, 2, 2), float32)` | kerbs and walls, m; with `obstacle_map` |
-    | `vehicle` | `Box(0, inf, (11,), float32)` | the car, `VehicleParameters.numbers`: constant; with `obstacle_map` |
+    | `vehicle` | `Box(0, 1000, (11,), float32)` | the car, `VehicleParameters.numbers`: constant; with `obstacle_map` |
     | `movers` | `Box(-1000, 1000, (n, 24, 2), float32)` | outlines of moving road users, m; with `obstacle_map` and \
 `traffic` |
 

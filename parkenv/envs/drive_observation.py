@@ -49,7 +49,7 @@ def drive_observation_space(
     if obstacle_map:
         shown["cars"] = spaces.Box(-FAR, FAR, (MOST_CARS, CORNERS, 2), np.float32)
         shown["lines"] = spaces.Box(-FAR, FAR, (MOST_LINES, 2, 2), np.float32)
-        shown["vehicle"] = spaces.Box(0.0, np.inf, vehicle.numbers.shape, np.float32)
+        shown["vehicle"] = spaces.Box(0.0, 1000.0, vehicle.numbers.shape, np.float32)
         if n_movers:
             shown["movers"] = spaces.Box(-FAR, FAR, (n_movers, CORNERS, 2), np.float32)
     return spaces.Dict(shown)

@@ -27,6 +27,7 @@ AGENT_COLORS = {
     "mdp-tuned": "#117733",
     "greedy-goal": "#e69f00",
     "greedy-drive": "#d55e00",
+    "greedy-total": "#ddcc77",
     "first-free": "#009e73",
     "random": "#8c8c8c",
     "oracle": "#000000",
