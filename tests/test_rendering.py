@@ -61,7 +61,8 @@ def stand_in(env, p_occupied=None, observed=None, **changes):
         belief = dataclasses.replace(belief, p_occupied=p_occupied)
     if observed is not None:
         belief.observed_at[:] = np.where(observed, 0.0, -1.0)
-    names = "arrival time vertex path parked over failed_parks walk_s parking_cost_s total_s".split()
+    names = ("arrival", "time", "vertex", "path", "parked", "over", "failed_parks")
+    names += ("walk_s", "parking_cost_s", "total_s")
     return SimpleNamespace(**{n: getattr(state, n) for n in names} | {"belief": belief} | changes)
 
 
