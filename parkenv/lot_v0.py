@@ -85,7 +85,7 @@ class _CarsAsAgents:
         )
         self.scenario = self.fleet.scenario
         self.render_mode, self.max_cycles = render_mode, max_cycles
-        self.possible_agents = [f"car_{i}" for i in range(demand.arrivals.most)]
+        self.possible_agents = [f"car_{i}" for i in range(demand.arrivals.max_cars)]
         self.agents: list[str] = []
         self._observation_space = self.fleet.observation_space
         self._observation_spaces: dict[str, spaces.Dict] = {}

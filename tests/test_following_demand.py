@@ -43,10 +43,10 @@ def expected_cars(rates, survives):
 
 def test_a_lot_that_stays_as_full_needs_the_cars_that_leave():
     process = steady(0.6, 5400.0)
-    rates = FollowingArrivals(process, MORNING, ExponentialTime(5400.0)).on(TUESDAY).per_hour
+    rates = FollowingArrivals(process, MORNING, ExponentialTime(5400.0)).rates_of(TUESDAY).per_hour
     assert rates[7:15] == pytest.approx([50 * 0.6 * 3600.0 / 5400.0] * 8, rel=0.01)
     assert max(rates[:7] + rates[15:]) < 1e-6
-    twice = FollowingArrivals(process, MORNING, ExponentialTime(5400.0), times=2.0).on(TUESDAY).per_hour
+    twice = FollowingArrivals(process, MORNING, ExponentialTime(5400.0), scale=2.0).rates_of(TUESDAY).per_hour
     assert twice == pytest.approx([2.0 * rate for rate in rates], abs=1e-6)
 
 
@@ -72,7 +72,7 @@ def test_the_course_of_a_process_is_the_mean_of_its_worlds():
 )
 def test_no_other_arrivals_come_closer_to_the_counts(curve, minutes, hour, change):
     process, stay_s = process_of_curve(np.zeros(80), curve, 7200.0), 60.0 * minutes
-    rates = np.array(FollowingArrivals(process, MORNING, ExponentialTime(stay_s)).on(TUESDAY).per_hour)
+    rates = np.array(FollowingArrivals(process, MORNING, ExponentialTime(stay_s)).rates_of(TUESDAY).per_hour)
     course = process.course(Arrival(86400.0 + MORNING.start_s), TIMES)
 
     def apart(rates):
@@ -96,7 +96,7 @@ def test_each_recorded_day_is_followed_for_itself():
     log = OccupancyLog(tuple(map(str, range(12))), days, slot, day, 7 * 3600.0 + 1800.0 * step, taken)
     occupancy, window = RecordedOccupancy(log, np.arange(12.0)), ArrivalWindow((0,), 8 * 3600.0, 12 * 3600.0)
     follows = FollowingArrivals(occupancy, window, ConstantTime(1800.0))
-    rates = [sum(follows.on(day).per_hour) for day in occupancy.arrival_days(window)]
+    rates = [sum(follows.rates_of(day).per_hour) for day in occupancy.arrival_days(window)]
     assert rates == sorted(rates)
     assert rates[2] > 1.5 * rates[0]
     hours = 3600.0 * np.arange(8.0, 13.0)
@@ -145,10 +145,11 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     assert hours[0]["counted_occupancy"] < 0.3 < 0.7 < hours[4]["counted_occupancy"]
     for its in hours:
         assert its["occupancy"] == pytest.approx(its["counted_occupancy"], abs=0.05)
-    assert departures(summary["hours"]) == []
+    assert departures(summary["hours"], summary["rows"]) == []
     few = parkenv("fleet", "--resume", "--arrivals-per-hour", "counted,20", "--out", tmp_path / "out")
     assert (few.returncode, few.stderr) == (0, "")
-    (said,) = departures(json.loads((tmp_path / "out" / "summary.json").read_text())["hours"])
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    (said,) = departures(summary["hours"], summary["rows"])
     assert said in few.stdout
     assert "20 cars an hour" in said
     assert "--arrivals-per-hour counted" in said

@@ -36,9 +36,9 @@ from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
 MAX_CARS = 1_000_000
 """Maximum number of cars of a world."""
-_QUANTILES = 400
-_RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.most`
-_FOLLOWED_S = 300.0
+_QUANTILES = 400  # equally probable stays that stand for their law
+_RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.max_cars`
+_FOLLOWED_S = 300.0  # between the moments at which a lot is compared with its occupancy model
 _NO_RATE = 1e-9  # cars an hour
 
 
@@ -146,7 +146,7 @@ class Arrivals(Protocol):
     """When the cars of a world arrive."""
 
     @property
-    def most(self) -> int:
+    def max_cars(self) -> int:
         """Maximum number of cars of a world."""
 
     def begin_s(self, arrival_s: float) -> float:
@@ -173,7 +173,7 @@ class Headways:
         require_number("Headways.mean_s", self.mean_s, above=0.0)
 
     @property
-    def most(self) -> int:
+    def max_cars(self) -> int:
         """Number of cars."""
         return self.cars
 
@@ -219,7 +219,7 @@ class PoissonArrivals:
             raise InputError(
                 f"PoissonArrivals.per_hour is {self.per_hour!r}, want a rate above 0 in the window: no car would arrive"
             )
-        if self.most > MAX_CARS:
+        if self.max_cars > MAX_CARS:
             raise InputError(
                 f"PoissonArrivals.per_hour: {self.expected:,.0f} cars arrive in the window, want at most {MAX_CARS:,}"
             )
@@ -230,7 +230,7 @@ class PoissonArrivals:
         return float(self._times()[1][-1])
 
     @property
-    def most(self) -> int:
+    def max_cars(self) -> int:
         """Number of cars that is exceeded once in 10^12 worlds; further arrivals are left out."""
         return int(poisson.isf(_RARE, self.expected)) + 1
 
@@ -243,7 +243,7 @@ class PoissonArrivals:
         """Draw the arrivals; see `Arrivals`. A world in which nobody would arrive has one car, at the end."""
         del arrival_s, day
         times, expected = self._times()
-        arrivals = np.cumsum(_gaps(key, self.most))
+        arrivals = np.cumsum(_gaps(key, self.max_cars))
         arrivals = arrivals[arrivals < expected[-1]]
         if not len(arrivals):
             return np.array([self.end_s])
@@ -269,21 +269,21 @@ class FollowingArrivals:
         occupancy: the model of the lot.
         window: weekdays, beginning of the world, and end of the arrivals.
         stay: law of the time that a car stays in its slot.
-        times: so many times these arrivals, above 0.
+        scale: factor of these arrivals, above 0.
     """
 
     occupancy: OccupancyModel
     window: ArrivalWindow
     stay: Duration
-    times: float = 1.0
+    scale: float = 1.0
 
     def __post_init__(self) -> None:
-        require_number("FollowingArrivals.times", self.times, above=0.0)
+        require_number("FollowingArrivals.scale", self.scale, above=0.0)
 
     @property
-    def most(self) -> int:
+    def max_cars(self) -> int:
         """Maximum number of cars of a day."""
-        return max(self.on(day).most for day in self.occupancy.arrival_days(self.window))
+        return max(self.rates_of(day).max_cars for day in self.occupancy.arrival_days(self.window))
 
     def begin_s(self, arrival_s: float) -> float:
         """Return the beginning of the window."""
@@ -292,10 +292,10 @@ class FollowingArrivals:
 
     def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
         """Draw the arrivals of a day; see `Arrivals`."""
-        return self.on(day).draw(key, arrival_s, day)
+        return self.rates_of(day).draw(key, arrival_s, day)
 
-    def on(self, day: ArrivalDay) -> PoissonArrivals:
-        """Return the arrivals of one of the days."""
+    def rates_of(self, day: ArrivalDay) -> PoissonArrivals:
+        """Return the arrivals of one of the days, with their rates by hour."""
         start, end = self.window.start_s, self.window.end_s
         seconds = np.append(np.arange(start + _FOLLOWED_S, end, _FOLLOWED_S), end).astype(np.float64)
         midnight = day.weekday * DAY_S
@@ -306,7 +306,7 @@ class FollowingArrivals:
         rates, _ = nnls(_parked(stays, edges, seconds), wanted)
         # Where nobody has to come, arrivals still need some rate above 0.
         by_hour = np.full(DAY_HOURS, _NO_RATE)
-        by_hour[(edges[:-1] // HOUR_S).astype(np.int64)] += self.times * rates
+        by_hour[(edges[:-1] // HOUR_S).astype(np.int64)] += self.scale * rates
         return PoissonArrivals(tuple(by_hour), start, end)
 
 
@@ -331,7 +331,7 @@ class ListedArrivals:
         object.__setattr__(self, "times_s", times)
 
     @property
-    def most(self) -> int:
+    def max_cars(self) -> int:
         """Number of cars."""
         return len(self.times_s)
 
@@ -393,8 +393,10 @@ class Demand:
         for name, wanted in (("arrivals", "draw"), ("stay", "quantile"), ("patience", "quantile")):
             value = getattr(self, name)
             if not hasattr(value, wanted):
-                kinds = "arrivals such as Headways" if name == "arrivals" else "a law such as ExponentialTime"
-                raise InputError(f"Demand.{name} is {value!r:.60}, want {kinds}")
+                examples = (
+                    "arrivals such as Headways" if name == "arrivals" else "a law such as ExponentialTime"
+                )
+                raise InputError(f"Demand.{name} is {value!r:.60}, want {examples}")
         for name in ("entry_weights", "goal_weights"):
             object.__setattr__(self, name, _weights(f"Demand.{name}", getattr(self, name)))
 
