@@ -135,7 +135,8 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
     ]  # fmt: skip
     its = study(*specs, agents=("greedy-goal",), knows=("own",), arrivals_per_hour=(60.0,), days=5)
     before, after = days = [[its.run_day(one, day) for day in range(5)] for one in its.fleet_settings]
-    rows = summarize_changes(days, {name: built.lot.zones for name, built in its.built.items()})
+    prices = {"before": {"far": 1.0, "near": 1.0}, "after": {"far": 1.0, "near": 1.2}}
+    rows = summarize_changes(days, prices)
     assert [row["zone"] for row in rows] == [None, "far", "near"]
     whole, *by_zone = rows
     paid = [np.array(day["paid_cents"].split(), float).mean() / 100.0 for day in (before[0], after[0])]
@@ -149,5 +150,17 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
     ]
     assert whole["paid_change"] == pytest.approx(np.mean(changes))
     assert sum(row["cars_a_day"] for row in by_zone) == pytest.approx(whole["cars_a_day"])
-    assert "with prices as time" in sentence(without_nan(whole))
+    parts = "parking_cost_change_s", "gave_up_change_s"
+    assert [whole[name] for name in parts] == pytest.approx(
+        [
+            np.mean(
+                [
+                    a[name.replace("_change", "")] - b[name.replace("_change", "")]
+                    for a, b in zip(after, before, strict=True)
+                ]
+            )
+            for name in parts
+        ]
+    )
+    assert "near 1 → 1.2 an hour" in sentence(without_nan(whole))
     assert not [row for row in headlines([], without_nan(rows)) if "zone" in row["where"]]

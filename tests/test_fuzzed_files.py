@@ -284,7 +284,7 @@ FLEET_SUMMARY = {
     "changes": [
         {
             "change": "knows", "before": "own observations", "after": "a live map for 50 %", "zone": None,
-            "scenario": "mini",
+            "prices": None, "scenario": "mini",
             "agents": "random", "knows": "shared", "share": 0.5, "arrivals_per_hour": 20.0, "days": 2,
             "cars_a_day": 20.0,
         }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,6 +71,9 @@ def _table(scenario: str, rows: list[dict[str, Any]]) -> Table:
     )
 
 
+_HEADINGS = {"knows": "members know", "share": "members", "arrivals_per_hour": "cars/h"}
+
+
 class Fleet(AgentStudyCommand):
     """On a day, residents are parked when the hours of arrival begin, and leave after the rest of their stay.
 
@@ -102,17 +106,17 @@ class Fleet(AgentStudyCommand):
         """Print the tables of a study of many cars, and what changes between scenarios in sentences."""
         if not result.rows:
             return
-        several = [name for name in ("scenario", "agents") if len({row[name] for row in result.rows}) > 1]
+        names = _setting_columns(result.rows)
         mixed = any(0.0 < row["share"] < 1.0 for row in result.rows)
-        setting = [*several, "members know", "members", "cars/h"]
+        setting = [_HEADINGS.get(name, name) for name in names]
         headings = [
             *setting, "total s [95 %]", *(["members s", "others s"] if mixed else []), "search s", "95 % below s",
             "failed attempts", "no slot found", "cruising", "slots taken", "price of anarchy", "over bound",
         ]  # fmt: skip
-        cells = [[*(row[name] for name in several), *_cells(row, mixed=mixed)] for row in result.rows]
-        agents = "" if "agents" in several else f", {result.rows[0]['agents']}"
+        cells = [[*_setting(row, names), *_cells(row, mixed=mixed)] for row in result.rows]
+        agents = "" if "agents" in names else f", {result.rows[0]['agents']}"
         console.print(make_table(f"{self.study.title}{agents}", headings, cells))
-        self._show_money(console, result, several)
+        _show_money(console, result, names)
         changes = without_nan(result.summary["changes"])
         if changes:
             groups = ["members s [95 %]", "others s [95 %]"] if mixed else []
@@ -124,7 +128,7 @@ class Fleet(AgentStudyCommand):
             cells = [
                 [
                     row["after"], row["before"], *([row["zone"] or "all"] if zone else []),
-                    *(row[name] for name in several), *_setting(row), _interval(row, "change_s", "+.1f"),
+                    *_setting(row, names), _interval(row, "change_s", "+.1f"),
                     *(_interval(row, f"{group.split()[0]}_change_s", "+.1f") for group in groups),
                     *(_interval(row, "paid_change", "+.2f") for _ in paid),
                     *(_number(row[name], ".0%") for name in ("better_off", "worse_off")),
@@ -136,40 +140,34 @@ class Fleet(AgentStudyCommand):
         for row in shown_changes(changes):
             if row["change"] == "scenario":
                 console.print(sentence(row), soft_wrap=True)
-        for line in departures(result.summary["hours"]):
+        for line in departures(result.summary["hours"], result.rows):
             console.print(line, soft_wrap=True)
 
-    def _show_money(self, console: Console, result: Result, several: list[str]) -> None:
-        """Print what the total time is made of, and who pays where."""
-        terms = [
-            term for term in COST_TERMS if not term.optional or any(row[term.field] for row in result.rows)
+
+def _show_money(console: Console, result: Result, names: list[str]) -> None:
+    """Print what the total time is made of, and who pays where."""
+    setting, zones = [_HEADINGS.get(name, name) for name in names], result.summary["zones"]
+    terms = [term for term in COST_TERMS if not term.optional or any(row[term.field] for row in result.rows)]
+    fields = [*(term.field for term in terms), "queued_s"]
+    headings = [*setting, *(term.label for term in terms), "of it in queues"]
+    headings += ["paid a car", "cars that pay"] if zones else []
+    cells = [
+        [
+            *_setting(row, names),
+            *(f"{row[name]:.1f}" for name in fields),
+            *([f"{row['paid']:.2f}", f"{row['paying_share']:.0%}"] if zones else []),
         ]
-        fields = [*(term.field for term in terms), "queued_s"]
+        for row in result.rows
+    ]
+    console.print(make_table("What the total time is made of, s a car", headings, cells))
+    if zones:
         headings = [
-            *several,
-            "members know",
-            "members",
-            "cars/h",
-            *(term.label for term in terms),
-            "of it in queues",
-        ]
-        cells = [
-            [*(row[name] for name in several), *_setting(row), *(f"{row[name]:.1f}" for name in fields)]
-            for row in result.rows
-        ]
-        zones = result.summary["zones"]
-        if zones:
-            headings += ["paid a car", "cars that pay"]
-            money = [[f"{row['paid']:.2f}", f"{row['paying_share']:.0%}"] for row in result.rows]
-            cells = [row + more for row, more in zip(cells, money, strict=True)]
-        console.print(make_table("What the total time is made of, s a car", headings, cells))
-        if zones:
-            headings = [
-                *several, "members know", "members", "cars/h", "zone", "slots", "price/h", "slots taken", "cars a day",
-                "of all", "paid a day [95 %]", "paid a car",
-            ]  # fmt: skip
-            cells = [[*(row[name] for name in several), *_setting(row), *_zone_cells(row)] for row in zones]
-            console.print(make_table("Zones", headings, cells))
+            *setting, "zone", "slots", "price/h", "slots taken", "cars a day", "of all",
+            "paid a day [95 %]", "paid a car",
+        ]  # fmt: skip
+        console.print(
+            make_table("Zones", headings, ([*_setting(row, names), *_zone_cells(row)] for row in zones))
+        )
 
 
 def _zone_cells(row: Row) -> list[str]:
@@ -185,15 +183,24 @@ def _zone_cells(row: Row) -> list[str]:
     ]
 
 
-def _setting(row: Row) -> list[str]:
-    rate = row["arrivals_per_hour"]
-    return [row["knows"], f"{row['share']:.0%}", rate if isinstance(rate, str) else f"{rate:g}"]
+def _setting_columns(rows: Sequence[Row]) -> list[str]:
+    """Return the columns that tell settings apart, and the demand."""
+    several = [name for name in ("scenario", "agents") if len({row[name] for row in rows}) > 1]
+    guided = ["knows", "share"] if any(row["share"] for row in rows) else []
+    return [*several, *guided, "arrivals_per_hour"]
+
+
+def _setting(row: Row, names: Sequence[str]) -> list[str]:
+    values = [row[name] for name in names]
+    return [
+        value if isinstance(value, str) else format(value, ".0%" if name == "share" else "g")
+        for name, value in zip(names, values, strict=True)
+    ]
 
 
 def _cells(row: Row, *, mixed: bool) -> list[str]:
     counted = row.get("counted_occupancy")
     return [
-        *_setting(row),
         _interval(row, "total_s", ".1f"),
         *([_number(row[name], ".1f") for name in ("members_s", "others_s")] if mixed else []),
         f"{row['search_s']:.1f}",

@@ -207,7 +207,7 @@ class CountsSpec(Spec):
     """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
 
     file: FilePath = Field(
-        description="Counts: car_park,capacity,hour,free (or hour_utc) as .csv or .csv.gz."
+        description="Counts: car_park,capacity,hour,free (or hour_utc), .csv or .csv.gz; each holds at its hour's end."
     )
     car_park: Annotated[
         str,
@@ -428,7 +428,7 @@ class Costs(Spec):
     )
     stay_s: float = option(
         HOUR_S,
-        "Expected stay, s, which the price is for; in a fleet each car knows its own.",
+        "Expected stay, which the price is for; in a fleet each car knows its own.",
         name="--stay-min",
         takes="MINUTES",
         panel="Prices",

@@ -162,7 +162,10 @@ def _issues(
 def _missing(lot: InferredLot, entries: FloatArray, goals: FloatArray) -> Iterator[str]:
     if not len(entries):
         x, y = lot.entries[0].tolist()
-        yield f"no entry: the file has no road; give one by --entry X,Y, or --entry auto for {x:.1f},{y:.1f}"
+        yield (
+            f"no entry: the file has no road; give one by --entry X,Y, or --entry auto for {x:.1f},{y:.1f}; if it has "
+            "several car parks, --split makes a lot of each"
+        )
     if not len(goals):
         x, y = lot.goal[0].tolist()
         yield (

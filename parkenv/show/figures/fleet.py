@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.ticker import MaxNLocator
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.show.figures.lot import draw_zones, zone_colors
@@ -51,18 +52,20 @@ def save_fleet_figure(
     whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
     mixed = [row for row in rows if 0.0 < row["share"] < 1.0]
     priced = [row for row in whole if np.isfinite(row["price_of_anarchy"])]
-    panels: list[Callable[[Axes], None]] = [lambda ax: _draw_search(ax, whole, closed_form)]
+    panels: dict[str, Callable[[Axes], None]] = {}
+    if len(whole) > 1 or not hours:  # a single point says little
+        panels["search time"] = lambda ax: _draw_search(ax, whole, closed_form)
     if priced:
-        panels.append(lambda ax: _draw_price(ax, priced))
+        panels["price of anarchy"] = lambda ax: _draw_price(ax, priced)
     if mixed and any(row["knows"] == "own" for row in rows):
-        panels.append(lambda ax: _draw_shares(ax, rows))
+        panels["members and others"] = lambda ax: _draw_shares(ax, rows)
     if hours:
-        panels.append(lambda ax: _draw_hours(ax, hours))
+        panels["occupancy by hour"] = lambda ax: _draw_hours(ax, hours)
     agents = list(dict.fromkeys(row["agents"] for row in rows))
     known = list(dict.fromkeys(row["knows"] for row in rows))
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(0.6 + 4.0 * len(panels), 3.9), layout="constrained")
-        for ax, draw in zip(np.ravel(figure.subplots(1, len(panels))), panels, strict=True):
+        for ax, draw in zip(np.ravel(figure.subplots(1, len(panels))), panels.values(), strict=True):
             draw(ax)
             ax.grid(visible=True)
         handles = [Line2D([], [], color=KNOWLEDGE_COLORS[name], label=f"knows: {name}") for name in known]
@@ -70,10 +73,11 @@ def save_fleet_figure(
             Line2D([], [], color="#666666", linestyle=line, marker=marker, markersize=4, label=agent)
             for agent, (line, marker) in zip(agents, _cycled(agents), strict=True)
         ]
-        handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
+        if "search time" in panels:
+            handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
         figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels)))
         figure.suptitle(title, x=0.01, ha="left")
-        save_picture(figure, path, f"{title}: search time, price of anarchy, members and others.")
+        save_picture(figure, path, f"{title}: {', '.join(panels)}.")
 
 
 def _cycled(agents: Sequence[str]) -> list[tuple[Any, str]]:
@@ -178,8 +182,16 @@ def _draw_hours(ax: Axes, rows: Sequence[Row]) -> None:
         line, marker = _STYLES[number % len(_STYLES)]
         style = {"color": _SIMULATED, "linestyle": line, "marker": marker, "markersize": 4}
         ax.plot(hour + 0.5, 100.0 * simulated, label=f"simulated, arrivals {_demand(demand)}", **style)
-    ax.set(xlabel="hour of the day", ylabel="%", ylim=(0.0, 100.0), title="Occupancy")
+    ax.set(ylabel="%", ylim=(0.0, 100.0), title="Occupancy")
+    _mark_hours(ax, [row["hour"] for row in its])
     ax.legend()
+
+
+def _mark_hours(ax: Axes, hours: Sequence[int]) -> None:
+    """Mark full hours on the horizontal axis, from the first of the hours to the end of the last one."""
+    ax.set_xlim(min(hours), max(hours) + 1)
+    ax.xaxis.set_major_locator(MaxNLocator(5, integer=True))
+    ax.xaxis.set_major_formatter(lambda hour, _: f"{hour:02.0f}:00")
 
 
 def save_zones_figure(lot: ParkingLot, zones: Sequence[Row], hours: Sequence[Row], path: str | Path) -> None:
@@ -202,20 +214,21 @@ def save_zones_figure(lot: ParkingLot, zones: Sequence[Row], hours: Sequence[Row
     days = len({row["day"] for row in its})
     title = f"{first['scenario']}: zones, {first['agents']}, {_demand(first['arrivals_per_hour'])}"
     with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, 3.4), layout="constrained")
-        left, middle, right = figure.subplots(1, 3, width_ratios=(2.2, 1.0, 1.0))
-        draw_zones(lot, left)
+        figure = Figure(figsize=(5.8, 6.2), layout="constrained")
+        axes = figure.subplot_mosaic([["map", "map"], ["taken", "paid"]], height_ratios=(1.3, 1.0))
+        draw_zones(lot, axes["map"])
         for zone, color in zip(lot.zones, zone_colors(lot), strict=True):
-            for ax, column, scale in ((middle, "occupancy", 100.0), (right, "paid", 1.0)):
+            for ax, column, scale in ((axes["taken"], "occupancy", 100.0), (axes["paid"], "paid", 1.0)):
                 sums: dict[int, float] = {}
                 for row in its:
                     if row["zone"] == zone:
                         sums[row["hour"]] = sums.get(row["hour"], 0.0) + scale * row[column] / days
                 at = [hour + 0.5 for hour in sorted(sums)]
                 ax.plot(at, [sums[hour] for hour in sorted(sums)], color=color, marker="o", markersize=4)
-        middle.set(xlabel="hour of the day", ylabel="%", ylim=(0.0, 100.0), title="Slots taken")
-        right.set(xlabel="hour of the day", title="Paid an hour, when cars park", ylim=(0.0, None))
-        for ax in (middle, right):
-            ax.grid(visible=True)
+        axes["taken"].set(ylabel="%", ylim=(0.0, 100.0), title="Slots taken")
+        axes["paid"].set(title="Paid an hour, when cars park", ylim=(0.0, None))
+        for name in ("taken", "paid"):
+            _mark_hours(axes[name], [row["hour"] for row in its])
+            axes[name].grid(visible=True)
         figure.suptitle(title, x=0.01, ha="left")
         save_picture(figure, path, f"{title}: map, slots taken and revenue by hour.")

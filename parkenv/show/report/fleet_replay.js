@@ -271,7 +271,7 @@ class FleetReplay {
 
   groupOf(its) {
     const rate = its.arrivals_per_hour;
-    return `${this.several ? "" : `${its.scenario} · `}${typeof rate === "string" ? `demand ${rate}` : `${rate} cars an hour`} · day ${its.day}`;
+    return `${this.several ? "" : `${its.scenario} · `}${typeof rate === "string" ? `demand ${rate}` : `${rate} cars an hour`} · day ${its.day}${its.date && !this.several ? `, ${its.date}` : ""}`;
   }
 
   /** Name of a setting within its day. */
@@ -392,7 +392,7 @@ class FleetReplay {
     for (const { name, day, view, canvas, clock, counts } of this.shown) {
       const { searching, failing, queueing } = view.draw(Math.min(seconds, day.duration));
       const taken = day.taken / day.lot.slots.length;
-      clock.textContent = moment(day.recorded.begin_s + seconds, "").slice(4);
+      clock.textContent = moment(day.recorded.begin_s + seconds, day.recorded.date).slice(day.recorded.date ? 0 : 4);
       const words = [["searching", searching, "--car"], ["in a failed attempt", failing, "--failed"], ["in a queue", queueing, "--queue"]]
         .filter(([, count], i) => i < 2 || count > 0)
         .map(([text, count, color]) => make("span", {}, make("b", {}, String(count)), ` ${text}`));

@@ -19,9 +19,8 @@ const palette = {
 
 /** Metres shown around the followed car. */
 const AROUND = 44;
-const MARGIN = 2.5;
-/** Around a lot that fills its canvas: the car at an entry is whole. */
-const WIDE_MARGIN = 5;
+/** Metres around the lot: its outermost lane, and the car at an entry, are whole. */
+const MARGIN = 5;
 
 class LotView {
   /** With fill, the lot fills the canvas, turned with east up if it is then larger; else the height follows from the lot. */
@@ -42,7 +41,7 @@ class LotView {
   /** Adopt the canvas's width, and its height if the lot fills it. */
   resize() {
     const [x0, y0, x1, y1] = this.lot.bounds;
-    const margin = 2 * (this.fill ? WIDE_MARGIN : MARGIN);
+    const margin = 2 * MARGIN;
     const size = [x1 - x0 + margin, y1 - y0 + margin];
     const width = this.canvas.clientWidth || 600;
     const most = Math.min(Math.max(420, window.innerHeight * 0.62), 720);

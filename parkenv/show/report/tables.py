@@ -141,12 +141,13 @@ _KNOWN = {
         Column("balked_fraction", "found no slot", share=True),
         Column("members_s", "time of members", "s", help="Total time of members"),
         Column("others_s", "time of the others", "s", help="Total time of those who are no members"),
-        Column("members_difference_s", "change, members", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
-        Column("others_difference_s", "change, the others", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
+        Column("members_difference_s", "change by guidance, members", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
+        Column("others_difference_s", "change by guidance, others", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
         Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),
         Column("clairvoyant_s", "clairvoyant bound", "s", help="Lower bound that knows all arrivals and stays"),
         Column("price_over_bound", "price over the bound", digits=3, help="Total time over the clairvoyant bound"),
         Column("before", "instead of"),
+        Column("prices", "prices"),
         Column("zone", "zone", help="Of changes: in which the cars parked before; – for all cars"),
         Column("cars_a_day", "cars a day", digits=0),
         Column("paid", "paid a car", digits=2, help="In the currency of the prices; mean over all cars"),
@@ -160,6 +161,8 @@ _KNOWN = {
         Column("members_change_s", "change, members", "s", signed=True, help=f"{_PAIRED}: members after the change"),
         Column("others_change_s", "change, the others", "s", signed=True, help=_PAIRED),
         Column("search_change_s", "change, search time", "s", signed=True, help=_PAIRED),
+        Column("parking_cost_change_s", "change, parking cost", "s", signed=True, help=f"{_PAIRED}; prices as time"),
+        Column("gave_up_change_s", "change, give-up penalty", "s", signed=True, help=_PAIRED),
         Column("balked_change", "change, found no slot", share=True, signed=True, help=_PAIRED),
         Column("paid_change", "change, paid a car", digits=2, signed=True, help=f"{_PAIRED}; in the prices' currency"),
         Column("better_off", "better off", share=True, digits=0, help="Cars that gain at least a second"),
@@ -171,8 +174,8 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "after", "before", "zone", "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed", "change_s",
-    "members_change_s", "others_change_s", "paid_change", "better_off", "worse_off", "total_s", "median_s",
+    "after", "before", "prices", "zone", "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed",
+    "change_s", "members_change_s", "others_change_s", "paid_change", "better_off", "worse_off", "total_s", "median_s",
     "gave_up_fraction", "difference_s", "gap_to_exact",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
@@ -180,7 +183,7 @@ _ORDER = (
 OF_FLEETS = {
     column.key: column
     for column in (
-        Column("difference_s", "change, all cars", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
+        Column("difference_s", "change by guidance, all cars", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
         Column("median_s", "median time", "s", help="Median of the total times of a day's cars"),
         Column(
             "bound_s",
@@ -200,6 +203,14 @@ OF_FLEETS = {
 """Columns that mean something else in the table of `parkenv fleet`."""
 _OF_GIVING_UP = ("median_s", "gave_up_fraction")
 """Columns that are left out where no search gave up."""
+_OF_MEMBERS = (
+    "knows", "share", "members_s", "others_s", "difference_s", "members_difference_s", "others_difference_s",
+    "members_change_s", "others_change_s",
+)  # fmt: skip
+"""Columns that are left out where there are no members."""
+_PARTS = ("parking_cost_change_s", "gave_up_change_s")
+"""Columns that are left out where they are 0 or unknown."""
+_NOTHING = {repr(value) for value in (None, [0.0] * 3, [0.0, None, None])}
 _TABLES_OF_THEIR_OWN = ("by_weather",)
 _UNITS = (("_kmh", "km/h"), ("_ms", "ms"), ("_s", "s"), ("_m", "m"), ("_deg", "°"), ("_rad", "rad"))
 
@@ -248,7 +259,10 @@ def table_of(
     keys = [k for k in _ORDER if k in keys] + [k for k in keys if k not in _ORDER and k != "leads"]
     if not any(row.get("gave_up_fraction", 1.0) for row in flat):
         keys = [k for k in keys if k not in _OF_GIVING_UP]
+    if not any(row.get("share", 1.0) for row in flat):
+        keys = [k for k in keys if k not in _OF_MEMBERS]
     values = {key: [row.get(key) for row in flat] for key in keys}
+    keys = [k for k in keys if k not in _PARTS or set(map(repr, values[k])) - _NOTHING]
     same = []
     if len(rows) > 1:
         same = [k for k in keys if len({repr(v) for v in values[k]}) == 1]

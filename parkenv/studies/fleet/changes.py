@@ -18,10 +18,11 @@ from parkenv.studies.results import Row
 NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
 LEAST_DAYS = 5
-"""Days below which nothing is called better or worse: a bootstrap of so few is narrower than 95 %."""
+"""Days below which nothing is called better or worse: with fewer, a bootstrap interval covers less than 95 %."""
+_SHOWN_S = 0.05  # a part of a change that is said
 CHANGES = (
-    "change_s", "members_change_s", "others_change_s", "search_change_s", "balked_change", "paid_change",
-    "better_off", "worse_off",
+    "change_s", "members_change_s", "others_change_s", "search_change_s", "parking_cost_change_s", "gave_up_change_s",
+    "balked_change", "paid_change", "better_off", "worse_off",
 )  # fmt: skip
 """Columns of a change: each has a 95 % interval over the days of both."""
 GUIDANCE = {
@@ -31,7 +32,7 @@ GUIDANCE = {
 
 
 def summarize_changes(
-    settings: Sequence[list[Row]], zones: Mapping[str, Sequence[str]] = MappingProxyType({})
+    settings: Sequence[list[Row]], prices: Mapping[str, Mapping[str, float]] = MappingProxyType({})
 ) -> list[Row]:
     """Return a row for each change between two settings, from the days of each setting, at least one.
 
@@ -42,7 +43,7 @@ def summarize_changes(
 
     Args:
         settings: the days of each setting.
-        zones: names of the zones of the lot of each scenario.
+        prices: of each scenario, the price of an hour in each zone of the lot, in the order of the zones.
     """
     by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
     first = settings[0][0]["scenario"] if settings else ""
@@ -56,9 +57,11 @@ def summarize_changes(
             if its[what] != before[what] and (pairs := paired_days(days, earlier)):
                 names = _words(what, its | before), _words(what, its)
                 head = {"change": what, "before": names[0], "after": names[1], **its, "days": len(pairs)}
-                named = zones.get(str((its | before)["scenario"]), ())
-                for number, zone in enumerate((None, *named) if len(named) > 1 else (None,)):
-                    changes = [_change(*pair, number) for pair in pairs]
+                earlier_prices = prices.get(str((its | before)["scenario"]), {})
+                head["prices"] = _new_prices(earlier_prices, prices.get(str(its["scenario"]), {}))
+                named = tuple(earlier_prices)
+                for zone_number, zone in enumerate((None, *named) if len(named) > 1 else (None,)):
+                    changes = [_change(*pair, zone_number) for pair in pairs]
                     rows.append(head | {"zone": zone} | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
     return sorted(rows, key=lambda row: row["change"] != "scenario")
 
@@ -76,31 +79,48 @@ def _words(what: str, setting: Row) -> str:
     return f"{GUIDANCE[setting['knows']]} for {members}"
 
 
-def _change(after: Row, before: Row, zone: int) -> Row:
-    """Return what changes on a day for the cars that parked in a zone before, 0 for all; NaN where it is not known."""
+def _new_prices(before: Mapping[str, float], after: Mapping[str, float]) -> str | None:
+    """Return the prices that change, in words; None if none does.
+
+    Examples:
+        >>> _new_prices({"centre": 0.0, "ring": 0.5}, {"centre": 2.0, "ring": 0.5})
+        'centre 0 → 2 an hour'
+    """
+    new = [
+        f"{zone} {before[zone]:g} → {price:g}"
+        for zone, price in after.items()
+        if before.get(zone, price) != price
+    ]
+    return f"{', '.join(new)} an hour" if new else None
+
+
+def _change(after: Row, before: Row, zone_number: int) -> Row:
+    """Return what changes on a day for the cars that parked in a zone before; NaN where it is not known.
+
+    Zones have the numbers of `CAR_LISTS`, from 1; 0 is for all cars.
+    """
     row = dict.fromkeys(("cars_a_day", *CHANGES), float("nan"))
-    if not zone:
+    if not zone_number:
         row |= {
             "cars_a_day": after["cars"],
             "change_s": after["total_s"] - before["total_s"],
             "search_change_s": after["search_s"] - before["search_s"],
+            "parking_cost_change_s": after["parking_cost_s"] - before["parking_cost_s"],
+            "gave_up_change_s": after["gave_up_s"] - before["gave_up_s"],
             "balked_change": after["balked_fraction"] - before["balked_fraction"],
         }
-    times, earlier, member = (
-        _numbers(after, "total_cs"),
-        _numbers(before, "total_cs"),
-        _numbers(after, "member"),
-    )
+    times, earlier = _numbers(after, "total_cs"), _numbers(before, "total_cs")
+    member = _numbers(after, "member")
     if not len(times) == len(earlier) == len(member) > 0:
         return row
-    its = _numbers(before, "zone") == zone if zone else np.ones(len(times), bool)
+    its = _numbers(before, "zone") == zone_number if zone_number else np.ones(len(times), bool)
     gained = (times - earlier) / 100.0
-    paid = _numbers(after, "paid_cents"), _numbers(before, "paid_cents")
-    if len(paid[0]) or len(paid[1]):
-        row["paid_change"] = _mean(
-            np.subtract(*(cents if len(cents) else 0.0 * times for cents in paid))[its] / 100.0
-        )
-    row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])} if zone else {}
+    cents, earlier_cents = _numbers(after, "paid_cents"), _numbers(before, "paid_cents")
+    if len(cents) or len(earlier_cents):
+        free = np.zeros(len(times))  # in a lot without prices
+        cents, earlier_cents = (known if len(known) else free for known in (cents, earlier_cents))
+        row["paid_change"] = _mean((cents - earlier_cents)[its] / 100.0)
+    row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])} if zone_number else {}
     return row | {
         "members_change_s": _mean(gained[its & (member == 1.0)]),
         "others_change_s": _mean(gained[its & (member == 0.0)]),
@@ -121,13 +141,12 @@ def _numbers(day: Mapping[str, Any], name: str) -> FloatArray:
 
 
 def sentence(row: Row) -> str:
-    """Return a change in a sentence; it calls nothing better or worse whose interval includes 0."""
+    """Return a change in a sentence; it calls no mean a gain or a loss whose interval includes 0."""
     said = [_gain(row, "change_s", "a car saves", "a car loses", "a car")]
-    if is_known(row["paid_change"]):
-        said[0] += " with prices as time"
     minutes = abs(row["change_s"]) * row["cars_a_day"] / 60.0
     if is_clear(row, "change_s") and minutes >= 1.0:
         said[0] += f", all cars of a day together {minutes:,.0f} min"
+    said[0] += f": {parts}" if (parts := made_of(row)) else ""
     if is_known(row["members_change_s"]) and is_known(row["others_change_s"]):
         said.append(_gain(row, "members_change_s", "members save", "members lose", "members"))
         said.append(_gain(row, "others_change_s", "the others save", "the others lose", "the others"))
@@ -143,20 +162,55 @@ def sentence(row: Row) -> str:
             f"the share that finds no slot {way} by {100.0 * abs(row['balked_change']):.1f} percentage points"
         )
     after = row["after"] if row["change"] == "scenario" else row["after"][0].upper() + row["after"][1:]
-    return f"{after} instead of {row['before']} ({', '.join(where(row))}): {'; '.join(said)}."
+    return f"{after} instead of {row['before']} ({', '.join([*_new(row), *where(row)])}): {'; '.join(said)}."
+
+
+def made_of(row: Row) -> str:
+    """Return how much of a change of the total time is time, how much prices, and how much give-up penalties.
+
+    Empty if it is time alone, or if the parts are not known.
+    """
+    cost_s, gave_up_s = row["parking_cost_change_s"], row["gave_up_change_s"]
+    if not is_known(cost_s):
+        return "with prices as time" if is_known(row["paid_change"]) else ""
+    if max(abs(cost_s), abs(gave_up_s)) < _SHOWN_S:
+        return ""
+    time_s = row["change_s"] - cost_s - gave_up_s
+    parts = [f"{abs(time_s):.1f} s {'longer' if time_s > 0.0 else 'shorter'}"]
+    if abs(cost_s) >= _SHOWN_S:
+        paid = row["paid_change"]
+        amount = (
+            f"{abs(paid):.2f} {'more' if paid > 0.0 else 'less'} paid" if is_known(paid) else "parking costs"
+        )
+        parts.append(f"{amount} ({cost_s:+.1f} s as time)")
+    if abs(gave_up_s) >= _SHOWN_S:
+        way = "more" if gave_up_s > 0.0 else "less"
+        parts.append(
+            f"{abs(gave_up_s):.1f} s {way} give-up penalty ({row['balked_change']:+.1%} find no slot)"
+        )
+    return ", ".join(parts)
 
 
 def where(row: Row) -> list[str]:
     """Return what is equal before and after a change, in words."""
-    equal = [row["agents"], rate_text(row["arrivals_per_hour"])]
     if row["change"] == "knows":
-        return [f"{row['agents']} on {row['scenario']}", *equal[1:]]
+        return place(row)
+    equal = [row["agents"], rate_text(row["arrivals_per_hour"])]
     equal += [] if row["knows"] == OWN else [_words("knows", row)]
     return [*equal, f"cars that parked in zone {row['zone']} before"] if row["zone"] else equal
 
 
+def place(row: Row) -> list[str]:
+    """Return who drives where, and the demand, in words."""
+    return [f"{row['agents']} on {row['scenario']}", rate_text(row["arrivals_per_hour"])]
+
+
+def _new(row: Row) -> list[str]:
+    return [row["prices"]] if row["prices"] else []
+
+
 def off_in_words(row: Row) -> str:
-    """Return the shares of the cars that gain and lose, in words."""
+    """Return the shares of the cars that gain and lose, in words: each is compared with itself, whatever the mean."""
     gain, lose = row["better_off"], row["worse_off"]
     return f"{gain:.0%} of the cars are better off by {NOTICED_S:g} s or more, {lose:.0%} worse off"
 
@@ -177,7 +231,7 @@ def _gain(row: Row, name: str, saves: str, loses: str, who: str) -> str:
     shown = f"{value:+.1f} s" + (f" [{ends[0]:+.1f}, {ends[1]:+.1f}]" if ends else "")
     if row["days"] < LEAST_DAYS:
         return f"{who}: {shown} on {plural(row['days'], 'day')}, too few to tell"
-    return f"{who}: no clear difference, {shown}"
+    return f"{who}: no clear difference on average, {shown}"
 
 
 def is_known(value: float | None) -> bool:
@@ -198,19 +252,23 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
     """
     if not (chosen := [row for row in shown_changes(changes) if not row["zone"]]):
         return [
-            {"label": ", ".join(where(row | {"change": "knows"})), "value": f"{row['total_s']:.1f} s a car"}
-            for row in rows[:most]
+            {"label": ", ".join(place(row)), "value": f"{row['total_s']:.1f} s a car"} for row in rows[:most]
         ]
     made = []
     for row in chosen[:most]:
-        value = "no clear difference" if row["days"] >= LEAST_DAYS else "too few days to tell"
+        value = "no clear difference on average" if row["days"] >= LEAST_DAYS else "too few days to tell"
         interval, ends = "no interval", interval_of(row, "change_s")
         if ends:
             interval = f"95 % interval {ends[0]:+.1f} to {ends[1]:+.1f} s"
         if is_clear(row, "change_s"):
             value = f"{abs(row['change_s']):.1f} s {'less' if row['change_s'] < 0.0 else 'more'} a car"
             interval = "95 % interval {:.1f} to {:.1f} s".format(*sorted(map(abs, ends or ())))
-        one = {"label": f"{row['after']} instead of {row['before']}", "where": ", ".join(where(row))}
+        if parts := made_of(row):
+            interval = f"{parts}; {interval}"
+        one = {
+            "label": f"{row['after']} instead of {row['before']}",
+            "where": ", ".join([*_new(row), *where(row)]),
+        }
         off = {"better": row["better_off"], "worse": row["worse_off"]} if is_known(row["better_off"]) else {}
         made.append(one | {"value": value, "interval": interval} | off)
     return made

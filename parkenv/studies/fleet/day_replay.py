@@ -98,6 +98,7 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
             "scenario": scenario.name,
             **setting.columns,
             "day": day,
+            "date": fleet.day.date,
             "begin_s": round(begin, 3),
             "goal": scenario.goal,
             "duration": _centiseconds(float(cars["ended_at"].max()) - begin),

@@ -388,11 +388,15 @@ class FleetStudy(Study):
         days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
+        prices = {
+            name: {zone: its.tariff.per_hour.get(zone, 0.0) for zone in its.lot.zones}
+            for name, its in self.built.items()
+        }
         return {
             "manoeuvre_s": self.blocked_s,
             **options,
             "rows": summarize_days(days),
-            "changes": summarize_changes(days, {name: its.lot.zones for name, its in self.built.items()}),
+            "changes": summarize_changes(days, prices),
             "hours": summarize_hours(days, int(first)),
             "zones": self._zones(results),
         }
@@ -464,14 +468,15 @@ class FleetStudy(Study):
             low, high = row["price_of_anarchy_ci95"]
             if None not in (row["price_of_anarchy"], low, high) and row["knows"] == OWN:
                 finding += f"; the price of anarchy is {row['price_of_anarchy']:.3f} [{low:.3f}, {high:.3f}]"
-                if low > 1.0:
-                    finding += (
-                        f": everybody for himself takes {row['price_of_anarchy'] - 1.0:.0%} longer than with slots "
-                        "reserved for all"
-                    )
+                finding += (
+                    f": everybody for himself takes {row['price_of_anarchy'] - 1.0:.0%} longer than with slots "
+                    "reserved for all"
+                    if low > 1.0
+                    else ": reservations would save nothing measurable"
+                )
             findings.append(f"{finding}.")
         findings += [sentence(row) for row in changes if row["change"] == "knows"]
-        return findings + departures(summary["hours"])
+        return findings + departures(summary["hours"], summary["rows"])
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:

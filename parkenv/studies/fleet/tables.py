@@ -86,25 +86,37 @@ def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
     return rows
 
 
-def departures(hours: Sequence[Row]) -> list[str]:
-    """Say for each agent and demand when the lot is least as full as counted: by more than `FAR`, and not by chance.
+def departures(hours: Sequence[Row], rows: Sequence[Row]) -> list[str]:
+    """Say when the lot is least as full as counted, by more than `FAR` and not by chance, and why, if that is known.
 
-    Of the first scenario; nothing of so many times the counted demand, which is not meant to be as full.
+    A line for each scenario, agent and demand; nothing of so many times the counted demand, which is not meant to be as
+    full.
+
+    Args:
+        hours: of `summarize_hours`.
+        rows: of `summarize_days`.
     """
-    worst: dict[tuple[str, float | str], Row] = {}
+    balked = {tuple(row[name] for name in SETTING_COLUMNS): row["balked_fraction"] for row in rows}
+    worst: dict[tuple[str, str, float | str], Row] = {}
     for row in sorted(hours, key=lambda row: abs(row["excess"])):
-        low, high = row["excess_ci95"]
-        rate, first = row["arrivals_per_hour"], row["scenario"] == hours[0]["scenario"]
-        meant = first and (rate == COUNTED or not isinstance(rate, str))
+        (low, high), rate = row["excess_ci95"], row["arrivals_per_hour"]
+        meant = rate == COUNTED or not isinstance(rate, str)
         if meant and abs(row["excess"]) > FAR and (low or 0.0) * (high or 0.0) > 0.0:
-            worst[row["agents"], rate] = row
-    why = "shorter stays (--stay-min) may follow better", "it is full at times, and cars go elsewhere"
-    return [
-        f"{agent}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
-        f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}; "
-        f"{why[row['excess'] < 0.0] if rate == COUNTED else '--arrivals-per-hour counted follows the counts'}."
-        for (agent, rate), row in worst.items()
-    ]
+            worst[row["scenario"], row["agents"], rate] = row
+    lines = []
+    for (scenario, agent, rate), row in worst.items():
+        why = ""
+        if rate != COUNTED:
+            why = "; --arrivals-per-hour counted follows the counts"
+        elif row["excess"] > 0.0:
+            why = "; shorter stays (--stay-min) may follow better"
+        elif gone := balked.get(tuple(row[name] for name in SETTING_COLUMNS)):
+            why = f"; it is full at times, and {gone:.1%} of the cars go elsewhere"
+        lines.append(
+            f"{agent} on {scenario}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
+            f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}{why}."
+        )
+    return lines
 
 
 def _differences(pairs: Pairs) -> Row:
