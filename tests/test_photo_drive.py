@@ -23,9 +23,9 @@ from parkenv.perception.detector import Detections, DetectorErrors
 from parkenv.perception.hog_detector import HogDetector
 from parkenv.perception.monocular import (
     HEIGHT,
-    USUAL,
     GroundView,
     RangingErrors,
+    UsualCars,
     corners_of_cars,
     distances_ahead,
     localize_boxes,
@@ -45,11 +45,11 @@ def view_of(height=1.3, pitch=0.0):
 
 def usual_box(ground, ahead, aside, view, tall=HEIGHT, wide=None, foot=None):
     """The box of a car: its tyres and roof ahead of or behind its nearest side as usual, (4,) px."""
-    its_foot, _, roof, width, _, _ = USUAL[view]
-    width = width if wide is None else wide
-    tyres = ahead + (its_foot if foot is None else foot)
+    usual = UsualCars.seen_as(view)
+    width = usual.width if wide is None else wide
+    tyres = ahead + (usual.foot if foot is None else foot)
     bottom = ground.pixels(tyres, 0.0, 0.0)[1]
-    top = ground.pixels(ahead + roof, 0.0, tall)[1]
+    top = ground.pixels(ahead + usual.roof, 0.0, tall)[1]
     # Sides are measured at the row of the tyres, and as far ahead as the nearest side.
     scale = CAMERA.fx * (
         math.cos(ground.mount.pitch) + (bottom - CAMERA.cy) / CAMERA.fy * math.sin(ground.mount.pitch)
@@ -81,8 +81,8 @@ def test_the_stated_deviation_is_that_of_the_error(detector, view, ahead):
     errors, found, std = RangingErrors(detector), [], []
     for _ in range(n):
         ground = view_of(pitch=math.degrees(rng.normal(0.0, errors.pitch)))
-        foot, foot_std, _, width, width_std, _ = USUAL[view]
-        sizes = rng.normal([HEIGHT, width, foot], [0.12, width_std, foot_std])
+        usual = UsualCars.seen_as(view)
+        sizes = rng.normal([HEIGHT, usual.width, usual.foot], [0.12, usual.width_std, usual.foot_std])
         box = usual_box(ground, ahead, 0.0, view, sizes[0], max(sizes[1], 0.8), sizes[2])
         box += (box[3] - box[1]) * (detector.shift + rng.normal(0.0, detector.std))
         at, its, _ = distances_ahead(detector.corrected(box[None]), np.array([view]), view_of(), errors)
@@ -91,6 +91,18 @@ def test_the_stated_deviation_is_that_of_the_error(detector, view, ahead):
     off = np.abs(np.array(found) - ahead) / std
     assert 0.58 < (off < 1.0).mean() < 0.8
     assert (off < 2.0).mean() > 0.9
+
+
+@pytest.mark.parametrize("detector", [DetectorErrors(), HogDetector.errors])
+@pytest.mark.parametrize("pitch", [-4.0, 0.0, 4.0])
+def test_boxes_that_end_above_the_horizon_are_no_cars(detector, pitch):
+    """However probable, and as high and wide as a car: the ground is elsewhere."""
+    ground, tall = view_of(pitch=pitch), 250.0
+    horizon = CAMERA.cy + CAMERA.fy * math.tan(ground.mount.pitch)
+    for bottom, cars in ((horizon + 270.0, 1), (horizon - 1.0, 0), (horizon - 60.0, 0)):
+        box = np.array([[500.0, bottom - tall, 820.0, bottom]]) + tall * np.array(detector.shift)
+        found = Detections(box, np.ones(1), np.ones(1, np.bool_))
+        assert len(localize_boxes(found, ground, np.zeros(3), RangingErrors(detector))) == cars
 
 
 def test_cars_are_placed_in_their_slots_and_uncertain_ones_in_none():
@@ -109,7 +121,7 @@ def test_cars_are_placed_in_their_slots_and_uncertain_ones_in_none():
         ahead = (math.cos(yaw) * away[:, 0] + math.sin(yaw) * away[:, 1])[:, None] + along
         aside = (math.sin(yaw) * away[:, 0] - math.cos(yaw) * away[:, 1])[:, None] + across
         sides = ground.pixels(ahead, aside, np.zeros_like(ahead))[..., 0]
-        boxes = np.array([usual_box(ground, a.min() + USUAL[0, 5], 0.0, 0) for a in ahead])
+        boxes = np.array([usual_box(ground, a.min() + UsualCars.seen_as(0).corner, 0.0, 0) for a in ahead])
         boxes[:, 0], boxes[:, 2] = sides.min(axis=1), sides.max(axis=1)
         sure = np.ones(len(near), np.float32)
         errors = RangingErrors.of_poses(error, 0.0)
@@ -200,6 +212,7 @@ BOMB = (
         ("p.csv", "x,y\n0,1\n", "want columns time or file"),
         ("p.csv", "time,x,y\nnoon,1,2\n", "time is 'noon'"),
         ("p.csv", "time,x,y\n1e12,1,2\n", "time is '1e12'"),
+        ("p.csv", "time,x,y\n637574.285,1,2\n", "time is '637574.285'"),
         ("p.csv", "time,x,y\n9999-12-31T23:59:59Z,1,2\n", "time is '9999"),
     ],
 )  # fmt: skip

@@ -1,6 +1,7 @@
 """Recorded drives: there and back through MCAP, poses between messages, and recordings that are refused."""
 
 import math
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,6 +12,8 @@ from parkenv import InputError, make_scenario
 from parkenv.files.recordings import footage_in
 from parkenv.files.videos import Video
 from parkenv.mapping.drive_calibration import DriveCalibration
+from parkenv.mapping.photo_options import PhotoOptions
+from parkenv.mapping.photographs import Photographs
 from parkenv.mapping.recorded_drive import Head, RecordedDrive, map_drive, recording
 from parkenv.mapping.store import MapStore
 from parkenv.perception.detector import Detections
@@ -257,6 +260,26 @@ def test_what_a_rig_measures_comes_back_to_the_bit(tmp_path):
         )
         np.testing.assert_array_equal(captured.capture.scans["laser"], was.capture.scans["laser"])
     assert {path.name for path in tmp_path.iterdir()} == {"d.mcap"}
+
+
+def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_path, monkeypatch):
+    rig, none = SensorRig.named("camera"), (np.zeros((0, 0)),) * 2
+    pictures = [np.full((480, 640, 3), 50 * k, np.uint8) for k in range(3)]
+    with recording(tmp_path / "drive.mcap", rig) as writer:
+        for k, picture in enumerate(pictures):
+            capture = Capture(np.zeros(3), {"right": Frame(picture, *none, np.zeros((0, 0), int))}, {}, {})
+            writer.add(TimedCapture(200_000.0 + k, capture), np.array([2.0 * k, 1.0, 0.1]))
+        writer.close(Head("key", 200_000.0, "camera", "rain"))
+    monkeypatch.chdir(tmp_path)
+    code = (Path(__file__).parents[1] / "docs/camera.md").read_text().split("```python\n")[1].split("```")[0]
+    exec(compile(code, "camera.md", "exec"), {})
+    taken = Photographs(tmp_path / "photos", PhotoOptions(fov=90.0))
+    photographed = RecordedDrive(tmp_path / "photos", photographs=taken)
+    assert photographed.start == 200_000.0
+    back = list(photographed.captures())
+    np.testing.assert_allclose([pose for _, pose in back], [[2.0 * k, 1.0, 0.1] for k in range(3)])
+    for (captured, _), picture in zip(back, pictures, strict=True):
+        np.testing.assert_array_equal(captured.capture.images["camera"].image, picture)
 
 
 @pytest.mark.parametrize(

@@ -168,6 +168,9 @@ class MapDrive(Command):
         console.print(
             make_table(None, ["figure", "value"], ((name, str(value)) for name, value in row.items()))
         )
+        if not row["seen"]:
+            why = f": poses ± {row['pose_error_m']:.2g} m; see --pose-error" if "pose_error_m" in row else ""
+            console.print(f"No slot could be told apart{why}", style="yellow")
         console.print(f"Written: {self.out / 'map.sqlite'}, map.png, cars.csv, summary.json")
 
 

@@ -16,8 +16,8 @@ from parkenv.files.limited_reading import read_xml
 
 MONDAY_S = 4 * 86_400
 """1970-01-05, the first Monday of Unix time, s."""
-_LEAST_UNIX_S = 1e8  # smaller times are seconds since Monday 00:00
-_MOST_UNIX_S = 9e9  # in the year 2255; nanoseconds fit 64 bits
+_WEEK_S = 604_800  # smaller times are since Monday 00:00
+_UNIX_S = (1e8, 9e9)  # 1973 to 2255; nanoseconds fit 64 bits
 _STEP_M = 1.0  # between the positions of which a heading is made
 _WANT = "want columns time or file, x and y (m) or lat and lon (degrees), and yaw (rad) or heading (degrees) if known"
 
@@ -62,9 +62,9 @@ class Track:
 def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     """Read a GPX file (`.gpx`), or a CSV table.
 
-    A table has `time` (a date, Unix time, or seconds since Monday 00:00) or `file` (a picture's name), or both; `x` and
-    `y` (m in the lot) or `lat` and `lon` (degrees); and, if they are known, `yaw` (rad, counter-clockwise from x) or
-    `heading` (degrees, clockwise from north). Other columns are skipped.
+    A table has `time` or `file` (a picture's name), or both; `x` and `y` (m in the lot) or `lat` and `lon` (degrees);
+    and, if they are known, `yaw` (rad, counter-clockwise from x) or `heading` (degrees, clockwise from north). Other
+    columns are skipped. A time is a date, Unix time from 1e8 s on, or, below 604,800 s, time since Monday 00:00.
 
     Args:
         path: the file.
@@ -73,7 +73,10 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     Raises:
         InputError: the file cannot be read, or lacks something; the message is one line.
     """
-    time = Kind("a date such as 2026-05-04T09:00:00Z, or seconds", lambda text: stamp_in(text, timezone_s))
+    time = Kind(
+        "a date (2026-05-04T09:00:00Z), Unix time, or seconds of a week",
+        lambda text: stamp_in(text, timezone_s),
+    )
     kinds = dict.fromkeys(("x", "y", "lat", "lon", "heading"), NUMBER) | {"time": time}
     kinds["yaw"] = Kind("radians, -6.3 to 6.3", _angle)
     if path.suffix.lower() == ".gpx":
@@ -122,12 +125,17 @@ def stamp_in(text: str, timezone_s: float) -> int:
     """
     try:
         seconds: float = NUMBER.parse(text)
-        fraction, shift = 0, timezone_s - MONDAY_S if abs(seconds) < _LEAST_UNIX_S else 0.0
+        is_of_week, fraction = 0.0 <= seconds < _WEEK_S, 0
+        shift = timezone_s - MONDAY_S if is_of_week else 0.0
     except ValueError:
         date = datetime.fromisoformat(text)
-        fraction, shift = date.microsecond * 1000, timezone_s if date.tzinfo is None else 0.0
+        is_of_week, fraction, shift = (
+            False,
+            date.microsecond * 1000,
+            timezone_s if date.tzinfo is None else 0.0,
+        )
         seconds = date.replace(microsecond=0, tzinfo=date.tzinfo or UTC).timestamp()
-    if abs(seconds) > _MOST_UNIX_S:
+    if not is_of_week and not _UNIX_S[0] <= seconds <= _UNIX_S[1]:
         raise ValueError(text)
     return round((seconds - shift) * 1e9) + fraction
 

@@ -60,6 +60,7 @@ class Photographs:
     Attributes:
         calibration: the camera, with a topic for the pictures.
         errors: of the poses.
+        without_pose: number of photographs that the table of poses does not name.
 
     Raises:
         InputError: a file cannot be read, or something is missing; the message says what is wanted.
@@ -82,6 +83,10 @@ class Photographs:
         self.calibration = calibration
         self._zone_s = 3600.0 * calibration.timezone_h
         poses = options.poses or (path if path.is_dir() else path.parent) / POSES
+        if options.poses is None and not poses.is_file():
+            raise InputError(
+                f"{path}: has no poses, want --poses FILE (.csv, .gpx), or {POSES} beside the pictures"
+            )
         self.track = read_track(poses, self._zone_s)
         with naming(poses):
             xy = self._in_metres(self.track, frame)
@@ -91,7 +96,9 @@ class Photographs:
             usual if options.pose_error is None else options.pose_error,
             _TRACK_YAW if np.isnan(self.track.yaw).any() else 0.0,
         )
+        pictures = len(self._files)
         self._stamps = self._times() if self._film is None else None
+        self.without_pose = pictures - len(self._files)
 
     @contextmanager
     def open(self) -> Iterator[tuple[dict[str, str], Messages]]:
@@ -141,7 +148,9 @@ class Photographs:
             try:
                 taken.append(stamp_in(image_time(file) or "", self._zone_s) + round(late * 1e9))
             except ValueError as error:
-                raise InputError(f"{file}: has no Exif time, want one, a column file, or --fps") from error
+                raise InputError(
+                    f"{file}: has no Exif time, want one, --fps, or a column `file` in the poses"
+                ) from error
         return np.array(taken, np.int64)
 
     def _usual_camera(self) -> CameraSpec:

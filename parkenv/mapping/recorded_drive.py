@@ -55,7 +55,7 @@ PAIR_S = 0.1
 GAP_S = 2.0
 """Longest time between two poses that a pose is interpolated between, s."""
 HEAD, POSE = "/parkenv/drive", "/pose"
-_MONDAY_S = 4 * DAY_S  # 1970-01-05, the first Monday of Unix time
+_MONDAY_S = 1_704_067_200  # 2024-01-01; drives are recorded as if in the week from this Monday on
 _STRING, _POSE_2D = "std_msgs/msg/String", "geometry_msgs/msg/Pose2D"
 _SCAN = "sensor_msgs/msg/LaserScan"
 _POSES = (
@@ -101,7 +101,7 @@ class DriveWriter:
 
     def add(self, captured: TimedCapture, vehicle: FloatArray) -> None:
         """Append a capture and the pose of the vehicle by its odometry, (3,)."""
-        stamp = round((_MONDAY_S + captured.time) * 1e9)
+        stamp = _MONDAY_S * 10**9 + round(captured.time * 1e9)
         x, y, yaw = (float(v) for v in vehicle)
         self._send(POSE, _POSE_2D, stamp, x=x, y=y, theta=yaw)
         capture = captured.capture
@@ -232,6 +232,13 @@ class RecordedDrive:
             return self.head.time
         zone = self.calibration.timezone_h * 3600.0 if self.calibration else 0.0
         return (self._stamps["pose"][0] / 1e9 + zone - _MONDAY_S) % (7.0 * DAY_S)
+
+    @property
+    def without_pose(self) -> int:
+        """Number of pictures of the first camera that have no pose, and are left out."""
+        return sum(self.pose_at(stamp) is None for stamp in self._stamps[self._first]) + (
+            self.photographs.without_pose if self.photographs else 0
+        )
 
     def captures(self, every: float = 0.0) -> Iterator[tuple[TimedCapture, FloatArray]]:
         """Yield the captures, and the vehicle's pose of each, (3,) x, y in m and yaw in rad.
@@ -402,9 +409,8 @@ class RecordedDrive:
     def _frames(self, every: float) -> list[tuple[int, dict[str, int], FloatArray]]:
         """Return the stamp, the index of each sensor's part, and the pose of each capture."""
         others = {key: np.array(s, np.int64) for key, s in self._stamps.items() if key != "pose"}
-        first = next(key for key in others if key.startswith("image:"))
         plan: list[tuple[int, dict[str, int], FloatArray]] = []
-        for stamp in self._stamps[first]:
+        for stamp in self._stamps[self._first]:
             nearest = {key: _nearest(stamps, stamp) for key, stamps in others.items()}
             paired = all(abs(int(others[key][i]) - stamp) <= PAIR_S * 1e9 for key, i in nearest.items())
             pose = self.pose_at(stamp)
@@ -415,10 +421,15 @@ class RecordedDrive:
             plan.append((stamp, nearest, pose))
         if not plan:
             raise InputError(
-                f"{self.path}: no picture of {self._streams[first].topic} has a pose and measurements of all other "
-                f"sensors within {PAIR_S} s"
+                f"{self.path}: no picture of {self._streams[self._first].topic} has a pose and measurements of all "
+                f"other sensors within {PAIR_S} s"
             )
         return plan
+
+    @property
+    def _first(self) -> str:
+        """The key of the first camera."""
+        return next(key for key in self._stamps if key.startswith("image:"))
 
     def pose_at(self, stamp: int) -> FloatArray | None:
         """Return the interpolated pose, (3,), at a time, ns of Unix time; None where there is none."""

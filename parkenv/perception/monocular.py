@@ -29,26 +29,49 @@ from sim_sensors.rig import Mount
 
 HEIGHT, HEIGHT_STD = 1.54, 0.12
 """Height of a car, m, and its standard deviation."""
-USUAL = np.array(
+
+
+class UsualCars(NamedTuple):
+    """Where usual cars are behind their nearest side, (n,) m each, in the middle of which a laser's beams end.
+
+    | field | what |
+    |---|---|
+    | `foot`, `foot_std` | how far behind that side its tyres stand, where its box ends, and the standard deviation |
+    | `roof` | how far behind that side the edge of its roof is |
+    | `width`, `width_std` | how wide its box is, as if it stood at that side, and the standard deviation |
+    | `corner` | how far its nearest corner is before that side |
+    """
+
+    foot: FloatArray
+    foot_std: FloatArray
+    roof: FloatArray
+    width: FloatArray
+    width_std: FloatArray
+    corner: FloatArray
+
+    @classmethod
+    def seen_as(cls, view: NDArray[np.integer]) -> UsualCars:
+        """Return those of each `View`, (n,): means over simulated drives."""
+        return cls(*_BY_VIEW[view].T)
+
+
+_BY_VIEW = np.array(
     [
         [0.55, 0.25, 1.2, 1.95, 0.9, 0.25],  # end
         [0.0, 0.25, 0.6, 3.4, 1.1, 1.0],  # oblique
         [0.1, 0.2, 0.4, 4.1, 0.7, 0.1],  # side
     ]
 )
-"""By `View`, m, over simulated drives: how far behind its nearest side (where a laser's beams end, in the middle) a
-car's tyres stand, on which its box ends, and the standard deviation of that; how far the edge of its roof is; how wide
-its box is, as if it stood at that side, and the standard deviation; and how far its nearest corner is before it."""
 REACH = 15.0
-"""m, from which a car is not located: by then the distance is worth little."""
+"""m, beyond which cars are dropped: their distance is worth little."""
 _NEAREST = 0.5  # m
-_CUT = 0.8  # m, further standard deviation of a distance where the picture's border cuts the car beside
+_CUT = 0.8  # m, further standard deviation of the distance of a car that the left or right border cuts
 _EDGE = 0.5  # px, standard deviation of the edge of the smallest box
-_LENGTH_STD = 0.3  # m, of a centre behind the nearest side
-_MIDDLE = 0.05  # of a box's width, between its middle and that of the car
+_LENGTH_STD = 0.3  # m, standard deviation of how far a car's centre is behind its nearest side
+_MIDDLE = 0.05  # standard deviation between the middles of box and car, as a fraction of the box's width
 _UNKNOWN = 1e6  # m², variance of a measurement that the picture's border prevents
-_AGREE = 3.0  # standard deviations up to which height and ground may differ
-_HIDDEN = 0.5  # fraction of a lower edge behind nearer boxes from which it is not the car's own
+_AGREE = 3.0  # standard deviations up to which measurements agree
+_HIDDEN = 0.5  # fraction of a box's lower edge that nearer boxes cover, from which it is not the car's own
 
 
 class RangingErrors(NamedTuple):
@@ -102,31 +125,43 @@ def distances_ahead(
         errors: standard deviations.
 
     Returns:
-        (n,) m; their standard deviations, (n,) m; and whether ground and height agree, (n,) bool.
+        (n,) m; their standard deviations, (n,) m; and whether ground and height agree, on ground within `REACH`, (n,)
+        bool.
     """
     camera, mount = ground.camera, ground.mount
-    foot, foot_std, roof, width, width_std, _ = USUAL[view].T
-    rows = boxes[:, [3, 1]]
+    usual, none = UsualCars.seen_as(view), np.zeros(len(boxes))
+    foot, roof, width = usual.foot, usual.roof, usual.width
     low, high = np.minimum(ground.slope(boxes[:, 3]), -1e-3), ground.slope(boxes[:, 1])
     across = ground.aside(boxes[:, 2], boxes[:, 3]) - ground.aside(boxes[:, 0], boxes[:, 3])
-    # span = mount.z / (tall + foot) + (HEIGHT - mount.z) / (tall + roof), for the tyres and for the roof.
+    by_ground, by_width = -mount.z / low - foot, width / across
+    # Tyres and roof at low = -z / (d + foot) and high = (HEIGHT - z) / (d + roof) span high - low: the greater root of
+    # span d² + (span (foot + roof) - HEIGHT) d + span foot roof - z roof - (HEIGHT - z) foot = 0.
     span, over = np.maximum(high - low, 1e-3), HEIGHT - mount.z
     half = 0.5 * (span * (foot + roof) - HEIGHT)
     root = np.sqrt(np.maximum(half**2 - span * (span * foot * roof - mount.z * roof - over * foot), 1e-9))
-    far, tall, wide = -mount.z / low - foot, (root - half) / span, width / across
-    # Derivatives of the three by the sources of error: lower and upper edge, the others, pitch, foot, height, width.
+    by_height = (root - half) / span
+    # Derivatives of the three by each source of error, times its standard deviation.
     edge = np.hypot((boxes[:, 3] - boxes[:, 1])[:, None] * errors.detector.std, _EDGE)
-    per_px = (1.0 + np.stack([low, high], 1) ** 2) / (1.0 + ((rows - camera.cy) / camera.fy) ** 2) / camera.fy
-    by_span = -(tall + foot) * (tall + roof) / (2.0 * root)
-    by = np.zeros((len(boxes), 3, 8))
-    by[:, 0, 0] = (far + foot) / low * per_px[:, 0] * edge[:, 3]
-    by[:, 1, 0], by[:, 1, 1] = by_span * per_px[:, 0] * edge[:, 3], -by_span * per_px[:, 1] * edge[:, 1]
-    by[:, 2, 2], by[:, 2, 3] = (wide / across / camera.fx * edge[:, side] for side in (0, 2))
-    by[:, 0, 4] = -(far + foot) / low * (1.0 + low**2) * errors.pitch
-    by[:, 1, 4] = by_span * (high**2 - low**2) * errors.pitch
-    by[:, 0, 5], by[:, 1, 5] = -foot_std, -(span * (tall + roof) - over) / (2.0 * root) * foot_std
-    by[:, 1, 6] = (tall + foot) / (2.0 * root) * HEIGHT_STD
-    by[:, 2, 7] = wide * width_std / width
+    per_px = (1.0 + np.stack([low, high], 1) ** 2) / (
+        1.0 + ((boxes[:, [3, 1]] - camera.cy) / camera.fy) ** 2
+    ) / camera.fy  # fmt: skip
+    low_std, high_std = (per_px * edge[:, [3, 1]]).T
+    low_by_pitch = (1.0 + low**2) * errors.pitch
+    by_low = (by_ground + foot) / low
+    by_span = -(by_height + foot) * (by_height + roof) / (2.0 * root)
+    height_by_foot = -(span * (by_height + roof) - over) / (2.0 * root)
+    left_std, right_std = by_width / across / camera.fx * edge[:, [0, 2]].T
+    jacobian = {
+        "lower edge": (by_low * low_std, by_span * low_std, none),
+        "upper edge": (none, -by_span * high_std, none),
+        "left edge": (none, none, left_std),
+        "right edge": (none, none, right_std),
+        "pitch": (-by_low * low_by_pitch, by_span * (high**2 - low**2) * errors.pitch, none),
+        "foot": (-usual.foot_std, height_by_foot * usual.foot_std, none),
+        "height": (none, (by_height + foot) / (2.0 * root) * HEIGHT_STD, none),
+        "width": (none, none, by_width * usual.width_std / width),
+    }
+    by = np.array(list(jacobian.values())).transpose(2, 1, 0)
     below = boxes[:, 3] >= (1.0 - MARGIN) * camera.height
     above = boxes[:, 1] <= MARGIN * camera.height
     beside = (boxes[:, 0] <= MARGIN * camera.width) | (boxes[:, 2] >= (1.0 - MARGIN) * camera.width)
@@ -134,9 +169,12 @@ def distances_ahead(
     covariance = by @ by.transpose(0, 2, 1) + unknown[:, :, None] * np.eye(3)
     weight = np.linalg.inv(covariance).sum(axis=2)
     variance = 1.0 / weight.sum(axis=1)
-    estimates = np.stack([far, tall, wide], axis=1)
+    estimates = np.stack([by_ground, by_height, by_width], axis=1)
     apart = covariance[:, 0, 0] + covariance[:, 1, 1] - 2.0 * covariance[:, 0, 1]
-    agree = np.abs(far - tall) <= _AGREE * np.sqrt(apart)
+    agree = np.abs(by_ground - by_height) <= _AGREE * np.sqrt(apart)
+    # Towards the horizon `apart` grows without bound, and everything would agree.
+    agree &= ground.slope(boxes[:, 3]) < 0.0
+    agree &= low - _AGREE * np.hypot(low_std, low_by_pitch) < -mount.z / REACH
     return variance * (weight * estimates).sum(axis=1), np.sqrt(variance), agree
 
 
@@ -150,7 +188,8 @@ def localize_boxes(
     """Locate the detected cars from their boxes alone, with the covariance of each.
 
     Dropped are boxes that reach from the picture's left border to the right one, those of which nearer ones hide the
-    lower edge, and those whose height and lower edge do not agree: what is there is no car on the ground.
+    lower edge, those that end above the horizon, and those whose height and lower edge do not agree: no car on the
+    ground in front of the camera looks so.
 
     Args:
         detections: detections in the camera's image.
@@ -170,11 +209,11 @@ def localize_boxes(
     sure &= ~(cut_left & cut_right)
     rows = np.flatnonzero(sure & agree & (ahead > _NEAREST) & (ahead < REACH) & ~_is_hidden(boxes))
     boxes, ahead, std, view = boxes[rows], ahead[rows], std[rows], detections.view[rows]
+    usual = UsualCars.seen_as(view)
     left, right = (ground.aside(boxes[:, side], boxes[:, 3]) for side in (0, 2))
     # A car that the picture's border cuts goes on there to its usual width.
-    width, width_std = USUAL[view, 3], USUAL[view, 4]
-    left = np.where(cut_left[rows], np.minimum(left, right - width / ahead), left)
-    right = np.where(cut_right[rows], np.maximum(right, left + width / ahead), right)
+    left = np.where(cut_left[rows], np.minimum(left, right - usual.width / ahead), left)
+    right = np.where(cut_right[rows], np.maximum(right, left + usual.width / ahead), right)
     cut, aside = (cut_left | cut_right)[rows], 0.5 * (left + right)
     std = np.hypot(std, _CUT * cut)
     x, y, yaw = ground.mount.in_world(vehicle)
@@ -183,7 +222,7 @@ def localize_boxes(
     def centres(heading: FloatArray) -> FloatArray:
         """Return the centres, (n, 2), of cars whose nearest corner is so far ahead and which fill the boxes' middle."""
         along, across = corners_of_cars(heading - yaw)
-        depth = ahead - USUAL[view, 5] - along.min(axis=1)
+        depth = ahead - usual.corner - along.min(axis=1)
         shift = aside * depth
         for _ in range(5):
             slope = (shift[:, None] + across) / np.maximum(depth[:, None] + along, _NEAREST)
@@ -199,7 +238,9 @@ def localize_boxes(
     along = np.hypot(std * stretch, _LENGTH_STD)
     edges = 0.5 * math.hypot(errors.detector.std[0], errors.detector.std[2]) * (boxes[:, 3] - boxes[:, 1])
     sideways = np.hypot(edges, _MIDDLE * (boxes[:, 2] - boxes[:, 0])) / camera.fx
-    across = np.hypot(np.hypot(*(xy - [x, y]).T) * np.hypot(sideways, errors.heading), 0.8 * width_std * cut)
+    across = np.hypot(
+        np.hypot(*(xy - [x, y]).T) * np.hypot(sideways, errors.heading), 0.8 * usual.width_std * cut
+    )
     c, s = np.cos(bearing), np.sin(bearing)
     scaled = np.stack([c * along, -s * across, s * along, c * across], axis=1).reshape(-1, 2, 2)
     return LocatedCars(

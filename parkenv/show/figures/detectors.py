@@ -41,14 +41,15 @@ def save_reach(rows: Sequence[Row], ylabel: str, path: Path) -> None:
         figure = Figure(figsize=(3.4 * columns + 0.6, 2.5 * lines + 0.9), layout="constrained")
         axes = figure.subplots(lines, columns, sharex=True, sharey=True, squeeze=False).ravel()
         for ax, weather in zip(axes, panels, strict=False):
-            for i, (rig, detector) in enumerate((r, d) for r in rigs for d in detectors):
+            surveys = [(r, d) for r in rigs for d in detectors]
+            for i, (rig, detector) in enumerate(surveys):
                 its = [r for r in rows if (r["weather"], r["rig"], r["detector"]) == (weather, rig, detector)]
                 if not its:
                     continue
                 color = COLORS[detectors.index(detector) % len(COLORS)]
                 line = LINES[rigs.index(rig) % len(LINES)]
                 # Offset the points, so that the intervals do not hide each other.
-                x = np.array([np.mean(r["distance_m"]) for r in its]) + 0.18 * (i - 1.5)
+                x = np.array([np.mean(r["distance_m"]) for r in its]) + 0.18 * (i - (len(surveys) - 1) / 2)
                 rate, low, high = (np.array([r[c] for r in its]) for c in ("rate", "low", "high"))
                 ax.plot(
                     x, rate, color=color, linestyle=line, marker="o", markersize=3, linewidth=1.5,

@@ -21,7 +21,7 @@ from parkenv.mapping.discovery import DiscoveryScore, FoundSlots
 from parkenv.mapping.inference import Prediction
 from parkenv.mapping.odometry import between, moved
 from parkenv.mapping.survey import SessionResult
-from parkenv.perception.detector import Detections
+from parkenv.perception.detector import LEAST_PROBABILITY, PROBABILITY, Detections
 from parkenv.show.colors import PALETTE, hex_color
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
@@ -98,9 +98,8 @@ def save_detections(result: SessionResult, path: Path) -> None:
             Patch(fill=False, edgecolor="#{:02x}{:02x}{:02x}".format(*color), linewidth=width, label=name)
             for name, color, width in kinds
         ]
-        note = Line2D(
-            [], [], linestyle="none", marker="$0.97$", markersize=18, color=INK, label="probability"
-        )
+        least = f"{LEAST_PROBABILITY:g} where a distance confirms it, else {PROBABILITY:g}"
+        note = Line2D([], [], linestyle="none", label=f"number: probability, at least {least}")
         figure.legend(handles=[*handles, note], loc="lower left", ncols=5)
         figure.subplots_adjust(0.01, 0.08, 0.99, 0.91, wspace=0.02)
         save_picture(figure, path, "Camera frames of a survey drive, with the cars that were detected")
@@ -129,7 +128,8 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         )
         cars = result.session.cars
         paint(axes[1], [headings(cars, CAR_COLOR)], 3.0)
-        axes[1].set_title(f"{plural(len(cars), 'detection')} of cars, frame by frame")
+        boxes = plural(result.score.detections, "detection")
+        axes[1].set_title(f"cars, frame by frame: {len(cars)} of {boxes} have a distance")
         heading = Line2D([], [], color=CAR_COLOR, linewidth=2.0, label="a car's middle and heading")
         _draw_key(axes[1], [heading])
         _draw_states(lot, result, axes[2])
@@ -213,11 +213,12 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(7.0, 3.8), layout="constrained")
         ax = figure.subplots()
-        for i, weather in enumerate(dict.fromkeys(row["weather"] for row in rows)):
+        weathers = list(dict.fromkeys(row["weather"] for row in rows))
+        for i, weather in enumerate(weathers):
             its = [row for row in rows if row["weather"] == weather]
             color = WEATHER_COLORS.get(weather, UNKNOWN)
             # Offset the points, so that the intervals do not hide each other.
-            x = np.array([np.mean(row["distance_m"]) for row in its]) + 0.09 * (i - 2)
+            x = np.array([np.mean(row["distance_m"]) for row in its]) + 0.09 * (i - (len(weathers) - 1) / 2)
             rate = np.array([row["rate"] for row in its])
             low, high = np.array([row["rate_ci95"] for row in its]).T
             ax.plot(
@@ -225,7 +226,7 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
             )
             ax.vlines(x, low, high, color=color, linewidth=1.2, alpha=0.7)
         ax.set(
-            xlabel="distance from the camera to the middle of the car, m",
+            xlabel="distance from the camera to the middle of the car, m; points in the middle of their range",
             ylabel="share of unoccluded cars that are detected",
             ylim=(0.0, 1.03),
         )

@@ -60,7 +60,7 @@ def add_recording(
         progress: called as captures are mapped; how many there will be is not known.
 
     Returns:
-        What was found: captures, slots seen and taken, cars, and the largest correction of a pose, m.
+        What was found: captures, slots seen and taken, cars, and the errors and largest correction of poses, m.
 
     Raises:
         InputError: the recording cannot be read, or the map holds it already.
@@ -82,25 +82,24 @@ def add_recording(
         found = map_drive(drive, scenario.lot, finder, every, counted(progress, "Mapping"), localise)
         store.add(found.session)
         log = store.log()
-    save_map(
-        scenario.lot,
-        predict(log, found.session.time),
-        None,
-        f"{scenario.name}: {drive.key}",
-        folder / "map.png",
-    )
+    day, second = divmod(round(found.session.time), DAY_S)
+    begins = f"{DAY_NAMES[int(day) % 7]} {int(second) // 3600:02d}:{int(second) // 60 % 60:02d}"
+    map_then = predict(log, found.session.time)
+    save_map(scenario.lot, map_then, None, f"{scenario.name}, {begins}", folder / "map.png")
     write_csv(folder / "cars.csv", CAR_COLUMNS, found.cars)
     states, std = found.states, [car["distance_std_m"] for car in found.cars if "distance_std_m" in car]
-    day, second = divmod(round(found.session.time), DAY_S)
     return {
         "recording": str(recording),
         "key": drive.key,
-        "begins": f"{DAY_NAMES[int(day) % 7]} {int(second) // 3600:02d}:{int(second) // 60 % 60:02d}",
+        "begins": begins,
         "captures": found.frames,
+        "pictures_without_pose": drive.without_pose,
         "slots": scenario.lot.n_slots,
         "seen": int(states.in_view.sum()),
         "taken": int((states.occupied & states.in_view).sum()),
         "cars_located": len(found.session.cars),
+        "cars_in_slots": sum(car["slot"] != "" for car in found.cars),
         "corrected_m": round(found.corrected_m, 3),
+        **({"pose_error_m": round(taken.errors.position, 3)} if taken else {}),
         **({"distance_std_m": round(float(np.median(std)), 3)} if std else {}),
     }

@@ -14,7 +14,7 @@ from parkenv.show.colors import PALETTE, belief_colors, mixed_color
 from parkenv.show.frames.drive import movers, steered_car
 from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, LotFrames, clock, paint_goal, write_line
 from parkenv.show.frames.search import KEY_WIDTH, strip_with_key, walk
-from parkenv.show.painters.opencv import paint
+from parkenv.show.painters.opencv import paint, write_tag
 from parkenv.show.scene import DISC, Layer, Lines, Marks, posed
 from parkenv.studies.trips.driven_search import DrivenSearch, Trip
 
@@ -27,7 +27,8 @@ COLORS = 96
 """Number of colours of an animation: enough for drawings, and small files."""
 
 _SLOT_PX = 26.0  # a slot's width in the picture near the car
-_INSET = 0.34
+_INSET, _MARGIN = 0.34, 10
+_CAPTION = "Colours: what the car believes"
 _STEP_S = 0.1
 
 
@@ -64,8 +65,10 @@ class TripFrames:
         near = self._picture(self._near, occupied, 2.0, steered_car(driver.vehicle, driver.state))
         far = self._picture(self._far, occupied, 3.0, [disc])[self._rows]
         width, height = round(_INSET * WIDTH), round(_INSET * len(far))
-        near[: height + 3, : width + 3] = PALETTE["ink"]
-        near[:height, :width] = cv2.resize(far, (width, height), interpolation=cv2.INTER_AREA)
+        inset = cv2.resize(far, (width, height), interpolation=cv2.INTER_AREA)
+        framed = cv2.copyMakeBorder(inset, 2, 2, 2, 2, cv2.BORDER_CONSTANT, value=PALETTE["ink"])
+        near[_MARGIN : _MARGIN + height + 4, _MARGIN : _MARGIN + width + 4] = framed
+        write_tag(near, _CAPTION, (_MARGIN, 2 * _MARGIN + height + 4), PALETTE["white"])
         return np.vstack([near, self._line()])
 
     def _picture(
