@@ -3,11 +3,10 @@
 import gymnasium as gym
 
 import parkenv
-from planners import make_agent
 
 scenario = parkenv.make_scenario("campus")
 env = gym.make("parkenv/Search-v2", scenario=scenario, render_mode="ansi")
-agent = make_agent("mdp", scenario)
+agent = parkenv.make_agent("mdp", scenario)
 
 observation, info = env.reset(seed=7)
 print(env.render())

@@ -1,15 +1,19 @@
-"""How bold should the planner be? Sweep what it believes a failed try to cost."""
+"""How bold should the planner be? Vary what it believes a failed attempt to cost, in the same worlds.
 
-import numpy as np
+The world charges 10 s all along. `parkenv compare --failure-cost sweep` varies both: what the world charges, and with
+it what planners believe.
+"""
 
-from parkenv import make_scenario
-from parkenv.studies.episodes import EpisodeRunner
-from planners import make_agent
+import parkenv
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.cases import rows_of
+from parkenv.studies.workers import SERIAL
 
-scenario = make_scenario("jam")
-print("failure cost s   total s   driven m   walked m   re-plans")
-for failure_s in (1.0, 5.0, 10.0, 30.0, 90.0):
-    runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario, failure_s=failure_s))
-    rows = [runner.run(seed).row for seed in range(20)]
-    means = [np.mean([row[name] for row in rows]) for name in ("total_s", "driven_m", "walked_m", "replans")]
-    print(f"{failure_s:14.0f} " + " ".join(f"{m:10.1f}" for m in means))
+agents = [AgentSpec(name="mdp", failure_s=failure_s) for failure_s in (10.0, 1.0, 5.0, 30.0, 90.0)]
+print("total s   minus the first [95 %]   driven m   walked m   agent")
+for row in rows_of(agents, parkenv.make_scenario("jam"), range(20), SERIAL):
+    low, high = row["difference_s_ci95"]
+    print(
+        f"{row['total_s']:7.1f} {row['difference_s']:+11.1f} [{low:+5.1f}, {high:+5.1f}] "
+        f"{row['driven_m']:10.1f} {row['walked_m']:10.1f}   {row['agent']}"
+    )

@@ -9,7 +9,6 @@ from stable_baselines3.common.evaluation import evaluate_policy
 import parkenv
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.studies.statistics import mean_interval
-from planners import make_agent
 from planners.model_file import save_model
 
 SCENARIO, WORLDS, ENVS = "campus", 250, 50
@@ -19,7 +18,7 @@ def total_times(name: str) -> list[float]:
     """Total times of an agent, s, in the same worlds for every agent: those that follow from the seed."""
     envs = SearchVecEnv(ENVS, SCENARIO, observation="local" if ":" in name else "full", max_episode_steps=500)
     envs.seed(3_000_000)
-    agent = make_agent(name, parkenv.make_scenario(SCENARIO))
+    agent = parkenv.make_agent(name, parkenv.make_scenario(SCENARIO))
     returns, _ = evaluate_policy(agent, envs, WORLDS, return_episode_rewards=True, warn=False)
     return [-value for value in returns]
 

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from parkenv import make_agent
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.show.figures.picture_files import save_film
 from parkenv.show.frames.fleet import FleetRenderer
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
-from planners.agent import make_agent
 from planners.heuristics import POLICIES
 
 FILM_S, FRAMES_PER_S = 90, 15

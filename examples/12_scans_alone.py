@@ -14,7 +14,6 @@ import parkenv
 from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.studies.simulate import make_search, simulate
 from parkenv.studies.statistics import mean_interval
-from planners import make_agent
 from planners.model_file import save_model
 
 SCENARIO, DECISIONS, SEED = [*sys.argv[1:], *("mini", "2048", "0")[len(sys.argv) - 1 :]]
@@ -34,7 +33,7 @@ with tempfile.NamedTemporaryFile(suffix=".safetensors") as file:
     agents |= {name: name for name in ("mdp", "first-free", "random")}
     for title, name in agents.items():
         scenario = parkenv.make_scenario(SCENARIO)
-        agent = make_agent(name, scenario)
+        agent = parkenv.make_agent(name, scenario)
         # Equal seeds give equal worlds; the policy gets scans there, planners beliefs. Who does not park is charged.
         env = make_search(scenario, agent, max_episode_steps=500)
         totals = [simulate(env, agent, 1_000_000 + world).info["total_s"] for world in range(WORLDS)]

@@ -227,8 +227,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.
 
     ```python
-    >>> from parkenv import lot_v0
-    >>> from planners.agent import make_agent
+    >>> from parkenv import lot_v0, make_agent
     >>> env = lot_v0.env(scenario="mini", cars=3)
     >>> env.reset(seed=1)
     >>> driver, memory, returns = make_agent("belief", env.unwrapped.scenario), {}, {}

@@ -106,6 +106,7 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
     tries = {(r["scenario"], r["failure_cost_s"]): r for r in rows if r["agent"] == "greedy-drive"}
     assert len(tries) == 26
+    assert all(row["blind"] == (name == "mini-blind") for (name, _), row in tries.items())
     assert {r["scenario"] for r in rows if r["agent"] == "mdp-tuned"} == {"mini"}
     assert all(r["failed_s"] == 0.0 for (name, _), r in tries.items() if name == "mini")
     blind = [tries["mini-blind", cost]["total_s"] for cost in (0.0, 8.0, 30.0, 120.0)]
@@ -144,7 +145,7 @@ def test_parking_costs_of_a_lot_file_reach_rows_table_and_figures(tmp_path):
         "--occupancy-levels", "none", "--out", tmp_path / "out",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert re.search(r"walk +parking ", done.stdout)
+    assert re.search(r"walk s +parking s ", done.stdout)
     for row in json.loads((tmp_path / "out" / "summary.json").read_text())["rows"]:
         assert row["parking_cost_s"] == pytest.approx(12.5 * row["parked_fraction"])
         parts = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")

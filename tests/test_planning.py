@@ -135,7 +135,7 @@ def test_a_low_discount_is_warned_of():
     lot = grid_lot(2, 40)
     scenario = make_scenario(lot, failure_s=90.0)
     mdp = ParkingMDP.from_belief(scenario, np.full(lot.n_slots, 0.99), gamma=0.99)
-    with pytest.warns(CirclingWarning, match=r"gamma 0\.99 is too low"):
+    with pytest.warns(CirclingWarning, match="gamma"):
         mdp.check_discount(policy_iteration(mdp).values)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -146,7 +146,7 @@ def test_a_low_discount_is_warned_of():
 def test_a_failure_cost_at_which_trying_in_vain_looks_best_is_warned_of():
     scenario = make_scenario("jam", failure_s=0.0)
     mdp = ParkingMDP.from_belief(scenario, np.ones(scenario.lot.n_slots))
-    with pytest.warns(CirclingWarning, match="failure cost of 0 s"):
+    with pytest.warns(CirclingWarning, match="failure_s"):
         mdp.check_discount(policy_iteration(mdp).values)
 
 
@@ -186,7 +186,7 @@ def test_the_shortest_edge_does_not_make_circling_pay():
     assert scenario.move_s[scenario.lot.neighbors >= 0].min() < 0.002
     assert discount(make_scenario("campus")) == discount(make_scenario("street")) == 0.9999
     p_occupied = np.full(24, 0.95)
-    with pytest.warns(CirclingWarning, match=r"gamma 0\.9999 is too low"):
+    with pytest.warns(CirclingWarning, match="gamma"):
         make_agent("mdp", scenario, gamma=0.9999).solve(p_occupied)
     plans = [make_agent("mdp", scenario, solver=solver) for solver in ("label_setting", "policy_iteration")]
     assert 0.9999 < plans[0].gamma < 1.0

@@ -131,7 +131,7 @@ _DETAILS: tuple[Column, ...] = (
     ("parked", lambda r: f"{r['parked_fraction']:.0%}"),
     ("replans", lambda r: f"{r['replans']:.1f}"),
     ("ms/decision", lambda r: f"{r['decision_ms']:.2f}" if "decision_ms" in r else ""),
-    ("p99", lambda r: f"{r['decision_ms_p99']:.2f}" if "decision_ms" in r else ""),
+    ("p99 ms", lambda r: f"{r['decision_ms_p99']:.2f}" if "decision_ms" in r else ""),
 )
 _OF_GIVING_UP: tuple[Column, ...] = (
     ("median s", lambda r: _seconds(r["median_s"])),
@@ -172,7 +172,7 @@ def _cost_columns(rows: Sequence[Row]) -> Iterator[Column]:
     """Yield a column for each term of the costs, but for optional ones that are 0."""
     for term in COST_TERMS:
         if not term.optional or any(row[term.field] for row in rows):
-            yield term.name.replace("_", " "), lambda row, field=term.field: _seconds(row[field])  # type: ignore[misc]
+            yield f"{term.name.replace('_', ' ')} s", lambda row, field=term.field: _seconds(row[field])  # type: ignore[misc]
 
 
 def _difference(row: Row, first_agent: str) -> str:

@@ -180,15 +180,18 @@ class ParkingMDP:
         if self.gamma == 1.0:
             return
         edges = self.move_s[self.neighbors >= 0]
-        shortest = min(float(edges.min()) if len(edges) else np.inf, self.wait_s)
-        if (self.p_free < 1.0).any():
-            shortest = min(shortest, self.failure_s)
+        shortest, what = min(float(edges.min()) if len(edges) else np.inf, self.wait_s), "driving in circles"
+        if (self.p_free < 1.0).any() and self.failure_s < shortest:
+            shortest, what = self.failure_s, "attempting a taken slot"
         bound = shortest / (1.0 - self.gamma)
         worst = float(-values.min())
         if worst >= bound:
             warnings.warn(
-                f"gamma {self.gamma} is too low for this lot and a failure cost of {self.failure_s:g} s: circling, or "
-                f"failed attempts for ever, cost {bound:.0f} s discounted, the worst state {worst:.0f} s",
+                f"with gamma {self.gamma}, {what} for ever costs {bound:.0f} s, no more than the longest search, "
+                f"{worst:.0f} s, so the plan may prefer it to parking; set gamma nearer to 1"
+                if bound > 0.0
+                else "a failed attempt costs nothing, so the plan may attempt a taken slot for ever; set a failure "
+                "cost above 0 s, for this planner alone by its option failure_s",
                 CirclingWarning,
                 stacklevel=2,
             )

@@ -51,6 +51,7 @@ _KNOWN = {
     for column in (
         Column("scenario", "scenario"),
         Column("test_scenario", "tested on"),
+        Column("blind", "blind", help="Whether no slot is observed before an attempt"),
         Column("occupancy_level", "occupancy level", share=True, digits=0, help="Mean occupancy the lot was set to"),
         Column("agent", "agent"),
         Column("map", "map at first", help="fixed: right, does not learn; none: the agent uses no map"),
@@ -74,7 +75,7 @@ _KNOWN = {
         Column("driven_m", "distance driven", "m", 0),
         Column("walked_m", "distance walked", "m", 0),
         Column("slots_passed", "slots passed"),
-        Column("occupancy", "slots taken", share=True, digits=0, help="Share of slots taken at the arrival"),
+        Column("occupancy", "slots taken at arrival", share=True, digits=0),
         Column("decision_ms", "a decision takes", "ms", 2, help="Median wall time of a decision"),
         Column("decision_ms_p99", "99 % of decisions below", "ms", 2, help="99th percentile of their wall times"),
         Column("gap_to_exact", "above the optimum", share=True, digits=2, signed=True),
@@ -173,8 +174,9 @@ _KNOWN = {
     )
 }  # fmt: skip
 _ORDER = (
-    "scenario", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh",
-    "after", "before", "prices", "zone", "agent", "agents", "arrivals_per_hour", "knows", "share", "hour", "seed",
+    "scenario", "blind", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh",
+    "v_drive_kmh", "after", "before", "prices", "zone", "agent", "agents", "arrivals_per_hour", "knows", "share",
+    "hour", "seed",
     "change_s", "members_change_s", "others_change_s", "paid_change", "better_off", "worse_off", "total_s", "median_s",
     "gave_up_fraction", "difference_s", "gap_to_exact",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
@@ -271,8 +273,10 @@ def table_of(
             k
             for k in same
             if values[k][0] is None
-            or k in _ORDER[:8]
-            or k in ("agents", "change", "days", "episodes", "rig", "slots", *_OPTIONAL)
+            or k in _ORDER[:9]
+            or k in ("agents", "change", "days", "episodes", "rig", "slots")
+            # Parts of a sum stay beside it, unless they add nothing.
+            or (k in _OPTIONAL and not values[k][0])
         ]
     shown = [k for k in keys if k not in same]
     return {

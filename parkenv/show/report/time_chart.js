@@ -87,7 +87,7 @@ function showTimeChart(root, table) {
   keys.push(make("span", { class: "key" }, line, "95 % interval of the mean"));
   if (rows.some((row) => row.bound_s)) keys.push(make("span", { class: "key" }, dashes, "clairvoyant lower bound"));
   root.append(
-    make("p", { class: "quiet" }, `Mean seconds from the entry of the lot to the goal; in bold, the agents that no other is shown to be faster than.${rows.some((row) => row.total_s[0] > end) ? " Bars far longer than the others are cut off." : ""}`),
+    make("p", { class: "quiet" }, `Mean seconds from the entry of the lot to the goal; in bold, the agents that no other, the oracle apart, is shown to be faster than.${rows.some((row) => row.total_s[0] > end) ? " Bars far longer than the others are cut off." : ""}`),
     make("div", { class: "card chart" }, make("div", { class: "legend" }, ...keys), grid),
   );
   return true;

@@ -21,6 +21,7 @@ from parkenv.studies.statistics import LEAST_PAIRS, columns_of, mean_interval, p
 from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.scenario import KMH, Scenario
+from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
@@ -182,14 +183,16 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
     `leads` says whether no other agent of the setting, the oracle apart, is shown to be faster (`_mark_leaders`).
+    If some cases are blind, `blind` says which: no slot is observed before an attempt.
     If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
 
     Args:
         cells: cases with the seeds of their episodes.
         finished: rows of episodes, by `Case.key`.
     """
-    rows = []
+    rows, cells = [], list(cells)
     by_setting: dict[tuple[Any, ...], list[tuple[Row, list[Row]]]] = {}
+    blind = {case.scenario.name: case.scenario.sensor_model == SensorModel.blind() for case, _ in cells}
     for case, seeds in cells:
         episodes = [finished[key] for s in seeds if (key := case.key(s)) in finished]
         if not episodes:
@@ -199,6 +202,8 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
         times = list(itertools.chain.from_iterable(decision_s(row) for row in episodes))
         its = by_setting.setdefault(setting, [])
         rows.append(summarize(columns, episodes, its[0][1] if its else None, times))
+        if any(blind.values()):
+            rows[-1]["blind"] = blind[case.scenario.name]
         its.append((rows[-1], episodes))
     for its in by_setting.values():
         _mark_leaders(its)

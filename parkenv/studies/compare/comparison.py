@@ -68,7 +68,8 @@ class Grid(Spec):
     failure_s: Values[Cost] | None = option(
         None,
         "Seconds that the world charges for a failed attempt, and that planners expect unless their own "
-        "options say otherwise. sweep: 0 to 120 s.",
+        "options say otherwise. sweep: 0 to 120 s, and again as scenario NAME-blind, in which no slot is "
+        "observed before an attempt, for agents that can do without.",
         name="--failure-cost",
         takes="S[,S...]|sweep",
         default="the scenario's, 10",

@@ -241,11 +241,10 @@ class SearchPublication(Publication):
         return f"""import gymnasium as gym
 import parkenv
 from parkenv.envs.{wrapper}
-from planners import make_agent
 
 scenario = parkenv.make_scenario("{next(iter(self.specs))}")
 env = {wrapper.rpartition(" ")[2]}(gym.make({env}), k={self.card.k})
-agent = make_agent("{self.name}", scenario)
+agent = parkenv.make_agent("{self.name}", scenario)
 observation, info = env.reset(seed=0)
 action, state = agent.predict(observation)"""
 
