@@ -87,9 +87,8 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
             try:
                 rows.append({name: kinds[name].parse(point.get(name, "")) for name in ("time", "lat", "lon")})
             except ValueError as error:
-                raise InputError(
-                    f"{path}: track point {number} is {str(point)[:120]}, want lat, lon and time"
-                ) from error
+                its = str(point)[:120]
+                raise InputError(f"{path}: track point {number} is {its}, want lat, lon and time") from error
     elif not path.is_file():
         raise InputError(f"{path}: no such file")
     else:
@@ -103,18 +102,15 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     stamps = np.array([row.get("time", (MONDAY_S + k) * 10**9) for k, row in enumerate(rows)], np.int64)
     if (fall := np.flatnonzero(np.diff(stamps) <= 0)).size:
         one, two = stamps[fall[0] : fall[0] + 2] / 1e9
-        raise InputError(
-            f"{path}: time goes from {one:.3f} to {two:.3f} s at pose {fall[0] + 2}, want it to rise"
-        )
+        at_pose = f"{one:.3f} to {two:.3f} s at pose {fall[0] + 2}"
+        raise InputError(f"{path}: time goes from {at_pose}, want it to rise")
     at = np.array([[row[name] for name in pair] for row in rows])
     if pair[0] == "lon" and (off := np.flatnonzero((np.abs(at) > (180.0, 90.0)).any(axis=1))).size:
-        raise InputError(
-            f"{path}: pose {off[0] + 1} is lon, lat {at[off[0]].tolist()}, want a place on the globe"
-        )
+        place = at[off[0]].tolist()
+        raise InputError(f"{path}: pose {off[0] + 1} is lon, lat {place}, want a place on the globe")
     turned = [row.get("yaw", math.pi / 2 - math.radians(row.get("heading", math.nan))) for row in rows]
-    return Track(
-        stamps, tuple(row["file"] for row in rows if "file" in has), at, pair[0] == "lon", np.array(turned)
-    )
+    files = tuple(row["file"] for row in rows if "file" in has)
+    return Track(stamps, files, at, pair[0] == "lon", np.array(turned))
 
 
 def stamp_in(text: str, timezone_s: float) -> int:

@@ -164,9 +164,8 @@ class Photographs:
         made = PinholeCamera.from_field_of_view(width, height, math.radians(self._options.fov))
         numbers = {name: getattr(made, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
         mount = dict(zip(("z", "yaw", "pitch"), self._options.mount, strict=True))
-        return CameraSpec(
-            name="camera", mount=MountSpec.parse(mount, dict.fromkeys(mount, "--mount")), **numbers
-        )
+        parsed = MountSpec.parse(mount, dict.fromkeys(mount, "--mount"))
+        return CameraSpec(name="camera", mount=parsed, **numbers)
 
     def _in_metres(self, track: Track, frame: LocalFrame | None) -> FloatArray:
         if not track.in_degrees:

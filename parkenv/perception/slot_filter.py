@@ -143,7 +143,7 @@ class SlotFilter:
         sure = np.zeros(self.lot.n_slots)
         np.maximum.at(sure, there, likely[slots >= 0])
         there = np.unique(there)
-        doubted = _logits(P_PRIOR + sure[there] * (P_OCCUPIED - P_PRIOR))
+        doubted = _logit(P_PRIOR + sure[there] * (P_OCCUPIED - P_PRIOR))
         self.log_odds[there] += _logit(P_OCCUPIED) if cars.covariance is None else doubted
         self.in_view[there] = self.updated[there] = True
         self._clip()
@@ -194,10 +194,8 @@ class SlotFilter:
         aside = (math.sin(yaw) * to_x - math.cos(yaw) * to_y)[:, None] + across
         in_front = ahead.min(axis=1) > 0.5
         near, ahead, aside = near[in_front], ahead[in_front], aside[in_front]
-        tall = np.full_like(ahead, 1.45)
-        corners = np.concatenate(
-            [ground.pixels(ahead, aside, z) for z in (np.zeros_like(tall), tall)], axis=1
-        )
+        heights = (np.full_like(ahead, z) for z in (0.0, 1.45))
+        corners = np.concatenate([ground.pixels(ahead, aside, z) for z in heights], axis=1)
         low, high = corners.min(axis=1), corners.max(axis=1)
         size = np.array([ground.camera.width, ground.camera.height])
         inside = (np.minimum(high, size) - np.maximum(low, 0.0)) / (high - low)
@@ -215,7 +213,7 @@ class SlotFilter:
         near, away = near[clear], np.hypot(*(self.lot.slot_xy[near[clear]] - [x, y]).T)
         shift = np.hypot(errors.position, errors.heading * away)
         sure = erf(self._size[near, 1] / np.maximum(math.sqrt(2.0) * shift, 1e-9))
-        change = -_logits(P_PRIOR + sure * (1.0 / (1.0 + errors.detector.missed) - P_PRIOR)) * (
+        change = -_logit(P_PRIOR + sure * (1.0 / (1.0 + errors.detector.missed) - P_PRIOR)) * (
             sure > LEAST_SHARE
         )
         self.log_odds[near] += change
@@ -262,11 +260,7 @@ class SlotFilter:
         return np.stack([along, np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0]], axis=1)
 
 
-def _logit(p: float) -> float:
-    return math.log(p / (1.0 - p))
-
-
-def _logits(p: FloatArray) -> FloatArray:
+def _logit(p: FloatArray | float) -> FloatArray:
     return np.asarray(np.log(p / (1.0 - p)))
 
 

@@ -226,7 +226,8 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
             )
             ax.vlines(x, low, high, color=color, linewidth=1.2, alpha=0.7)
         ax.set(
-            xlabel="distance from the camera to the middle of the car, m; points in the middle of their range",
+            xlabel="distance from the camera to the middle of the car, m; points in the middle of ranges",
+            xticks=sorted({end for row in rows for end in row["distance_m"]}),
             ylabel="share of unoccluded cars that are detected",
             ylim=(0.0, 1.03),
         )
