@@ -103,6 +103,8 @@ def test_the_sweep_over_failure_costs_tells_seen_slots_from_unseen_ones(tmp_path
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert [p.name for p in tmp_path.glob("*.png")] == ["time_against_failure_cost_mini.png"]
+    # A row of each agent, with and without observations, and a column of each cost.
+    assert len(re.findall(r"^ (?:greedy-drive|mdp-tuned)(?: +\d+\.\d){13} *$", done.stdout, re.M)) == 3
     rows = json.loads((tmp_path / "summary.json").read_text())["rows"]
     tries = {(r["scenario"], r["failure_cost_s"]): r for r in rows if r["agent"] == "greedy-drive"}
     assert len(tries) == 26

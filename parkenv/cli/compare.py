@@ -97,10 +97,12 @@ class Compare(AgentStudyCommand):
         from parkenv.world.scenario import KMH
 
         count = setting_count(result.rows)
-        for printed in result_tables(result.rows, console.width) if count <= MOST_TABLES else []:
+        few = count <= MOST_TABLES
+        tables = result_tables(result.rows, console.width) if few else cost_tables(result.rows)
+        for printed in tables if few or len(tables) <= MOST_TABLES else []:
             console.print(printed)
-        if count > MOST_TABLES:
-            console.print(f"{count} settings: their tables are in summary.json")
+        if not few:
+            console.print(f"{count} settings: intervals and paired differences are in summary.json")
         if (measured := result.summary.get("calibrated")) is not None:
             console.print(
                 f"Calibrated over {plural(measured['trips'], 'trip')}: failure cost {measured['failure_s']:.4g} s, "
@@ -165,6 +167,21 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             headings = ("agent", *(heading for heading, _ in columns))
             cells = ((row["agent"], *(text(row) for _, text in columns)) for row in its_rows)
             tables.append(make_table(title if columns is not details else None, headings, cells))
+    return tables
+
+
+def cost_tables(rows: list[Row]) -> list[Table]:
+    """Make the tables of mean total times by failure cost: one of each scenario and speeds."""
+    grids: dict[tuple[Any, ...], dict[str, dict[float, str]]] = {}
+    for row in rows:
+        grid = grids.setdefault((row["scenario"], row["v_walk_kmh"], row["v_drive_kmh"]), {})
+        grid.setdefault(row["agent"], {})[row["failure_cost_s"]] = _seconds(row["total_s"])
+    tables = []
+    for (name, walk, drive), grid in grids.items():
+        costs = sorted({cost for cells in grid.values() for cost in cells})
+        title = f"{name}: mean total time, s, by failure cost, s; walk {walk:g} km/h, drive {drive:g} km/h"
+        cells = ((agent, *(its.get(cost, "") for cost in costs)) for agent, its in grid.items())
+        tables.append(make_table(title, ("agent", *(f"{cost:g}" for cost in costs)), cells))
     return tables
 
 

@@ -127,13 +127,25 @@ class RunFolder:
         return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
 
     @property
+    def again(self) -> list[str]:
+        """The words of a command that repeats the run in a folder beside it; its own if it may replace the run."""
+        words = [str(word) for word in self.summary["command"]]
+        if self.kind not in STUDIES or {"--resume", "--overwrite"} & set(words):
+            return words
+        out, path = ("--out", "-o"), self.path if self.path.name else self.path.resolve()
+        kept = [
+            word for word, before in zip(words, ["", *words], strict=False) if not {word, before} & {*out}
+        ]
+        return [*(word for word in kept if not word.startswith("--out=")), "--out", f"{path}-again"]
+
+    @property
     def figures(self) -> list[Path]:
         """The PNG files in the folder, by name."""
         return sorted(self.path.glob("*.png"))
 
     def data(self, recordings: Sequence[Recording] = (), notes: Sequence[str] = ()) -> dict[str, Any]:
         """Return the data of the run's page; see `page_data`."""
-        return page_data(self.kind, self.page, self.summary, recordings, notes)
+        return page_data(self.kind, self.page, {**self.summary, "command": self.again}, recordings, notes)
 
 
 def write_report(

@@ -186,7 +186,10 @@ def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]
     _require_rows(blind)
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(11.0, 4.2), layout="constrained")
-        panels = (("slots observed from the lane", observed), ("no observation before an attempt", blind))
+        panels = (
+            ("slots observed from the lane", observed),
+            ("no observation before an attempt (agents that can)", blind),
+        )
         for ax, (title, rows) in zip(figure.subplots(1, 2), panels, strict=True):
             _draw_lines(ax, rows, _limit(rows), lambda row: float(row["failure_cost_s"]))
             last = max(row["failure_cost_s"] for row in rows)
@@ -242,7 +245,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         low, high = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
         dashes = (0, (4, 2)) if agent == "oracle" else "-"
         # The interval of a line beyond the limit would only cover the others.
-        ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.15, linewidth=0)
+        ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.07, linewidth=0)
         ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)
         ends.append((total[-1], x[-1], agent, color))
     ax.set(xlim=(min(places) - 1.0, max(places) + 1.0), ylim=(0, limit))

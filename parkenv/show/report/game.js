@@ -304,7 +304,7 @@ function showResult(number) {
       finished() ? null : make("button", { type: "button", class: "first", onclick: proceed }, search.over ? `World ${played.length + 1}` : `Back to world ${played.length + 1}`),
       make("button", { type: "button", class: finished() ? "first" : null, onclick: save }, "Save scores")),
     table(number),
-    make("p", { class: "quiet" }, "Regret: seconds above the clairvoyant bound. Check saved scores, and compare them with all agents:"),
+    make("p", { class: "quiet" }, "Regret: seconds above the clairvoyant bound. This command checks saved scores and compares them; --agents takes any others, too:"),
     make("code", {}, `parkenv compare --scenario ${problem.scenario} --seed ${worlds[0].seed} -n ${played.length} --agents belief,human:scores.json,oracle`),
   );
   part("result").replaceChildren(root);
@@ -372,7 +372,7 @@ function table(number) {
 function drawReplay(drivers, world, seconds) {
   const inCars = drivers.map(({ search: its, track }) => ({ its, track, k: track.at(seconds), parked: its.parked && seconds >= track.end - 0.005 }));
   const goal = lot.goals[problem.goal];
-  part("clock").replaceChildren(seconds2(seconds), make("small", {}, " s"));
+  part("clock").replaceChildren(make("small", {}, "replay "), seconds2(seconds), make("small", {}, " s"));
   view.begin(track0(inCars[0], seconds));
   const taken = (i) => isTaken(world, i, world.arrival_s + seconds);
   view.drawSlots((i) => (taken(i) ? -1 : 0), () => true, taken);

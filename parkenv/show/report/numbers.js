@@ -17,10 +17,16 @@ function asColumn(column, value) {
   if (typeof value === "boolean") return value ? "yes" : "no";
   if (typeof value === "string") return value;
   if (column.share) return `${written(100 * value, column.digits, column.signed)} %`;
-  const digits = Number.isInteger(value) && column.digits > 1 ? 0 : column.digits;
+  return written(value, column.decimals ?? decimalsOf(column, [value]), column.signed);
+}
+
+/** Return how many decimals all numbers of a column get. */
+function decimalsOf(column, values) {
+  const numbers = values.flat().filter((value) => typeof value === "number");
+  if (numbers.every(Number.isInteger)) return column.digits > 1 ? 0 : column.digits;
+  if (column.digits > 0 || !GIVEN.includes(column.key)) return column.digits;
   // A cost of 2.5 s must not be rounded where the others are whole numbers.
-  const text = column.digits === 0 && !Number.isInteger(value) ? String(Number(value.toPrecision(4))) : written(value, digits, column.signed);
-  return text;
+  return Math.max(...numbers.map((value) => (String(Number(value.toPrecision(4))).split(".")[1] ?? "").length));
 }
 
 const DAYS = ["Mon", "Tue", "Wed", "Thu", "Fri", "Sat", "Sun"];

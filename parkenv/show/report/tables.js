@@ -3,6 +3,8 @@
 /** Columns of a row that a phone shows at once. */
 const AT_ONCE = 10;
 const SETTING = ["scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
+/** Columns of numbers that somebody chose, which are not rounded. */
+const GIVEN = [...SETTING, "arrivals_per_hour"];
 
 function sortValue(value) {
   if (Array.isArray(value)) return value[0];
@@ -58,7 +60,8 @@ function factsTable(table) {
 }
 
 function sortableTable(table) {
-  const { columns, rows } = table;
+  const { rows } = table;
+  const columns = table.columns.map((column, k) => ({ ...column, decimals: decimalsOf(column, rows.map((row) => row[k])) }));
   const body = make("tbody");
   const classOf = (k) => [isWord[k] ? "word" : "", k === lead || k === agent ? "lead" : "", settings.includes(k) ? "setting" : "", k === agent ? "agent" : "", k >= AT_ONCE && columns.length > AT_ONCE + 1 ? "minor" : ""].join(" ").trim() || null;
   const isWord = columns.map((_, i) => rows.every((row) => row[i] === null || typeof row[i] === "string"));
