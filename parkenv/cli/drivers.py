@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -71,9 +71,6 @@ def _table(scenario: str, rows: list[dict[str, Any]]) -> Table:
     )
 
 
-_HEADINGS = {"knows": "members know", "share": "members", "arrivals_per_hour": "cars/h"}
-
-
 class Fleet(AgentStudyCommand):
     """On a day, residents are parked when the hours of arrival begin, and leave after the rest of their stay.
 
@@ -107,8 +104,8 @@ class Fleet(AgentStudyCommand):
         if not result.rows:
             return
         names = _setting_columns(result.rows)
+        setting = names.values()
         mixed = any(0.0 < row["share"] < 1.0 for row in result.rows)
-        setting = [_HEADINGS.get(name, name) for name in names]
         headings = [
             *setting, "total s [95 %]", *(["members s", "others s"] if mixed else []), "search s", "95 % below s",
             "failed attempts", "no slot found", "cruising", "slots taken", "price of anarchy", "over bound",
@@ -144,9 +141,9 @@ class Fleet(AgentStudyCommand):
             console.print(line, soft_wrap=True)
 
 
-def _show_money(console: Console, result: Result, names: list[str]) -> None:
+def _show_money(console: Console, result: Result, names: dict[str, str]) -> None:
     """Print what the total time is made of, and who pays where."""
-    setting, zones = [_HEADINGS.get(name, name) for name in names], result.summary["zones"]
+    setting, zones = names.values(), result.summary["zones"]
     terms = [term for term in COST_TERMS if not term.optional or any(row[term.field] for row in result.rows)]
     fields = [*(term.field for term in terms), "queued_s"]
     headings = [*setting, *(term.label for term in terms), "of it in queues"]
@@ -183,19 +180,19 @@ def _zone_cells(row: Row) -> list[str]:
     ]
 
 
-def _setting_columns(rows: Sequence[Row]) -> list[str]:
-    """Return the columns that tell settings apart, and the demand."""
+def _setting_columns(rows: Sequence[Row]) -> dict[str, str]:
+    """Return the columns that tell settings apart, and the demand, with their headings."""
     several = [name for name in ("scenario", "agents") if len({row[name] for row in rows}) > 1]
-    guided = ["knows", "share"] if any(row["share"] for row in rows) else []
-    return [*several, *guided, "arrivals_per_hour"]
+    guided = {"knows": "members know", "share": "members"} if any(row["share"] for row in rows) else {}
+    return dict(zip(several, several, strict=True)) | guided | {"arrivals_per_hour": "cars/h"}
 
 
-def _setting(row: Row, names: Sequence[str]) -> list[str]:
-    values = [row[name] for name in names]
-    return [
-        value if isinstance(value, str) else format(value, ".0%" if name == "share" else "g")
-        for name, value in zip(names, values, strict=True)
-    ]
+def _setting(row: Row, names: Iterable[str]) -> list[str]:
+    written = {
+        "share": f"{row['share']:.0%}",
+        "arrivals_per_hour": str(row["arrivals_per_hour"]).removesuffix(".0"),
+    }
+    return [written.get(name) or str(row[name]) for name in names]
 
 
 def _cells(row: Row, *, mixed: bool) -> list[str]:

@@ -75,7 +75,10 @@ def save_fleet_figure(
         ]
         if "search time" in panels:
             handles.append(Line2D([], [], color=_GREY, linewidth=1.0, label=_CLOSED_FORM))
-        figure.legend(handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels)))
+        if list(panels) != ["occupancy by hour"]:  # which has a legend of its own
+            figure.legend(
+                handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels))
+            )
         figure.suptitle(title, x=0.01, ha="left")
         save_picture(figure, path, f"{title}: {', '.join(panels)}.")
 

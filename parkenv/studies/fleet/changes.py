@@ -57,10 +57,9 @@ def summarize_changes(
             if its[what] != before[what] and (pairs := paired_days(days, earlier)):
                 names = _words(what, its | before), _words(what, its)
                 head = {"change": what, "before": names[0], "after": names[1], **its, "days": len(pairs)}
-                earlier_prices = prices.get(str((its | before)["scenario"]), {})
-                head["prices"] = _new_prices(earlier_prices, prices.get(str(its["scenario"]), {}))
-                named = tuple(earlier_prices)
-                for zone_number, zone in enumerate((None, *named) if len(named) > 1 else (None,)):
+                old, new = (prices.get(str(one["scenario"]), {}) for one in (its | before, its))
+                head["prices"] = _new_prices(old, new)
+                for zone_number, zone in enumerate((None, *old) if len(old) > 1 else (None,)):
                     changes = [_change(*pair, zone_number) for pair in pairs]
                     rows.append(head | {"zone": zone} | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
     return sorted(rows, key=lambda row: row["change"] != "scenario")
@@ -146,12 +145,16 @@ def sentence(row: Row) -> str:
     minutes = abs(row["change_s"]) * row["cars_a_day"] / 60.0
     if is_clear(row, "change_s") and minutes >= 1.0:
         said[0] += f", all cars of a day together {minutes:,.0f} min"
-    said[0] += f": {parts}" if (parts := made_of(row)) else ""
+    if parts := made_of(row):
+        said[0] += f": {parts}"
+    elif is_known(row["paid_change"]):
+        said[0] += " with prices as time"
     if is_known(row["members_change_s"]) and is_known(row["others_change_s"]):
         said.append(_gain(row, "members_change_s", "members save", "members lose", "members"))
         said.append(_gain(row, "others_change_s", "the others save", "the others lose", "the others"))
     if is_known(row["better_off"]):
-        said.append(off_in_words(row))
+        gain, lose = row["better_off"], row["worse_off"]  # each car compared with itself, whatever the mean
+        said.append(f"{gain:.0%} of the cars are better off by {NOTICED_S:g} s or more, {lose:.0%} worse off")
     if is_clear(row, "paid_change"):
         way = "less" if row["paid_change"] < 0.0 else "more"
         low, high = sorted(map(abs, row["paid_change_ci95"]))
@@ -162,7 +165,7 @@ def sentence(row: Row) -> str:
             f"the share that finds no slot {way} by {100.0 * abs(row['balked_change']):.1f} percentage points"
         )
     after = row["after"] if row["change"] == "scenario" else row["after"][0].upper() + row["after"][1:]
-    return f"{after} instead of {row['before']} ({', '.join([*_new(row), *where(row)])}): {'; '.join(said)}."
+    return f"{after} instead of {row['before']} ({', '.join(where(row))}): {'; '.join(said)}."
 
 
 def made_of(row: Row) -> str:
@@ -171,31 +174,27 @@ def made_of(row: Row) -> str:
     Empty if it is time alone, or if the parts are not known.
     """
     cost_s, gave_up_s = row["parking_cost_change_s"], row["gave_up_change_s"]
-    if not is_known(cost_s):
-        return "with prices as time" if is_known(row["paid_change"]) else ""
-    if max(abs(cost_s), abs(gave_up_s)) < _SHOWN_S:
+    if not is_known(cost_s) or max(abs(cost_s), abs(gave_up_s)) < _SHOWN_S:
         return ""
     time_s = row["change_s"] - cost_s - gave_up_s
     parts = [f"{abs(time_s):.1f} s {'longer' if time_s > 0.0 else 'shorter'}"]
+    ways = ["more" if part > 0.0 else "less" for part in (cost_s, gave_up_s)]
     if abs(cost_s) >= _SHOWN_S:
         paid = row["paid_change"]
-        amount = (
-            f"{abs(paid):.2f} {'more' if paid > 0.0 else 'less'} paid" if is_known(paid) else "parking costs"
-        )
+        amount = f"{abs(paid):.2f} {ways[0]} paid" if is_known(paid) else f"{ways[0]} cost of parking"
         parts.append(f"{amount} ({cost_s:+.1f} s as time)")
     if abs(gave_up_s) >= _SHOWN_S:
-        way = "more" if gave_up_s > 0.0 else "less"
-        parts.append(
-            f"{abs(gave_up_s):.1f} s {way} give-up penalty ({row['balked_change']:+.1%} find no slot)"
-        )
+        penalty = f"{abs(gave_up_s):.1f} s {ways[1]} give-up penalty"
+        parts.append(f"{penalty} ({row['balked_change']:+.1%} find no slot)")
     return ", ".join(parts)
 
 
 def where(row: Row) -> list[str]:
-    """Return what is equal before and after a change, in words."""
+    """Return the prices that change, and what is equal before and after a change, in words."""
     if row["change"] == "knows":
         return place(row)
-    equal = [row["agents"], rate_text(row["arrivals_per_hour"])]
+    equal = [row["prices"]] if row["prices"] else []
+    equal += [row["agents"], rate_text(row["arrivals_per_hour"])]
     equal += [] if row["knows"] == OWN else [_words("knows", row)]
     return [*equal, f"cars that parked in zone {row['zone']} before"] if row["zone"] else equal
 
@@ -203,16 +202,6 @@ def where(row: Row) -> list[str]:
 def place(row: Row) -> list[str]:
     """Return who drives where, and the demand, in words."""
     return [f"{row['agents']} on {row['scenario']}", rate_text(row["arrivals_per_hour"])]
-
-
-def _new(row: Row) -> list[str]:
-    return [row["prices"]] if row["prices"] else []
-
-
-def off_in_words(row: Row) -> str:
-    """Return the shares of the cars that gain and lose, in words: each is compared with itself, whatever the mean."""
-    gain, lose = row["better_off"], row["worse_off"]
-    return f"{gain:.0%} of the cars are better off by {NOTICED_S:g} s or more, {lose:.0%} worse off"
 
 
 def is_clear(row: Row, name: str) -> bool:
@@ -265,10 +254,7 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
             interval = "95 % interval {:.1f} to {:.1f} s".format(*sorted(map(abs, ends or ())))
         if parts := made_of(row):
             interval = f"{parts}; {interval}"
-        one = {
-            "label": f"{row['after']} instead of {row['before']}",
-            "where": ", ".join([*_new(row), *where(row)]),
-        }
+        one = {"label": f"{row['after']} instead of {row['before']}", "where": ", ".join(where(row))}
         off = {"better": row["better_off"], "worse": row["worse_off"]} if is_known(row["better_off"]) else {}
         made.append(one | {"value": value, "interval": interval} | off)
     return made

@@ -103,20 +103,20 @@ def departures(hours: Sequence[Row], rows: Sequence[Row]) -> list[str]:
         meant = rate == COUNTED or not isinstance(rate, str)
         if meant and abs(row["excess"]) > FAR and (low or 0.0) * (high or 0.0) > 0.0:
             worst[row["scenario"], row["agents"], rate] = row
-    lines = []
-    for (scenario, agent, rate), row in worst.items():
-        why = ""
-        if rate != COUNTED:
-            why = "; --arrivals-per-hour counted follows the counts"
-        elif row["excess"] > 0.0:
-            why = "; shorter stays (--stay-min) may follow better"
-        elif gone := balked.get(tuple(row[name] for name in SETTING_COLUMNS)):
-            why = f"; it is full at times, and {gone:.1%} of the cars go elsewhere"
-        lines.append(
-            f"{agent} on {scenario}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
-            f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}{why}."
-        )
-    return lines
+
+    def reason(row: Row) -> str:
+        gone = balked.get(tuple(row[name] for name in SETTING_COLUMNS))
+        if row["arrivals_per_hour"] != COUNTED:
+            return "; --arrivals-per-hour counted follows the counts"
+        if row["excess"] > 0.0:
+            return "; shorter stays (--stay-min) may follow better"
+        return f"; it is full at times, and {gone:.1%} of the cars go elsewhere" if gone else ""
+
+    return [
+        f"{agent} on {scenario}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
+        f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}{reason(row)}."
+        for (scenario, agent, rate), row in worst.items()
+    ]
 
 
 def _differences(pairs: Pairs) -> Row:
