@@ -28,7 +28,10 @@ PAGES = {
     "lot": ("`parkenv.lot_v0`", "lot_v0:LotEnv", "fleet_campus.gif", "python examples/09_many_cars.py fleet.gif"),
 }  # fmt: skip
 """Of each page: title, class, film, and the command that made the film."""
-MORE = {"lot": ("The parallel form", "lot_v0:LotParallelEnv")}
+MORE = {
+    "search": ("The local observation", "engine.local_observation"),
+    "lot": ("The parallel form", "lot_v0:LotParallelEnv"),
+}
 FLAGS = re.DOTALL | re.MULTILINE
 
 
@@ -73,9 +76,10 @@ def with_base(text):
 
 
 def markdown(path):
-    """Return the docstring of a class as Markdown: doctests as programs, arguments and errors as lists."""
-    module, name = path.split(":")
-    doc = inspect.getdoc(getattr(importlib.import_module(f"parkenv.{module}"), name))
+    """Return the docstring of a class or a module as Markdown: doctests as programs, arguments and errors as lists."""
+    module, _, name = path.partition(":")
+    described = importlib.import_module(f"parkenv.{module}")
+    doc = inspect.getdoc(getattr(described, name) if name else described)
     doc = re.sub(
         r"^```python\n(?!>>>)", "```py\n", doc, flags=FLAGS
     )  # a long program: shown, not run by tests

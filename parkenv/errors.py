@@ -87,6 +87,19 @@ def require_one_of(name: str, value: object, known: Collection[object]) -> None:
         raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known))}")
 
 
+def require_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Check the names of keyword arguments.
+
+    Raises:
+        TypeError: one is unknown, in Python's own words; with the closest known name, and all known names.
+    """
+    for name in given:
+        if name not in known:
+            raise TypeError(
+                f"{function}() got an unexpected keyword argument {name!r}; {nearest(name, known)}"
+            )
+
+
 def _is_flag(value: object) -> bool:
     return isinstance(value, bool)
 

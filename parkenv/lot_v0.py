@@ -27,7 +27,7 @@ from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
 from parkenv.errors import InputError, require_whole
-from parkenv.scenarios.build import ScenarioSource, make_scenario
+from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
 from parkenv.world.demand import MAX_CARS, Demand, Headways
 from parkenv.world.lot import ACTIONS
 
@@ -72,6 +72,7 @@ class _CarsAsAgents:
             demand = Demand(Headways(int(cars)))
         if isinstance(max_cycles, bool) or not isinstance(max_cycles, (int, np.integer)) or max_cycles < 1:
             raise InputError(f"max_cycles is {max_cycles!r}, want a whole number of at least 1")
+        require_changes((type(self), LotEnv), changes, *self._fleet_options)
         options = {name: value for name, value in changes.items() if name in self._fleet_options}
         fields = {name: value for name, value in changes.items() if name not in options}
         # With the hidden occupancy: not for agents.

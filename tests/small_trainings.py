@@ -40,6 +40,7 @@ def make_small(patch):
         _change(patch, configs.FLEET_CONFIGS, name, 8, {"n_steps": 32, "batch_size": 256})
     for name in configs.DRIVE_CONFIGS:
         _change(patch, configs.DRIVE_CONFIGS, name, 16, DRIVE[name] | NETWORK)
+    patch.setattr(configs, "MIN_UPDATES", 0)
     # An untrained agent drives in circles.
     patch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
 

@@ -31,6 +31,21 @@ def test_an_unknown_keyword_is_a_type_error_as_of_any_python_function(name):
             make(name, frameskip=4, **OPTIONS[name])
 
 
+def test_a_misspelt_argument_of_the_environment_itself_has_a_hint():
+    for make in (gym.make, lambda *a, **k: gym.make_vec(a[0], 2, **k)):
+        with pytest.raises(TypeError, match=r"Env\(\) .*'observaton'; did you mean 'observation'"):
+            make("parkenv/Search-v2", observaton="local")
+    for make in (lot_v0.env, lot_v0.parallel_env):
+        with pytest.raises(TypeError, match=r"did you mean 'background'"):
+            make(backgrund="none")
+
+
+def test_a_number_of_slots_needs_the_local_observation():
+    for make in (gym.make, lambda *a, **k: gym.make_vec(a[0], 2, **k)):
+        with pytest.raises(InputError, match="k is 3, want None"):
+            make("parkenv/Search-v2", scenario="mini", k=3)
+
+
 def test_other_makers_say_it_alike_and_name_what_is_near():
     for make in (lot_v0.env, lot_v0.parallel_env, lambda **k: make_scenario("mini", **k)):
         with pytest.raises(TypeError, match=r"unexpected keyword argument 'failure_cost'.*'failure_s'"):

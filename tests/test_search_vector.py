@@ -407,7 +407,10 @@ def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environme
             "day of option arrival is 'sun', want one of mon, tue",
         ),
         ({"place": 0, "arrival": -1}, "option arrival is -1, want a finite number at least 0"),
-        ({"place": 0, "arrival": "Tue at 8"}, "want HH:MM"),
+        *(
+            ({"place": 0, "arrival": text}, f"option arrival is '{text}', want seconds since Monday 00:00")
+            for text in ("Tue at 8", "8:30", "Tue", "Tuesday 8:30", "Tue 25:00", "weekdays 08:30")
+        ),
     ],
 )
 def test_a_start_that_is_none_is_refused(options, message):

@@ -446,6 +446,19 @@ def test_a_mask_that_allows_nothing_is_refused(trained):
         agent.predict(observation)
 
 
+@pytest.mark.parametrize("algorithm", ["ppo", "maskable-ppo", "recurrent-ppo", "dqn"])
+def test_short_trainings_have_smaller_batches(algorithm):
+    usual = SEARCH_CONFIGS[algorithm]
+    short = usual.for_steps(30_000)
+    assert usual.for_steps(2_000_000) is usual
+    if algorithm == "dqn":
+        assert short is usual
+    else:
+        size = short.settings["batch_size"] / short.n_envs
+        assert size == usual.settings["batch_size"] / usual.n_envs
+        assert 30_000 / (short.n_envs * short.settings["n_steps"]) >= 12
+
+
 def test_every_algorithm_has_a_recipe():
     assert SEARCH_CONFIGS.keys() | DRIVE_CONFIGS.keys() == ALGORITHMS.keys()
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -147,13 +149,13 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
     for row in rows:
         key = (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"])
         settings.setdefault(key, []).append(row)
-    tables = []
+    tables, short = [], _short_labels(row["agent"] for row in rows)
     for (name, failure, walk, drive), its_rows in settings.items():
         first = its_rows[0]["agent"]
         results: tuple[Column, ...] = (
             ("total s [95 %]", lambda r: _interval(r["total_s"], r["total_s_ci95"])),
             *(_OF_GIVING_UP if any(row["gave_up_fraction"] for row in its_rows) else ()),
-            (f"minus {first} [95 %]", lambda r, a=first: _difference(r, a)),  # type: ignore[misc]
+            (f"minus {short[first]} [95 %]", lambda r, a=first: _difference(r, a)),  # type: ignore[misc]
             ("regret s", lambda r: _seconds(r["regret_s"])),
         )
         if any("gap_to_exact" in row for row in its_rows):
@@ -165,7 +167,7 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
         details = (*_cost_columns(its_rows), *_DETAILS)
         for columns in [results + details] if width >= WIDE else [results, details]:
             headings = ("agent", *(heading for heading, _ in columns))
-            cells = ((row["agent"], *(text(row) for _, text in columns)) for row in its_rows)
+            cells = ((short[row["agent"]], *(text(row) for _, text in columns)) for row in its_rows)
             tables.append(make_table(title if columns is not details else None, headings, cells))
     return tables
 
@@ -183,6 +185,13 @@ def cost_tables(rows: list[Row]) -> list[Table]:
         cells = ((agent, *(its.get(cost, "") for cost in costs)) for agent, its in grid.items())
         tables.append(make_table(title, ("agent", *(f"{cost:g}" for cost in costs)), cells))
     return tables
+
+
+def _short_labels(agents: Iterable[str]) -> dict[str, str]:
+    """Return labels without the folders of files, or whole where two agents would have the same."""
+    short = {agent: re.sub(r":[^()]*[/\\]", ":", agent) for agent in agents}
+    times = Counter(short.values())
+    return {agent: label if times[label] == 1 else agent for agent, label in short.items()}
 
 
 def _cost_columns(rows: Sequence[Row]) -> Iterator[Column]:

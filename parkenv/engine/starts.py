@@ -7,7 +7,7 @@ from typing import Any
 
 from parkenv.compiled.keyed_random import episode_key
 from parkenv.engine.records import Searches
-from parkenv.errors import require_number, require_one_of, require_whole
+from parkenv.errors import InputError, require_number, require_one_of, require_whole
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.week import DAY_S, WEEK_S
 
@@ -42,8 +42,12 @@ def choose_start(searches: Searches, index: int, episode: int, options: Mapping[
         arrival = options["arrival"]
         if isinstance(arrival, str):
             day, _, hour = arrival.strip().partition(" ")
-            window = ArrivalWindow.parse(f"{hour}-{hour}", day)
-            arrival = DAY_S * window.weekdays[0] + window.start_s
+            try:
+                require_one_of("day", day.lower(), DAY_NAMES)
+                arrival = DAY_S * DAY_NAMES.index(day.lower()) + ArrivalWindow.parse(f"{hour}-{hour}").start_s
+            except InputError:
+                wanted = "seconds since Monday 00:00 or a text such as 'Tue 08:30'"
+                raise InputError(f"option arrival is {arrival!r:.60}, want {wanted}") from None
         require_number("option arrival", arrival, least=0.0, below=WEEK_S)
         weekday, record["chosen_second"] = divmod(float(arrival), DAY_S)
         days = [day.weekday for day in scenarios[place].occupancy.arrival_days(scenarios[place].arrival)]

@@ -13,7 +13,7 @@ from parkenv.envs.sensors import SensingSearchEnv
 from parkenv.perception.detector import Detector
 from parkenv.perception.pipeline import PerceptionPipeline, PerceptionResult
 from parkenv.perception.slot_filter import SlotObservation
-from parkenv.scenarios.build import ScenarioSource, make_scenario
+from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
 from parkenv.world.scenario import Scenario
 from parkenv.world.sensor_model import SensorModel
 from sim_sensors.rig import SensorRig, TimedCapture
@@ -155,6 +155,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
         k: int | None = None,
         **changes: Any,
     ) -> None:
+        require_changes((type(self),), changes)
         world = make_scenario(scenario, **changes)
         sensors = make_rig(rig, world, picture_width)
         self.perception = OnboardPerception(world, sensors, weather, captures, every, detector)

@@ -29,7 +29,7 @@ from parkenv.engine.spaces import action_number, space_of
 from parkenv.engine.starts import choose_start
 from parkenv.engine.state import SearchState
 from parkenv.errors import InputError, require_one_of
-from parkenv.scenarios.build import ScenarioSources, make_scenarios
+from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.world.lot import ACTIONS
 from parkenv.world.occupancy.python_functions import raise_error
 from parkenv.world.scenario import Scenario
@@ -163,7 +163,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     - `scenario`: a `Scenario`; the name of a packaged one: campus, jam, street, mini; a scenario file (.toml); a lot
       (.geojson), with a week and days as in busy real car parks; a folder of such files; or a sequence of
       these. See `parkenv.make_scenarios`.
-    - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`.
+    - `render_mode`: `rgb_array` (480, 640, 3), `human` (needs the extra `human`), or `ansi`. A frame shows which
+      slots are truly taken, hidden from the agent, and as colours the agent's belief.
     - `observation`: `full`, as above; `occupancy`, the same without `belief` and `step_observed`; or `local`, a `Dict`
       of `local` and `action_mask` that describes the car's surroundings, see `parkenv.engine.local_observation`.
     - `k`: number of slots that `local` describes, 5 if None.
@@ -220,6 +221,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
         require_one_of("observation", observation, OBSERVATIONS)
+        require_changes((type(self),), changes)
+        if k is not None and observation != "local":
+            raise InputError(f"k is {k!r}, want None unless observation is local")
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.render_mode = render_mode
         self.action_space = spaces.Discrete(len(ACTIONS))

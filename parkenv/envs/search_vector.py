@@ -30,7 +30,7 @@ from parkenv.engine.starts import choose_start
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import BELIEF_PARTS, OBSERVATIONS
 from parkenv.errors import InputError, require_whole
-from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios
+from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios, require_changes
 from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
@@ -153,6 +153,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         except ValueError:
             known = ", ".join(m.value for m in AutoresetMode)
             raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
+        require_changes((type(self), ParkSearchVectorEnv), changes)
+        if k is not None and observation not in ("local", "scan"):
+            raise InputError(f"k is {k!r}, want None unless observation is local or scan")
         observer = _observer(observation, k) if isinstance(observation, str) else observation
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.num_envs = n = int(num_envs)

@@ -15,7 +15,7 @@ from parkenv.engine.spaces import LATEST
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import SearchEnv
 from parkenv.errors import InputError
-from parkenv.scenarios.build import ScenarioSource, make_scenario
+from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
 from sim_sensors.rig import SensorRig, TimedCapture
 
 FARTHEST = 1e7  # bound, m, of the observed positions: Gymnasium requires one, and every lot is smaller
@@ -143,6 +143,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     ) -> None:
         if observation not in OBSERVATIONS:
             raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
+        require_changes((type(self),), changes)
         super().__init__(make_scenario(scenario, **changes), render_mode)
         sensors = make_rig(rig, self.scenario, picture_width)
         if observation == "scan":

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import inspect
+from collections.abc import Iterable, Sequence
 from datetime import date, timedelta
 from functools import lru_cache
 from pathlib import Path
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_keywords
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.spec import (
     CountsSpec,
@@ -100,6 +101,19 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
     if not source:
         raise InputError("scenario is an empty sequence, want at least one scenario")
     return [scenario for each in source for scenario in make_scenarios(each, **changes)]
+
+
+def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str) -> None:
+    """Check the further keywords of an environment, its class first of `owners`: fields of the scenario, or others.
+
+    Raises:
+        TypeError: one is unknown; the message also lists the environment's own arguments.
+    """
+    own = [one for owner in owners for one in inspect.signature(owner).parameters.values()]
+    named = [one.name for one in own if one.kind is not inspect.Parameter.VAR_KEYWORD]
+    fields = [field.name for field in dataclasses.fields(Scenario)]
+    known = dict.fromkeys((*named, *others, *fields, "day_error"))
+    require_keywords(owners[0].__name__, changes, known)
 
 
 def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, nearest, require_number
+from parkenv.errors import InputError, require_keywords, require_number
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
@@ -198,12 +198,7 @@ class SearchProblem:
             TypeError: an unknown field; the message lists the known ones.
         """
         known = [f.name for f in dataclasses.fields(self) if f.init]
-        for name in changes:
-            if name not in known:
-                hint = nearest(name, known)
-                raise TypeError(
-                    f"{type(self).__name__}() got an unexpected keyword argument {name!r}; {hint}"
-                )
+        require_keywords(type(self).__name__, changes, known)
         return dataclasses.replace(self, **changes)
 
 

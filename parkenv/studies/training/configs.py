@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from typing import Any, Self
 
 REWARD_SCALE = 0.01  # scales returns of about -100 s to about -1
 MAX_STEPS = 500  # step limit of training episodes: longer searches only drive in circles
+MIN_UPDATES = 12  # a training with fewer has smaller batches
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,18 @@ class TrainingConfig:
     # fraction of the learning rate at the end of training; it falls linearly
     final_learning_rate: float = 1.0
     steps: int = 0  # decisions of a training whose specification does not say how many
+
+    def for_steps(self, steps: int) -> Self:
+        """Return the settings for a training of so many decisions.
+
+        The settings are for millions. A short training on-policy would update its network once or twice, and learn
+        nothing: it has a quarter of the environments and of the batch, until there are `MIN_UPDATES` updates.
+        """
+        config = self
+        while config.n_envs >= 16 and steps < MIN_UPDATES * config.n_envs * config.settings.get("n_steps", 0):
+            batch = {"batch_size": config.settings["batch_size"] // 4}
+            config = replace(config, n_envs=config.n_envs // 4, settings={**config.settings, **batch})
+        return config
 
 
 _ON_POLICY: dict[str, Any] = {

@@ -36,13 +36,13 @@ class RLTraining(Training):
 
     @property
     def config(self) -> TrainingConfig:
-        """Training config of the algorithm."""
-        return self.configs[self.algorithm]
+        """Training config of the algorithm, for a training of so many steps."""
+        return self.configs[self.algorithm].for_steps(self.steps)
 
     @property
     def steps(self) -> int:
         """See `Training`."""
-        return self.spec.steps or self.config.steps
+        return self.spec.steps or self.configs[self.algorithm].steps
 
     @property
     def evaluate_every(self) -> int:

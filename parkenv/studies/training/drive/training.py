@@ -53,7 +53,7 @@ class DriveTraining(RLTraining):
     @property
     def config(self) -> DriveTrainingConfig:
         """See `RLTraining`."""
-        return DRIVE_CONFIGS[self.algorithm]
+        return DRIVE_CONFIGS[self.algorithm].for_steps(self.steps)
 
     @cached_property
     def lots(self) -> tuple[ParkingLot, ...]:
