@@ -153,3 +153,23 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     assert said in few.stdout
     assert "20 cars an hour" in said
     assert "--arrivals-per-hour counted" in said
+
+
+@pytest.mark.parametrize(("balked", "said"), [(0.0, False), (0.02, True)])
+def test_a_lot_is_said_to_be_full_only_where_cars_went_elsewhere(balked, said):
+    compared = [
+        {"scenario": name, "agents": "random", "knows": "own", "share": 0.0, "arrivals_per_hour": "counted"}
+        for name in ("first", "second")
+    ]
+    short = {
+        "hour": 12,
+        "occupancy": 0.79,
+        "counted_occupancy": 0.85,
+        "excess": -0.06,
+        "excess_ci95": [-0.08, -0.04],
+    }
+    lines = departures(
+        [its | short for its in compared], [its | {"balked_fraction": balked} for its in compared]
+    )
+    assert [name in line for name, line in zip(("first", "second"), lines, strict=True)] == [True, True]
+    assert ["elsewhere" in line for line in lines] == [said, said]
