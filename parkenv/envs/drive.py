@@ -136,6 +136,7 @@ length and width over the car's |
 
     ```python
     >>> import gymnasium as gym
+    >>> import numpy as np
     >>> import parkenv
     >>> env = gym.make("parkenv/Drive-v1", lot="campus", kinds=("oblique",))
     >>> observation, info = env.reset(seed=0)

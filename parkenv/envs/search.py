@@ -172,6 +172,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     ```python
     >>> import gymnasium as gym
+    >>> import numpy as np
     >>> import parkenv
     >>> env = gym.make("parkenv/Search-v2", scenario="mini", failure_s=5.0)
     >>> observation, info = env.reset(seed=0)
