@@ -126,7 +126,8 @@ def grids(n: int, seed: int) -> list[ParkingLot]:
 
 
 def _ours(scenario: ScenarioSources, batch: int, observation: str, copy: bool = True) -> ParkSearchVectorEnv:
-    return ParkSearchVectorEnv(batch, scenario, observation=observation, k=NEAREST, copy=copy)
+    k = NEAREST if observation == "local" else None
+    return ParkSearchVectorEnv(batch, scenario, observation=observation, k=k, copy=copy)
 
 
 def _driving(scenario: Scenario, batch: int) -> ParkSearchVectorEnv:
