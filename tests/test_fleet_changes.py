@@ -164,3 +164,9 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
     )
     assert "near 1 → 1.2 an hour" in sentence(without_nan(whole))
     assert not [row for row in headlines([], without_nan(rows)) if "zone" in row["where"]]
+    for day in before:
+        day["zone"] = " ".join(["0", *day["zone"].split()[1:]])
+    whole, nowhere, *by_zone = without_nan(summarize_changes(days, prices))
+    assert nowhere["cars_a_day"] == 1.0
+    assert sum(row["cars_a_day"] for row in (nowhere, *by_zone)) == pytest.approx(whole["cars_a_day"])
+    assert "found no slot before" in sentence(nowhere)

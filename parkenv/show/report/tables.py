@@ -149,7 +149,7 @@ _KNOWN = {
         Column("price_over_bound", "price over the bound", digits=3, help="Total time over the clairvoyant bound"),
         Column("before", "instead of"),
         Column("prices", "prices"),
-        Column("zone", "zone", help="Of changes: in which the cars parked before; – for all cars"),
+        Column("zone", "zone", help="Of changes: where the cars parked before; – for all cars"),
         Column("cars_a_day", "cars a day", digits=0),
         Column("paid", "paid a car", digits=2, help="In the currency of the prices; mean over all cars"),
         Column("paying_share", "cars that pay", share=True, digits=0),

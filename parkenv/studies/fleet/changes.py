@@ -19,6 +19,8 @@ NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
 LEAST_DAYS = 5
 """Days below which nothing is called better or worse: with fewer, a bootstrap interval covers less than 95 %."""
+NOWHERE = "no slot"
+"""Stands for the zone of the cars that found no slot before."""
 _SHOWN_S = 0.05  # a part of a change that is said
 CHANGES = (
     "change_s", "members_change_s", "others_change_s", "search_change_s", "parking_cost_change_s", "gave_up_change_s",
@@ -39,7 +41,9 @@ def summarize_changes(
     A scenario is compared with the first one, and guidance with nobody knowing more than what it observes; everything
     else is equal. Days are paired, and on each of them the cars: members, and others, are the same cars before and
     after. Differences are those after minus those before, so that negative times are gains. Where a lot has several
-    zones, further rows are about the cars that parked in each `zone` before; None for all cars.
+    zones, further rows are about the cars that parked in each `zone` before, and about those that found no slot, if
+    there are some on each day: those who park gain less than the others by any change, as they had luck before. `zone`
+    is None for all cars.
 
     Args:
         settings: the days of each setting.
@@ -59,9 +63,13 @@ def summarize_changes(
                 head = {"change": what, "before": names[0], "after": names[1], **its, "days": len(pairs)}
                 old, new = (prices.get(str(one["scenario"]), {}) for one in (its | before, its))
                 head["prices"] = _new_prices(old, new)
-                for zone_number, zone in enumerate((None, *old) if len(old) > 1 else (None,)):
+                zones = enumerate((NOWHERE, *old)) if len(old) > 1 else ()
+                for zone_number, zone in ((None, None), *zones):
                     changes = [_change(*pair, zone_number) for pair in pairs]
-                    rows.append(head | {"zone": zone} | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
+                    if zone != NOWHERE or all(change["cars_a_day"] for change in changes):
+                        rows.append(
+                            head | {"zone": zone} | day_means(changes, ("cars_a_day", *CHANGES), CHANGES)
+                        )
     return sorted(rows, key=lambda row: row["change"] != "scenario")
 
 
@@ -93,13 +101,13 @@ def _new_prices(before: Mapping[str, float], after: Mapping[str, float]) -> str 
     return f"{', '.join(new)} an hour" if new else None
 
 
-def _change(after: Row, before: Row, zone_number: int) -> Row:
+def _change(after: Row, before: Row, zone_number: int | None) -> Row:
     """Return what changes on a day for the cars that parked in a zone before; NaN where it is not known.
 
-    Zones have the numbers of `CAR_LISTS`, from 1; 0 is for all cars.
+    Zones have the numbers of `CAR_LISTS`: from 1, and 0 for no slot. None is for all cars.
     """
     row = dict.fromkeys(("cars_a_day", *CHANGES), float("nan"))
-    if not zone_number:
+    if zone_number is None:
         row |= {
             "cars_a_day": after["cars"],
             "change_s": after["total_s"] - before["total_s"],
@@ -112,14 +120,15 @@ def _change(after: Row, before: Row, zone_number: int) -> Row:
     member = _numbers(after, "member")
     if not len(times) == len(earlier) == len(member) > 0:
         return row
-    its = _numbers(before, "zone") == zone_number if zone_number else np.ones(len(times), bool)
+    its = np.ones(len(times), bool) if zone_number is None else _numbers(before, "zone") == zone_number
     gained = (times - earlier) / 100.0
     cents, earlier_cents = _numbers(after, "paid_cents"), _numbers(before, "paid_cents")
     if len(cents) or len(earlier_cents):
         free = np.zeros(len(times))  # in a lot without prices
         cents, earlier_cents = (known if len(known) else free for known in (cents, earlier_cents))
         row["paid_change"] = _mean((cents - earlier_cents)[its] / 100.0)
-    row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])} if zone_number else {}
+    if zone_number is not None:
+        row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])}
     return row | {
         "members_change_s": _mean(gained[its & (member == 1.0)]),
         "others_change_s": _mean(gained[its & (member == 0.0)]),
@@ -185,7 +194,7 @@ def made_of(row: Row) -> str:
         parts.append(f"{amount} ({cost_s:+.1f} s as time)")
     if abs(gave_up_s) >= _SHOWN_S:
         penalty = f"{abs(gave_up_s):.1f} s {ways[1]} give-up penalty"
-        parts.append(f"{penalty} ({row['balked_change']:+.1%} find no slot)")
+        parts.append(f"{penalty} ({row['balked_change']:+.2%} find no slot)")
     return ", ".join(parts)
 
 
@@ -196,7 +205,10 @@ def where(row: Row) -> list[str]:
     equal = [row["prices"]] if row["prices"] else []
     equal += [row["agents"], rate_text(row["arrivals_per_hour"])]
     equal += [] if row["knows"] == OWN else [_words("knows", row)]
-    return [*equal, f"cars that parked in zone {row['zone']} before"] if row["zone"] else equal
+    if not row["zone"]:
+        return equal
+    found = "found no slot" if row["zone"] == NOWHERE else f"parked in zone {row['zone']}"
+    return [*equal, f"cars that {found} before"]
 
 
 def place(row: Row) -> list[str]:
