@@ -43,7 +43,8 @@ def figures():
         for found in re.finditer(
             r"(?:!\[[^]]*\]\(|--8<-- \"docs/(?=bench))([^)\"]+)|(?:^\|.*\n)+", text, re.M
         ):
-            if found[1] or len(NUMBER.findall(found[0])) >= 6:
+            specified = "| Meaning |" in found[0].partition("\n")[0]  # what numbers mean, no results
+            if found[1] or (len(NUMBER.findall(found[0])) >= 6 and not specified):
                 start = text.rfind("\n#", 0, found.start()) + 1
                 end = text.find("\n#", found.end())
                 after = commands(text[found.end() : end if end > 0 else None])

@@ -262,7 +262,7 @@ def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
     draft = of_lot(tmp_path, grid_lot(2, 8))
     with pytest.raises(InputError, match=r"give one by --entry X,Y, .*; no goal: .*--goal X,Y"):
         draft.lot()
-    x, y = map(float, draft.missing[0].split(" auto for ")[1].split(","))
+    x, y = map(float, draft.missing[0].split(" auto for ")[1].split(";")[0].split(","))
     given = of_lot(tmp_path, grid_lot(2, 8), entries=((x, y),), goals=((9.0, 9.0),))
     guessed = of_lot(tmp_path, grid_lot(2, 8), guess_entry=True, guess_goal=True)
     assert given.lot().n_slots == guessed.lot().n_slots == 16

@@ -67,18 +67,18 @@ def make_batch(n, scenario, **options):
     )
 
 
-def assert_parity(scenarios, observation="full", n=4, steps=250, k=5, **changes):
+def assert_parity(scenarios, observation="full", n=4, steps=250, **changes):
     """Whole episodes, several in a row, of each search of a batch and of the single environment of its seed.
 
     Returns the names of the places of the episodes that ended.
     """
-    envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, k=k, **changes)
+    envs = make_batch(n, scenarios, observation=observation, max_episode_steps=LIMIT, **changes)
     singles = [
         gym.make("parkenv/Search-v2", scenario=scenarios, max_episode_steps=LIMIT, **changes)
         for _ in range(n)
     ]
     if observation == "local":
-        singles = [LocalObservation(env, k) for env in singles]
+        singles = [LocalObservation(env) for env in singles]
     batch, _ = envs.reset(seed=7)
     alone = [env.reset(seed=7 + i)[0] for i, env in enumerate(singles)]
     rng = np.random.default_rng(0)
