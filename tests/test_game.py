@@ -147,26 +147,20 @@ def test_the_next_changes_of_slots_are_found_to_the_last_bit(kind):
     assert np.array_equal(found, World.next_change(world, slots, begin, begin + 7_200.0))
 
 
+def compared(agents, out, *more):
+    """Return the summary of a comparison in three searches on `mini`."""
+    done = parkenv(
+        "compare", "--scenario", "mini", "--seed", "4", "-n", "3", "--agents", agents, "--jobs", "1", "--no-figures",
+        *more, "--out", out,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return json.loads((out / "summary.json").read_text())
+
+
 def test_scores_are_a_row_of_a_comparison(scores, tmp_path):
     agents = f"belief,{saved(scores, tmp_path)},oracle"
     out = tmp_path / "compared"
-    command = [
-        "compare",
-        "--scenario",
-        "mini",
-        "--seed",
-        "4",
-        "-n",
-        "3",
-        "--agents",
-        agents,
-        "--jobs",
-        "1",
-        "--no-figures",
-    ]
-    done = parkenv(*command, "--out", out)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((out / "summary.json").read_text())
+    summary = compared(agents, out)
     belief, human, _ = summary["rows"]
     assert human["agent"] == agents.split(",")[1]
     assert human["total_s"] == belief["total_s"]
@@ -335,22 +329,7 @@ def test_a_finger_plays_all_worlds_on_a_phone_and_python_counts_the_scores(brows
     button(browser, "#result .go .first")
     scores = tmp_path / "scores.json"
     scores.write_text(browser.execute_script("return window.saved"))
-    command = [
-        "compare",
-        "--scenario",
-        "mini",
-        "--seed",
-        "4",
-        "-n",
-        "3",
-        "--agents",
-        f"oracle,human:{scores}",
-        "--jobs",
-        "1",
-    ]
-    done = parkenv(*command, "--occupancy-levels", "none", "--no-figures", "--out", tmp_path / "out")
-    assert done.returncode == 0, done.stderr
-    human = json.loads((tmp_path / "out" / "summary.json").read_text())["rows"][1]
+    human = compared(f"oracle,human:{scores}", tmp_path / "out", "--occupancy-levels", "none")["rows"][1]
     assert rows[-1][1] == f"{human['total_s']:.1f}"
     assert make_agent(f"human:{scores}", make_scenario("mini")).totals.keys() == {w["seed"] for w in worlds}
     assert browser.get_log("browser") == []

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
 from parkenv.show.plurals import plural
-from parkenv.studies.fleet.setting import OWN, SETTING_COLUMNS, rate_text
+from parkenv.studies.fleet.setting import CAR_LISTS, OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.fleet.tables import day_means, paired_days
 from parkenv.studies.results import Row
 
@@ -49,6 +48,7 @@ def summarize_changes(
         settings: the days of each setting.
         prices: of each scenario, the price of an hour in each zone of the lot, in the order of the zones.
     """
+    settings = [[_with_lists(day) for day in days] for days in settings]
     by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
     first = settings[0][0]["scenario"] if settings else ""
     rows = []
@@ -102,7 +102,7 @@ def _new_prices(before: Mapping[str, float], after: Mapping[str, float]) -> str 
 
 
 def _change(after: Row, before: Row, zone_number: int | None) -> Row:
-    """Return what changes on a day for the cars that parked in a zone before; NaN where it is not known.
+    """Return what changes on a day, with its lists, for cars that parked in a zone before; NaN where it is not known.
 
     Zones have the numbers of `CAR_LISTS`: from 1, and 0 for no slot. None is for all cars.
     """
@@ -116,13 +116,12 @@ def _change(after: Row, before: Row, zone_number: int | None) -> Row:
             "gave_up_change_s": after["gave_up_s"] - before["gave_up_s"],
             "balked_change": after["balked_fraction"] - before["balked_fraction"],
         }
-    times, earlier = _numbers(after, "total_cs"), _numbers(before, "total_cs")
-    member = _numbers(after, "member")
+    times, earlier, member = after["total_cs"], before["total_cs"], after["member"]
     if not len(times) == len(earlier) == len(member) > 0:
         return row
-    its = np.ones(len(times), bool) if zone_number is None else _numbers(before, "zone") == zone_number
+    its = np.ones(len(times), bool) if zone_number is None else before["zone"] == zone_number
     gained = (times - earlier) / 100.0
-    cents, earlier_cents = _numbers(after, "paid_cents"), _numbers(before, "paid_cents")
+    cents, earlier_cents = after["paid_cents"], before["paid_cents"]
     if len(cents) or len(earlier_cents):
         free = np.zeros(len(times))  # in a lot without prices
         cents, earlier_cents = (known if len(known) else free for known in (cents, earlier_cents))
@@ -141,8 +140,9 @@ def _mean(values: NDArray[Any]) -> float:
     return float(values.mean()) if len(values) else float("nan")
 
 
-def _numbers(day: Mapping[str, Any], name: str) -> FloatArray:
-    return np.array(day.get(name, "").split(), np.float64)
+def _with_lists(day: Row) -> Row:
+    """Return a day with `CAR_LISTS` as arrays, (n_cars,) float64, empty where they are not known."""
+    return {**day, **{name: np.array(day.get(name, "").split(), np.float64) for name in CAR_LISTS}}
 
 
 # ---- in words

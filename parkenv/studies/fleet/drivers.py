@@ -59,10 +59,9 @@ def policy_of(
 
             sampled = agent.card.algorithm != "dqn"
             return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
-    # Learned agents observe costs themselves.
-    return None, AgentsByStay(spec, scenario, known) if scenario.tariff and not isinstance(
-        agent, LearnedAgent
-    ) else agent
+    if isinstance(agent, LearnedAgent) or not scenario.tariff:
+        return None, agent  # learned agents observe costs themselves
+    return None, AgentsByStay(spec, scenario, known)
 
 
 class AgentsByStay:
