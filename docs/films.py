@@ -1,6 +1,13 @@
-"""The films of the environments' pages: `python docs/films.py [NAME ...]` makes them in docs/pictures."""
+"""The films of the environments' pages and of the game: `python docs/films.py [NAME ...]` makes them in docs/pictures.
 
+The game is played in Chromium, driven by selenium (extra dev).
+"""
+
+import io
+import json
+import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import cv2
@@ -83,12 +90,78 @@ def drive():
     return frames
 
 
+CLOCK = """
+let now = 0, waiting = [];
+performance.now = () => now;
+window.requestAnimationFrame = f => waiting.push(f);
+window.pass = ms => { now += ms; const due = waiting; waiting = []; due.forEach(f => f(now)); };
+"""
+SHOWN = 'document.querySelector("#result").getClientRects().length'
+TAP = """
+const game = document.querySelector("#lot"), to = {pointerId: 1, clientX: arguments[0], clientY: arguments[1]};
+for (const name of ["pointerdown", "pointerup"]) game.dispatchEvent(new PointerEvent(name, {...to, bubbles: true}));
+"""
+
+
+def play(targets=("C10", "A19", "A19")):
+    """Film a game in which a person goes to some slots, parks in the last one, and sees the agents' drives."""
+    from PIL import Image
+    from selenium import webdriver
+
+    with tempfile.TemporaryDirectory() as folder:
+        page, frames = Path(folder) / "play.html", []
+        subprocess.run(
+            ["parkenv", "play", "--html", "--worlds", "10", "--seed", "5", "--out", page], check=True
+        )
+        options = webdriver.ChromeOptions()
+        for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"):
+            options.add_argument(flag)
+        with webdriver.Chrome(options=options) as browser:
+            size = {"width": 1040, "height": 600, "deviceScaleFactor": 1, "mobile": False}
+            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+            # The page's clock stands still between frames.
+            browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": CLOCK})
+            browser.get(page.as_uri())
+
+            def ask(script, *values):
+                return browser.execute_script(f"return {script}", *values)
+
+            def shoot(n=1):
+                for _ in range(n):
+                    for _ in range(2):
+                        browser.execute_script("pass(50)")
+                    frames.append(
+                        np.array(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
+                    )
+
+            def shoot_until(script, most=160):
+                for _ in range(most):
+                    shoot()
+                    if ask(script):
+                        return
+
+            lot = json.loads(ask('document.querySelector("#game-data").textContent'))["problem"]["lot"]
+            corner = ask('(r => [r.x, r.y])(document.querySelector("#lot").getBoundingClientRect())')
+            shoot(8)
+            for target in targets:
+                ring = lot["slots"][lot["slot_ids"].index(target)]
+                x, y = ask("game.toPixels(arguments[0])", [(ring[0] + ring[4]) / 2, (ring[1] + ring[5]) / 2])
+                browser.execute_script(TAP, corner[0] + x, corner[1] + y)
+                shoot(2)
+                shoot_until(f'document.querySelector("#lot").dataset.steps || {SHOWN}')
+                shoot(3)
+            shoot_until('document.querySelector("#result .play").ariaLabel == "Play"')
+            shoot(8)
+    return frames
+
+
 FILMS = {
     "search": (search, 6), "search-vector": (search_vector, 6), "search-sensors": (search_sensors, 4),
-    "drive": (drive, 10),
+    "drive": (drive, 10), "play": (play, 10),
 }  # fmt: skip
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or FILMS:
         film, fps = FILMS[name]
-        save_film(film(), Path(__file__).parent / "pictures" / f"env_{name}.gif", fps=fps, colors=128)
+        file = "play_campus.gif" if name == "play" else f"env_{name}.gif"
+        save_film(film(), Path(__file__).parent / "pictures" / file, fps=fps, colors=128)

@@ -187,7 +187,8 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
 
     ## Observation space
     The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `day_error`, `action_mask`. It holds
-    what the car knows, by default what it has observed itself, and its forecast for its own arrival.
+    what the car knows, by default what it has observed itself, and its forecast for its own arrival. Where parking has
+    prices, `stay_s`, `Box(0, inf, (1,), float32)`, is the car's own stay, s, which it pays for.
 
     ## Rewards
     Minus the duration of a car's step, s, as in `parkenv/Search-v2`, given when the step is over; parking also

@@ -42,12 +42,12 @@ class Fit(Command):
 
     log: LogFile = Field(
         description="A log, datetime,camera,slot_id,weather,occupied, or counts, car_park,capacity,hour,free (or "
-        "hour_utc), as .csv or .csv.gz."
+        "hour_utc, time, time_utc), as .csv or .csv.gz."
     )
     max_gap_h: float = option(
         2.0, "Observations of a log farther apart than this, h, are not linked.", takes="H", ge=0
     )
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts with hour_utc.")
+    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
     out: Path = option(
         Path("results/occupancy"),
         "Folder for summary.json and, of a log, process.json and rates.png.",
@@ -106,14 +106,14 @@ class Evaluate(Command):
         """
 
     log: LogFile = Field(
-        description="Counts, car_park,capacity,hour,free (or hour_utc), or a log of slots, "
+        description="Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), or a log of slots, "
         "datetime,camera,slot_id,weather,occupied, as .csv or .csv.gz."
     )
     from_day: Date | None = option(
         None, "First day that is scored.", name="--from", takes="DATE", default="halfway"
     )
     car_parks: Axis[str] | None = option(None, "Car parks.", takes="NAME[,...]", default="all")
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time of hour_utc.")
+    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
     seed: Seed = Field(0, description="Seed of the bootstrap.")
     out: Path = option(
         Path("results/forecasts"), "Folder for summary.json and a picture of each model.", short="-o"

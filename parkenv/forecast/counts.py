@@ -1,7 +1,9 @@
 """Hourly counts of free places of whole car parks, cleaned by stated rules.
 
-A file has the columns `car_park,capacity,free` and `hour` (local time) or `hour_utc`. Real counts have faults. Each
-reading that is changed or dropped is counted under the name of its rule:
+A file has the columns `car_park,capacity,free` and `hour` (local time), the hour at whose end the reading holds, or
+`time`, the moment of the reading: one of 09:00 sharp holds for the end of the hour before it. `hour_utc` and `time_utc`
+are the same in UTC. Real counts have faults. Each reading that is changed or dropped is counted under the name of its
+rule:
 
 - `negative`: below 0. Down to -5 % of the capacity it counts as full, below that it is dropped.
 - `above_capacity`: more free places than places. Up to 5 % it counts as empty, above that it is dropped (unless
@@ -36,12 +38,15 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.limited_reading import csv_rows
 
 HOURS = 24
+TIME_COLUMNS = ("hour", "hour_utc", "time", "time_utc")
+"""Names of the column that says when a reading was taken."""
 MAX_COUNT_BYTES = 512_000_000
 """Maximum size of a file of counts, unpacked."""
 MAX_NAME = 200
 """Maximum length of a car park's name, characters."""
 MAX_DAYS = 400_000
 """Maximum number of car parks times days of a file of counts."""
+_AN_INSTANT = timedelta(microseconds=1)
 _TOLERANCE = 0.05  # of the capacity
 _SURPRISE = math.log(1e9)
 _WINDOW = 28  # days
@@ -76,7 +81,7 @@ class Counts:
 
         Args:
             path: .csv or .csv.gz.
-            timezone: IANA name of the local time of `hour_utc`, and of when summer time begins and ends.
+            timezone: IANA name of the local time of `hour_utc` and `time_utc`, and of when summer time begins and ends.
 
         Raises:
             InputError: the file cannot be read, or is not such a file; the message names file, line and field.
@@ -166,11 +171,13 @@ def _time_zone(name: str) -> ZoneInfo:
 def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
     rows = csv_rows(path, MAX_COUNT_BYTES)
     _, header = next(rows, (0, []))
-    time = "hour_utc" if "hour_utc" in header else "hour"
+    time = next((name for name in TIME_COLUMNS if name in header), "hour")
     try:
         columns = [header.index(name) for name in ("car_park", "capacity", time, "free")]
     except ValueError:
-        raise InputError(f"{path}: want the columns car_park,capacity,hour,free (or hour_utc)") from None
+        wanted = f"car_park,capacity,hour,free (or {', '.join(TIME_COLUMNS[1:])} for hour)"
+        raise InputError(f"{path}: want the columns {wanted}") from None
+    utc, before = time.endswith("_utc"), _AN_INSTANT if time.startswith("time") else timedelta(0)
     names: dict[str, int] = {}
     times: dict[str, tuple[int, int]] = {}
     numbers: dict[str, float] = {}
@@ -181,7 +188,7 @@ def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
             raise InputError(f"{path}: line {line}: car_park is {name!a:.40}, want a printable name")
         try:
             if moment not in times:
-                times[moment] = _local_hour(moment, zone, utc=time == "hour_utc")
+                times[moment] = _local_hour(moment, zone, utc, before)
             for text in (capacity, free):
                 if text not in numbers:
                     numbers[text] = float(text) if text.strip() else math.nan
@@ -212,9 +219,9 @@ def _read(path: str | Path, zone: ZoneInfo) -> _Readings:
     )
 
 
-def _local_hour(text: str, zone: ZoneInfo, *, utc: bool) -> tuple[int, int]:
-    """Return the day (proleptic Gregorian ordinal) and the hour of a time."""
-    moment = datetime.fromisoformat(text)
+def _local_hour(text: str, zone: ZoneInfo, utc: bool, before: timedelta) -> tuple[int, int]:
+    """Return the day (proleptic Gregorian ordinal) and the hour of the time `before` a given one."""
+    moment = datetime.fromisoformat(text) - before
     if utc or moment.tzinfo is not None:
         moment = (moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)).astimezone(zone)
     return moment.toordinal(), moment.hour

@@ -207,7 +207,7 @@ class CountsSpec(Spec):
     """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
 
     file: FilePath = Field(
-        description="Counts: car_park,capacity,hour,free (or hour_utc), .csv or .csv.gz; each holds at its hour's end."
+        description="Counts: car_park,capacity,hour,free, each at its hour's end, or `time` for moments; .csv, .csv.gz."
     )
     car_park: Annotated[
         str,
@@ -218,7 +218,7 @@ class CountsSpec(Spec):
             "car parks on the lot, each as a scenario of its own. all: those that show some use.",
         ),
     ] = Field(description="Name of the car park in the file.")
-    timezone: str = Field("Europe/Berlin", description="Of the hours in `hour_utc`.")
+    timezone: str = Field("Europe/Berlin", description="Of `hour_utc` and `time_utc`.")
     pull: float = Field(
         1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
     )
