@@ -97,7 +97,7 @@ def test_nobody_is_faster_than_alone():
     fleet.run(agents)
     assert (fleet.cars["total_s"] >= roads.alone_s(fleet.cars) - 1e-9).all()
     parked = fleet.cars[fleet.cars["slot"] >= 0]
-    assert (parked["driven_m"] >= roads.metres(parked) - 1e-9).all()
+    assert (parked["driven_m"] >= roads.direct_m(parked) - 1e-9).all()
 
 
 def test_an_agent_in_python_drives_as_the_compiled_one():

@@ -181,7 +181,7 @@ def test_revenue_is_price_times_stay_of_the_parked_cars(tmp_path):
     assert [centre["parked_a_day"], other["parked_a_day"]] == np.mean(cars_in, axis=0).tolist()
     of_cars = [paid / len(its) for paid, its in zip(revenue, days, strict=True)]
     assert row["paid"] == pytest.approx(np.mean(of_cars))
-    rows = list(csv.DictReader((tmp_path / "run" / "zones.csv").open()))
+    rows = list(csv.DictReader((tmp_path / "run" / "blocks.csv").open()))
     assert sum(float(line["paid"]) for line in rows) == pytest.approx(sum(revenue))
 
 

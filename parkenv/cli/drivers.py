@@ -13,7 +13,7 @@ from parkenv.show.plurals import plural
 from parkenv.studies.commute.study import Commute as CommuteStudy
 from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown_changes
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.fleet.tables import departures
+from parkenv.studies.fleet.tables import ONE_DAY, departures
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.cost_terms import COST_TERMS
 
@@ -95,7 +95,7 @@ class Fleet(AgentStudyCommand):
     study: FleetStudy = FleetStudy()
     out: Path = option(
         Path("results/fleet"),
-        "Folder for experiment.json, days.csv, zones.csv, summary.json and figures.",
+        "Folder for experiment.json, days.csv, blocks.csv, lanes.csv, hours.csv, summary.json and figures.",
         short="-o",
     )
 
@@ -113,6 +113,8 @@ class Fleet(AgentStudyCommand):
         cells = [[*_setting(row, names), *_cells(row, mixed=mixed)] for row in result.rows]
         agents = "" if "agents" in names else f", {result.rows[0]['agents']}"
         console.print(make_table(f"{self.study.title}{agents}", headings, cells))
+        if all(row["days"] == 1 for row in result.rows):
+            console.print(ONE_DAY, soft_wrap=True)
         _show_money(console, result, names)
         changes = without_nan(result.summary["changes"])
         if changes:
@@ -159,7 +161,7 @@ def _show_money(console: Console, result: Result, names: dict[str, str]) -> None
     console.print(make_table("What the total time is made of, s a car", headings, cells))
     if zones:
         headings = [
-            *setting, "zone", "slots", "price/h", "slots taken", "cars a day", "of all",
+            *setting, "zone", "slots", "price/h", "slots taken", "cars a day", "of all", "refused", "search s",
             "paid a day [95 %]", "paid a car",
         ]  # fmt: skip
         console.print(
@@ -175,6 +177,8 @@ def _zone_cells(row: Row) -> list[str]:
         f"{row['occupancy']:.0%}",
         f"{row['parked_a_day']:.0f}",
         f"{row['share_parked']:.0%}",
+        f"{row['refused_a_day']:.0f}",
+        _number(row["search_s"], ".1f"),
         _interval(row, "paid_a_day", ".2f"),
         _number(row["paid_a_car"], ".2f"),
     ]

@@ -413,6 +413,12 @@ class Fleet:
         """Steps of all cars since `keep_steps`, (n,) of the dtype STEP, in order of their beginning."""
         return self._kept.get("steps", np.zeros(0, STEP))[: int(self._record["n_kept_steps"])].copy()
 
+    def take_steps(self) -> NDArray[np.void]:
+        """Return the kept steps, and keep only later ones: a day with many cars has more than fit into memory."""
+        steps = self.steps
+        self._record["n_kept_steps"] = 0
+        return steps
+
     # ---- decisions
 
     def run(self, agents: Sequence[Any] | None = None, until: float = math.inf) -> None:

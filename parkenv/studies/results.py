@@ -167,6 +167,55 @@ class CsvTable(Table):
 
 
 @dataclass(frozen=True, eq=False)
+class LongTable(Table):
+    """A table whose rows have many lines each: a column of a row is a list with a value for each of its lines.
+
+    Args:
+        file, keys: see `Table`.
+        line_keys: columns that tell the lines of a row apart.
+        columns: the other columns.
+        kinds: what a column holds.
+        other: what all other columns hold.
+    """
+
+    file: str
+    keys: Sequence[str]
+    line_keys: Sequence[str]
+    columns: Sequence[str]
+    kinds: Mapping[str, Kind]
+    other: Kind = NUMBER
+
+    def read(self, folder: Path) -> list[Row]:
+        """See `Table`; of lines that are there twice, as after a crash, the last one counts."""
+        in_line = (*self.line_keys, *self.columns)
+        found: dict[Key, dict[Key, Key]] = {}
+        records = typed_records(
+            folder / self.file,
+            lambda column: self.kinds.get(column, self.other),
+            (*self.keys, *in_line),
+            whole_lines=True,
+        )
+        for _, record in records:
+            lines = found.setdefault(self.key(record), {})
+            lines[tuple(record[c] for c in self.line_keys)] = tuple(record[c] for c in in_line)
+        return [
+            dict(zip(self.keys, key, strict=True))
+            | {c: list(values) for c, values in zip(in_line, zip(*lines.values(), strict=True), strict=True)}
+            for key, lines in found.items()
+        ]
+
+    def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
+        """See `Table`."""
+        in_line = (*self.line_keys, *self.columns)
+        lines = (
+            {c: row[c] for c in self.keys} | dict(zip(in_line, values, strict=True))
+            for row in rows
+            for values in zip(*(row[c] for c in in_line), strict=True)
+        )
+        yield self.file, csv_text((*self.keys, *in_line), lines, header=header)
+
+
+@dataclass(frozen=True, eq=False)
 class JsonTable(Table):
     """A table whose rows hold lists: a JSON object in each line.
 

@@ -83,13 +83,15 @@ def ratio_interval(values: ArrayLike, others: ArrayLike) -> tuple[float, float, 
         others: (n,) numbers.
 
     Returns:
-        Ratio, lower and upper end. The resampling of pairs has a fixed seed.
+        Ratio, lower and upper end, NaN for a single pair. The resampling of pairs has a fixed seed.
 
     Examples:
         >>> ratio_interval([2.0, 4.0], [1.0, 2.0])
         (2.0, 2.0, 2.0)
     """
     mine, theirs = np.asarray(values, dtype=np.float64), np.asarray(others, dtype=np.float64)
+    if len(mine) < 2:
+        return float(mine.sum() / theirs.sum()), np.nan, np.nan
     drawn = np.random.default_rng(0).integers(0, len(mine), (RESAMPLES, len(mine)))
     low, high = np.percentile(mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1), [2.5, 97.5])
     return float(mine.sum() / theirs.sum()), float(low), float(high)

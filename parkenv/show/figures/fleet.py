@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -197,41 +197,33 @@ def _mark_hours(ax: Axes, hours: Sequence[int]) -> None:
     ax.xaxis.set_major_formatter(lambda hour, _: f"{hour:02.0f}:00")
 
 
-def save_zones_figure(lot: ParkingLot, zones: Sequence[Row], hours: Sequence[Row], path: str | Path) -> None:
+def save_zones_figure(
+    lot: ParkingLot, title: str, hours: Sequence[int], courses: Mapping[str, FloatArray], path: str | Path
+) -> None:
     """Draw the zones of a lot: where they are, how full they are by hour, and what is paid in them.
-
-    Hours are means over the days of one setting: the last one where nobody knows more than it observes, if any.
 
     Args:
         lot: the lot.
-        zones: of `summarize_zones`.
-        hours: rows of `zones.csv`.
+        title: title of the figure.
+        hours: of the day.
+        courses: `occupancy` and `paid` by zone and hour, (n_zones, n_hours) each.
         path: file to write.
 
     Raises:
         InputError: the file cannot be written.
     """
-    names = ("agents", "knows", "share", "arrivals_per_hour")
-    first = max(reversed(zones), key=lambda row: row["knows"] == "own")
-    its = [row for row in hours if all(row[name] == first[name] for name in names)]
-    days = len({row["day"] for row in its})
-    title = f"{first['scenario']}: zones, {first['agents']}, {_demand(first['arrivals_per_hour'])}"
+    at = [hour + 0.5 for hour in hours]
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(5.8, 6.2), layout="constrained")
-        axes = figure.subplot_mosaic([["map", "map"], ["taken", "paid"]], height_ratios=(1.3, 1.0))
+        axes = figure.subplot_mosaic([["map", "map"], ["occupancy", "paid"]], height_ratios=(1.3, 1.0))
         draw_zones(lot, axes["map"])
-        for zone, color in zip(lot.zones, zone_colors(lot), strict=True):
-            for ax, column, scale in ((axes["taken"], "occupancy", 100.0), (axes["paid"], "paid", 1.0)):
-                sums: dict[int, float] = {}
-                for row in its:
-                    if row["zone"] == zone:
-                        sums[row["hour"]] = sums.get(row["hour"], 0.0) + scale * row[column] / days
-                at = [hour + 0.5 for hour in sorted(sums)]
-                ax.plot(at, [sums[hour] for hour in sorted(sums)], color=color, marker="o", markersize=4)
-        axes["taken"].set(ylabel="%", ylim=(0.0, 100.0), title="Slots taken")
+        for number, color in enumerate(zone_colors(lot)):
+            for name, scale in (("occupancy", 100.0), ("paid", 1.0)):
+                axes[name].plot(at, scale * courses[name][number], color=color, marker="o", markersize=4)
+        axes["occupancy"].set(ylabel="%", ylim=(0.0, 100.0), title="Slots taken")
         axes["paid"].set(title="Paid an hour, when cars park", ylim=(0.0, None))
-        for name in ("taken", "paid"):
-            _mark_hours(axes[name], [row["hour"] for row in its])
+        for name in ("occupancy", "paid"):
+            _mark_hours(axes[name], hours)
             axes[name].grid(visible=True)
         figure.suptitle(title, x=0.01, ha="left")
         save_picture(figure, path, f"{title}: map, slots taken and revenue by hour.")

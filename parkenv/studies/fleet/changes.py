@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.show.plurals import plural
-from parkenv.studies.fleet.setting import CAR_LISTS, OWN, SETTING_COLUMNS, rate_text
+from parkenv.studies.fleet.setting import CAR_LISTS, NOWHERE, OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.fleet.tables import day_means, paired_days
 from parkenv.studies.results import Row
 
@@ -18,8 +18,6 @@ NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
 LEAST_DAYS = 5
 """Days below which nothing is called better or worse: with fewer, a bootstrap interval covers less than 95 %."""
-NOWHERE = "no slot"
-"""Stands for the zone of the cars that found no slot before."""
 _SHOWN_S = 0.05  # a part of a change that is said
 CHANGES = (
     "change_s", "members_change_s", "others_change_s", "search_change_s", "parking_cost_change_s", "gave_up_change_s",

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.engine.fleet import Fleet
+from parkenv.studies.fleet.blocks import has_zones, paid
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
 from parkenv.studies.fleet.setting import BY_HOUR
-from parkenv.studies.fleet.zones import has_zones, paid
 from parkenv.world.cost_terms import COST_FIELDS
+from parkenv.world.drive_graph import linestrings
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import HOUR_S
 
@@ -32,19 +35,33 @@ class Roads:
         lot = problem.lot
         entries = np.unique(lot.entry_vertices)
         metres = dijkstra(lot.drive_matrix(), indices=entries)[:, : lot.n_slots]
-        self._metres = dict(zip(map(int, entries), metres, strict=True))
-        self._entries, self._drive_s = entries, metres / problem.v_drive
+        self._entries, self._metres, self._drive_s = entries, metres, metres / problem.v_drive
         self._problem, self._cost_s = problem, problem.walk_s + lot.slot_parking_cost_s
         self.first_slot_m = float(metres.min(axis=1).mean())
         free_s, zones = self._drive_s + self._cost_s, range(len(lot.zones))
         # By entry and zone, without prices.
         self._alone_s = np.stack([free_s[:, lot.zone_of_slot == zone].min(axis=1) for zone in zones], axis=1)
 
-    def metres(self, cars: NDArray[np.void]) -> FloatArray:
-        """Return the shortest drive of parked cars from entry to slot, (n,) m."""
-        return np.array(
-            [self._metres[int(e)][s] for e, s in zip(cars["entry"], cars["slot"], strict=True)], np.float64
-        )
+    def direct_m(self, cars: NDArray[np.void]) -> FloatArray:
+        """Return the shortest drive of cars from their entries to their slots, (n,) m; 0 without a slot."""
+        rows = np.searchsorted(self._entries, cars["entry"])
+        return np.where(cars["slot"] >= 0, self._metres[rows, cars["slot"]], 0.0)
+
+    def cruised_m(self, cars: NDArray[np.void]) -> FloatArray:
+        """Return what the drives of cars exceed the shortest ones by, (n,) m: all of it without a slot."""
+        return np.maximum(cars["driven_m"] - self.direct_m(cars), 0.0)
+
+    @cached_property
+    def lane_of_edge(self) -> IntArray:
+        """Lane of each edge of the drive graph, (n_vertices, 4): the nearest to its middle."""
+        lot = self._problem.lot
+        ends = lot.vertex_xy[lot.neighbors]
+        middle = (lot.vertex_xy[:, None] + ends).reshape(-1, 2) / 2
+        tree = shapely.STRtree(linestrings([lane.points for lane in lot.lanes]))
+        edge, lane = tree.query_nearest(shapely.points(middle), all_matches=False)
+        found = np.zeros(len(middle), np.int64)
+        found[edge] = lane
+        return found.reshape(lot.neighbors.shape)
 
     def alone_s(self, cars: NDArray[np.void]) -> FloatArray:
         """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster."""
@@ -97,9 +114,7 @@ def day_measures(
     """
     cars, amounts = fleet.cars, paid(fleet)
     times, parked = cars["total_s"], cars["slot"] >= 0
-    direct_m = np.zeros(len(cars))
-    direct_m[parked] = roads.metres(cars[parked])
-    cruised_m = np.maximum(cars["driven_m"] - direct_m, 0.0)
+    cruised_m = roads.cruised_m(cars)
     driven_m = float(cars["driven_m"].sum())
     return {
         "cars": len(cars),

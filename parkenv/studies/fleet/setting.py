@@ -13,6 +13,8 @@ from parkenv.studies.results import Row
 from parkenv.world.cost_terms import COST_FIELDS
 
 OWN = "own"
+NOWHERE = "no slot"
+"""Stands for the block, and the zone, of cars that find no slot."""
 COUNTED = "counted"
 """Arrivals with which the lot becomes as full as counted, or as its world says; `1.2x` are so many times these."""
 MAX_PER_HOUR = 1e6
@@ -95,6 +97,10 @@ class Setting:
             "scenario": self.scenario, "agents": self.agent.label, "knows": self.knows, "share": self.share,
             "arrivals_per_hour": self.arrivals_per_hour,
         }  # fmt: skip
+
+    def holds(self, row: Row) -> bool:
+        """Return whether a row is about this setting."""
+        return all(row[name] == value for name, value in self.columns.items())
 
     def __str__(self) -> str:
         _, agent, knows, share, rate = self.columns.values()

@@ -251,6 +251,14 @@ class FleetStudy(Study):
             for name in self.built
         ]
 
+    @property
+    def shown_settings(self) -> list[Setting]:
+        """One setting of each scenario, to be drawn: the last one where nobody knows more than it observes, if any."""
+        by_scenario: dict[str, Setting] = {}
+        for setting in sorted(self.fleet_settings, key=lambda one: one.knows == OWN):
+            by_scenario[setting.scenario] = setting
+        return [by_scenario[name] for name in self.built]
+
     def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
         """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled.
 
@@ -293,9 +301,9 @@ class FleetStudy(Study):
         """
         import numpy as np
 
+        from parkenv.studies.fleet.blocks import Blocks, Tally, day_rows
         from parkenv.studies.fleet.clairvoyant_bound import clairvoyant_bound_s
         from parkenv.studies.fleet.measures import car_lists, day_measures, filling
-        from parkenv.studies.fleet.zones import ZONES, has_zones, zone_rows
         from parkenv.world.occupancy.process import Arrival
 
         fleet, agents = self.fleet(setting)
@@ -304,12 +312,14 @@ class FleetStudy(Study):
         bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
         window, occupancy = fleet.scenario.arrival, fleet.scenario.occupancy
         times = fleet.begin + np.arange(0.0, window.end_s - window.start_s, SAMPLE_S)
-        taken = []
+        taken, tally = [], Tally(fleet, roads)
         try:
             for time in times:
                 fleet.run(agents, until=float(time))
                 taken.append(fleet.taken())
+                tally.update()
             fleet.run(agents)
+            tally.update()
         except InputError as error:
             raise InputError(f"{setting}, day {day}, {error}") from error
         counted = np.full(len(times), np.nan)
@@ -320,8 +330,9 @@ class FleetStudy(Study):
         measured = day_measures(fleet, roads, members, filled, bound_s)
         lists = car_lists(fleet, members) if self._lists_cars else {}
         row = {**setting.columns, "day": day}
-        zones = zone_rows(fleet, times, np.array(taken)) if has_zones(fleet.scenario) else []
-        return {**row, **measured, **lists, ZONES.file: [row | zone for zone in zones]}
+        blocks = Blocks.of(fleet.scenario.lot)
+        of_tables = day_rows(fleet, blocks, tally, roads.cruised_m(fleet.cars), times, np.array(taken))
+        return {**row, **measured, **lists, **{file: row | its for file, its in of_tables.items()}}
 
     @property
     def _lists_cars(self) -> bool:
@@ -362,19 +373,16 @@ class FleetStudy(Study):
 
     @property
     def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
-        """See `Study`: what happens in zones, too, if there are any."""
-        from parkenv.studies.fleet.zones import ZONES, has_zones
+        """See `Study`: what happens in blocks, lanes and hours, too."""
+        from parkenv.studies.fleet.blocks import TABLES
 
-        return (self.table, ZONES) if any(map(has_zones, self.built.values())) else (self.table,)
+        return (self.table, *TABLES)
 
     def keep(self, work: Setting, rows: Sequence[Row], results: Results) -> None:
-        """See `Study`: what happened in zones."""
-        from parkenv.studies.fleet.zones import ZONES
-
+        """See `Study`: what happened in blocks, lanes and hours."""
         del work
-        for row in rows:
-            if zones := row.pop(ZONES.file):
-                results.add(zones, ZONES, sync=False)
+        for table in self.all_tables[1:]:
+            results.add([row.pop(table.file) for row in rows], table, sync=False)
 
     def label(self, work: Setting) -> str:
         """See `Study`."""
@@ -382,10 +390,16 @@ class FleetStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
+        from parkenv.studies.fleet.blocks import BLOCKS, has_zones, summarize_blocks
         from parkenv.studies.fleet.changes import summarize_changes
         from parkenv.studies.fleet.tables import summarize_days, summarize_hours
 
         days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
+        keys = [key for work, items in self.cells() for item in items for key in self.keys(work, item)]
+        for table in self.all_tables[1:]:
+            results.put_in_order(keys, table)
+        blocks = results.rows(BLOCKS)
+        zoned = [row for key in keys if (row := blocks.get(key)) and has_zones(self.built[row["scenario"]])]
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
         prices = {
@@ -398,21 +412,8 @@ class FleetStudy(Study):
             "rows": summarize_days(days),
             "changes": summarize_changes(days, prices),
             "hours": summarize_hours(days, int(first)),
-            "zones": self._zones(results),
+            "zones": summarize_blocks(zoned, "zone", prices),
         }
-
-    def _zones(self, results: Results) -> list[Row]:
-        """Put the rows of zones, if there are any, in the order of settings and days, and summarise them."""
-        from parkenv.studies.fleet.zones import ZONES, summarize_zones
-
-        if ZONES not in self.all_tables:
-            return []
-        rows = results.rows(ZONES)
-        days = (key for work, items in self.cells() for item in items for key in self.keys(work, item))
-        order = {key: number for number, key in enumerate(days)}
-        keys = sorted((key for key in rows if key[:-2] in order), key=lambda key: order[key[:-2]])
-        results.put_in_order(keys, ZONES)
-        return summarize_zones([rows[key] for key in keys])
 
     @property
     def title(self) -> str:
@@ -427,8 +428,8 @@ class FleetStudy(Study):
         from parkenv.files.file_names import file_name
         from parkenv.show.figures.fleet import save_fleet_figure, save_zones_figure
         from parkenv.show.plurals import plural
+        from parkenv.studies.fleet.blocks import BLOCKS, by_hour, has_zones
         from parkenv.studies.fleet.measures import looks_s
-        from parkenv.studies.fleet.zones import ZONES
 
         tasks: list[Task[object]] = [
             partial(
@@ -441,19 +442,22 @@ class FleetStudy(Study):
             )
             for name, scenario in self.built.items()
         ]
-        for name, scenario in self.built.items():
-            zones = [row for row in result.summary["zones"] if row["scenario"] == name]
-            if zones:
-                hours = [row for row in result.results.rows(ZONES).values() if row["scenario"] == name]
-                file = file_name("zones" if len(self.built) == 1 else f"zones_{name}", ".png")
-                tasks.append(partial(save_zones_figure, scenario.lot, zones, hours, result.folder / file))
+        for setting in self.shown_settings:
+            scenario = self.built[setting.scenario]
+            days = [row for row in result.results.rows(BLOCKS).values() if setting.holds(row)]
+            if has_zones(scenario) and days:
+                name = "zones" if len(self.built) == 1 else f"zones_{setting.scenario}"
+                title = f"{setting.scenario}: zones, {setting.agent.label}, {rate_text(setting.arrivals_per_hour)}"
+                _, hours, courses = by_hour(days, "zone")
+                path = result.folder / file_name(name, ".png")
+                tasks.append(partial(save_zones_figure, scenario.lot, title, hours, courses, path))
         return tasks
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: what competition costs, for each agent and demand."""
         from parkenv.studies.fleet.changes import sentence, shown_changes
-        from parkenv.studies.fleet.tables import departures
+        from parkenv.studies.fleet.tables import ONE_DAY, departures
 
         shown: dict[tuple[Any, ...], Row] = {}
         for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
@@ -476,6 +480,7 @@ class FleetStudy(Study):
                 )
             findings.append(f"{finding}.")
         findings += [sentence(row) for row in changes if row["change"] == "knows"]
+        findings += [ONE_DAY] if all(row["days"] == 1 for row in summary["rows"]) else []
         return findings + departures(summary["hours"], summary["rows"])
 
     @classmethod

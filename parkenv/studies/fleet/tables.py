@@ -23,6 +23,8 @@ DIFFERENCES = {
     "others_difference_s": "others_s",
 }
 """Columns of paired differences, and the measures that are compared."""
+ONE_DAY = "One day has no interval: a difference may be chance. Five days or more (-n 5) tell."
+"""Said where each setting has one day."""
 Pairs = list[tuple[Row, Row]]
 """The same days in two settings."""
 

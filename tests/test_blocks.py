@@ -1,0 +1,88 @@
+"""What a day with many cars tells: blocks, lanes and hours, in which no car, metre or coin is lost."""
+
+import json
+
+import numpy as np
+import pytest
+from small_lots import features
+
+from parkenv import ParkingLot, fleet
+from parkenv.engine.records import STATES
+from parkenv.lots import packaged_lot, write_lot
+from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """Two days in a small lot of two zones, one with a price, in which some cars find no slot."""
+    folder, plain = tmp_path_factory.mktemp("blocks"), packaged_lot("mini")
+    zone = np.where(plain.walk_m() <= np.median(plain.walk_m()), "centre", "")
+    write_lot(ParkingLot(**features(plain) | {"slot_zone": zone}), folder / "zoned.geojson")
+    spec = {
+        "lot": str(folder / "zoned.geojson"),
+        "costs": {"prices": {"centre": 3.0}},
+        "arrivals": {"hours": "08:30-10:30"},
+    }
+    found = fleet(
+        scenarios=[spec], agents=("random",), arrivals_per_hour=(60.0,), knows=("own",), days=2, patience_s=200.0,
+        jobs=1, folder=folder / "run",
+    )  # fmt: skip
+    its, cars = found.study, []
+    for day in range(2):
+        world, agents = its.fleet(its.fleet_settings[0])
+        world.reset(its.seed, day)
+        world.run(agents)
+        cars.append(world.cars)
+    return found, cars
+
+
+def columns(run, table):
+    """The rows of a table, as arrays by column, one for each day."""
+    rows = run[0].results.rows(table).values()
+    return [{name: np.array(row[name]) for name in (*table.line_keys, *table.columns)} for row in rows]
+
+
+def test_every_car_is_somewhere_at_the_end_of_each_hour(run):
+    for day, cars in zip(columns(run, HOURS), run[1], strict=True):
+        assert (sum(day[state] for state in STATES) == len(cars)).all()
+        assert day["due"][-1] == day["searching"][-1] == 0
+        assert day["balked"][-1] == (cars["slot"] < 0).sum() > 0
+
+
+def test_blocks_hold_all_cars_attempts_seconds_metres_and_coins(run):
+    for blocks, hours, cars in zip(columns(run, BLOCKS), columns(run, HOURS), run[1], strict=True):
+        assert blocks["arrivals"].sum() == len(cars)
+        assert blocks["refused"].sum() == cars["failed_parks"].sum() > 0
+        search_s = cars["ended_at"] - cars["arrival"]
+        for name, of_cars in (("search_s", search_s), ("walk_s", cars["walk_s"])):
+            total = np.nansum(blocks[name] * blocks["arrivals"])
+            assert total == pytest.approx(of_cars.sum(), abs=0.005 * len(cars))
+        # Cars that are parked at the end of an hour have come and not left, block by block.
+        inside = blocks["block"] != NOWHERE
+        for hour, parked in zip(hours["hour"], hours["parked"], strict=True):
+            until = inside & (blocks["hour"] <= hour)
+            assert (blocks["arrivals"] - blocks["departures"])[until].sum() == parked
+        centre = blocks["block"] == "centre"
+        assert blocks["paid"][centre].sum() == pytest.approx(blocks["paid"].sum())
+        assert set(blocks["slots"][centre]) == {5}
+
+
+def test_detours_of_lanes_are_those_of_cars(run):
+    days = run[0].results.of(run[0].study, run[0].study.cells()[0])
+    for lanes, blocks, day, cars in zip(columns(run, LANES), columns(run, BLOCKS), days, run[1], strict=True):
+        assert lanes["driven_m"].sum() == pytest.approx(cars["driven_m"].sum(), rel=1e-3)
+        assert lanes["cruised_m"].sum() == pytest.approx(day["cruised_m"] * len(cars), rel=1e-3)
+        assert np.nansum(blocks["cruised_m"] * blocks["arrivals"]) == pytest.approx(
+            lanes["cruised_m"].sum(), rel=1e-3
+        )
+        assert (lanes["cruised_m"] <= lanes["driven_m"]).all()
+
+
+def test_tables_are_read_as_they_were_written_and_the_last_of_two_equal_lines_counts(run):
+    folder = run[0].folder
+    for table in (BLOCKS, LANES, HOURS):
+        rows = table.read(folder)
+        assert json.dumps(rows) == json.dumps(list(run[0].results.rows(table).values()))
+        table.append(folder, rows[:1], sync=False)
+        assert json.dumps(table.read(folder)) == json.dumps(rows)
+        table.write(folder, rows)
