@@ -109,4 +109,4 @@ def test_no_fleet_is_below_it(knows):
             fleet.reset(2, day)
             bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
             fleet.run(agents)
-            assert roads.alone_s(fleet.cars).sum() - 1e-4 <= bound_s <= fleet.cars["total_s"].sum()
+            assert roads.alone_s(fleet).sum() - 1e-4 <= bound_s <= fleet.cars["total_s"].sum()

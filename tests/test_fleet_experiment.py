@@ -95,7 +95,7 @@ def test_nobody_is_faster_than_alone():
     fleet, agents = its.fleet(its.fleet_settings[0])
     fleet.reset(1)
     fleet.run(agents)
-    assert (fleet.cars["total_s"] >= roads.alone_s(fleet.cars) - 1e-9).all()
+    assert (fleet.cars["total_s"] >= roads.alone_s(fleet) - 1e-9).all()
     parked = fleet.cars[fleet.cars["slot"] >= 0]
     assert (parked["driven_m"] >= roads.direct_m(parked) - 1e-9).all()
 

@@ -66,7 +66,7 @@ from parkenv.world.demand import Demand
 from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, draw_arrival
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.python_functions import raise_error
-from parkenv.world.scenario import SearchProblem
+from parkenv.world.scenario import Drivers, SearchProblem
 from parkenv.world.week import DAY_S
 from parkenv.world.week_hours import hour_of_week
 
@@ -363,14 +363,14 @@ class Fleet:
         self._cars = cars
         capacity = max(n, sum(len(one.records) for one in self._pool))
         self._record["n_cars"], self._record["n_free"] = n, 0
-        if self.scenario.tariff:
-            zone_cost_s = self.scenario.zone_cost_s(cars["stay_s"])
-            if not np.isfinite(zone_cost_s).all():
+        if self.scenario.has_rules:
+            drivers = self.drivers_of(slice(None))
+            if not np.isfinite(self.scenario.zone_price(drivers)).all():
                 raise InputError(
                     "Demand.stays: a stay is infinite, want finite ones where parking has a price"
                 )
-            self._keep({"zone_cost_s": zone_cost_s})
-            self._record["n_zones"] = zone_cost_s.shape[1]
+            self._keep({"zone_cost_s": self.scenario.zone_cost_s(drivers)})
+            self._record["n_zones"] = len(self.scenario.lot.zones)
         self._keep(
             {
                 "cars": cars,
@@ -561,7 +561,16 @@ class Fleet:
     def arrival_cost_s(self, car: int) -> NDArray[np.float64]:
         """Return what arriving in each slot costs a car, (n_slots,) s: walk, and parking for its own stay."""
         problem = self.scenarios[self._cars["place"][car]]
-        return np.asarray(problem.walk_s + problem.parking_cost_of(self._cars["stay_s"][car]))
+        return np.asarray(problem.walk_s + problem.parking_cost_of(self.drivers_of(car)))
+
+    def zone_cost_s(self) -> NDArray[np.float64]:
+        """Return what parking in each zone costs each car, (n_cars, n_zones) s; see `SearchProblem.zone_cost_s`."""
+        return self.scenario.zone_cost_s(self.drivers_of(slice(None)))
+
+    def drivers_of(self, cars: Any) -> Drivers:
+        """Return what decides where some cars, an index of `cars`, may park and what it costs them."""
+        one = self.scenario.driver
+        return one._replace(stay_s=self._cars["stay_s"][cars], arrival_s=self._cars["arrival"][cars])
 
     # ---- what is known of cars and slots
 
@@ -574,7 +583,7 @@ class Fleet:
             further["reserved"] = spaces.Box(-1, 1, (lot.n_slots,), np.int8)
         if self.leaving_soon_s > 0.0:
             further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
-        if self.scenario.tariff:
+        if self.scenario.has_rules:
             further["stay_s"] = spaces.Box(0.0, np.inf, (1,), np.float32)
         if self.sees_cars:
             further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
@@ -600,7 +609,7 @@ class Fleet:
             observation["reserved"] = mine.astype(np.int8) - np.int8(record["reserved"] == UNGUIDED)
         if self.leaving_soon_s > 0.0:
             observation["leaving"] = self._leaving_in_view(int(vertex))
-        if self.scenario.tariff:
+        if self.scenario.has_rules:
             observation["stay_s"] = np.float32(self._cars["stay_s"][[car]])
         if self.sees_cars:
             observation["cars"] = self._cars_in_view(car, int(vertex))

@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.quality import QualityIssue
 from parkenv.world.drive_graph import GraphError
+from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, ParkingLot
+from parkenv.world.tariff import Zone
 
 NEAR_ON_GLOBE = 1.0
 """Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""
@@ -103,6 +106,10 @@ class LotDraft:
     frame: LocalFrame | None = None  # geographic frame of the lot; None if the file has none
     # (k, 2) m, centres of slots whose shape is unknown; for figures
     loose: FloatArray = field(default_factory=lambda: np.empty((0, 2)))
+    facilities: tuple[Facility, ...] = ()  # counted ones need no slot here
+    zone_rules: Mapping[str, Zone] = field(default_factory=dict)
+    goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_goals,)
+    entry_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_entries,)
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> LotDraft:
@@ -117,6 +124,10 @@ class LotDraft:
             goals=lot.goals,
             walls=lot.walls,
             found=(f"slots: {lot.n_slots}, lanes: {len(lot.lanes)}, of a lot file",),
+            facilities=lot.facilities,
+            zone_rules=lot.zone_rules,
+            goal_weights=lot.goal_weights,
+            entry_weights=lot.entry_weights,
         )
 
     def lot(self) -> ParkingLot:
@@ -125,42 +136,66 @@ class LotDraft:
         Raises:
             InputError: something is missing or the parts do not fit together; the message gives details.
         """
-        if self.missing:
-            raise InputError("; ".join(self.missing))
         try:
-            return ParkingLot(
-                name=self.name,
-                slot_ids=self.slot_ids,
-                **self.slots.columns(),
-                lanes=self.lanes,
-                entries=self.entries,
-                goals=self.goals,
-                walls=self.walls,
-            )
+            return self._lot()
         except GraphError as error:
             problem = error.problems[0]
             what = f"slot {self.slot_ids[problem.index]!r}" if problem.kind == "slot" else problem.kind
             raise InputError(f"{what} {problem.message}") from error
 
+    def _lot(self) -> ParkingLot:
+        if self.missing:
+            raise InputError("; ".join(self.missing))
+        return ParkingLot(
+            name=self.name,
+            slot_ids=self.slot_ids,
+            **self.slots.columns(),
+            lanes=self.lanes,
+            entries=self.entries,
+            goals=self.goals,
+            walls=self.walls,
+            facilities=self.facilities,
+            zone_rules=self.zone_rules,
+            goal_weights=self.goal_weights,
+            entry_weights=self.entry_weights,
+        )
+
     def searchable(self) -> LotDraft:
-        """Return the draft without slots that cannot be reached from an entry; they are listed in `left_out`.
+        """Return the draft without slots and facilities that no entry leads to; they are listed in `left_out`.
 
         An incomplete draft is returned unchanged.
         """
         try:
-            lot = self.lot()
+            lot = self._lot()
+        except GraphError as error:
+            if error.problems[0].kind != "facility":
+                return self
+            names = tuple(self.facilities[problem.index].name for problem in error.problems)
+            lost = np.isin(self.slots.facility, names)
+            return self._without(lost, LeftOut("facilities that no entry leads to", names)).searchable()
         except InputError:
             return self
         far = ~np.isfinite(dijkstra(lot.drive_matrix(), indices=lot.entry_vertices, min_only=True))
-        lost = far[: lot.n_slots]
+        lost = far[: len(self.slot_ids)]
         if not lost.any() or lost.all():
             return self
-        kept = np.flatnonzero(~lost)
         ids = tuple(self.slot_ids[i] for i in np.flatnonzero(lost))
+        return self._without(lost, LeftOut("slots that cannot be reached from an entry", ids))
+
+    def _without(self, lost: BoolArray, left_out: LeftOut) -> LotDraft:
+        """Return the draft without slots, (n_slots,) bool, and facilities that are left out or have no slots then."""
+        kept = np.flatnonzero(~lost)
+        slots = self.slots[kept]
+        named = set(slots.facility.tolist())
         return replace(
             self,
             slot_ids=tuple(self.slot_ids[i] for i in kept),
-            slots=self.slots[kept],
+            slots=slots,
             slot_source=tuple(self.slot_source[i] for i in kept),
-            left_out=(*self.left_out, LeftOut("slots that cannot be reached from an entry", ids)),
+            left_out=(*self.left_out, left_out),
+            facilities=tuple(
+                facility
+                for facility in self.facilities
+                if (facility.is_counted and facility.name not in left_out.ids) or facility.name in named
+            ),
         )

@@ -30,7 +30,7 @@ BUILDING_SETBACK = TWO_WAY_HALF_WIDTH + KERB_SIZE[1] + 2.9
 class Slots:
     """The columns of n slots: each field `name` is the column `slot_name` of `ParkingLot`.
 
-    An empty `parking_cost_s` means zeros, an empty `zone` none.
+    An empty `parking_cost_s` means zeros, an empty `zone` or `facility` none.
     """
 
     xy: FloatArray
@@ -40,12 +40,12 @@ class Slots:
     mouth: NDArray[np.int8]
     parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     zone: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+    facility: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
 
     def __post_init__(self) -> None:
-        if not len(self.parking_cost_s):
-            object.__setattr__(self, "parking_cost_s", np.zeros(len(self.xy)))
-        if not len(self.zone):
-            object.__setattr__(self, "zone", np.zeros(len(self.xy), np.str_))
+        for name, dtype in (("parking_cost_s", np.float64), ("zone", np.str_), ("facility", np.str_)):
+            if not len(getattr(self, name)):
+                object.__setattr__(self, name, np.zeros(len(self.xy), dtype))
 
     def __len__(self) -> int:
         return len(self.xy)

@@ -164,7 +164,7 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
     if recognised:
         draft = replace(draft, found=(recognised, *draft.found))
     if options.goals:
-        draft = replace(draft, goals=points_in_frame(None, options.goals))
+        draft = replace(draft, goals=points_in_frame(None, options.goals), goal_weights={})
     if options.entries:
-        draft = replace(draft, entries=points_in_frame(None, options.entries))
+        draft = replace(draft, entries=points_in_frame(None, options.entries), entry_weights={})
     return draft

@@ -144,7 +144,7 @@ def build(spec: ScenarioSpec) -> Scenario:
         lot = _lot(spec.lot)
         goal = 0
         if isinstance(spec.goal, tuple):
-            lot = dataclasses.replace(lot, goals=np.array([spec.goal]))
+            lot = dataclasses.replace(lot, goals=np.array([spec.goal]), goal_weights={})
         else:
             goal = spec.goal
         if not goal < len(lot.goals):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import TYPE_CHECKING
@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest, require_number
 from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
-from parkenv.world.tariff import NO_ZONE
+from parkenv.world.facility import NOMINAL_SLOT, Facility, facility_problem, nominal_slots
+from parkenv.world.tariff import NO_ZONE, PUBLIC, Zone
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -94,7 +95,14 @@ class ParkingLot:
         walls: polylines, (k, 2) m each; they block the view, not pedestrians.
         slot_parking_cost_s: (n_slots,) float64, s, at least 0: cost of parking in each slot, as time. A price is
             converted by the value of time: 2 € at 12 € per hour are 600 s. Empty: all 0.
-        slot_zone: (n_slots,) str, tariff zone of each slot; empty text: none. Empty: none has one.
+        slot_zone: (n_slots,) str, tariff zone of each slot; empty text: that of its facility, or none. Empty: none has
+            one.
+        slot_facility: (n_slots,) str, facility of each slot; empty text: none. Empty: none has one.
+        facilities: kerbs, car parks and garages. A counted one is the slot of its name: the last slots are the counted
+            facilities in their order, and are appended where they are missing.
+        zone_rules: rules of zones, by name; empty: zones have none, and prices come from the scenario alone.
+        goal_weights: how much demand each goal attracts, (n_goals,) float64 by purpose of the drivers; empty: unknown.
+        entry_weights: how much demand comes from each entry, (n_entries,) float64 by purpose; empty: unknown.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
@@ -104,10 +112,15 @@ class ParkingLot:
         entry_vertices: (n_entries,) int64, the vertex of each entry.
         zones: names of the zones, sorted; `NO_ZONE` stands for slots without one.
         zone_of_slot: (n_slots,) int64, index into `zones`.
+        facility_of_slot: (n_slots,) int64, index into `facilities`; -1: none.
+        capacity: (n_slots,) int64, number of cars that fit: 1, but for counted facilities.
+        classes: classes of users that the rules name, `public` first.
 
     Raises:
-        InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal.
-        GraphError: slots or entries out of reach of all lanes, or more than four lanes out of one junction.
+        InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal, a name of a
+            facility or zone that the lot does not have.
+        GraphError: slots, entries or facilities out of reach of all lanes, more than four lanes out of one junction, or
+            a counted facility that no entry leads to.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -131,6 +144,11 @@ class ParkingLot:
     walls: tuple[FloatArray, ...] = ()
     slot_parking_cost_s: FloatArray = field(default_factory=lambda: np.zeros(0))
     slot_zone: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+    slot_facility: NDArray[np.str_] = field(default_factory=lambda: np.zeros(0, np.str_))
+    facilities: tuple[Facility, ...] = ()
+    zone_rules: Mapping[str, Zone] = field(default_factory=dict)
+    goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)
+    entry_weights: Mapping[str, FloatArray] = field(default_factory=dict)
 
     vertex_xy: FloatArray = field(init=False)
     vertex_yaw: FloatArray = field(init=False)
@@ -139,17 +157,23 @@ class ParkingLot:
     entry_vertices: NDArray[np.int64] = field(init=False)
     zones: tuple[str, ...] = field(init=False)
     zone_of_slot: NDArray[np.int64] = field(init=False)
+    facility_of_slot: NDArray[np.int64] = field(init=False)
+    capacity: NDArray[np.int64] = field(init=False)
+    classes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         def set_field(name: str, value: object) -> None:
             object.__setattr__(self, name, value)
 
-        self._require_names()
-        n = len(self.slot_ids)
         set_field("slot_ids", tuple(self.slot_ids))
         set_field("lanes", tuple(self.lanes))
+        set_field("facilities", tuple(self.facilities))
+        self._set_counted(set_field)
+        self._require_names()
+        n = len(self.slot_ids)
         if np.size(self.slot_parking_cost_s) == 0:
             set_field("slot_parking_cost_s", np.zeros(n))
+        self._set_facilities(set_field)
         self._set_zones(set_field)
         for name, shape in (
             ("slot_xy", (n, 2)),
@@ -177,12 +201,7 @@ class ParkingLot:
             raise InputError(f"lot {self.name!r}: slot_mouth must hold {n} values of {list(map(int, Mouth))}")
         mouth.flags.writeable = False
         set_field("slot_mouth", mouth)
-        walls = tuple(_frozen(wall, "walls") for wall in self.walls)
-        for wall in walls:
-            if wall.ndim != 2 or wall.shape[1] != 2 or len(wall) < 2:
-                raise InputError(f"lot {self.name!r}: a wall has shape {wall.shape}, want (at least 2, 2)")
-            _require_finite(f"lot {self.name!r}: walls", wall)
-        set_field("walls", walls)
+        self._set_walls(set_field)
         for kind, features in (("lane", self.lanes), ("entry", self.entries), ("goal", self.goals)):
             if len(features) == 0:
                 raise InputError(f"lot {self.name!r} has no {kind}")
@@ -194,6 +213,104 @@ class ParkingLot:
             values = getattr(graph, name)
             values.flags.writeable = False
             set_field(name, values)
+        self._require_reachable()
+        for name, points in (("goal_weights", self.goals), ("entry_weights", self.entries)):
+            set_field(name, self._weights(name, len(points)))
+
+    def _set_walls(self, set_field: Callable[[str, object], None]) -> None:
+        walls = tuple(_frozen(wall, "walls") for wall in self.walls)
+        for wall in walls:
+            if wall.ndim != 2 or wall.shape[1] != 2 or len(wall) < 2:
+                raise InputError(f"lot {self.name!r}: a wall has shape {wall.shape}, want (at least 2, 2)")
+            _require_finite(f"lot {self.name!r}: walls", wall)
+        set_field("walls", walls)
+
+    def _set_counted(self, set_field: Callable[[str, object], None]) -> None:
+        """Append the slots of counted facilities that are missing, and place all of them beside their lanes."""
+        counted = [facility for facility in self.facilities if facility.is_counted]
+        if not counted:
+            return
+        names, n = tuple(facility.name for facility in counted), len(self.slot_ids)
+        there = self.slot_ids[max(n - len(names), 0) :] == names
+        drawn = n - len(names) if there else n
+        xy, yaw = (
+            nominal_slots(self.facilities, [lane.points for lane in self.lanes])
+            if self.lanes
+            else (np.zeros((len(counted), 2)), np.zeros(len(counted)))
+        )
+        set_field("slot_ids", self.slot_ids[:drawn] + names)
+        for name, values in (
+            ("slot_xy", xy),
+            ("slot_yaw", yaw),
+            ("slot_length", np.full(len(names), NOMINAL_SLOT[0])),
+            ("slot_width", np.full(len(names), NOMINAL_SLOT[1])),
+            ("slot_mouth", np.full(len(names), Mouth.REAR)),
+            ("slot_parking_cost_s", np.zeros(len(names))),
+            ("slot_zone", np.array([facility.zone for facility in counted], np.str_)),
+            ("slot_facility", np.array(names, np.str_)),
+        ):
+            column = np.asarray(getattr(self, name))
+            if column.size == 0 and drawn:
+                column = np.zeros(drawn, values.dtype)
+            if len(column) not in (drawn, n):
+                raise InputError(f"lot {self.name!r}: {name} has {len(column)} values, want {n}")
+            set_field(name, np.concatenate([column[:drawn].reshape(-1, *values.shape[1:]), values]))
+
+    def _set_facilities(self, set_field: Callable[[str, object], None]) -> None:
+        """Number the facilities of the slots."""
+        n, what = len(self.slot_ids), f"lot {self.name!r}"
+        names = [facility.name for facility in self.facilities]
+        order = {name: i for i, name in enumerate(names)}
+        if len(order) < len(names):
+            repeated = next(name for i, name in enumerate(names) if name in names[:i])
+            raise InputError(f"{what}: facility {repeated!r:.40} appears twice")
+        given = np.array(self.slot_facility if np.size(self.slot_facility) else [""] * n, dtype=np.str_)
+        if given.shape != (n,):
+            raise InputError(f"{what}: slot_facility has shape {given.shape}, want ({n},)")
+        for name in set(given.tolist()) - {"", *names}:
+            raise InputError(f"{what} has no facility {name!r:.40}; {nearest(name, names)}")
+        index = np.array([order.get(name, -1) for name in given.tolist()], np.int64)
+        capacity = np.ones(n, np.int64)
+        n_slots = np.bincount(index[index >= 0], minlength=len(names))
+        for i, facility in enumerate(self.facilities):
+            if n_slots[i] == 0:
+                raise InputError(f"{what}: facility {facility.name!r:.40} has neither a capacity nor slots")
+            if facility.is_counted and n_slots[i] > 1:
+                raise InputError(
+                    f"{what}: facility {facility.name!r:.40} has a capacity, want no slots that name it"
+                )
+            if facility.is_counted:
+                capacity[index == i] = facility.capacity
+        for name, values in (("slot_facility", given), ("facility_of_slot", index), ("capacity", capacity)):
+            values.flags.writeable = False
+            set_field(name, values)
+
+    def _require_reachable(self) -> None:
+        """Require that an entry leads to every counted facility."""
+        counted = np.flatnonzero(self.is_counted)
+        if not len(counted):
+            return
+        from scipy.sparse.csgraph import dijkstra
+
+        reached = np.isfinite(dijkstra(self.drive_matrix(), indices=self.entry_vertices, min_only=True))
+        lost = self.facility_of_slot[counted[~reached[counted]]].tolist()
+        if lost:
+            reason = "cannot be reached from an entry"
+            raise GraphError([facility_problem(self.facilities[i], i, reason) for i in lost])
+
+    def _weights(self, name: str, count: int) -> dict[str, FloatArray]:
+        """Return validated weights by purpose."""
+        weights = {}
+        for purpose, given in getattr(self, name).items():
+            values = _frozen(given, f"lot {self.name!r}: {name}[{purpose!r:.40}]")
+            if values.shape != (count,):
+                raise InputError(
+                    f"lot {self.name!r}: {name}[{purpose!r:.40}] has shape {values.shape}, want ({count},)"
+                )
+            for value in values.tolist():
+                require_number(f"lot {self.name!r}: {name}[{purpose!r:.40}]", value, least=0.0)
+            weights[purpose] = values
+        return weights
 
     def _set_zones(self, set_field: Callable[[str, object], None]) -> None:
         """Number the zones of the slots, and require printable names."""
@@ -201,6 +318,10 @@ class ParkingLot:
         zone = np.array(self.slot_zone if np.size(self.slot_zone) else [""] * n, dtype=np.str_)
         if zone.shape != (n,):
             raise InputError(f"lot {self.name!r}: slot_zone has shape {zone.shape}, want ({n},)")
+        if self.facilities:
+            # One more for the index -1.
+            inherited = np.array([*(facility.zone for facility in self.facilities), ""])
+            zone = np.where(zone == "", inherited[self.facility_of_slot], zone)
         zone.flags.writeable = False
         set_field("slot_zone", zone)
         set_field("zones", tuple(sorted({name or NO_ZONE for name in zone.tolist()})))
@@ -211,6 +332,16 @@ class ParkingLot:
         for name in self.zones:
             if not is_plain(name):
                 raise InputError(f"lot {self.name!r}: zone {name!a:.60} has control characters")
+            if self.zone_rules and name != NO_ZONE and name not in self.zone_rules:
+                raise InputError(
+                    f"lot {self.name!r} has no rules of zone {name!r:.40}; {nearest(name, self.zone_rules)}"
+                )
+        set_field("zone_rules", dict(self.zone_rules))
+        for name, rules in self.zone_rules.items():
+            if name != rules.name:
+                raise InputError(f"lot {self.name!r}: zone_rules[{name!r:.40}] is of zone {rules.name!r:.40}")
+        users = {user for rules in self.zone_rules.values() for user in rules.users}
+        set_field("classes", (PUBLIC, *sorted(users - {PUBLIC})))
 
     def _require_names(self) -> None:
         """Require slots with different names, all of them printable."""
@@ -245,9 +376,22 @@ class ParkingLot:
         """Number of vertices of the drive graph: one per slot, then junctions and lane ends."""
         return len(self.vertex_xy)
 
+    @property
+    def is_counted(self) -> NDArray[np.bool_]:
+        """Whether each slot stands for a counted facility, (n_slots,) bool."""
+        counted = np.array([*(facility.is_counted for facility in self.facilities), False])
+        return counted[self.facility_of_slot]
+
+    def walk_from_xy(self) -> FloatArray:
+        """Where people begin to walk, (n_slots, 2) float64, m: the slot's centre, or a counted facility's point."""
+        points = [facility.xy for facility in self.facilities if facility.is_counted]
+        return (
+            np.concatenate([self.slot_xy[: self.n_slots - len(points)], points]) if points else self.slot_xy
+        )
+
     def walk_m(self, goal: int = 0) -> FloatArray:
         """Straight-line distance from each slot to a goal, (n_slots,) float64, m (eq. 3.25)."""
-        away = self.slot_xy - self.goals[goal]
+        away = self.walk_from_xy() - self.goals[goal]
         return np.asarray(np.hypot(away[:, 0], away[:, 1]))
 
     def mouth_xy(self) -> FloatArray:
@@ -338,6 +482,8 @@ def _same(a: object, b: object) -> bool:
         return np.array_equal(a, b)
     if isinstance(a, tuple) and isinstance(b, tuple):
         return len(a) == len(b) and all(map(_same, a, b))
+    if isinstance(a, Mapping) and isinstance(b, Mapping):
+        return a.keys() == b.keys() and all(_same(a[key], b[key]) for key in a)
     return a == b
 
 

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, require_keywords, require_number
+from parkenv.compiled.arrays import BoolArray, FloatArray
+from parkenv.errors import InputError, nearest, require_keywords, require_number
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
-from parkenv.world.tariff import HOUR_S, VALUE_OF_TIME, Tariff
+from parkenv.world.tariff import HOUR_S, VALUE_OF_TIME, Tariff, Zone
 from parkenv.world.traffic import Traffic
 
 KMH = 1 / 3.6  # 1 km/h in m/s
@@ -28,6 +29,16 @@ EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.fl
 
 Parking, and actions that the graph does not have, lead back to the same vertex.
 """
+
+
+class Drivers(NamedTuple):
+    """What decides where drivers may park and what it costs them: numbers, or arrays of one shape, (...)."""
+
+    stay_s: ArrayLike
+    arrival_s: ArrayLike  # s since Monday 00:00, from when the stay counts
+    value_of_time: ArrayLike  # of an hour, in the currency of the prices
+    classes: ArrayLike  # int64, sum of 2^i over the driver's classes `ParkingLot.classes[i]`
+    kwh: ArrayLike = 0.0  # charged while parked
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -46,6 +57,10 @@ class SearchProblem:
         tariff: prices of the lot's zones.
         stay_s: expected stay, s, which the price is for; in a fleet each car has its own.
         value_of_time: value of an hour of the driver's time, in the currency of the prices.
+        priced_at_s: clock time that prices and hours count from, s since Monday 00:00; in a fleet it is each car's
+            arrival.
+        classes: classes of users that the driver belongs to, beside `public`.
+        walk_back: whether the walk from the goal back to the car counts, too.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -62,6 +77,9 @@ class SearchProblem:
     tariff: Tariff = field(default_factory=Tariff)
     stay_s: float = HOUR_S
     value_of_time: float = VALUE_OF_TIME
+    priced_at_s: float = 34 * HOUR_S
+    classes: tuple[str, ...] = ()
+    walk_back: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.lot, ParkingLot):
@@ -74,13 +92,15 @@ class SearchProblem:
         self.tariff.require_zones(self.lot.zones, self.lot.name)
         for name in ("v_drive", "v_walk", "wait_s", "value_of_time"):
             require_number(name, getattr(self, name), above=0.0)
-        for name in ("failure_s", "give_up_s", "stay_s"):
+        for name in ("failure_s", "give_up_s", "stay_s", "priced_at_s"):
             require_number(name, getattr(self, name), least=0.0)
+        object.__setattr__(self, "classes", tuple(self.classes))
+        self.class_bits(self.classes)
 
     @cached_property
     def walk_s(self) -> FloatArray:
-        """Walk from each slot to the goal, (n_slots,) s (eq. 3.25)."""
-        return _read_only(self.lot.walk_m(self.goal) / self.v_walk)
+        """Walk from each slot to the goal, and back where that counts, (n_slots,) s (eq. 3.25)."""
+        return _read_only(self.lot.walk_m(self.goal) / self.v_walk * (2.0 if self.walk_back else 1.0))
 
     @cached_property
     def arrival_cost_s(self) -> FloatArray:
@@ -90,26 +110,71 @@ class SearchProblem:
     @cached_property
     def parking_cost_s(self) -> FloatArray:
         """Parking cost of each slot as time, (n_slots,) s: that of the lot, and the price of the expected stay."""
-        return _read_only(self.parking_cost_of(self.stay_s))
+        return _read_only(self.parking_cost_of(self.driver))
 
-    def parking_cost_of(self, stay_s: FloatArray | float) -> FloatArray:
-        """Return what stays of the driver cost in each slot, (..., n_slots) s: that of the lot, and the price."""
-        return self.lot.slot_parking_cost_s + self.zone_cost_s(stay_s)[..., self.lot.zone_of_slot]
+    @property
+    def driver(self) -> Drivers:
+        """The driver of the search."""
+        bits = self.class_bits(self.classes)
+        return Drivers(self.stay_s, self.priced_at_s, self.value_of_time, bits)
 
-    def zone_cost_s(self, stay_s: FloatArray | float) -> FloatArray:
-        """Return what stays of the driver cost in each of the lot's zones, (..., n_zones) s.
+    def class_bits(self, classes: Iterable[str]) -> int:
+        """Return the number that stands for classes of users in `Drivers`; `public` is always among them.
 
-        That is the price divided by the value of time; agents plan on it, and the reward charges it.
-
-        Args:
-            stay_s: (...) s, lengths of the stays.
+        Raises:
+            InputError: no zone of the lot names a class.
         """
-        return self.tariff.amounts(self.lot.zones, stay_s) * (HOUR_S / self.value_of_time)
+        known = self.lot.classes
+        for name in classes:
+            if name not in known:
+                raise InputError(
+                    f"classes has {name!r:.40}, no class of lot {self.lot.name!r:.40}; {nearest(name, known)}"
+                )
+        return sum(1 << i for i, name in enumerate(known) if i == 0 or name in classes)
+
+    @cached_property
+    def zone_rules(self) -> tuple[Zone, ...]:
+        """Rules of the lot's zones, in their order, with the prices of the tariff."""
+        return tuple(self.tariff.priced(self.lot.zone_rules.get(name, Zone(name))) for name in self.lot.zones)
+
+    def parking_cost_of(self, drivers: Drivers) -> FloatArray:
+        """Return what drivers pay in each slot as time, (..., n_slots) s: that of the lot, and `zone_cost_s`."""
+        return self.lot.slot_parking_cost_s + self.zone_cost_s(drivers)[..., self.lot.zone_of_slot]
+
+    def zone_cost_s(self, drivers: Drivers) -> FloatArray:
+        """Return what parking costs drivers in each of the lot's zones as time, (..., n_zones) s.
+
+        That is the price divided by the value of time, infinite where a driver may not park: in none of the zone's
+        classes of users, outside its hours, or for longer than its longest stay. Agents plan on it, and the reward
+        charges it.
+        """
+        seconds = HOUR_S / np.asarray(drivers.value_of_time, np.float64)[..., None]
+        return np.where(self.admits(drivers), self.zone_price(drivers) * seconds, np.inf)
+
+    def zone_price(self, drivers: Drivers) -> FloatArray:
+        """Return what drivers pay in each of the lot's zones, (..., n_zones) in the currency of the prices."""
+        arrival, stay, kwh = np.broadcast_arrays(drivers.arrival_s, drivers.stay_s, drivers.kwh)
+        return np.stack([zone.price.amount(arrival, stay, kwh) for zone in self.zone_rules], axis=-1)
+
+    def admits(self, drivers: Drivers) -> BoolArray:
+        """Return whether drivers may park in each of the lot's zones, (..., n_zones) bool."""
+        arrival, stay, classes = np.broadcast_arrays(drivers.arrival_s, drivers.stay_s, drivers.classes)
+        known = self.lot.classes
+        allowed = []
+        for zone in self.zone_rules:
+            users = sum(1 << i for i, name in enumerate(known) if name in zone.users)
+            allowed.append(((classes.astype(np.int64) & users) != 0) & zone.admits(arrival, stay))
+        return np.stack(allowed, axis=-1)
 
     @property
     def is_priced(self) -> bool:
         """Whether slots have prices or parking costs."""
-        return bool(self.tariff) or bool(self.lot.slot_parking_cost_s.any())
+        return self.has_rules or bool(self.lot.slot_parking_cost_s.any())
+
+    @cached_property
+    def has_rules(self) -> bool:
+        """Whether prices, hours, longest stays or classes tell drivers apart, or are stated, be they 0."""
+        return bool(self.tariff) or any(zone != Zone(zone.name) for zone in self.zone_rules)
 
     @cached_property
     def move_s(self) -> FloatArray:

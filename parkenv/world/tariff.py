@@ -1,18 +1,26 @@
-"""Tariffs: what parking in each zone of a lot costs, by the length of the stay."""
+"""Zones of a lot: who may park there, when and for how long, and what it costs by stay and clock time."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import pairwise
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, nearest, require_number
+from parkenv.files.file_names import is_plain
 
 NO_ZONE = "other"
 """Zone of the slots for which a lot names none."""
+PUBLIC = "public"
+"""The class of users that every driver belongs to."""
 VALUE_OF_TIME = 12.0
 """Default value of an hour of a driver's time, in the currency of the prices.
 
@@ -20,21 +28,269 @@ The US Department of Transportation values local personal travel at half of the 
 12.3 euros (Revised Departmental Guidance on Valuation of Travel Time in Economic Analysis, 2016).
 """
 HOUR_S = 3600.0
+DAY_S = 24 * HOUR_S
+WEEK_S = 7 * DAY_S
+DAYS = ("Mo", "Tu", "We", "Th", "Fr", "Sa", "Su")
+_RULE = re.compile(r"(?:(?P<days>[A-Z][a-z](?:[-,][A-Z][a-z])*) +)?(?P<times>off|\d?\d:\d\d-\d.*)")
+_SPAN = re.compile(r"(\d?\d):(\d\d)-(\d?\d):(\d\d)")
+
+
+@dataclass(frozen=True)
+class Hours:
+    """Hours of the week.
+
+    Args:
+        days: for each day from Monday on, pairs of begin and end, minutes since midnight.
+
+    Examples:
+        >>> hours = Hours.parse("Mo-Fr 08:00-18:00; Sa 09:00-13:00")
+        >>> float(hours.within(0.0, 2 * 86400.0)) / 3600
+        20.0
+    """
+
+    days: tuple[tuple[tuple[int, int], ...], ...]
+
+    @classmethod
+    def parse(cls, text: object, field: str = "hours") -> Hours:
+        """Read hours in OpenStreetMap's notation: `Mo-Fr 08:00-12:00,13:00-18:00; Sa 09:00-13:00`, or `24/7`.
+
+        A rule without days is for all of them, `off` empties its days, and a later rule replaces earlier ones on its
+        days. A span across midnight is written as two.
+
+        Args:
+            text: the hours.
+            field: what messages call them.
+
+        Raises:
+            InputError: another text, or a span that does not end after it begins.
+        """
+        if not isinstance(text, str):
+            raise InputError(f"{field} is {text!r:.40}, want a text such as 'Mo-Sa 08:00-20:00'")
+        days: list[tuple[tuple[int, int], ...]] = [()] * 7
+        for rule in text.replace("24/7", "00:00-24:00").split(";"):
+            match = _RULE.fullmatch(rule.strip())
+            if match is None:
+                raise InputError(f"{field} is {text!r:.40}, want hours such as 'Mo-Sa 08:00-20:00'")
+            spans = () if match["times"] == "off" else _spans(match["times"], field)
+            for day in _days(match["days"] or "Mo-Su", field):
+                days[day] = spans
+        return cls(tuple(days))
+
+    def __str__(self) -> str:
+        # Days with equal hours share a rule; `parse` reads the text back.
+        by_spans: dict[tuple[tuple[int, int], ...], list[str]] = {}
+        for name, spans in zip(DAYS, self.days, strict=True):
+            by_spans.setdefault(spans, []).append(name)
+        rules = []
+        for spans, names in by_spans.items():
+            times = ",".join(f"{a // 60:02}:{a % 60:02}-{b // 60:02}:{b % 60:02}" for a, b in spans) or "off"
+            whole = DAYS[DAYS.index(names[0]) :][: len(names)]
+            run = len(names) > 2 and list(whole) == names
+            rules.append(f"{f'{names[0]}-{names[-1]}' if run else ','.join(names)} {times}")
+        return "; ".join(rules)
+
+    @cached_property
+    def _week(self) -> tuple[FloatArray, FloatArray]:
+        """Times of the week, s, and the seconds of these hours before each; linear between."""
+        spans = [(DAY_S * d + 60.0 * a, DAY_S * d + 60.0 * b) for d in range(7) for a, b in self.days[d]]
+        edges = np.array([0.0, *(t for span in spans for t in span), WEEK_S])
+        open_s = np.diff(edges)
+        open_s[::2] = 0.0
+        return edges, np.r_[0.0, np.cumsum(open_s)]
+
+    def within(self, begin_s: ArrayLike, stay_s: ArrayLike) -> FloatArray:
+        """Return how many seconds of stays fall into these hours, (...) s.
+
+        Args:
+            begin_s: (...) s since Monday 00:00.
+            stay_s: (...) s, at least 0; may be infinite.
+        """
+        edges, before = self._week
+        begin, stay = np.asarray(begin_s, np.float64), np.asarray(stay_s, np.float64)
+        known = np.where(np.isfinite(stay), stay, 0.0)
+
+        def until(time: FloatArray) -> FloatArray:
+            weeks, rest = np.divmod(time, WEEK_S)
+            return np.asarray(weeks * before[-1] + np.interp(rest, edges, before))
+
+        endless = np.inf if before[-1] else 0.0
+        return np.where(np.isfinite(stay), until(begin + known) - until(begin), endless)
+
+
+def _days(text: str, field: str) -> list[int]:
+    """Return the days of a text such as `Mo-Fr,Su`; a range may run across Sunday."""
+    days = []
+    for part in text.split(","):
+        names = part.split("-")
+        for name in names:
+            if name not in DAYS:
+                raise InputError(f"{field} has the day {name!r}, want one of {', '.join(DAYS)}")
+        first, last = DAYS.index(names[0]), DAYS.index(names[-1])
+        days += [(first + k) % 7 for k in range((last - first) % 7 + 1)]
+    return days
+
+
+def _spans(text: str, field: str) -> tuple[tuple[int, int], ...]:
+    spans = []
+    for part in text.split(","):
+        match = _SPAN.fullmatch(part.strip())
+        h, m, end_h, end_m = map(int, match.groups()) if match else (0, 60, 0, 60)
+        begin, end = 60 * h + m, 60 * end_h + end_m
+        if max(m, end_m) > 59 or max(begin, end) > 24 * 60:
+            raise InputError(f"{field} has {part!r:.40}, want a span such as 08:00-20:00")
+        if end <= begin:
+            raise InputError(
+                f"{field} has {part!r}, want an end after the begin: across midnight, write two spans"
+            )
+        spans.append((begin, end))
+    spans.sort()
+    for (_, end), (begin, _) in pairwise(spans):
+        if begin < end:
+            raise InputError(f"{field} has {text!r:.40}, want spans that do not overlap")
+    return tuple(spans)
+
+
+@dataclass(frozen=True)
+class Price:
+    """What a stay costs, in any currency.
+
+    Args:
+        per_hour: price of an hour; with steps, of each hour beyond the last one.
+        steps: pairs of a stay, s, and the price of stays up to it, both increasing: a ticket machine's table.
+        free_s: s, first charged seconds of a stay that cost nothing.
+        daily_cap: the most that 24 hours from the begin of the stay cost; with it, each 24 hours are a stay of their
+            own.
+        charged: hours when parking is charged; only they count as stay. None: always.
+        per_kwh: price of each kWh charged into the car, on top.
+
+    Raises:
+        InputError: a value out of its range, or steps that fall; the message names the field.
+
+    Examples:
+        >>> price = Price(steps=((3600.0, 1.0), (7200.0, 3.0)), per_hour=2.0, daily_cap=8.0)
+        >>> price.amount(0.0, np.array([1800.0, 7200.0, 10800.0, 86400.0])).tolist()
+        [1.0, 3.0, 5.0, 8.0]
+    """
+
+    per_hour: float = 0.0
+    steps: tuple[tuple[float, float], ...] = ()
+    free_s: float = 0.0
+    daily_cap: float | None = None
+    charged: Hours | None = None
+    per_kwh: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("per_hour", "free_s", "per_kwh"):
+            require_number(name, getattr(self, name), least=0.0)
+        if self.daily_cap is not None:
+            require_number("daily_cap", self.daily_cap, least=0.0)
+        object.__setattr__(self, "steps", tuple(map(tuple, self.steps)))
+        least_s = least = 0.0
+        for k, step in enumerate(self.steps):
+            if len(step) != 2:
+                raise InputError(f"steps[{k}] is {step!r:.40}, want a stay in seconds and a price")
+            require_number(f"steps[{k}]: stay", step[0], above=least_s)
+            require_number(f"steps[{k}]: price", step[1], least=0.0)
+            if step[1] < least:
+                raise InputError(
+                    f"steps[{k}] has the price {step[1]:g}, want at least {least:g}: prices must not fall"
+                )
+            least_s, least = step
+
+    def __bool__(self) -> bool:
+        """Whether any stay costs anything."""
+        return any((self.per_hour, self.per_kwh, *(price for _, price in self.steps)))
+
+    def amount(self, begin_s: ArrayLike, stay_s: ArrayLike, kwh: ArrayLike = 0.0) -> FloatArray:
+        """Return what stays cost, (...) in the currency.
+
+        Args:
+            begin_s: (...) s since Monday 00:00.
+            stay_s: (...) s, at least 0; may be infinite.
+            kwh: (...) kWh charged.
+        """
+        begin, stay = np.broadcast_arrays(np.asarray(begin_s, np.float64), np.asarray(stay_s, np.float64))
+        if self.daily_cap is None:
+            cost = self._of(begin, stay)
+        else:
+            known = np.where(np.isfinite(stay), stay, 0.0)
+            weeks, rest = np.divmod(known, WEEK_S)
+            week = self._of_days(begin, np.full_like(stay, WEEK_S))
+            cost = np.where(weeks > 0.0, weeks * week, 0.0) + self._of_days(begin, rest)
+            cost = np.where(np.isfinite(stay), cost, np.where(week > 0.0, np.inf, 0.0))
+        return np.asarray(cost + self.per_kwh * np.asarray(kwh) if self.per_kwh else cost)
+
+    def _of_days(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
+        """Return what stays of at most a week cost where each 24 hours are capped."""
+        cap = np.inf if self.daily_cap is None else self.daily_cap
+        days = range(math.ceil(float(np.max(stay, initial=0.0)) / DAY_S))
+        parts = [self._of(begin + DAY_S * k, np.clip(stay - DAY_S * k, 0.0, DAY_S)) for k in days]
+        return np.asarray(sum(np.minimum(part, cap) for part in parts) + np.zeros_like(stay))
+
+    def _of(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
+        charged = stay if self.charged is None else self.charged.within(begin, stay)
+        charged = np.maximum(charged - self.free_s, 0.0)
+        if not self.steps:
+            # A stay for ever is free where an hour is.
+            return charged / HOUR_S * self.per_hour if self.per_hour else np.zeros_like(charged)
+        until, price = np.array(self.steps, np.float64).T
+        row = np.minimum(np.searchsorted(until, charged), len(until) - 1)
+        beyond = np.maximum(charged - until[-1], 0.0) / HOUR_S * self.per_hour if self.per_hour else 0.0
+        return np.where(charged > 0.0, price[row] + beyond, 0.0)
+
+
+@dataclass(frozen=True)
+class Zone:
+    """The rules of a zone: its price, and who may park there, when and for how long.
+
+    Args:
+        name: its name.
+        price: what stays cost.
+        hours: when cars may be parked there; a stay must lie within. None: always.
+        max_stay_s: s, longest stay; where the price has charged hours, only these count.
+        users: classes of users, one of which a driver must belong to: `public` (everyone), or names such as
+            `permit-a`, `disabled`, `charging`, `customers`, `delivery`, `private`.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+    """
+
+    name: str
+    price: Price = field(default_factory=Price)
+    hours: Hours | None = None
+    max_stay_s: float | None = None
+    users: tuple[str, ...] = (PUBLIC,)
+
+    def __post_init__(self) -> None:
+        if self.max_stay_s is not None:
+            require_number("max_stay_s", self.max_stay_s, above=0.0)
+        users = tuple(self.users)
+        if not users or not all(isinstance(user, str) and user and is_plain(user) for user in users):
+            raise InputError(f"users is {users!a:.40}, want names of classes")
+        object.__setattr__(self, "users", users)
+
+    def admits(self, begin_s: ArrayLike, stay_s: ArrayLike) -> BoolArray:
+        """Return whether the hours and the longest stay allow stays, (...) bool, whatever the class of the driver."""
+        begin, stay = np.broadcast_arrays(np.asarray(begin_s, np.float64), np.asarray(stay_s, np.float64))
+        allowed = np.ones(stay.shape, bool)
+        if self.hours is not None:
+            # A tolerance for rounding: a millisecond.
+            allowed &= self.hours.within(begin, stay) >= stay - 1e-3
+        if self.max_stay_s is not None:
+            counted = stay if self.price.charged is None else self.price.charged.within(begin, stay)
+            allowed &= counted <= self.max_stay_s
+        return allowed
 
 
 @dataclass(frozen=True)
 class Tariff:
-    """A price per hour for each zone.
+    """Prices per hour that replace those of a lot's zones.
 
     Args:
-        per_hour: price of an hour by zone, at least 0, in any currency; zones without a price are free.
+        per_hour: price of an hour by zone, at least 0, in any currency; other zones keep their prices.
 
     Raises:
         InputError: a price is no number of at least 0.
-
-    Examples:
-        >>> Tariff({"centre": 2.0}).amounts(["centre", "ring"], np.array([1800.0, 3600.0])).tolist()
-        [[1.0, 0.0], [2.0, 0.0]]
     """
 
     per_hour: Mapping[str, float] = field(default_factory=dict)
@@ -51,19 +307,12 @@ class Tariff:
     def __reduce__(self) -> tuple[type[Tariff], tuple[dict[str, float]]]:
         return Tariff, (dict(self.per_hour),)
 
-    def amounts(self, zones: Sequence[str], stay_s: FloatArray | float) -> FloatArray:
-        """Return what stays cost in each zone, (..., n_zones) in the currency.
+    def priced(self, zone: Zone) -> Zone:
+        """Return the zone with the price that the tariff has for it, or as it is."""
+        per_hour = self.per_hour.get(zone.name)
+        return zone if per_hour is None else replace(zone, price=Price(per_hour))
 
-        Args:
-            zones: names of the zones.
-            stay_s: (...) s, lengths of the stays.
-        """
-        per_hour = np.array([self.per_hour.get(zone, 0.0) for zone in zones])
-        # A stay for ever is free where an hour is.
-        with np.errstate(invalid="ignore"):
-            return np.where(per_hour > 0.0, np.multiply.outer(np.asarray(stay_s) / HOUR_S, per_hour), 0.0)
-
-    def require_zones(self, zones: Sequence[str], lot: str) -> None:
+    def require_zones(self, zones: tuple[str, ...], lot: str) -> None:
         """Check that a lot has every zone with a price.
 
         Raises:

@@ -12,7 +12,9 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
-from parkenv.world.lot import Lane
+from parkenv.world.facility import Facility
+from parkenv.world.lot import FARTHEST, Lane, ParkingLot
+from parkenv.world.tariff import Zone
 
 KINDS = {
     "slot": ("Polygon",),
@@ -20,6 +22,7 @@ KINDS = {
     "entry": ("Point",),
     "goal": ("Point",),
     "wall": ("LineString", "Polygon"),
+    "facility": ("Point",),
 }
 """The kinds of features, and the geometry types allowed for each."""
 
@@ -37,6 +40,23 @@ class LotProblem:
         return f"{self.severity}: {where}{self.message}"
 
 
+@dataclass(frozen=True)
+class RawFeature:
+    """A feature with a valid geometry: its parts are slices of one array of all positions."""
+
+    number: int
+    kind: str
+    properties: dict[str, Any]
+    parts: list[slice]
+    given_id: object
+
+
+def is_coordinate(value: Any) -> bool:
+    """Whether a JSON value is a finite number within `FARTHEST`."""
+    # Comparisons with NaN are false; a bool is an int in Python but not a number in JSON.
+    return type(value) in (float, int) and abs(value) <= FARTHEST
+
+
 @dataclass
 class LotContents:
     """The valid features of a file; `numbers[kind]` are their feature numbers, `errors` those of the other features."""
@@ -50,6 +70,10 @@ class LotContents:
     entries: list[FloatArray] = field(default_factory=list)
     goals: list[FloatArray] = field(default_factory=list)
     walls: list[FloatArray] = field(default_factory=list)
+    facilities: list[Facility] = field(default_factory=list)
+    zone_rules: dict[str, Zone] = field(default_factory=dict)
+    # by kind, `goal` or `entry`: the weights by purpose of each
+    weights: dict[str, list[dict[str, float]]] = field(default_factory=lambda: {"entry": [], "goal": []})
     numbers: dict[str, list[int]] = field(default_factory=lambda: {kind: [] for kind in KINDS})
     errors: list[LotProblem] = field(default_factory=list)
 
@@ -63,7 +87,17 @@ class LotContents:
             "entries": np.array(self.entries),
             "goals": np.array(self.goals),
             "walls": tuple(self.walls),
+            "facilities": tuple(self.facilities),
+            "zone_rules": self.zone_rules,
+            "goal_weights": self._weights("goal"),
+            "entry_weights": self._weights("entry"),
         }
+
+    def _weights(self, kind: str) -> dict[str, FloatArray]:
+        """Return the weights of goals or entries by purpose, (n,) each; 0 where one has none."""
+        each = self.weights[kind]
+        purposes = dict.fromkeys(purpose for weights in each for purpose in weights)
+        return {name: np.array([weights.get(name, 0.0) for weights in each]) for name in purposes}
 
     def error(self, feature: int | None, message: str) -> None:
         """Record an error of a feature, or of the file as a whole."""
@@ -71,7 +105,7 @@ class LotContents:
 
 
 def graph_errors(contents: LotContents) -> list[LotProblem]:
-    """Return errors of the drive graph: slots and entries without a lane, junctions with too many lanes."""
+    """Return errors of the drive graph: slots, entries and facilities without a lane, junctions with too many lanes."""
     lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
     if not lanes:
         return []
@@ -102,4 +136,19 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
                 return errors
             left[kind] = np.delete(left[kind], [problem.index for problem in error.problems])
         else:
-            return errors
+            return errors or _facility_errors(contents)
+
+
+def _facility_errors(contents: LotContents) -> list[LotProblem]:
+    """Return the errors of facilities that are out of reach; those of other features are known."""
+    if contents.errors or not contents.facilities:
+        return []
+    try:
+        ParkingLot(**contents.columns())
+    except GraphError as error:
+        numbers = contents.numbers["facility"]
+        return [
+            LotProblem("error", numbers[problem.index], f"facility {problem.message}")
+            for problem in error.problems
+        ]
+    return []

@@ -8,11 +8,15 @@ to metres east and north of the centre of the features; metres without either ar
 
 | kind | geometry | properties |
 |---|---|---|
-| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; `zone`, none if absent; all or none of `center`, `yaw`, \
-`length`, `width`, `mouth` (rear, left, right) |
+| `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; `zone` and `facility`, none if absent; all or none of \
+`center`, `yaw`, `length`, `width`, `mouth` (rear, left, right) |
 | `lane` | LineString | `oneway`, false if absent |
-| `entry`, `goal` | Point | |
+| `entry`, `goal` | Point | `weights`, numbers by purpose, none if absent |
 | `wall` | LineString or Polygon | |
+| `facility` | Point | `name`, `type` (kerb, lot, garage), `zone`; a counted one `capacity`, `gate_s`, `inside_s`, \
+`known` (nothing, sign, live), `delay_s` |
+
+The member `zones` has the rules of zones by name (`parkenv.lots.formats.geojson_supply`).
 
 A file made by an import may have the member `import`: its source, what was guessed, and what may be wrong with it.
 """
@@ -31,8 +35,15 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
-from parkenv.lots.formats.contents import KINDS, LotContents
-from parkenv.lots.formats.geojson_slots import SLOT_SHAPE, RawFeature, is_coordinate, read_slots
+from parkenv.lots.formats.contents import KINDS, LotContents, RawFeature, is_coordinate
+from parkenv.lots.formats.geojson_slots import SLOT_SHAPE, read_slots
+from parkenv.lots.formats.geojson_supply import (
+    facility_properties,
+    read_facilities,
+    read_weights,
+    read_zones,
+    zone_document,
+)
 from parkenv.lots.formats.positions import Positions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.quality import Provenance
@@ -62,6 +73,8 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
     }
     if provenance is not None:
         head["import"] = provenance.document()
+    if lot.zone_rules:
+        head["zones"] = {name: zone_document(zone) for name, zone in lot.zone_rules.items()}
     features = ",\n".join(json.dumps(feature) for feature in _features(lot))
     text = f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n'
     with atomic_write(path) as beside:
@@ -97,16 +110,37 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         (Mouth(mouth).name.lower() for mouth in lot.slot_mouth),
         strict=True,
     )
-    costs, zones = lot.slot_parking_cost_s.tolist(), lot.slot_zone.tolist()
-    for slot_id, ring, shape, cost, zone in zip(lot.slot_ids, rings, shapes, costs, zones, strict=True):
+    columns = zip(
+        lot.slot_ids,
+        rings,
+        shapes,
+        lot.slot_parking_cost_s.tolist(),
+        lot.slot_zone.tolist(),
+        lot.slot_facility.tolist(),
+        lot.is_counted.tolist(),
+        strict=True,
+    )
+    for slot_id, ring, shape, cost, zone, facility, is_counted in columns:
+        if is_counted:
+            continue  # Its facility says all of it.
         exact = dict(zip(SLOT_SHAPE, shape, strict=True))
-        priced = ({"parking_cost_s": cost} if cost else {}) | ({"zone": zone} if zone else {})
-        yield feature("Polygon", [ring], kind="slot", id=slot_id, **priced, **exact)
+        given = {"parking_cost_s": cost, "zone": zone, "facility": facility}
+        given = {name: value for name, value in given.items() if value}
+        yield feature("Polygon", [ring], kind="slot", id=slot_id, **given, **exact)
     for lane in lot.lanes:
         yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway)
-    for kind, points in (("entry", lot.entries), ("goal", lot.goals)):
-        for xy in points.tolist():
-            yield feature("Point", xy, kind=kind)
+    for kind, points, weights in (
+        ("entry", lot.entries, lot.entry_weights),
+        ("goal", lot.goals, lot.goal_weights),
+    ):
+        for i, xy in enumerate(points.tolist()):
+            given = (
+                {"weights": {name: float(weight[i]) for name, weight in weights.items()}} if weights else {}
+            )
+            yield feature("Point", xy, kind=kind, **given)
+    for place in lot.facilities:
+        xy = place.xy or lot.slot_xy[lot.slot_facility == place.name].mean(axis=0).tolist()
+        yield feature("Point", list(xy), kind="facility", **facility_properties(place))
     for wall in lot.walls:
         if is_building(wall):
             yield feature("Polygon", [wall.tolist()], kind="wall")
@@ -125,6 +159,7 @@ def read_contents(path: Path) -> LotContents:
         contents.name = _check_head(document, path.stem)
         system = Positions(True) if "frame" in document else Positions.of(document, path)
         contents.found = system.found
+        contents.zone_rules = read_zones(document.get("zones", {}))
     except InputError as error:
         contents.error(None, str(error))
         return contents
@@ -140,7 +175,7 @@ def read_contents(path: Path) -> LotContents:
             del positions[mark:]
             contents.error(number, str(error))
     for kind in ("slot", "lane", "entry", "goal"):
-        if kind not in kinds_seen:
+        if kind not in kinds_seen | ({"slot"} if "facility" in kinds_seen else set()):
             contents.error(None, f"no {kind}: an empty lot, want at least one feature of kind {kind!r}")
 
     xy = np.array(positions, dtype=np.float64).reshape(-1, 2)
@@ -161,8 +196,9 @@ def read_contents(path: Path) -> LotContents:
             xy = contents.frame.to_xy(xy)
 
     for feature in raw:
-        if feature.kind != "slot":
+        if feature.kind not in ("slot", "facility"):
             _add_feature(contents, feature, [xy[part] for part in feature.parts])
+    read_facilities(contents, [feature for feature in raw if feature.kind == "facility"], xy)
     read_slots(contents, [feature for feature in raw if feature.kind == "slot"], xy, exact=system.in_metres)
     contents.errors.sort(key=lambda problem: -1 if problem.feature is None else problem.feature)
     return contents
@@ -179,6 +215,12 @@ def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatAr
     elif feature.kind == "wall":
         contents.walls += parts
     else:
+        try:
+            weights = read_weights(feature)
+        except InputError as error:
+            contents.error(feature.number, str(error))
+            return
+        contents.weights[feature.kind].append(weights)
         points = contents.entries if feature.kind == "entry" else contents.goals
         points.append(parts[0][0])
     contents.numbers[feature.kind].append(feature.number)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,33 +11,17 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.file_names import is_plain
-from parkenv.lots.formats.contents import LotContents
+from parkenv.lots.formats.contents import LotContents, RawFeature, is_coordinate
+from parkenv.lots.formats.geojson_supply import read_zone
 from parkenv.lots.generators import Slots
 from parkenv.lots.slot_polygons import slots_from_polygons
-from parkenv.world.lot import FARTHEST, SLOT_SIDE, Mouth
+from parkenv.world.lot import SLOT_SIDE, Mouth
 
 SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
 MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
 SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the rectangle of its properties
-
-
-@dataclass(frozen=True)
-class RawFeature:
-    """A feature with a valid geometry: its parts are slices of one array of all positions."""
-
-    number: int
-    kind: str
-    properties: dict[str, Any]
-    parts: list[slice]
-    given_id: object
-
-
-def is_coordinate(value: Any) -> bool:
-    """Whether a JSON value is a finite number within `FARTHEST`."""
-    # Comparisons with NaN are false; a bool is an int in Python but not a number in JSON.
-    return type(value) in (float, int) and abs(value) <= FARTHEST
 
 
 def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exact: bool) -> None:
@@ -56,6 +40,13 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
     shapes: list[tuple[float, ...] | None] = []
     costs: list[float] = []
     zones: list[str] = []
+    facilities: list[str] = []
+    drawn = [facility.name for facility in contents.facilities if not facility.is_counted]
+    first_with |= {
+        facility.name: contents.numbers["facility"][i]
+        for i, facility in enumerate(contents.facilities)
+        if facility.is_counted
+    }
     for i, feature in enumerate(raw):
         try:
             slot_id = _slot_id(feature)
@@ -67,7 +58,9 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
             if not valid[i]:
                 reason = shapely.is_valid_reason(polygons[i])
                 raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
-            cost, zone = _parking_cost(feature.properties, slot_id), _zone(feature.properties, slot_id)
+            cost = _parking_cost(feature.properties, slot_id)
+            zone = read_zone(feature.properties, f"slot {slot_id!r:.40}", contents.zone_rules)
+            facility = _facility(feature.properties, slot_id, drawn)
             shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
         except InputError as error:
             contents.error(feature.number, str(error))
@@ -76,6 +69,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
         ids.append(slot_id)
         costs.append(cost)
         zones.append(zone)
+        facilities.append(facility)
 
     polygons = polygons[valid_rows]
     bare = np.array([shape is None for shape in shapes], dtype=bool)
@@ -102,8 +96,12 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
             f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
         )
     kept = np.flatnonzero(~disagrees & ~thin)
-    cost_s, zone_names = np.array(costs, np.float64), np.array(zones, np.str_)
-    contents.slots = replace(slots, parking_cost_s=cost_s, zone=zone_names)[kept]
+    contents.slots = replace(
+        slots,
+        parking_cost_s=np.array(costs, np.float64),
+        zone=np.array(zones, np.str_),
+        facility=np.array(facilities, np.str_),
+    )[kept]
     contents.slot_ids = [ids[k] for k in kept]
     contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
 
@@ -130,12 +128,15 @@ def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
     return float(cost)
 
 
-def _zone(properties: dict[str, Any], slot_id: str) -> str:
-    """Return the zone of a slot; empty text if not given."""
-    zone = properties.get("zone", "")
-    if not isinstance(zone, str) or not is_plain(zone) or ("zone" in properties and not zone):
-        raise InputError(f"slot {slot_id!r:.40}: zone is {zone!r:.40}, want a name")
-    return zone
+def _facility(properties: dict[str, Any], slot_id: str, drawn: list[str]) -> str:
+    """Return the facility that a slot belongs to, one of those whose slots are drawn; empty text if not given."""
+    facility = properties.get("facility", "")
+    if facility not in drawn and "facility" in properties:
+        hint = nearest(str(facility), drawn)
+        raise InputError(
+            f"slot {slot_id!r:.40}: facility is {facility!r:.40}, want that of a feature without a capacity; {hint}"
+        )
+    return str(facility)
 
 
 def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:

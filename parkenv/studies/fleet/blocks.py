@@ -94,14 +94,14 @@ class Blocks:
 
 def has_zones(scenario: Scenario) -> bool:
     """Return whether there is something to say of zones."""
-    return bool(scenario.tariff) or scenario.lot.zones != (NO_ZONE,)
+    return scenario.has_rules or scenario.lot.zones != (NO_ZONE,)
 
 
 def paid(fleet: Fleet) -> FloatArray:
     """Return what each car of a day whose searches are over pays, (n_cars,), in the currency of the prices."""
     lot, cars = fleet.scenario.lot, fleet.cars
     zone = lot.zone_of_slot[cars["slot"]]
-    amounts = fleet.scenario.tariff.amounts(lot.zones, cars["stay_s"])[np.arange(len(cars)), zone]
+    amounts = fleet.scenario.zone_price(fleet.drivers_of(slice(None)))[np.arange(len(cars)), zone]
     return np.where(cars["slot"] >= 0, amounts, 0.0)
 
 

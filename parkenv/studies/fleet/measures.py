@@ -63,10 +63,10 @@ class Roads:
         found[edge] = lane
         return found.reshape(lot.neighbors.shape)
 
-    def alone_s(self, cars: NDArray[np.void]) -> FloatArray:
+    def alone_s(self, fleet: Fleet) -> FloatArray:
         """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster."""
-        rows = np.searchsorted(self._entries, cars["entry"])
-        return np.asarray((self._alone_s[rows] + self._problem.zone_cost_s(cars["stay_s"])).min(axis=1))
+        rows = np.searchsorted(self._entries, fleet.cars["entry"])
+        return np.asarray((self._alone_s[rows] + fleet.zone_cost_s()).min(axis=1))
 
     def parking_day(self, fleet: Fleet) -> ParkingDay:
         """Return the day of a fleet that has been reset: its cars to come, and when its residents leave."""
@@ -81,7 +81,7 @@ class Roads:
             cost_s=np.asarray(self._cost_s, np.float64),
             free_from=leaves_at.astype(np.float64),
             zone=np.array(self._problem.lot.zone_of_slot),
-            zone_cost_s=self._problem.zone_cost_s(cars["stay_s"]),
+            zone_cost_s=fleet.zone_cost_s(),
             give_up_s=float(self._problem.give_up_s),
         )
 
@@ -132,7 +132,7 @@ def day_measures(
         **filled,
         "members_s": _mean(times[members]),
         "others_s": _mean(times[~members]),
-        "bound_s": float(roads.alone_s(cars).mean()),
+        "bound_s": float(roads.alone_s(fleet).mean()),
         "clairvoyant_s": clairvoyant_s / len(cars),
         **{name: float(cars[name].mean()) for name in COST_FIELDS},
         "paid": float(amounts.mean()),

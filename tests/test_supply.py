@@ -1,0 +1,229 @@
+"""Supply of every kind: facilities that are drawn or counted, rules of zones, and weights, from the file on."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from parkenv import InputError, make_scenario
+from parkenv.lots import check_lot, grid_lot, packaged_lot, read_lot, write_lot
+from parkenv.lots.draft import LotDraft
+from parkenv.world.drive_graph import GraphError
+from parkenv.world.facility import FACILITY_KINDS, KNOWN, Facility
+from parkenv.world.scenario import Drivers
+from parkenv.world.tariff import DAY_S, WEEK_S, Hours, Price, Tariff, Zone
+
+GARAGE = Facility(
+    "P1", "garage", "inner", capacity=40, xy=(30.0, 12.0), gate_s=10.0, inside_s=(30.0, 90.0), known="sign"
+)
+INNER = Zone("inner", Price(2.0, charged=Hours.parse("Mo-Sa 08:00-20:00")), users=("public", "permit-a"))
+PERMIT = Zone("permit", users=("permit-a",))
+
+
+def town(**changes):
+    """The lot `mini` with a kerb of three slots for permits, and a garage."""
+    lot = packaged_lot("mini")
+    kerb = Facility("kerb", "kerb", "permit")
+    features = {
+        "facilities": (GARAGE, kerb),
+        "slot_facility": ["kerb"] * 3 + [""] * (lot.n_slots - 3),
+        "zone_rules": {zone.name: zone for zone in (INNER, PERMIT)},
+    }
+    return replace(lot, **features | changes)
+
+
+def test_a_counted_facility_is_one_slot_at_its_lane():
+    lot = town()
+    assert lot.slot_ids[-1] == "P1"
+    assert lot.capacity.tolist() == [1] * 10 + [40]
+    assert [lot.facilities[i].name for i in lot.facility_of_slot[[0, -1]]] == ["kerb", "P1"]
+    assert lot.slot_zone.tolist() == ["permit"] * 3 + [""] * 7 + ["inner"]
+    assert lot.classes == ("public", "permit-a")
+    # People walk from its point, cars stop at its lane; what was there before stays.
+    assert lot.walk_m()[-1] == pytest.approx(np.hypot(*(lot.goals[0] - GARAGE.xy)))
+    plain = packaged_lot("mini")
+    np.testing.assert_array_equal(lot.walk_m()[:-1], plain.walk_m())
+    np.testing.assert_array_equal(lot.vertex_xy[:9], plain.vertex_xy[:9])
+    assert replace(lot, name="again").slot_ids == lot.slot_ids
+
+
+hours = st.lists(
+    st.lists(st.integers(0, 1440), max_size=4, unique=True).map(
+        lambda ends: tuple(zip(sorted(ends)[::2], sorted(ends)[1::2], strict=False))
+    ),
+    min_size=7,
+    max_size=7,
+).map(lambda days: Hours(tuple(days)))
+amounts = st.integers(0, 400).map(lambda cents: cents / 100)
+steps = st.lists(st.tuples(st.integers(1, 7200), amounts), max_size=3).map(
+    lambda parts: tuple(
+        (float(sum(p[0] for p in parts[: k + 1])), sum(p[1] for p in parts[: k + 1]))
+        for k in range(len(parts))
+    )
+)
+prices = st.builds(
+    Price, amounts, steps, st.sampled_from([0.0, 900.0]), st.none() | amounts, st.none() | hours, amounts
+)
+names = st.text("Ga ä1", min_size=1, max_size=6)
+zones = st.builds(
+    Zone,
+    names,
+    prices,
+    st.none() | hours,
+    st.none() | st.floats(60.0, 1e6),
+    st.lists(st.sampled_from(["public", "permit-a", "disabled"]), min_size=1, max_size=2).map(tuple),
+)
+
+
+@given(
+    rules=st.lists(zones, min_size=1, max_size=3, unique_by=lambda zone: zone.name),
+    counted=st.lists(
+        st.builds(
+            Facility,
+            name=names.map(lambda name: f"P {name}"),
+            kind=st.sampled_from(FACILITY_KINDS),
+            capacity=st.integers(1, 999),
+            xy=st.tuples(st.floats(-50.0, 80.0), st.floats(-50.0, 50.0)),
+            gate_s=st.floats(0.0, 60.0),
+            inside_s=st.tuples(st.floats(0.0, 60.0), st.floats(0.0, 600.0)),
+            known=st.sampled_from(KNOWN),
+            delay_s=st.floats(0.0, 600.0),
+        ),
+        max_size=3,
+        unique_by=lambda facility: facility.name,
+    ),
+    weights=st.dictionaries(names, st.floats(0.0, 1e6), max_size=2),
+)
+def test_towns_are_read_back_to_the_bit(tmp_path, rules, counted, weights):
+    grid = grid_lot(2, 4)
+    lot = replace(
+        grid,
+        slot_zone=[rules[0].name] + [""] * 7,
+        slot_facility=["", "row", "row"] + [""] * 5,
+        facilities=(*counted, Facility("row", "lot", rules[-1].name)),
+        zone_rules={zone.name: zone for zone in rules},
+        goal_weights={name: [weight] for name, weight in weights.items()},
+        entry_weights={name: [weight] for name, weight in weights.items()},
+    )
+    path = tmp_path / "lot.geojson"
+    write_lot(lot, path)
+    assert read_lot(path) == lot
+    assert LotDraft.of_lot(lot).lot() == lot
+    assert not [problem for problem in check_lot(path) if problem.severity == "error"]
+
+
+@given(price=prices, begin=st.integers(0, 10080), stay=st.integers(0, 5 * 1440))
+def test_a_price_is_what_counting_minutes_gives(price, begin, stay):
+    """Against a driver who looks at the tariff table each minute."""
+    days = 1 if price.daily_cap is None else -(-stay // 1440)
+    total = 0.0
+    for day in range(days):
+        minutes = stay if price.daily_cap is None else min(1440, stay - 1440 * day)
+        charged = 0
+        for minute in range(begin + 1440 * day, begin + 1440 * day + minutes):
+            spans = price.charged.days[minute // 1440 % 7] if price.charged else ((0, 1440),)
+            charged += any(a <= minute % 1440 < b for a, b in spans)
+        paid_s = max(60.0 * charged - price.free_s, 0.0)
+        rest = paid_s - price.steps[-1][0] if price.steps else paid_s
+        cost = next((p for limit, p in price.steps if paid_s <= limit), None) if paid_s else 0.0
+        if cost is None:
+            cost = (price.steps[-1][1] if price.steps else 0.0) + price.per_hour * max(rest, 0.0) / 3600.0
+        total += cost if price.daily_cap is None else min(cost, price.daily_cap)
+    amount = price.amount(60.0 * begin, np.array([60.0 * stay]), 2.0)
+    np.testing.assert_allclose(amount, [total + 2.0 * price.per_kwh], atol=1e-9)
+
+
+def test_long_stays_are_paid_by_the_day():
+    capped = Price(1.0, daily_cap=8.0)
+    days = np.array([0.5, 1.0, 3.25, 7.0, 365.0, np.inf])
+    expected = [8.0, 8.0, 30.0, 56.0, 365 * 8.0, np.inf]
+    assert capped.amount(3600.0, days * DAY_S).tolist() == expected
+    assert Price().amount(0.0, np.array([np.inf])).tolist() == [0.0]
+    assert Hours.parse("Mo 08:00-09:00").within(0.0, 2 * WEEK_S) == 7200.0
+
+
+def test_who_may_park_where_and_when():
+    """The row of a driver is infinite where class, hours or longest stay forbid to park."""
+    loading = Zone(
+        "inner",
+        Price(6.0, charged=Hours.parse("Mo-Fr 08:00-18:00")),
+        Hours.parse("Mo-Sa 06:00-22:00"),
+        3600.0,
+    )
+    scenario = make_scenario(town(zone_rules={"inner": loading, "permit": PERMIT}))
+    assert scenario.lot.zones == ("inner", "other", "permit")
+    assert scenario.has_rules
+    assert not make_scenario("mini").has_rules
+    monday, permit = 9 * 3600.0, scenario.class_bits(["permit-a"])
+    row = scenario.zone_cost_s(Drivers([1800.0, 1800.0, 7200.0], [monday, 0.0, monday], 12.0, [1, permit, 1]))
+    np.testing.assert_allclose(row, [[900.0, 0.0, np.inf], [np.inf, 0.0, 0.0], [np.inf, 0.0, np.inf]])
+    # Outside the charged hours, neither price nor limit counts.
+    evening = scenario.zone_cost_s(Drivers(7200.0, 18.5 * 3600.0, 12.0, 1))
+    assert evening.tolist() == [0.0, 0.0, np.inf]
+    free = scenario.replace(tariff=Tariff({"inner": 0.0}), stay_s=1800.0)
+    assert free.parking_cost_s[-1] == 0.0
+    assert free.replace(walk_back=True).arrival_cost_s[-1] == 2 * free.arrival_cost_s[-1]
+    with pytest.raises(InputError, match="did you mean 'permit-a'"):
+        scenario.replace(classes=("permit",))
+
+
+def broken(document, kind, **properties):
+    """The document with properties of the first feature of a kind changed."""
+    next(f for f in document["features"] if f["properties"]["kind"] == kind)["properties"] |= properties
+
+
+ERRORS = {
+    "must not fall": lambda d: d["zones"]["inner"]["price"].update(steps=[[60, 2], [120, 1]]),
+    r"hours has '20:00-08:00', want an end after": lambda d: d["zones"]["inner"].update(hours="20:00-08:00"),
+    "charged is 'daily', want hours such as": lambda d: d["zones"]["inner"]["price"].update(charged="daily"),
+    "no member 'per_hours' of price; did you mean 'per_hour'": lambda d: d["zones"]["inner"].update(
+        price={"per_hours": 1}
+    ),
+    "zone 'inner': users is 'all'": lambda d: d["zones"]["inner"].update(users="all"),
+    "facility 'P1': capacity is -3": lambda d: broken(d, "facility", capacity=-3),
+    "facility 'P1': type is 'silo', want one of kerb": lambda d: broken(d, "facility", type="silo"),
+    "facility 'P1': zone is 'iner', want one of the file's zones; did you mean 'inner'": lambda d: broken(
+        d, "facility", zone="iner"
+    ),
+    "facility is 'curb', want that of a feature": lambda d: broken(d, "slot", facility="curb"),
+    "no property 'capacty' of facilities; did you mean 'capacity'": lambda d: broken(
+        d, "facility", capacty=1
+    ),
+    "id 'P1' appears already": lambda d: broken(d, "slot", id="P1"),
+    "weights": lambda d: broken(d, "goal", weights={"shop": -1}),
+    "m from the nearest lane, want at most 150 m": lambda d: [
+        f["geometry"].update(coordinates=[500.0, 20.0])
+        for f in d["features"]
+        if f["properties"].get("name") == "P1"
+    ],
+}
+
+
+@pytest.mark.parametrize("message", ERRORS)
+def test_a_wrong_town_is_refused_in_one_line(tmp_path, message):
+    path = tmp_path / "town.geojson"
+    write_lot(town(), path)
+    document = json.loads(path.read_text())
+    ERRORS[message](document)
+    path.write_text(json.dumps(document))
+    with pytest.raises(InputError, match=message) as caught:
+        read_lot(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+    assert any(message in str(problem) for problem in check_lot(path))
+
+
+def test_a_facility_that_no_entry_leads_to_is_named():
+    away = replace(packaged_lot("mini").lanes[0], points=np.array([[0.0, 100.0], [30.0, 100.0]]))
+    lot = packaged_lot("mini")
+    far = replace(GARAGE, zone="", xy=(10.0, 105.0))
+    with pytest.raises(GraphError, match="facility 0: 'P1' cannot be reached from an entry"):
+        replace(lot, lanes=(*lot.lanes, away), facilities=(far,))
+    draft = LotDraft.of_lot(replace(lot, lanes=(*lot.lanes, away)))
+    kept = replace(draft, facilities=(far, replace(GARAGE, name="P2", zone=""))).searchable()
+    assert [facility.name for facility in kept.facilities] == ["P2"]
+    assert kept.left_out[0].ids == ("P1",)
+    assert kept.lot().slot_ids[-1] == "P2"
