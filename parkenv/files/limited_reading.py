@@ -5,6 +5,7 @@ Every file that a user names is read through this module, `parkenv.files.archive
 
 from __future__ import annotations
 
+import bz2
 import csv
 import gzip
 import io
@@ -14,7 +15,7 @@ import re
 import stat
 import tomllib
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
@@ -34,6 +35,12 @@ _HUGE = re.compile(rb"[eE]\+?\d{3}")
 _LONG_NUMBER = re.compile(rb"[0-9]{301,}")
 # tomllib takes cubic time for a key of many parts.
 _DEEP_KEY = re.compile(r"(?:\.[ \t]*[\w\"'-]+[ \t]*){100}")
+
+_PACKED: dict[str, tuple[str, Callable[[Any], Any]]] = {
+    ".gz": ("gzip", lambda stored: gzip.GzipFile(fileobj=stored)),
+    ".tgz": ("gzip", lambda stored: gzip.GzipFile(fileobj=stored)),
+    ".bz2": ("bzip2", bz2.BZ2File),
+}
 
 
 class Counted(io.RawIOBase):
@@ -81,9 +88,14 @@ def require_file(path: str | Path) -> None:
         raise InputError(f"{path}: is a pipe or a device, want a file")
 
 
+def unpacked_path(path: Path) -> Path:
+    """Return a path without the suffix of a packed file: `town.osm` of `town.osm.gz` and `town.osm.bz2`."""
+    return path.with_suffix("") if path.suffix.lower() in _PACKED else path
+
+
 @contextmanager
 def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]:
-    """Open a file for reading at most `most` bytes; a name that ends in `.gz` is unpacked.
+    """Open a file for reading at most `most` bytes; names that end in `.gz` and `.bz2` are unpacked.
 
     What states that it has no bytes is read as empty. Files of /proc state so whatever they hold, and some of them wait
     for news when read, such as /proc/kmsg.
@@ -97,15 +109,15 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
     with file:
+        packed = _PACKED.get(Path(path).suffix.lower())
         try:
-            packed = str(path).endswith((".gz", ".tgz"))
             stored: io.BufferedIOBase = file if os.fstat(file.fileno()).st_size else io.BytesIO()
-            stream = gzip.GzipFile(fileobj=stored) if packed else stored
+            stream: Any = packed[1](stored) if packed else stored
             yield io.BufferedReader(Counted(stream, most, path), 1 << 20)
-        except (EOFError, gzip.BadGzipFile, zlib.error) as error:
-            raise InputError(f"{path}: not a whole gzip file ({error})") from error
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror or error}") from error
+        except (EOFError, zlib.error, OSError) as error:
+            if packed and not getattr(error, "strerror", None):
+                raise InputError(f"{path}: not a whole {packed[0]} file ({error})") from error
+            raise InputError(f"{path}: {getattr(error, 'strerror', None) or error}") from error
         except UnicodeDecodeError as error:
             raise InputError(f"{path}: not UTF-8 text: {error.reason} at byte {error.start}") from error
 

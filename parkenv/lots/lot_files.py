@@ -9,7 +9,7 @@ from pathlib import Path
 
 from parkenv.errors import InputError
 from parkenv.files.known_names import PACKAGED_LOTS
-from parkenv.files.limited_reading import is_there, read_json
+from parkenv.files.limited_reading import is_there, read_json, unpacked_path
 from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
 from parkenv.lots.formats.contents import graph_errors
 from parkenv.lots.formats.dragon_lake import dragon_lake_lot
@@ -40,7 +40,7 @@ def lot_format(path: Path) -> LotFormat | None:
 
     A JSON file that cannot be read counts as native: its reader then reports the error.
     """
-    suffix = path.suffix.lower()
+    suffix = unpacked_path(path).suffix.lower()
     if suffix in (".json", ".geojson"):
         try:
             is_osm = holds_osm(read_json(path))
@@ -128,8 +128,8 @@ def _read_whole(path: Path) -> tuple[ParkingLot, str]:
 def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a file of a real place.
 
-    Supported formats are OpenStreetMap (`.osm`, `.xml`, `.osm.pbf`, Overpass JSON, overpass-turbo GeoJSON; see
-    `parkenv.lots.osm.draft`), lists of slot centres (`.csv`; see
+    Supported formats are OpenStreetMap (`.osm`, `.xml`, `.osm.pbf`, Overpass JSON, overpass-turbo GeoJSON, also packed
+    as `.gz` and `.bz2`; see `parkenv.lots.osm.draft`), lists of slot centres (`.csv`; see
     `parkenv.lots.formats.slot_list`), the Dragon Lake map and native lots.
     Latitudes and longitudes are projected to metres east and north of the file's centre.
 

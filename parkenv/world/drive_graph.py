@@ -145,33 +145,40 @@ def _with_entry_points(
     lanes: Sequence[tuple[FloatArray, bool]], entry_xy: FloatArray
 ) -> tuple[list[tuple[FloatArray, bool]], FloatArray]:
     """Insert a node into the lane nearest to each entry; return the lanes and the nodes, (n_entries, 2) m."""
-    lanes = list(lanes)
+    parts = [[lane] for lane in lanes]
     points = np.empty((len(entry_xy), 2))
     problems = []
+    tree = shapely.STRtree(linestrings([centre for centre, _ in lanes]))
+    of, near = tree.query_nearest(shapely.points(entry_xy))
     for i, xy in enumerate(entry_xy):
-        lines = linestrings([centre for centre, _ in lanes])
         point = shapely.Point(xy)
+        # Earlier entries may have split the nearest lanes.
+        at = [(k, j) for k in np.sort(near[of == i]).tolist() for j in range(len(parts[k]))]
+        lines = linestrings([parts[k][j][0] for k, j in at])
         distance = np.asarray(shapely.distance(lines, point))
-        k = int(np.argmin(distance))
-        if distance[k] > ENTRY_REACH:
-            reason = f"is {distance[k]:.1f} m from the nearest lane, want at most {ENTRY_REACH:g} m"
+        nearest_line = int(np.argmin(distance))
+        if distance[nearest_line] > ENTRY_REACH:
+            reason = (
+                f"is {distance[nearest_line]:.1f} m from the nearest lane, want at most {ENTRY_REACH:g} m"
+            )
             problems.append(GraphProblem("entry", i, reason, (float(xy[0]), float(xy[1]))))
             continue
-        centre, oneway = lanes[k]
-        along = shapely.line_locate_point(lines[k], point)
+        k, j = at[nearest_line]
+        line, (centre, oneway) = lines[nearest_line], parts[k][j]
+        along = shapely.line_locate_point(line, point)
         station = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
         nearest = int(np.argmin(np.abs(station - along)))
         if abs(station[nearest] - along) > NODE_TOLERANCE:
             nearest = int(np.searchsorted(station, along))
-            on_lane = shapely.get_coordinates(shapely.line_interpolate_point(lines[k], along))
+            on_lane = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
             centre = np.insert(centre, nearest, on_lane, axis=0)
         points[i] = centre[nearest]
         if 0 < nearest < len(centre) - 1:
             # Splitting the lane at the entry makes it a node.
-            lanes[k : k + 1] = [(centre[: nearest + 1], oneway), (centre[nearest:], oneway)]
+            parts[k][j : j + 1] = [(centre[: nearest + 1], oneway), (centre[nearest:], oneway)]
     if problems:
         raise GraphError(problems)
-    return lanes, points
+    return [part for lane in parts for part in lane], points
 
 
 def linestrings(parts: Sequence[FloatArray]) -> NDArray[np.object_]:

@@ -199,8 +199,12 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
     lines = [lane.points for lane in lanes]
     oneway = [lane.oneway for lane in lanes]
     for _ in range(sum(map(len, lines))):
-        crowded = _crowded_node(lines, oneway)
-        if crowded is None or not _move_lane_end(lines, crowded):
+        moved: set[int] = set()
+        for users in _crowded_nodes(lines, oneway):
+            # The points of a moved lane are numbered anew: its other junctions wait for the next round.
+            if moved.isdisjoint(k for k, _ in users):
+                moved.update(_move_lane_end(lines, users))
+        if not moved:
             break
     return [Lane(points, one) for points, one in zip(lines, oneway, strict=True)]
 
@@ -211,19 +215,20 @@ def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[
     return forward + sum(i > 0 and not oneway[k] for k, i in at)
 
 
-def _crowded_node(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> set[tuple[int, int]] | None:
+def _crowded_nodes(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> list[set[tuple[int, int]]]:
     pairs = [(k, i) for k, line in enumerate(lines) for i in range(len(line))]
     at: dict[int, set[tuple[int, int]]] = {}
     for label, pair in zip(node_labels(np.concatenate(lines)).tolist(), pairs, strict=True):
         at.setdefault(label, set()).add(pair)
-    for users in at.values():
-        if _leaving(lines, oneway, users) > len(MOVES) and any(i in (0, len(lines[k]) - 1) for k, i in users):
-            return users
-    return None
+    return [
+        users
+        for users in at.values()
+        if _leaving(lines, oneway, users) > len(MOVES) and any(i in (0, len(lines[k]) - 1) for k, i in users)
+    ]
 
 
-def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool:
-    """Move the end of the lane closest to another arm onto that arm."""
+def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> tuple[int, ...]:
+    """Move the end of the lane closest to another arm onto that arm; return the two lanes, if there are any."""
     arms = []  # lane, point, neighbouring point, whether the lane ends here
     for k, i in sorted(users):
         ends = i in (0, len(lines[k]) - 1)
@@ -238,7 +243,7 @@ def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool
             if best is None or turn > best[0]:
                 best = (turn, a, b)
     if best is None:
-        return False
+        return ()
     k, i, _, _ = arms[best[1]]
     other, i_b, j_b, _ = arms[best[2]]
     arm = lines[other][j_b] - lines[other][i_b]
@@ -248,4 +253,4 @@ def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> bool
     moved = lines[k].copy()
     moved[i] = joint
     lines[k] = moved
-    return True
+    return k, other

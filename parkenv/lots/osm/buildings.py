@@ -37,7 +37,8 @@ class Area:
         Args:
             element: the element.
             frame: the lot's frame.
-            simple: whether outlines that cross themselves are refused; otherwise they are mended.
+            simple: whether outlines that cross themselves are refused; otherwise, and if the edge of the map cuts them,
+                they are mended.
 
         Raises:
             InputError: an outline that is open, or that crosses itself.
@@ -48,7 +49,7 @@ class Area:
             [shapely.Polygon(frame.to_xy(line)) for line in lines] for lines in (element.lines, element.holes)
         )
         for polygon in (*outer, *holes):
-            if simple and not polygon.is_valid:
+            if simple and not element.cut and not polygon.is_valid:
                 reason = shapely.is_valid_reason(polygon).split("[")[0]
                 raise InputError(f"{element.id}: its outline is not a simple one: {reason}")
         if element.tags.get("amenity") == "parking_space" and simple and len(outer) == 1 and not holes:
@@ -70,10 +71,10 @@ def areas_of(
 ) -> list[Area]:
     """Return the areas of the closed ones among the wanted elements.
 
-    Outlines that cross themselves are mended if they are those of buildings alone, or all with `mended`.
+    Outlines that cross themselves are mended but for those of parking spaces, or all with `mended`.
     """
     closed = (e for e in elements if wanted(e) and e.lines and e.is_closed and not e.is_node)
-    return [Area.of(e, frame, simple=not mended and "amenity" in e.tags) for e in closed]
+    return [Area.of(e, frame, simple=not mended and e.tags.get("amenity") == "parking_space") for e in closed]
 
 
 def is_building(element: OsmElement) -> bool:

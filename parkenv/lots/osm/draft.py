@@ -22,7 +22,8 @@ not.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -49,7 +50,7 @@ from parkenv.lots.osm.buildings import (
     split_walls,
     within,
 )
-from parkenv.lots.osm.elements import OsmElement, read_map
+from parkenv.lots.osm.elements import OsmElement, place_name, read_map
 from parkenv.lots.osm.kerbs import Junctions, kerb_of, kerb_slots
 from parkenv.lots.osm.outline_draft import outline_draft
 from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
@@ -72,18 +73,31 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
     """Draft a lot from an OpenStreetMap file; see the module for the rules.
 
     Args:
-        path: `.osm`, `.xml`, or the JSON and GeoJSON of Overpass.
+        path: `.osm`, `.xml`, `.osm.pbf`, or the JSON and GeoJSON of Overpass.
         options: goals, entries and bounds given by the user.
 
     Raises:
-        InputError: the file is incomplete, has another format or contains no parking, an outline crosses itself, or
+        InputError: the file is damaged, has another format or contains no parking, an outline crosses itself, or
             the elements are too far apart.
     """
     path = Path(path)
-    elements, positions = read_map(path)
+    place = read_map(path)
     with naming(path):
-        draft = draft_of_elements(path.stem, elements, options or ImportOptions(), positions.frame)
-    return replace(draft, found=(*([positions.found] if positions.found else []), *draft.found))
+        draft = draft_of_elements(
+            place_name(path), place.elements, options or ImportOptions(), place.positions.frame
+        )
+    found = (
+        *([place.positions.found] if place.positions.found else []),
+        *draft.found,
+        *cut_elements(place.elements),
+    )
+    return replace(draft, found=found, left_out=(*place.left_out, *draft.left_out))
+
+
+def cut_elements(elements: Sequence[OsmElement]) -> Iterator[str]:
+    """Yield a line about the elements that the edge of the map cuts."""
+    if cut := tuple(e.id for e in elements if e.cut):
+        yield str(LeftOut("cut at the edge of the map", cut))
 
 
 def draft_of_elements(
@@ -137,6 +151,7 @@ class _Group:
     owners: list[str] = field(default_factory=list)
     slots: list[Slots] = field(default_factory=list)
     ranks: list[int] = field(default_factory=list)
+    rows: Counter[str] = field(default_factory=Counter)  # number of slots so far of each row
 
     def add(self, owners: Sequence[str], ids: Sequence[str], slots: Slots, ranks: Sequence[int]) -> None:
         self.owners += owners
@@ -145,9 +160,10 @@ class _Group:
         self.ranks += ranks
 
     def add_row(self, owner: str, start: str, slots: Slots, rank: Rank) -> None:
-        """Add the slots of one element, numbered from 1."""
-        n = len(slots)
-        self.add([owner] * n, [f"{start}-{k + 1}" for k in range(n)], slots, [int(rank)] * n)
+        """Add the slots of one element, or of a part of it, numbered from 1."""
+        n, first = len(slots), self.rows[start] + 1
+        self.rows[start] += n
+        self.add([owner] * n, [f"{start}-{k + first}" for k in range(n)], slots, [int(rank)] * n)
 
 
 class _OsmImporter:
@@ -199,11 +215,12 @@ class _OsmImporter:
         for element in elements:
             if element.is_node or "highway" not in element.tags:
                 continue
-            road = road_of(element.id, element.tags, self.frame.to_xy(element.lines[0]))
-            if isinstance(road, str):
-                self._leave_out(road, element.id)
-            elif road is not None:
-                roads += [road] if box is None else network.clipped_road(road, box)
+            for line in element.lines:
+                road = road_of(element.id, element.tags, self.frame.to_xy(line))
+                if isinstance(road, str):
+                    self._leave_out(road, element.id)
+                elif road is not None:
+                    roads += [road] if box is None else network.clipped_road(road, box)
         return roads
 
     # ---- slots ----

@@ -3,7 +3,10 @@
 Four formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
 JSON (`elements`, with node references or `out geom;`), GeoJSON as overpass-turbo and osmtogeojson write
 it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`), and PBF with the package osmium.
-GeoJSON of polygons without any such tag holds outlines of parking spaces.
+GeoJSON of polygons without any such tag holds outlines of parking spaces. XML and JSON may be packed (`.gz`, `.bz2`).
+
+Extracts are clipped: ways lack the nodes beyond the edge, multipolygons some of their ways. Streets are cut there,
+areas are closed by a straight line between what is left, and what has nothing left is listed.
 
 OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
 expand into gigabytes or fetch other files.
@@ -12,6 +15,7 @@ expand into gigabytes or fetch other files.
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -24,7 +28,8 @@ import shapely
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
-from parkenv.files.limited_reading import is_there, read_bytes, read_json
+from parkenv.files.limited_reading import is_there, open_limited, read_json, unpacked_path
+from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.positions import Positions
 
 OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
@@ -32,6 +37,11 @@ MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 """Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
 KEYS = (*MAPPED_KEYS, "noexit")
 """Keys of the elements that an import reads."""
+MOST_ELEMENTS = 5_000_000
+"""Maximum number of nodes, ways and relations of one file: a city of a million people."""
+MOST_XML_BYTES = 512_000_000
+"""Maximum size of OSM XML, unpacked."""
+BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +54,7 @@ class OsmElement:
     # multipolygon. A closed line ends where it starts.
     lines: tuple[FloatArray, ...]
     holes: tuple[FloatArray, ...] = ()  # a multipolygon's inner rings
+    cut: bool = False  # whether parts of it are beyond the edge of the map
 
     @property
     def is_node(self) -> bool:
@@ -56,23 +67,37 @@ class OsmElement:
         return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
 
 
-def read_map(path: Path) -> tuple[list[OsmElement], Positions]:
-    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON in order, and what its positions are.
+@dataclass(frozen=True, eq=False)
+class OsmMap:
+    """What a file holds."""
+
+    elements: list[OsmElement]  # the tagged nodes, ways and multipolygons, in order
+    positions: Positions = field(default_factory=Positions)  # what the positions in the file are
+    left_out: tuple[LeftOut, ...] = ()  # those without an outline or a line
+
+
+def read_map(path: Path) -> OsmMap:
+    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON, cut at the edge of the map.
 
     Raises:
-        InputError: the file cannot be read, is incomplete or has another format; a position is not on the globe; a
-            tagged way refers to a node that is not in the file; or an element appears twice with different content.
+        InputError: the file cannot be read, is damaged, too large or has another format; a position is not on the
+            globe; an element appears twice with different content; or no way has a node in the file.
     """
-    if path.suffix.lower() == ".pbf":
-        return read_pbf(path), Positions()
-    is_xml = path.suffix.lower() in (".osm", ".xml")
-    content: Any = read_bytes(path) if is_xml else read_json(path)
+    suffix = unpacked_path(path).suffix.lower()
+    if suffix == ".pbf":
+        return _read_pbf(path)
+    if suffix in (".osm", ".xml"):
+        return _read_xml(path)
+    content = read_json(path)
     with naming(path):
-        if is_xml:
-            return _elements_of_xml(content), Positions()
         has_features = isinstance(content, dict) and isinstance(content.get("features"), list)
         positions = Positions.of(content, path) if has_features else Positions()
-        return elements_of_json(content, positions), positions
+        return map_of_json(content, positions)
+
+
+def place_name(path: Path) -> str:
+    """Return the name of a map by its file, such as `town` of `town.osm.pbf` and of `town.osm.gz`."""
+    return unpacked_path(path).stem.removesuffix(".osm")
 
 
 def holds_osm(document: object) -> bool:
@@ -133,6 +158,21 @@ class RawElements:
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
     ways: dict[int, RawWay] = field(default_factory=dict)
     relations: dict[int, RawRelation] = field(default_factory=dict)
+    left_out: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
+    count: int = 0  # of elements
+
+    def count_one(self) -> None:
+        """Count an element.
+
+        Raises:
+            InputError: there are too many.
+        """
+        self.count += 1
+        if self.count > MOST_ELEMENTS:
+            raise InputError(
+                f"has more than {MOST_ELEMENTS:,} nodes, ways and relations, the most that is read; cut the town out "
+                "of it, e.g. by `osmium extract`"
+            )
 
     def add_node(self, number: int, position: tuple[float, float], tags: dict[str, str]) -> None:
         """Add a node; Overpass may write it again, with or without its tags."""
@@ -154,59 +194,94 @@ class RawElements:
             way = RawWay(way.tags or before.tags, way.refs or before.refs, line)
         self.ways[number] = way
 
-    def elements(self) -> list[OsmElement]:
-        """Return the tagged elements, with their references resolved."""
+    def map(self, positions: Positions | None = None) -> OsmMap:
+        """Return the tagged elements with their references resolved, cut at the edge of the map.
+
+        Raises:
+            InputError: there are ways, but none has a node in the file.
+        """
         nodes = [
             OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
             for i, tags in self.node_tags.items()
             if i in self.positions
         ]
-        ways = [
-            OsmElement(f"way/{i}", way.tags, (line,))
-            for i, way in self.ways.items()
-            if way.tags and len(line := self.line_of(i, way)) > 1
-        ]
-        return nodes + ways + [self._area(i, relation) for i, relation in self.relations.items()]
+        tagged = {i: way for i, way in self.ways.items() if way.tags}
+        ways = [way for i, raw in tagged.items() if (way := self._way(i, raw)) is not None]
+        if self.left_out and not ways:
+            raise InputError(
+                "none of its ways has its nodes in the file; export with complete ways (Overpass: "
+                "`out body; >; out skel qt;` or `out geom;`)"
+            )
+        areas = [area for i, raw in self.relations.items() if (area := self._area(i, raw)) is not None]
+        left_out = tuple(LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items())
+        return OsmMap(nodes + ways + areas, positions or Positions(), left_out)
 
-    def line_of(self, number: int, way: RawWay) -> FloatArray:
-        """Return the positions of a way, (k, 2) degrees."""
+    def _line_of(self, way: RawWay) -> FloatArray:
+        """Return the positions of a way, (k, 2) degrees, NaN beyond the edge of the map."""
         if way.line is not None:
             return way.line
-        absent = next((ref for ref in way.refs if ref not in self.positions), None)
-        if absent is not None:
-            raise InputError(
-                f"way/{number}: its node {absent} is not in the file; export with complete ways "
-                "(Overpass: `out body; >; out skel qt;` or `out geom;`)"
-            )
-        return np.array([self.positions[ref] for ref in way.refs]).reshape(-1, 2)
+        return np.array([self.positions.get(ref, BEYOND) for ref in way.refs]).reshape(-1, 2)
 
-    def _area(self, number: int, relation: RawRelation) -> OsmElement:
-        name = f"relation/{number}"
+    def _way(self, number: int, way: RawWay) -> OsmElement | None:
+        name, line = f"way/{number}", self._line_of(way)
+        cut = bool(np.isnan(line).any())
+        if not cut:
+            return OsmElement(name, way.tags, (line,)) if len(line) > 1 else None
+        inside = line[~np.isnan(line[:, 0])]
+        lines = _runs(line) if "highway" in way.tags else _closed([inside])
+        if not lines:
+            self.left_out["ways beyond the edge of the map"].append(name)
+            return None
+        return OsmElement(name, way.tags, tuple(lines), cut=True)
+
+    def _area(self, number: int, relation: RawRelation) -> OsmElement | None:
+        name, cut = f"relation/{number}", False
         parts: dict[str, list[FloatArray]] = {"outer": [], "inner": []}
         for ref, role, line in relation.members:
-            if line is None:
-                if ref not in self.ways:
-                    raise InputError(f"{name}: its member way {ref} is not in the file")
-                line = self.line_of(ref, self.ways[ref])
-            if len(line) < 2:
-                raise InputError(f"{name}: its member way {ref} has {len(line)} positions, want a line")
-            parts["inner" if role == "inner" else "outer"].append(line)
-        if not parts["outer"]:
-            raise InputError(f"{name}: a multipolygon without an outer way")
-        return OsmElement(name, relation.tags, _rings(name, parts["outer"]), _rings(name, parts["inner"]))
+            if line is None and ref in self.ways:
+                line = self._line_of(self.ways[ref])
+            cut |= line is None or bool(np.isnan(line).any())
+            if line is not None:
+                parts["inner" if role == "inner" else "outer"] += _runs(line)
+        outer, inner = (_joined(parts[role]) for role in ("outer", "inner"))
+        if cut:
+            outer, inner = _closed(outer), _closed(inner)
+        elif not all(_is_ring(line) for line in (*outer, *inner)):
+            self.left_out["multipolygons with an open outline"].append(name)
+            return None
+        if not outer:
+            self.left_out["multipolygons without an outline in the file"].append(name)
+            return None
+        return OsmElement(name, relation.tags, tuple(outer), tuple(inner), cut)
 
 
-def _rings(name: str, lines: Sequence[FloatArray]) -> tuple[FloatArray, ...]:
-    """Join lines that meet end to end into closed rings."""
+def _is_ring(line: FloatArray) -> bool:
+    return len(line) >= 4 and np.array_equal(line[0], line[-1])
+
+
+def _runs(line: FloatArray) -> list[FloatArray]:
+    """Return the parts of a line of at least two positions within the edge of the map."""
+    inside = ~np.isnan(line[:, 0])
+    starts = np.flatnonzero(np.diff(np.r_[False, inside].astype(np.int8)) == 1)
+    ends = np.flatnonzero(np.diff(np.r_[inside, False].astype(np.int8)) == -1) + 1
+    return [line[i:j] for i, j in zip(starts, ends, strict=True) if j - i > 1]
+
+
+def _joined(lines: Sequence[FloatArray]) -> list[FloatArray]:
+    """Join lines that meet end to end."""
     if not lines:
-        return ()
+        return []
     joined = shapely.line_merge(shapely.MultiLineString([line.tolist() for line in lines]))
-    rings = tuple(shapely.get_coordinates(part) for part in shapely.get_parts(joined))
-    for ring in rings:
-        if len(ring) < 4 or not np.array_equal(ring[0], ring[-1]):
-            lon, lat = ring[-1]
-            raise InputError(f"{name}: its outline is open at {lat:.7f}, {lon:.7f}")
-    return rings
+    return [shapely.get_coordinates(part) for part in shapely.get_parts(joined)]
+
+
+def _closed(lines: Sequence[FloatArray]) -> list[FloatArray]:
+    """Close lines by a straight line at the edge of the map; those that enclose nothing are dropped."""
+    rings = [
+        line if len(line) and np.array_equal(line[0], line[-1]) else np.concatenate([line, line[:1]])
+        for line in lines
+    ]
+    return [ring for ring in rings if len(ring) >= 4]
 
 
 def _position(name: str, lat: object, lon: object) -> tuple[float, float]:
@@ -248,6 +323,8 @@ class _XmlReader:
         )
 
     def start(self, name: str, values: dict[str, str]) -> None:
+        if name in ("node", "way", "relation"):
+            self.raw.count_one()
         if not self._root:
             self._root = name
             if name != "osm":
@@ -293,24 +370,26 @@ class _XmlReader:
             raise InputError(f"<{element}>: {key} is {values.get(key)!r:.40}, want a whole number") from error
 
 
-def _elements_of_xml(data: bytes) -> list[OsmElement]:
+def _read_xml(path: Path) -> OsmMap:
     reader = _XmlReader()
     parser = ElementTree.XMLParser(target=reader)
-    try:
-        parser.feed(data)
-        parser.close()
-    except ElementTree.ParseError as error:
-        line, column = error.position
-        reason = str(error).split(":")[0]
-        raise InputError(f"not XML: line {line}, column {column}: {reason}") from error
-    return reader.raw.elements()
+    with open_limited(path, MOST_XML_BYTES) as file, naming(path):
+        try:
+            while data := file.read(1 << 20):
+                parser.feed(data)
+            parser.close()
+        except ElementTree.ParseError as error:
+            line, column = error.position
+            reason = str(error).split(":")[0]
+            raise InputError(f"not XML: line {line}, column {column}: {reason}") from error
+        return reader.raw.map()
 
 
 # ---- JSON ----
 
 
-def elements_of_json(document: Any, positions: Positions | None = None) -> list[OsmElement]:
-    """Return the elements of parsed Overpass JSON, or of GeoJSON with positions that are yet to be converted.
+def map_of_json(document: Any, positions: Positions) -> OsmMap:
+    """Return the map of parsed Overpass JSON, or of GeoJSON with positions that are yet to be converted.
 
     Raises:
         InputError: see `read_map`; the message does not name the file.
@@ -318,9 +397,9 @@ def elements_of_json(document: Any, positions: Positions | None = None) -> list[
     if not isinstance(document, dict):
         raise InputError(f"holds a {type(document).__name__}, want Overpass JSON or a FeatureCollection")
     if isinstance(document.get("elements"), list):
-        return _overpass_elements(document["elements"])
+        return _overpass_map(document["elements"])
     if isinstance(document.get("features"), list):
-        to_lonlat = positions.to_lonlat if positions is not None and positions.converts else None
+        to_lonlat = positions.to_lonlat if positions.converts else None
         elements: dict[str, tuple[int, OsmElement]] = {}
         for index, feature in enumerate(document["features"]):
             element = _feature_element(index, feature, to_lonlat)
@@ -331,12 +410,12 @@ def elements_of_json(document: Any, positions: Positions | None = None) -> list[
                 raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
         found = [element for _, element in elements.values()]
         if _holds_outlines(document["features"]):
-            return [replace(e, tags={"amenity": "parking_space"}) for e in found]
-        return found
+            found = [replace(e, tags={"amenity": "parking_space"}) for e in found]
+        return OsmMap(found, positions)
     raise InputError("no elements and no features, want Overpass JSON or a GeoJSON FeatureCollection")
 
 
-def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
+def _overpass_map(elements: Iterable[Any]) -> OsmMap:
     raw = RawElements()
     for index, element in enumerate(elements):
         kind = element.get("type") if isinstance(element, dict) else None
@@ -368,16 +447,18 @@ def _overpass_elements(elements: Iterable[Any]) -> list[OsmElement]:
                 if isinstance(m, dict) and m.get("type") == "way"
             ]
             raw.relations[number] = RawRelation(tags, members)
-    return raw.elements()
+    return raw.map()
 
 
 def _geometry(name: str, holder: Mapping[str, Any]) -> FloatArray | None:
     points = holder.get("geometry")
     if points is None:
         return None
-    if not isinstance(points, list) or not all(isinstance(p, dict) for p in points):
-        raise InputError(f"{name}: geometry has gaps, want whole ways: `out geom;` without a bounding box")
-    return np.array([_position(name, p.get("lat"), p.get("lon")) for p in points]).reshape(-1, 2)
+    if not isinstance(points, list) or not all(isinstance(p, dict | None) for p in points):
+        raise InputError(f"{name}: geometry is {points!r:.40}, want positions")
+    # Overpass writes null for nodes beyond a bounding box.
+    inside = (BEYOND if p is None else _position(name, p.get("lat"), p.get("lon")) for p in points)
+    return np.array(list(inside)).reshape(-1, 2)
 
 
 def _feature_element(
@@ -445,12 +526,8 @@ def _is_object(holder: Mapping[str, Any], key: str) -> bool:
 # ---- PBF ----
 
 
-def read_pbf(path: Path) -> list[OsmElement]:
-    """Read the parking, roads, buildings and entrances of an extract.
-
-    Raises:
-        InputError: osmium is not installed, or the file cannot be read.
-    """
+def _read_pbf(path: Path) -> OsmMap:
+    """Read the parking, roads, buildings and entrances of an extract."""
     try:
         import osmium
     except ImportError as error:
@@ -461,19 +538,21 @@ def read_pbf(path: Path) -> list[OsmElement]:
         raise InputError(f"{path}: No such file or directory")
     raw = RawElements()
     needed: set[int] = set()
-    try:
-        for relation in osmium.FileProcessor(str(path), osmium.osm.RELATION):
-            tags = dict(relation.tags)
-            if is_area_relation(tags):
-                members = [(m.ref, m.role) for m in relation.members if m.type == "w"]
-                raw.relations[relation.id] = RawRelation(tags, [(ref, role, None) for ref, role in members])
-                needed.update(ref for ref, _ in members)
-        for element in osmium.FileProcessor(str(path), osmium.osm.NODE | osmium.osm.WAY).with_locations():
-            _add(raw, element, needed)
-    except RuntimeError as error:
-        raise InputError(f"{path}: not an OpenStreetMap extract: {error}") from error
     with naming(path):
-        return raw.elements()
+        try:
+            for relation in osmium.FileProcessor(str(path), osmium.osm.RELATION):
+                raw.count_one()
+                tags = dict(relation.tags)
+                if is_area_relation(tags):
+                    ways = [(m.ref, m.role) for m in relation.members if m.type == "w"]
+                    raw.relations[relation.id] = RawRelation(tags, [(*way, None) for way in ways])
+                    needed.update(ref for ref, _ in ways)
+            for element in osmium.FileProcessor(str(path), osmium.osm.NODE | osmium.osm.WAY).with_locations():
+                raw.count_one()
+                _add(raw, element, needed)
+        except RuntimeError as error:
+            raise InputError(f"not an OpenStreetMap extract: {error}") from error
+        return raw.map()
 
 
 def _add(raw: RawElements, element: Any, needed: set[int]) -> None:
@@ -483,6 +562,5 @@ def _add(raw: RawElements, element: Any, needed: set[int]) -> None:
             location = element.location
             raw.add_node(element.id, (location.lon, location.lat), dict(element.tags))
     elif wanted or element.id in needed:
-        # Nodes beyond the edge of an extract have no position.
-        line = [(n.location.lon, n.location.lat) for n in element.nodes if n.location.valid()]
+        line = [(n.location.lon, n.location.lat) if n.location.valid() else BEYOND for n in element.nodes]
         raw.add_way(element.id, RawWay(dict(element.tags), [], np.array(line).reshape(-1, 2)))

@@ -40,7 +40,12 @@ def usable_spaces(
         with_disabled: whether spaces for disabled drivers are slots.
     """
     private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
-    reasons = [_why_no_slot(a.element.tags, a.polygon, private, with_disabled=with_disabled) for a in spaces]
+    reasons = [
+        "spaces cut at the edge of the map"
+        if a.element.cut
+        else _why_no_slot(a.element.tags, a.polygon, private, with_disabled=with_disabled)
+        for a in spaces
+    ]
     judged = list(zip(spaces, reasons, strict=True))
     return [a for a, why in judged if why is None], [(a, why) for a, why in judged if why is not None]
 

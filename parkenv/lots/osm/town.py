@@ -13,7 +13,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.lots.draft import ImportOptions, LotDraft
 from parkenv.lots.osm.draft import draft_of_elements, map_frame
-from parkenv.lots.osm.elements import OsmElement, read_map
+from parkenv.lots.osm.elements import OsmElement, place_name, read_map
 from parkenv.lots.osm.spaces import is_space
 from parkenv.world.drive_graph import component_labels
 
@@ -47,13 +47,13 @@ def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPA
         InputError: the file cannot be read, has no parking spaces or an outline that is none.
     """
     path = Path(path)
-    elements, positions = read_map(path)
+    place = read_map(path)
     with naming(path):
-        parts = list(split_town(path.stem, elements, least))
+        parts = list(split_town(place_name(path), place.elements, least))
     for name, part in parts:
         count = sum(map(is_space, part))
         try:
-            draft = draft_of_elements(name, part, options, positions.frame)
+            draft = draft_of_elements(name, part, options, place.positions.frame)
             draft.lot()
         except InputError as error:
             yield CarPark(name, count, None, str(error))
