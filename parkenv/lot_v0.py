@@ -28,7 +28,7 @@ from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
 from parkenv.errors import InputError, require_whole
 from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
-from parkenv.world.demand import MAX_CARS, Demand, Headways
+from parkenv.world.demand import MAX_CARS, Demand, Headways, TownDemand
 from parkenv.world.lot import ACTIONS
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ class _CarsAsAgents:
         self,
         scenario: ScenarioSource = "mini",
         cars: int = 5,
-        demand: Demand | None = None,
+        demand: Demand | TownDemand | None = None,
         background: str = "residents",
         max_cycles: int = MAX_STEPS,
         render_mode: str | None = None,
@@ -86,7 +86,7 @@ class _CarsAsAgents:
         )
         self.scenario = self.fleet.scenario
         self.render_mode, self.max_cycles = render_mode, max_cycles
-        self.possible_agents = [f"car_{i}" for i in range(demand.arrivals.max_cars)]
+        self.possible_agents = [f"car_{i}" for i in range(demand.max_cars)]
         self.agents: list[str] = []
         self._observation_space = self.fleet.observation_space
         self._observation_spaces: dict[str, spaces.Dict] = {}

@@ -6,6 +6,7 @@ generators", OOPSLA 2014), applied once for each of stream, slot and index.
 """
 
 import math
+import zlib
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,7 @@ PATIENCE_STREAM = 9
 GOAL_STREAM = 10
 KIND_STREAM = 11
 POLICY_STREAM = 12
+CLASS_STREAM = 13
 
 _WORD_BITS = 64
 _WORD = (1 << _WORD_BITS) - 1
@@ -103,6 +105,11 @@ def car_uniforms(world: np.uint64, stream: int, first: int, values: NDArray[np.f
     """Fill an array with the uniform numbers of the cars from `first` on, index 0 of the stream each."""
     for i in range(len(values)):
         values[i] = keyed_uniform(world, stream, first + i, 0)
+
+
+def named_key(key: np.uint64, name: str) -> np.uint64:
+    """Return the key of what has a name within a world, such as a purpose: another one for each name."""
+    return np.uint64(_absorbed(np.uint64(key), np.uint64(zlib.crc32(name.encode()) + (1 << 32))))
 
 
 def seed_state(seed: int) -> np.uint64:

@@ -62,7 +62,7 @@ from parkenv.engine.spaces import action_number, space_of
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
-from parkenv.world.demand import Demand
+from parkenv.world.demand import CarPlans, Demand, TownDemand
 from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, draw_arrival
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.python_functions import raise_error
@@ -171,7 +171,7 @@ class Fleet:
         demand: when cars arrive, how long they stay; by default one car.
         background: who else takes slots: `residents`, cars that stand there when the world begins, drawn from the
             scenario's occupancy, and leave once; `process`, the scenario's occupancy all day; `none`, nobody: the lot
-            is empty when the world begins.
+            is empty when the world begins. By default residents; nobody if cars of the demand are parked then.
         drivers: the kinds of drivers.
         max_steps: limit of a car's decisions.
         tick_s: durations of steps, and arrivals, are rounded up to multiples of this, s; 0: continuous time.
@@ -203,9 +203,9 @@ class Fleet:
     def __init__(
         self,
         scenario: ScenarioSource,
-        demand: Demand | None = None,
+        demand: Demand | TownDemand | None = None,
         *,
-        background: str = "residents",
+        background: str | None = None,
         drivers: Sequence[DriverKind] = (DriverKind(),),
         max_steps: int = MAX_STEPS,
         tick_s: float = 0.0,
@@ -224,7 +224,9 @@ class Fleet:
             "manoeuvre_s": manoeuvre_s,
             "leaving_soon_s": leaving_soon_s,
         }
-        self._require(background, max_steps, times)
+        if background is None and isinstance(self.demand, Demand | TownDemand):
+            background = "none" if any(one.parked for one in self.demand.purposes) else "residents"
+        background = self._require(background, max_steps, times)
         self._options: dict[str, Any] = {
             "background": background,
             "drivers": self.drivers,
@@ -281,8 +283,8 @@ class Fleet:
         self._drive_s: dict[int, NDArray[np.float64]] = {}
         self._surroundings: dict[int, Surroundings] = {}
 
-    def _require(self, background: str, max_steps: int, times: Mapping[str, float]) -> None:
-        if not isinstance(self.demand, Demand):
+    def _require(self, background: str | None, max_steps: int, times: Mapping[str, float]) -> str:
+        if not isinstance(self.demand, Demand | TownDemand):
             raise InputError(f"demand is a {type(self.demand).__name__}, want a Demand")
         if background not in BACKGROUNDS:
             raise InputError(f"background is {background!r}, want one of {', '.join(BACKGROUNDS)}")
@@ -295,6 +297,7 @@ class Fleet:
         for name, value in times.items():
             if not isinstance(value, (int, float, np.number)) or not 0.0 <= value < math.inf:
                 raise InputError(f"{name} is {value!r}, want a finite number of at least 0")
+        return background
 
     def _weighted(self, name: str, weights: tuple[float, ...], n: int) -> range:
         if weights and len(weights) != n:
@@ -325,7 +328,7 @@ class Fleet:
         days = occupancy.arrival_days(window)
         day, arrival_s = draw_arrival(key, len(days), float(window.start_s), float(window.end_s))
         self.day, midnight = days[day], days[day].weekday * DAY_S
-        begin_s = self.demand.arrivals.begin_s(arrival_s)
+        begin_s = self.demand.begin_s(arrival_s)
         begin = midnight + begin_s
         _, hour, second = hour_of_week(begin)
         record["key"], record["day"], record["midnight"], record["arrival"] = key, day, midnight, begin
@@ -341,6 +344,8 @@ class Fleet:
 
     def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
         plans = self.demand.draw(key, arrival_s, len(self._entries), self.day)
+        if plans.parked.any() or plans.walks_back.any():
+            raise InputError("Demand.parked and Demand.walks_back are not for fleets yet")
         n = len(plans.arrival_s)
         cars = np.zeros(n, CAR)
         cars["arrival"] = midnight + plans.arrival_s
@@ -361,6 +366,7 @@ class Fleet:
         cars["state"], cars["slot"] = DUE, NO_CAR
         cars["ended_at"] = cars["left_at"] = np.inf
         self._cars = cars
+        self._drivers = self._drivers_in(plans)
         capacity = max(n, sum(len(one.records) for one in self._pool))
         self._record["n_cars"], self._record["n_free"] = n, 0
         if self.scenario.has_rules:
@@ -383,6 +389,20 @@ class Fleet:
         )
         for searches in self._pool:
             self._add_free(searches)
+
+    def _drivers_in(self, plans: CarPlans) -> Drivers:
+        """Return what decides where the cars may park and what it costs them."""
+        usual, classes = self.scenario.driver, np.zeros(len(self._cars), np.int64)
+        for bit, name in enumerate(self.demand.class_names):
+            classes |= (plans.classes >> bit & 1) * self.scenario.class_bits((name,))
+        value_of_time = np.where(np.isnan(plans.value_of_time), usual.value_of_time, plans.value_of_time)
+        return Drivers(
+            self._cars["stay_s"],
+            self._cars["arrival"],
+            value_of_time,
+            classes | np.int64(self.scenario.class_bits(self.scenario.classes)),
+            plans.kwh,
+        )
 
     def _add_free(self, searches: Searches) -> None:
         """Add SEARCH records to those that are free."""
@@ -569,8 +589,7 @@ class Fleet:
 
     def drivers_of(self, cars: Any) -> Drivers:
         """Return what decides where some cars, an index of `cars`, may park and what it costs them."""
-        one = self.scenario.driver
-        return one._replace(stay_s=self._cars["stay_s"][cars], arrival_s=self._cars["arrival"][cars])
+        return Drivers(*(np.asarray(values)[cars] for values in self._drivers))
 
     # ---- what is known of cars and slots
 

@@ -33,7 +33,7 @@ from parkenv.engine.records import (
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.cost_terms import METRICS
-from parkenv.world.demand import Demand
+from parkenv.world.demand import Demand, TownDemand
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import kernel
 
@@ -87,7 +87,7 @@ class FleetVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]])
         self,
         num_envs: int,
         scenario: ScenarioSource,
-        demand: Demand,
+        demand: Demand | TownDemand,
         drivers: Sequence[DriverKind] = (DriverKind(),),
         k: int = 5,
         max_steps: int = MAX_STEPS,

@@ -14,6 +14,7 @@ import numpy as np
 
 from parkenv.errors import InputError, require_keywords
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
+from parkenv.scenarios.purposes import demand_of
 from parkenv.scenarios.spec import (
     CountsSpec,
     ForecastSpec,
@@ -149,7 +150,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             goal = spec.goal
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
-        occupancy = _occupancy(spec.occupancy, lot, goal)
+        occupancy, window = _occupancy(spec.occupancy, lot, goal), spec.arrivals.window()
         scenario = Scenario(
             name=spec.title,
             lot=lot,
@@ -166,7 +167,8 @@ def build(spec: ScenarioSpec) -> Scenario:
             sensor_model=sensor_model(spec.sensor_model),
             occupancy=occupancy,
             prior=_prior(spec.forecast, occupancy, lot, goal),
-            arrival=spec.arrivals.window(),
+            arrival=window,
+            demand=demand_of(spec.demand, lot, window),
             traffic=Traffic()
             if spec.traffic is None
             else Traffic(spec.traffic.cars, spec.traffic.pedestrians),

@@ -10,7 +10,13 @@ from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, GetJsonSchemaHandler, model_validator
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    GetJsonSchemaHandler,
+    model_validator,
+)
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
@@ -28,7 +34,15 @@ from parkenv.files.known_names import (
 )
 from parkenv.files.limited_reading import is_there
 from parkenv.files.option import Option, numbers_in, option, seconds_of_minutes
-from parkenv.files.spec_file import FilePath, OrText, PackagedDetector, Several, Spec, read_tables
+from parkenv.files.spec_file import (
+    FilePath,
+    OrText,
+    PackagedDetector,
+    Several,
+    Spec,
+    read_tables,
+)
+from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
@@ -532,6 +546,9 @@ class ScenarioSpec(Spec):
     )
     forecast: Annotated[ForecastSpec, BeforeValidator(_forecast_tables), OrText()] = ForecastSpec()
     arrivals: Arrivals = Arrivals()
+    demand: dict[PurposeName, PurposeSpec] = Field(
+        {}, description="What many cars come for, by the name of the purpose, in the hours of `arrivals`."
+    )
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
     sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = option(

@@ -8,8 +8,8 @@ process of twice the rate has the same gaps, half as long.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -18,8 +18,9 @@ from scipy.optimize import nnls
 from scipy.special import ndtri
 from scipy.stats import poisson
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
+    CLASS_STREAM,
     ENTRY_STREAM,
     GOAL_STREAM,
     HEADWAY_STREAM,
@@ -27,6 +28,7 @@ from parkenv.compiled.keyed_random import (
     PATIENCE_STREAM,
     STAY_STREAM,
     car_uniforms,
+    named_key,
 )
 from parkenv.errors import InputError, require_number, require_whole
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -36,6 +38,10 @@ from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
 MAX_CARS = 1_000_000
 """Maximum number of cars of a world."""
+MAX_CLASSES = 60
+"""Maximum number of classes of drivers."""
+CHARGING = "charging"
+"""The class of cars that need to charge."""
 _QUANTILES = 400  # equally probable stays that stand for their law
 _RARE = 1e-12  # probability of more arrivals than `PoissonArrivals.max_cars`
 _FOLLOWED_S = 300.0  # between the moments at which a lot is compared with its occupancy model
@@ -301,9 +307,8 @@ class FollowingArrivals:
         midnight = day.weekday * DAY_S
         course = self.occupancy.course(Arrival(midnight + start, day.date), midnight + seconds)
         edges = hours_between(start, end)
-        stays = self.stay.quantile((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
         wanted = self.occupancy.n_slots * (course.occupied - course.residents)
-        rates, _ = nnls(_parked(stays, edges, seconds), wanted)
+        rates, _ = nnls(parked_share(self.stay, edges, seconds), wanted)
         # Where nobody has to come, arrivals still need some rate above 0.
         by_hour = np.full(DAY_HOURS, _NO_RATE)
         by_hour[(edges[:-1] // HOUR_S).astype(np.int64)] += self.scale * rates
@@ -346,16 +351,51 @@ class ListedArrivals:
         return np.array(self.times_s)
 
 
+@dataclass(frozen=True)
+class NoArrivals:
+    """Nobody arrives: the cars of a purpose are all parked when the world begins.
+
+    Args:
+        start_s: beginning of the world, s of the day, in [0, 86400).
+    """
+
+    start_s: float
+
+    def __post_init__(self) -> None:
+        _require_second("NoArrivals.start_s", self.start_s)
+
+    @property
+    def max_cars(self) -> int:
+        """None."""
+        return 0
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return `start_s`."""
+        del arrival_s
+        return self.start_s
+
+    def draw(self, key: np.uint64, arrival_s: float, day: ArrivalDay) -> FloatArray:
+        """Return no arrival."""
+        del key, arrival_s, day
+        return np.zeros(0)
+
+
 class CarPlans(NamedTuple):
     """What is known of the cars of a world before anybody drives, (n,) each, in order of arrival.
 
     Attributes:
         arrival_s: float64, s of the day.
-        stay_s: float64, s, time in the slot.
+        stay_s: float64, s, time in the slot; of parked cars, what is left of it.
         patience_s: float64, s, length of the search after which the car goes elsewhere.
         entry: int64, index of the entry.
         goal: int64, index of the goal among those with a weight.
         kind: float64 in (0, 1), number that decides the kind of driver.
+        purpose: int64, index of the purpose.
+        value_of_time: float64, value of an hour of the driver's time; NaN: the scenario's.
+        classes: int64, bit k is set for drivers of the class `class_names[k]` of the demand.
+        walks_back: bool, whether the walk back from the goal counts, too.
+        kwh: float64, energy that the car takes where it can charge.
+        parked: bool, whether the car stands in a slot when the world begins; these come first.
     """
 
     arrival_s: FloatArray
@@ -364,11 +404,26 @@ class CarPlans(NamedTuple):
     entry: IntArray
     goal: IntArray
     kind: FloatArray
+    purpose: IntArray
+    value_of_time: FloatArray
+    classes: IntArray
+    walks_back: BoolArray
+    kwh: FloatArray
+    parked: BoolArray
+
+    @classmethod
+    def joined(cls, parts: Sequence[CarPlans]) -> CarPlans:
+        """Return the cars of several plans, one after another."""
+        return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in cls._fields})
+
+    def at(self, order: IntArray) -> CarPlans:
+        """Return the cars with these indices."""
+        return self._replace(**{name: getattr(self, name)[order] for name in self._fields})
 
 
 @dataclass(frozen=True)
 class Demand:
-    """The demand for parking in one lot.
+    """The demand for parking in one lot, of drivers with one purpose; `TownDemand` is that of several.
 
     Args:
         arrivals: when cars arrive.
@@ -378,6 +433,14 @@ class Demand:
         entry_weights: relative number of cars of each entry of the lot; empty: as in a single search, the scenario's
             entry, or all alike.
         goal_weights: relative number of cars of each goal of the lot; empty: the scenario's goal.
+        name: the purpose, such as `commuters`. Purposes of different names have different random numbers, so that one
+            can be changed without the others.
+        value_of_time: value of an hour of the drivers' time, in the currency of the prices; None: the scenario's.
+        classes: share of the drivers of each class, by its name, such as `permit-a`; independent of each other.
+        walks_back: whether the walk back from the goal counts as much as that to it.
+        kwh: energy that a car of the class `charging` takes.
+        parked: number of cars that stand in slots when the world begins. They leave after the rest of their stay, as
+            cars do that have come and gone by this law for long.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -388,6 +451,12 @@ class Demand:
     patience: Duration = field(default_factory=lambda: ConstantTime(math.inf))
     entry_weights: tuple[float, ...] = ()
     goal_weights: tuple[float, ...] = ()
+    name: str = ""
+    value_of_time: float | None = None
+    classes: Mapping[str, float] = field(default_factory=dict)
+    walks_back: bool = False
+    kwh: float = 0.0
+    parked: int = 0
 
     def __post_init__(self) -> None:
         for name, wanted in (("arrivals", "draw"), ("stay", "quantile"), ("patience", "quantile")):
@@ -399,6 +468,45 @@ class Demand:
                 raise InputError(f"Demand.{name} is {value!r:.60}, want {examples}")
         for name in ("entry_weights", "goal_weights"):
             object.__setattr__(self, name, _weights(f"Demand.{name}", getattr(self, name)))
+        if self.value_of_time is not None:
+            require_number("Demand.value_of_time", self.value_of_time, above=0.0)
+        for name, share in self.classes.items():
+            require_number(f"Demand.classes[{name!r}]", share, least=0.0, most=1.0)
+        if len(self.classes) > MAX_CLASSES:
+            raise InputError(f"Demand.classes has {len(self.classes)} names, want at most {MAX_CLASSES}")
+        require_number("Demand.kwh", self.kwh, least=0.0)
+        require_whole("Demand.parked", self.parked, most=MAX_CARS)
+
+    @property
+    def purposes(self) -> tuple[Demand, ...]:
+        """The demand itself: its one purpose."""
+        return (self,)
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the bits of `CarPlans.classes`."""
+        return tuple(self.classes)
+
+    @property
+    def max_cars(self) -> int:
+        """Maximum number of cars of a world."""
+        return self.arrivals.max_cars + self.parked
+
+    @property
+    def expected(self) -> float:
+        """Expected number of arrivals, of a Poisson process; else the maximum."""
+        return getattr(self.arrivals, "expected", self.arrivals.max_cars)
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return when the world begins, s of the day; see `Arrivals`."""
+        return self.arrivals.begin_s(arrival_s)
+
+    def scaled(self, factor: float) -> Demand:
+        """Return the demand with so many times the arrivals of a Poisson process, and the same cars parked."""
+        if not isinstance(self.arrivals, PoissonArrivals):
+            return self
+        rates = np.asarray(self.arrivals.per_hour) * factor
+        return replace(self, arrivals=replace(self.arrivals, per_hour=rates.tolist()))
 
     def draw(self, key: np.uint64, arrival_s: float, n_entries: int, day: ArrivalDay) -> CarPlans:
         """Draw the cars of the world with this key.
@@ -409,16 +517,35 @@ class Demand:
             n_entries: number of entries among which cars choose if there are no `entry_weights`.
             day: day of the world.
         """
-        arrival = self.arrivals.draw(key, arrival_s, day)
-        n = len(arrival)
+        own = named_key(key, self.name) if self.name else key
+        arriving = self._plans(own, self.arrivals.draw(own, arrival_s, day), n_entries, parked=False)
+        if not self.parked:
+            return arriving
+        since = np.full(self.parked, self.begin_s(arrival_s))
+        parked = self._plans(named_key(own, "parked"), since, n_entries, parked=True)
+        return CarPlans.joined([parked, arriving])
+
+    def _plans(self, key: np.uint64, arrival: FloatArray, n_entries: int, *, parked: bool) -> CarPlans:
+        n, u_stay = len(arrival), _uniforms(key, STAY_STREAM, len(arrival))
         entries = self.entry_weights or (1.0,) * n_entries
+        classes = np.zeros(n, np.int64)
+        for bit, (name, share) in enumerate(self.classes.items()):
+            drawn = _uniforms(named_key(key, name), CLASS_STREAM, n) < share
+            classes |= drawn.astype(np.int64) << bit
+        charges = classes >> self.class_names.index(CHARGING) & 1 if CHARGING in self.classes else 0
         return CarPlans(
             arrival,
-            self.stay.quantile(_uniforms(key, STAY_STREAM, n)),
+            rest_of_stay(self.stay, u_stay) if parked else self.stay.quantile(u_stay),
             self.patience.quantile(_uniforms(key, PATIENCE_STREAM, n)),
             _choices(_uniforms(key, ENTRY_STREAM, n), entries),
             _choices(_uniforms(key, GOAL_STREAM, n), self.goal_weights or (1.0,)),
             _uniforms(key, KIND_STREAM, n),
+            np.zeros(n, np.int64),
+            np.full(n, math.nan if self.value_of_time is None else self.value_of_time),
+            classes,
+            np.full(n, self.walks_back),
+            np.full(n, self.kwh) * charges,
+            np.full(n, parked),
         )
 
     @classmethod
@@ -445,12 +572,90 @@ class Demand:
         stays = _stay_quantiles(cars.stay_s, cars.ended)
         seen = cars.seen > 0
         edges, times = np.arange(DAY_HOURS + 1.0) * HOUR_S, np.arange(1.0 * DAY_PERIODS) * PERIOD_S
-        filled = _parked(np.array(stays), edges, times)[seen]
+        filled = parked_share(EmpiricalTime(stays), edges, times)[seen]
         weight = np.sqrt(cars.seen[seen])
         per_slot, _ = nnls(filled * weight[:, None], cars.arrived[seen] / cars.seen[seen] * weight)
         hours = per_slot.nonzero()[0]
         window = float(hours[0] * HOUR_S), float((hours[-1] + 1) * HOUR_S)
         return cls(PoissonArrivals(tuple(map(float, n_slots * per_slot)), *window), EmpiricalTime(stays))
+
+
+@dataclass(frozen=True)
+class TownDemand:
+    """The demand of drivers with several purposes.
+
+    Args:
+        purposes: the demand of each, of different names; either all of them weigh the lot's entries, or none does, and
+            so with goals.
+
+    Raises:
+        InputError: a value out of its range; the message names the field.
+    """
+
+    purposes: tuple[Demand, ...]
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "purposes", tuple(self.purposes))
+        names = [one.name for one in self.purposes]
+        if not names or len(set(names)) < len(names):
+            raise InputError(f"TownDemand.purposes are named {names}, want at least one, of different names")
+        if not any(one.arrivals.max_cars for one in self.purposes):
+            raise InputError("TownDemand.purposes: nobody arrives, want a rate above 0 in the window")
+        for name in ("entry_weights", "goal_weights"):
+            if len({len(getattr(one, name)) for one in self.purposes}) > 1:
+                raise InputError(f"TownDemand.purposes: {name} are of different lengths, want one for all")
+        if self.max_cars > MAX_CARS:
+            raise InputError(f"TownDemand.purposes: {self.max_cars:,} cars, want at most {MAX_CARS:,}")
+        if len(self.class_names) > MAX_CLASSES:
+            raise InputError(
+                f"TownDemand.purposes have {len(self.class_names)} classes, want at most {MAX_CLASSES}"
+            )
+
+    @property
+    def entry_weights(self) -> tuple[float, ...]:
+        """Those of the first purpose: as many as those of all."""
+        return self.purposes[0].entry_weights
+
+    @property
+    def goal_weights(self) -> tuple[float, ...]:
+        """Those of the first purpose: as many as those of all."""
+        return self.purposes[0].goal_weights
+
+    @property
+    def class_names(self) -> tuple[str, ...]:
+        """Names of the classes, in the order of the bits of `CarPlans.classes`."""
+        return tuple(dict.fromkeys(name for one in self.purposes for name in one.classes))
+
+    @property
+    def max_cars(self) -> int:
+        """Maximum number of cars of a world."""
+        return sum(one.max_cars for one in self.purposes)
+
+    @property
+    def expected(self) -> float:
+        """Expected number of arrivals."""
+        return sum(one.expected for one in self.purposes)
+
+    def begin_s(self, arrival_s: float) -> float:
+        """Return when the world begins, s of the day: with the first purpose."""
+        return min(one.begin_s(arrival_s) for one in self.purposes)
+
+    def scaled(self, factor: float) -> TownDemand:
+        """Return the demand with so many times the arrivals, and the same cars parked."""
+        return TownDemand(tuple(one.scaled(factor) for one in self.purposes))
+
+    def draw(self, key: np.uint64, arrival_s: float, n_entries: int, day: ArrivalDay) -> CarPlans:
+        """Draw the cars of the world with this key; see `Demand.draw`."""
+        bits, drawn = {name: bit for bit, name in enumerate(self.class_names)}, []
+        for number, one in enumerate(self.purposes):
+            plans = one.draw(key, arrival_s, n_entries, day)
+            classes = np.zeros_like(plans.classes)
+            for bit, name in enumerate(one.classes):
+                classes |= (plans.classes >> bit & 1) << bits[name]
+            drawn.append(plans._replace(purpose=np.full_like(classes, number), classes=classes))
+        plans = CarPlans.joined(drawn)
+        plans.arrival_s[plans.parked] = self.begin_s(arrival_s)
+        return plans.at(np.lexsort((~plans.parked, plans.arrival_s)))
 
 
 class _RecordedCars(NamedTuple):
@@ -503,14 +708,25 @@ def hours_between(start_s: float, end_s: float) -> FloatArray:
     return np.concatenate(([start_s], hours, [end_s]))
 
 
-def _parked(stays: FloatArray, edges: FloatArray, times: FloatArray) -> FloatArray:
+def parked_share(stay: Duration, edges: FloatArray, times: FloatArray) -> FloatArray:
     """Return the expected cars at k times, (k, m), if one car an hour arrives from one edge, (m + 1,), to the next.
 
     The share that arrived at u and stays at t is P(stay > t - u); its integral over u is the mean of min(stay, t - u).
     """
     since = np.maximum(times[:, None] - edges, 0.0)
-    stayed = np.minimum(stays, since[:, :, None]).mean(axis=2)
+    stayed = np.minimum(_equally_likely(stay), since[:, :, None]).mean(axis=2)
     return np.asarray(-np.diff(stayed, axis=1) / HOUR_S)
+
+
+def staying_share(stay: Duration, since_s: FloatArray) -> FloatArray:
+    """Return which share of the cars that are met parked is still there after k times, (k,); see `rest_of_stay`."""
+    stays = _equally_likely(stay)
+    return np.asarray(1.0 - np.minimum(stays, since_s[:, None]).mean(axis=1) / stays.mean())
+
+
+def _equally_likely(stay: Duration) -> FloatArray:
+    """Return stays that stand for their law, s, ascending."""
+    return stay.quantile((np.arange(_QUANTILES) + 0.5) / _QUANTILES)
 
 
 def _stay_quantiles(stays: FloatArray, ended: NDArray[np.bool_]) -> tuple[float, ...]:
@@ -529,6 +745,19 @@ def _stay_quantiles(stays: FloatArray, ended: NDArray[np.bool_]) -> tuple[float,
     left = max(float(survival[-1]), levels[-1] / 2)
     beyond = last + mean * np.log(np.maximum(left / levels, 1.0))
     return tuple(map(float, np.where(at < len(times), times[np.minimum(at, len(times) - 1)], beyond)))
+
+
+def rest_of_stay(stay: Duration, u: FloatArray) -> FloatArray:
+    """Return what is left of the stays of cars that are met parked, (k,) s, for uniform u in (0, 1).
+
+    Long stays are met more often, and each at a uniform moment: the law of the excess of a renewal process.
+    """
+    if not math.isfinite(stay.mean_s):
+        return np.full(len(u), math.inf)
+    stays = _equally_likely(stay)
+    until = np.cumsum(stays) / stays.sum()
+    met = np.minimum(np.searchsorted(until, u, side="right"), _QUANTILES - 1)
+    return np.asarray((until[met] - u) * stays.sum())
 
 
 def _uniforms(key: np.uint64, stream: int, n: int) -> FloatArray:

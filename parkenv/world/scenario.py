@@ -15,6 +15,7 @@ from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, nearest, require_keywords, require_number
+from parkenv.world.demand import Demand, TownDemand
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
@@ -277,6 +278,7 @@ class Scenario(SearchProblem):
         prior: model of the initial forecast; None: `occupancy`. A prior that differs from the world models an outdated
             map.
         arrival: when searches start.
+        demand: the cars of a day with many; None: such a day needs a demand of its own.
         entry: index into `lot.entries`; None draws one for each search.
         traffic: other road users in the lot, visible to simulated sensors and on driven trips.
         rig: name of the car's sensor rig, where sensors are simulated.
@@ -287,6 +289,7 @@ class Scenario(SearchProblem):
     occupancy: OccupancyModel
     prior: PriorModel | None = None
     arrival: ArrivalWindow = field(default_factory=ArrivalWindow)
+    demand: Demand | TownDemand | None = None
     entry: int | None = None
     traffic: Traffic = field(default_factory=Traffic)
     rig: str = "laser"
@@ -300,6 +303,8 @@ class Scenario(SearchProblem):
             raise InputError(f"traffic is a {type(self.traffic).__name__}, want a Traffic")
         if not isinstance(self.arrival, ArrivalWindow):
             raise InputError(f"arrival is {self.arrival!r:.60}, want an ArrivalWindow")
+        if not isinstance(self.demand, Demand | TownDemand | None):
+            raise InputError(f"demand is {self.demand!r:.60}, want a Demand, a TownDemand or None")
         for name in ("occupancy", "prior"):
             model = getattr(self, name)
             if model is not None and model.n_slots != self.lot.n_slots:

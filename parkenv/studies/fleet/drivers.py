@@ -13,12 +13,20 @@ from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.setting import times_counted
+from parkenv.studies.fleet.setting import COUNTED, GIVEN, times_demanded
 from parkenv.studies.fleet.tables import day_means
 from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers
-from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, FollowingArrivals, PoissonArrivals
+from parkenv.world.demand import (
+    ConstantTime,
+    Demand,
+    ExponentialTime,
+    FollowingArrivals,
+    PoissonArrivals,
+    TownDemand,
+)
 from parkenv.world.scenario import Scenario
+from parkenv.world.week import HOUR_S
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.heuristics import POLICIES
 from planners.heuristics.agents import TargetAgent
@@ -86,29 +94,38 @@ class AgentsByStay:
         return action, (agent, memory)
 
 
-def demand_in(scenario: Scenario, per_hour: float | str, stay_s: float, patience_s: float) -> Demand:
+def demand_in(
+    scenario: Scenario, per_hour: float | str, stay_s: float, patience_s: float
+) -> Demand | TownDemand:
     """Return the demand of a number of cars an hour in the hours of a scenario.
 
     Args:
         scenario: its hours of arrival are meant.
-        per_hour: cars an hour; or `counted`: as many as make the lot as full as it is in the scenario's world; or so
-            many times these, such as `1.2x`.
-        stay_s: mean of the exponentially distributed stays, s.
-        patience_s: search time after which a car goes elsewhere, s.
+        per_hour: cars an hour; of a scenario with a demand of its own, in the mean over its hours, for the purposes
+            that it has. Or `given`: that demand; `counted`: as many as make the lot as full as it is in the scenario's
+            world; or so many times the demand of a scenario that has one, and else of the counted one, such as `1.2x`.
+        stay_s: mean of the exponentially distributed stays, s, unless the scenario has a demand.
+        patience_s: search time after which a car goes elsewhere, s, unless the scenario has a demand.
 
     Raises:
-        InputError: the hours end when they begin, or a number is out of range.
+        InputError: the hours end when they begin, a number is out of range, or no demand is given.
     """
-    window = scenario.arrival
+    window, own = scenario.arrival, scenario.demand
     if window.end_s <= window.start_s:
         raise InputError(
             f"the arrivals of {scenario.name!r} are at one time, want hours in which cars arrive; "
             "set --hours, e.g. 08:00-12:00"
         )
+    if own is None and per_hour == GIVEN:
+        raise InputError(f"scenario {scenario.name!r} has no demand of its own, want cars an hour")
+    if own is not None and per_hour != COUNTED:
+        if isinstance(per_hour, str):
+            return own.scaled(times_demanded(per_hour))
+        return own.scaled(per_hour * (window.end_s - window.start_s) / HOUR_S / own.expected)
     stay = ExponentialTime(stay_s)
     arrivals: PoissonArrivals | FollowingArrivals
     if isinstance(per_hour, str):
-        arrivals = FollowingArrivals(scenario.occupancy, window, stay, times_counted(per_hour))
+        arrivals = FollowingArrivals(scenario.occupancy, window, stay, times_demanded(per_hour))
     else:
         arrivals = PoissonArrivals(per_hour, window.start_s, window.end_s)
     return Demand(arrivals, stay, ConstantTime(patience_s))
@@ -128,7 +145,7 @@ class MixedFleet:
     """
 
     scenario: Scenario
-    demand: Demand
+    demand: Demand | TownDemand
     knows: str = "own"
     share: float = 1.0
     among: AgentSpec | None = None

@@ -17,6 +17,8 @@ NOWHERE = "no slot"
 """Stands for the block, and the zone, of cars that find no slot."""
 COUNTED = "counted"
 """Arrivals with which the lot becomes as full as counted, or as its world says; `1.2x` are so many times these."""
+GIVEN = "given"
+"""Arrivals of the scenario's own demand; there, `1.2x` are so many times these."""
 MAX_PER_HOUR = 1e6
 SETTING_COLUMNS = ("scenario", "agents", "knows", "share", "arrivals_per_hour")
 MEASURES = (
@@ -30,37 +32,42 @@ CAR_LISTS = ("total_cs", "member", "zone", "paid_cents")
 with zones or prices, number of the zone that a car parks in, from 1, or 0, and what it pays for its stay."""
 BY_HOUR = ("occupancy_by_hour", "counted_by_hour")
 """Columns with the mean share of taken slots in each hour of the day's arrivals, simulated and as counted."""
-_WANTED = f"a number above 0 and at most {MAX_PER_HOUR:g}, {COUNTED}, or so many times that, such as 1.2x"
+_WANTED = (
+    f"a number above 0 and at most {MAX_PER_HOUR:g}, {GIVEN}, {COUNTED}, or so many times that, such as 1.2x"
+)
 
 
 def rate_of(value: float | str) -> float | str:
-    """Return cars an hour, `counted`, or a multiple such as `1.2x`, from a number or a text.
+    """Return cars an hour, `given`, `counted`, or a multiple such as `1.2x`, from a number or a text.
 
     Raises:
         ValueError: it is none of these; the message says what was wanted.
     """
     text = str(value).strip()
     try:
-        rate = 1.0 if text == COUNTED else float(text.removesuffix("x"))
+        rate = 1.0 if text in (GIVEN, COUNTED) else float(text.removesuffix("x"))
     except ValueError:
         rate = -1.0
     if not 0.0 < rate <= MAX_PER_HOUR:
         raise ValueError(_WANTED)
+    if text == GIVEN:
+        return GIVEN
     if text != COUNTED and not text.endswith("x"):
         return rate
     return COUNTED if rate == 1.0 else f"{rate:g}x"
 
 
-def times_counted(rate: str) -> float:
-    """Return how many times the counted demand this is."""
-    return 1.0 if rate == COUNTED else float(rate.removesuffix("x"))
+def times_demanded(rate: str) -> float:
+    """Return how many times the demand that is given or counted this is."""
+    return 1.0 if rate in (GIVEN, COUNTED) else float(rate.removesuffix("x"))
 
 
 _NUMBER_OR_TIMES = {
-    "type": ["number", "string"], "exclusiveMinimum": 0, "maximum": MAX_PER_HOUR, "pattern": rf"^({COUNTED}|[0-9.]+x)$",
+    "type": ["number", "string"], "exclusiveMinimum": 0, "maximum": MAX_PER_HOUR,
+    "pattern": rf"^({GIVEN}|{COUNTED}|[0-9.]+x)$",
 }  # fmt: skip
 Demanded = Annotated[float | str, BeforeValidator(rate_of), WithJsonSchema(_NUMBER_OR_TIMES)]
-"""Cars an hour, or multiples of the counted demand."""
+"""Cars an hour, or multiples of the demand that is given or counted."""
 KINDS = {
     **dict.fromkeys(("scenario", "agents", "knows"), TEXT),
     **dict.fromkeys(("day", "cars"), WHOLE),
@@ -81,7 +88,7 @@ class Setting:
         agent: agent that drives every car.
         knows: what members know, one of `KNOWLEDGE`.
         share: share of the cars that are members; the others know their own observations.
-        arrivals_per_hour: cars an hour; `counted`, or a multiple such as `1.2x`, see `rate_of`.
+        arrivals_per_hour: cars an hour; `given`, `counted`, or a multiple such as `1.2x`, see `rate_of`.
     """
 
     scenario: str
@@ -111,4 +118,4 @@ def rate_text(rate: float | str) -> str:
     """Return a demand in words: `60 cars an hour`, `demand as counted`."""
     if not isinstance(rate, str):
         return f"{rate:g} cars an hour"
-    return "demand as counted" if rate == COUNTED else f"{times_counted(rate):g} times the counted demand"
+    return f"demand as {rate}" if rate in (GIVEN, COUNTED) else f"{times_demanded(rate):g} times the demand"

@@ -34,6 +34,7 @@ from parkenv.studies.fleet.setting import (
     BY_HOUR,
     CAR_LISTS,
     COUNTED,
+    GIVEN,
     KINDS,
     MEASURES,
     OWN,
@@ -41,7 +42,7 @@ from parkenv.studies.fleet.setting import (
     Demanded,
     Setting,
     rate_text,
-    times_counted,
+    times_demanded,
 )
 from parkenv.studies.results import CsvTable, Results, Row, Table
 from parkenv.studies.study import Cell, Study
@@ -114,11 +115,12 @@ class FleetStudy(Study):
     )
     arrivals_per_hour: Values[Demanded] | None = option(
         None,
-        "Cars an hour that arrive; counted: as many as make the lot as full as it is in the scenario's world, by its "
-        "counts, log or process, hour by hour; 1.2x: 1.2 times as many.",
-        takes="X|counted|1.2x[,...]",
+        "Cars an hour that arrive. given: those of the scenario's own demand; counted: as many as make the lot as full "
+        "as it is in the scenario's world, by its counts, log or process, hour by hour; 1.2x: 1.2 times as many as "
+        "given, or else counted.",
+        takes="X|given|counted|1.2x[,...]",
         panel="Demand",
-        default="60,120,240; of a car park that was counted, counted",
+        default="given; without a demand of the scenario 60,120,240, of a car park that was counted, counted",
         parse=words_in,
     )
     days: int = option(10, "Days of each setting.", name="--episodes", short="-n", ge=1, le=100_000)
@@ -191,9 +193,11 @@ class FleetStudy(Study):
 
     @property
     def demands(self) -> tuple[float | str, ...]:
-        """Cars an hour, or multiples of the counted demand."""
+        """Cars an hour, or multiples of the demand that is given or counted."""
+        given = all(scenario.demand for scenario in self.scenarios)
         counted = all(scenario.occupancy.counts for scenario in self.scenarios)
-        return self.arrivals_per_hour or ((COUNTED,) if counted else (60.0, 120.0, 240.0))
+        usual = (GIVEN,) if given else (COUNTED,) if counted else (60.0, 120.0, 240.0)
+        return self.arrivals_per_hour or usual
 
     @cached_property
     def built(self) -> dict[str, Scenario]:
@@ -278,7 +282,6 @@ class FleetStudy(Study):
         fleet = Fleet(
             scenario,
             demand_in(self._followed(setting), setting.arrivals_per_hour, self.stay_s, self.patience_s),
-            background="residents",
             drivers=kinds,
             leave_full_lot=False,
             manoeuvre_s=self.blocked_s,
@@ -289,7 +292,13 @@ class FleetStudy(Study):
         return fleet, [agent, agent]
 
     def _followed(self, setting: Setting) -> Scenario:
-        """Return the first scenario with the same counts, log or process: in lots to compare, the same cars arrive."""
+        """Return the scenario whose cars arrive.
+
+        That is its own if it has a demand, or else the first one with the same counts, log or process: in lots to
+        compare, the same cars arrive.
+        """
+        if self.built[setting.scenario].demand is not None:
+            return self.built[setting.scenario]
         its = {spec.title: spec.occupancy for spec in self.scenarios}
         return self.built[next(name for name in its if its[name] == its[setting.scenario])]
 
@@ -323,7 +332,8 @@ class FleetStudy(Study):
         except InputError as error:
             raise InputError(f"{setting}, day {day}, {error}") from error
         counted = np.full(len(times), np.nan)
-        if occupancy.recorded or isinstance(setting.arrivals_per_hour, str):
+        follows = fleet.scenario.demand is None or setting.arrivals_per_hour == COUNTED
+        if follows and (occupancy.recorded or isinstance(setting.arrivals_per_hour, str)):
             counted = occupancy.course(Arrival(fleet.begin, fleet.day.date), times).occupied
         members = fleet.cars["kind"] == 0
         filled = filling(times, np.array([looked_at.mean() for looked_at in taken]), counted)
@@ -339,7 +349,7 @@ class FleetStudy(Study):
         # Of counted demand, about a car an hour for each slot.
         most = max(one.lot.n_slots for one in self.built.values())
         rates = (setting.arrivals_per_hour for setting in self.fleet_settings)
-        per_hour = sum(times_counted(rate) * most if isinstance(rate, str) else rate for rate in rates)
+        per_hour = sum(times_demanded(rate) * most if isinstance(rate, str) else rate for rate in rates)
         windows = [one.arrival for one in self.built.values()]
         hours = max(window.end_s - window.start_s for window in windows) / 3600.0
         return per_hour * hours * self.days <= MOST_LISTED

@@ -1,0 +1,162 @@
+"""Specification of the demand of a scenario: the tables `[demand.NAME]`, one for each purpose of drivers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
+
+from parkenv.errors import InputError, naming
+from parkenv.files.spec_file import Several, Spec
+from parkenv.world.demand import (
+    MAX_CARS,
+    Arrivals,
+    ConstantTime,
+    Demand,
+    Duration,
+    ExponentialTime,
+    LogNormalTime,
+    NoArrivals,
+    PoissonArrivals,
+    TownDemand,
+)
+from parkenv.world.lot import ParkingLot
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.week import DAY_HOURS
+
+MAX_RATE = 1e6
+"""Maximum number of cars an hour."""
+_RATES = f"a number from 0 to {MAX_RATE:g}, or {DAY_HOURS} of these, one for each hour of the day"
+
+
+def _rates(value: object) -> object:
+    """Expand a number to those of all hours."""
+    numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value] * DAY_HOURS
+    good = [isinstance(one, int | float) and not isinstance(one, bool) for one in numbers]
+    if len(numbers) != DAY_HOURS or not all(good) or not all(0.0 <= one <= MAX_RATE for one in numbers):
+        raise ValueError(_RATES)
+    return tuple(map(float, numbers))
+
+
+_RATE = {"type": "number", "minimum": 0, "maximum": MAX_RATE}
+Rates = Annotated[
+    tuple[float, ...],
+    BeforeValidator(_rates),
+    WithJsonSchema(
+        {"anyOf": [_RATE, {"type": "array", "items": _RATE, "minItems": DAY_HOURS, "maxItems": DAY_HOURS}]}
+    ),
+]
+Weights = Several[Annotated[float, Field(ge=0.0, le=1e12)]]
+
+
+def _purpose(value: str) -> str:
+    if not 0 < len(value) <= 80 or not value.isprintable():
+        raise ValueError("a name of 1 to 80 printable characters")
+    return value
+
+
+PurposeName = Annotated[str, AfterValidator(_purpose)]
+
+
+class PurposeSpec(Spec):
+    """Drivers with one purpose: when they arrive, how long they stay, where they go, and what they may and mind."""
+
+    arrivals_per_hour: Rates = Field(
+        description="Cars an hour, one number or 24, one for each hour of the day."
+    )
+    stay_s: float = Field(3600.0, ge=1.0, le=1e7, description="Mean stay.")
+    stay_law: Literal["exponential", "log-normal", "constant"] = "exponential"
+    stay_cv: float = Field(
+        1.0, gt=0.0, le=10.0, description="Standard deviation of log-normal stays, over their mean."
+    )
+    value_of_time: float | None = Field(
+        None,
+        gt=0.0,
+        le=1e6,
+        description="Value of an hour of their time, in the currency of the prices; that of `costs` if absent.",
+    )
+    classes: dict[str, Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
+        {}, description="Share of the drivers of each class, such as permit-a, disabled or charging."
+    )
+    walks_back: bool = Field(False, description="Whether the walk back to the car counts, too.")
+    patience_s: float = Field(
+        600.0, gt=0.0, le=1e7, description="Search time after which a car goes elsewhere."
+    )
+    kwh: float = Field(0.0, ge=0.0, le=1e3, description="Energy that a car of the class charging takes, kWh.")
+    parked: int = Field(0, ge=0, le=MAX_CARS, description="Cars that stand in slots when the hours begin.")
+    goals: Weights = Field(
+        (), description="Weight of each goal of the lot; those of the lot for this purpose if absent."
+    )
+    entries: Weights = Field(
+        (), description="Weight of each entry of the lot; those of the lot for this purpose if absent."
+    )
+
+    @property
+    def stay(self) -> Duration:
+        """Law of the stays."""
+        if self.stay_law == "log-normal":
+            return LogNormalTime(self.stay_s, self.stay_cv)
+        return (ConstantTime if self.stay_law == "constant" else ExponentialTime)(self.stay_s)
+
+    def arrivals(self, window: ArrivalWindow) -> Arrivals:
+        """Return the arrivals in a window."""
+        start, end = int(window.start_s // 3600), math.ceil(window.end_s / 3600)
+        if not any(self.arrivals_per_hour[start:end]):
+            return NoArrivals(window.start_s)
+        return PoissonArrivals(self.arrivals_per_hour, window.start_s, window.end_s)
+
+
+def demand_of(
+    purposes: Mapping[str, PurposeSpec], lot: ParkingLot, window: ArrivalWindow
+) -> TownDemand | None:
+    """Return the demand of the tables of a scenario; None if there are none.
+
+    A purpose that the lot has no weights for has the sum of those for its purposes; where the lot has none at all, all
+    weights are equal if another table has weights, or else goal and entry are those of the scenario.
+
+    Raises:
+        InputError: the hours end when they begin, a weight does not fit the lot, or nobody arrives; the message names
+            the table.
+    """
+    if not purposes:
+        return None
+    if window.end_s <= window.start_s:
+        raise InputError("arrivals.hours are one time, want hours in which the cars of `demand` arrive")
+    places = {"goals": (lot.goals, lot.goal_weights), "entries": (lot.entries, lot.entry_weights)}
+    others: dict[str, tuple[float, ...]] = {}
+    for field, (points, of_lot) in places.items():
+        some = any(getattr(one, field) for one in purposes.values())
+        others[field] = (
+            tuple(np.sum([*of_lot.values()], axis=0).tolist())
+            if of_lot
+            else (1.0,) * len(points)
+            if some
+            else ()
+        )
+    made = []
+    for name, one in purposes.items():
+        chosen: dict[str, tuple[float, ...]] = {}
+        for field, (points, of_lot) in places.items():
+            own = getattr(one, field) or tuple(of_lot.get(name, others[field]))
+            if own and len(own) != len(points):
+                raise InputError(
+                    f"demand.{name}.{field} has {len(own)} numbers, the lot has {len(points)} of these"
+                )
+            chosen[field] = own
+        with naming(f"demand.{name}"):
+            made.append(
+                Demand(
+                    one.arrivals(window),
+                    one.stay,
+                    ConstantTime(one.patience_s),
+                    chosen["entries"],
+                    chosen["goals"],
+                    name=name,
+                    **one.model_dump(include={"value_of_time", "classes", "walks_back", "kwh", "parked"}),
+                )
+            )
+    with naming("demand"):
+        return TownDemand(tuple(made))

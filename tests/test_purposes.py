@@ -1,0 +1,158 @@
+"""Drivers with several purposes: their cars, their tables in scenario files, and demand that follows counts."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from parkenv.compiled.keyed_random import world_key
+from parkenv.engine.fleet import Fleet
+from parkenv.errors import InputError
+from parkenv.scenarios.build import make_scenario
+from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.world.demand import (
+    ConstantTime,
+    Demand,
+    ExponentialTime,
+    Headways,
+    LogNormalTime,
+    NoArrivals,
+    PoissonArrivals,
+    TownDemand,
+    rest_of_stay,
+)
+from parkenv.world.occupancy.process import ArrivalDay
+from parkenv.world.tariff import Price, Zone
+
+DAY = ArrivalDay(0)
+WINDOW = 7 * 3600.0, 20 * 3600.0
+COMMUTERS = Demand(
+    PoissonArrivals(60.0, *WINDOW), LogNormalTime(8 * 3600.0, 0.3), name="commuters", value_of_time=18.0,
+    classes={"permit-a": 0.25, "charging": 0.5}, kwh=20.0,
+)  # fmt: skip
+RESIDENTS = Demand(
+    NoArrivals(WINDOW[0]), ExponentialTime(7200.0), name="residents", classes={"permit-a": 1.0},
+    walks_back=True, parked=400,
+)  # fmt: skip
+
+
+def drawn(demand, episode=0):
+    return demand.draw(world_key(1, episode), WINDOW[0], 2, DAY)
+
+
+def test_one_unnamed_purpose_is_the_demand_itself():
+    alone = Demand(Headways(30), ExponentialTime(900.0), goal_weights=(1.0, 3.0))
+    for ours, its in zip(drawn(TownDemand((alone,))), drawn(alone), strict=True):
+        assert_array_equal(ours, its)
+
+
+def test_purposes_keep_their_cars_whoever_else_comes():
+    town, alone = drawn(TownDemand((RESIDENTS, COMMUTERS))), drawn(COMMUTERS)
+    its = town.purpose == 1
+    assert_array_equal(town.arrival_s[its], alone.arrival_s)
+    assert_array_equal(town.stay_s[its], alone.stay_s)
+    assert np.all(np.diff(town.arrival_s) >= 0.0)
+    # Bits are those of the town's classes: permit-a of both purposes, charging of one.
+    assert set(town.classes[~its]) == {1}
+    assert np.mean(town.classes[its] & 1 > 0) == pytest.approx(0.25, abs=0.05)
+    charges = town.classes & 2 > 0
+    assert_array_equal(town.kwh, np.where(charges, 20.0, 0.0))
+    assert np.isnan(town.value_of_time[~its]).all()
+    assert (town.value_of_time[its] == 18.0).all()
+    assert_array_equal(town.walks_back, ~its)
+
+
+def test_parked_cars_come_first_and_change_nobody_else():
+    with_parked = drawn(Demand(COMMUTERS.arrivals, COMMUTERS.stay, name="commuters", parked=7))
+    assert with_parked.parked.tolist() == [True] * 7 + [False] * (len(with_parked.parked) - 7)
+    assert (with_parked.arrival_s[:7] == WINDOW[0]).all()
+    assert_array_equal(with_parked.stay_s[7:], drawn(COMMUTERS).stay_s)
+
+
+@pytest.mark.parametrize("law", [ExponentialTime(3600.0), LogNormalTime(3600.0, 0.5), ConstantTime(3600.0)])
+def test_the_rest_of_a_stay_has_the_mean_of_renewal_theory(law):
+    """E(S²) / 2 E(S); of stays that stand for their law, which cut the tail off."""
+    stays = law.quantile((np.arange(400) + 0.5) / 400)
+    rest = rest_of_stay(law, (np.arange(100_000) + 0.5) / 100_000)
+    assert rest.mean() == pytest.approx((stays**2).mean() / stays.mean() / 2.0, rel=1e-3)
+    assert rest.min() >= 0.0
+    assert rest.max() <= stays.max()
+    assert np.isinf(rest_of_stay(ConstantTime(math.inf), np.array([0.5]))).all()
+
+
+TABLES = {
+    "lot": "mini",
+    "arrivals": {"hours": "08:00-10:00"},
+    "demand": {
+        "shoppers": {"arrivals_per_hour": 30, "stay_s": 1800, "value_of_time": 8, "walks_back": True},
+        "staff": {
+            "arrivals_per_hour": [0] * 8 + [6] + [0] * 15, "stay_s": 28800, "stay_law": "log-normal",
+            "stay_cv": 0.2, "parked": 2, "goals": [1.0],
+        },
+    },
+}  # fmt: skip
+
+
+def test_a_scenario_file_has_purposes():
+    demand = make_scenario(ScenarioSpec.parse(TABLES, "town.toml")).demand
+    assert [one.name for one in demand.purposes] == ["shoppers", "staff"]
+    assert demand.expected == 66.0
+    assert demand.scaled(2.0).expected == 132.0
+    shoppers, staff = demand.purposes
+    assert staff.stay == LogNormalTime(28800.0, 0.2)
+    assert staff.parked == 2
+    assert shoppers.walks_back
+    assert (
+        shoppers.goal_weights == staff.goal_weights == (1.0,)
+    )  # a purpose without weights goes to all goals alike
+    assert shoppers.entry_weights == ()
+    assert make_scenario("mini").demand is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [
+        ({"arrivals_per_hour": [1.0] * 23}, "demand.shoppers.arrivals_per_hour"),
+        ({"arrivals_per_hour": -1.0}, "demand.shoppers.arrivals_per_hour"),
+        ({"arrivals": 3}, "unknown key 'arrivals'"),
+        ({"classes": {"permit-a": 1.5}}, "demand.shoppers.classes.permit-a"),
+        ({"stay_law": "weibull"}, "demand.shoppers.stay_law"),
+        ({"goals": [1.0, 2.0]}, "demand.shoppers.goals has 2 numbers, the lot has 1"),
+        ({"goals": [0.0]}, "goal_weights"),
+        ({"parked": -3}, "demand.shoppers.parked"),
+    ],
+)
+def test_bad_tables_are_named(changes, named):
+    tables = TABLES | {"demand": {"shoppers": {"arrivals_per_hour": 30} | changes}}
+    with pytest.raises(InputError, match=r"town\.toml") as error:
+        make_scenario(ScenarioSpec.parse(tables, "town.toml").of_file("town.toml"))
+    assert named in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_somebody_has_to_arrive():
+    tables = TABLES | {"demand": {"shoppers": {"arrivals_per_hour": 0, "parked": 3}}}
+    with pytest.raises(InputError, match="nobody arrives"):
+        make_scenario(ScenarioSpec.parse(tables, "town.toml"))
+
+
+def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
+    lot = make_scenario("mini").lot
+    zones = np.where(np.arange(10) < 5, "kerb", "residents")
+    rules = {"kerb": Zone("kerb", Price(3.0)), "residents": Zone("residents", users=("permit-a",))}
+    its = make_scenario(dataclasses.replace(lot, slot_zone=zones, zone_rules=rules))
+    of = [
+        Demand(Headways(5), ConstantTime(3600.0), name="rich", value_of_time=36.0),
+        Demand(Headways(5), ConstantTime(3600.0), name="residents", classes={"permit-a": 1.0}),
+    ]
+    fleet = Fleet(its, TownDemand(of))
+    fleet.reset(3)
+    costs = fleet.zone_cost_s()  # of kerb and residents
+    rich = np.isinf(costs[:, 1])
+    assert rich.sum() == 5
+    assert_array_equal(costs[rich, 0], 300.0)
+    assert_array_equal(costs[~rich], [[900.0, 0.0]] * 5)
+    with pytest.raises(InputError, match="permit-b"):
+        Fleet(its, Demand(Headways(2), classes={"permit-b": 1.0})).reset()
