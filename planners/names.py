@@ -11,6 +11,7 @@ AGENTS: dict[str, tuple[str, str]] = {
     "greedy-drive": ("planners.heuristics.agents", "GreedyDriveAgent"),
     "greedy-total": ("planners.heuristics.agents", "GreedyTotalAgent"),
     "first-free": ("planners.heuristics.agents", "FirstFreeAgent"),
+    "usual": ("planners.heuristics.agents", "UsualAgent"),
     "random": ("planners.heuristics.agents", "RandomAgent"),
     "oracle": ("planners.bounds.oracle", "OracleAgent"),
     "belief": ("planners.belief.agent", "BeliefAgent"),

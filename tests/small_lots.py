@@ -13,7 +13,7 @@ PITCHES = (2.5, 6.0, 15.0)
 VIEWS = (0.0, 6.0)
 MEAN_FREE = (0.1, 0.3, 0.6)
 SLOT_COLUMNS = (
-    "slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_parking_cost_s", "slot_zone",
+    "slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_parking_cost_s", "slot_zone", "slot_facility",
 )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """Heuristic baselines: agents against a plain reference, compiled policies against agents, to the last bit."""
 
+import dataclasses
 import itertools
 
 import gymnasium as gym
@@ -13,13 +14,15 @@ from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.studies.simulate import simulate
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
-from parkenv.world.lot import PARK
+from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.scenario import SearchProblem
+from parkenv.world.tariff import Zone
 from planners.agent import make_agent
 from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
 
 NAMES = ("greedy-goal", "greedy-drive", "greedy-total", "first-free")
+COMPILED = (*NAMES, "usual")
 NOISY = SensorModel(
     15.0, bands=(SensorBand(15.0, True, 0.9, 0.8, 0.1), SensorBand(15.0, False, 0.8, 0.8, 0.2))
 )
@@ -106,6 +109,62 @@ def test_agents_decide_as_the_definition_of_their_rule(name):
     assert decisions > 2000
 
 
+# ---- the rule of places
+
+
+def one_way_places(problem):
+    """Runs of slots between junctions, for a lot of one-way streets in one zone."""
+    neighbors, n = problem.lot.neighbors, problem.lot.n_slots
+    places = []
+    for v in neighbors[n:][neighbors[n:] >= 0].tolist():
+        run = []
+        while v < n:
+            run.append(v)
+            (v,) = neighbors[v][neighbors[v] >= 0].tolist()
+        places += [run] if run else []
+    return places
+
+
+def test_usual_heads_for_the_place_of_the_lowest_index():
+    problem = parkenv.make_scenario("street").public()
+    routes, agent, rng = DriveRoutes(problem), make_agent("usual", problem), np.random.default_rng(2)
+    places, n = one_way_places(problem), problem.lot.n_slots
+    for vertex in rng.integers(n, problem.lot.n_vertices, 60).tolist():
+        belief, seconds = random_belief(rng, problem), routes.seconds_from(vertex)
+        decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
+        state = np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
+        indices = {s: seconds[s] + problem.arrival_cost_s[s] for s in np.flatnonzero(state == OBSERVED_FREE)}
+        for run in places:
+            if unseen := [s for s in run if state[s] == 0]:
+                middle = run[(run.index(unseen[0]) + run.index(unseen[-1])) // 2]
+                q = 1.0 - float(belief.forecast[middle]) ** len(unseen)
+                drive = (seconds[unseen[0]] + seconds[unseen[-1]]) / 2.0
+                indices[unseen[-1]] = problem.arrival_cost_s[middle] + drive / q
+        memory = agent.begin({"vertex": vertex}, belief)
+        action = agent.decide({"vertex": vertex}, belief, memory)
+        assert indices[memory.target] == pytest.approx(min(indices.values()))
+        path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory).path)
+        assert path[-1] == memory.target
+        assert drive_s(problem, path) == pytest.approx(seconds[memory.target])
+
+
+@pytest.mark.parametrize("name", COMPILED)
+def test_nobody_heads_for_a_slot_that_is_not_allowed(name):
+    lot = parkenv.make_scenario("campus").lot
+    zone = np.where(np.arange(lot.n_slots) % 5 == 0, "open", "permits")
+    fields = {f.name: getattr(lot, f.name) for f in dataclasses.fields(lot) if f.init}
+    rules = {"open": Zone("open"), "permits": Zone("permits", users=("permit-a",))}
+    lot = ParkingLot(**{**fields, "slot_zone": zone, "zone_rules": rules})
+    scenario = parkenv.make_scenario("campus").replace(lot=lot)
+    for policy, agents in ((POLICIES[name], None), (None, [make_agent(name, scenario)])):
+        fleet = Fleet(scenario, Demand(Headways(8)), background="none", drivers=[DriverKind(policy=policy)])
+        fleet.reset(1)
+        fleet.run(agents)
+        slots = fleet.cars["slot"]
+        assert (slots >= 0).all()
+        assert (slots % 5 == 0).all()
+
+
 # ---- compiled policies
 
 
@@ -127,7 +186,7 @@ def random_world(seed):
     return scenario, demand, kind, options
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMPILED)
 def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
     decisions = 0
     for seed in range(48):
@@ -147,7 +206,7 @@ def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
     assert decisions > 5000
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", COMPILED)
 @pytest.mark.parametrize("source", ["mini", "campus", "jam"])
 def test_a_fleet_of_one_car_with_a_policy_is_the_search_of_its_agent(name, source):
     scenario = parkenv.make_scenario(source)

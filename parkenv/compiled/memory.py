@@ -6,6 +6,8 @@ dozen arrays, and is cheap to call from Python. Code that writes an address into
 
 from __future__ import annotations
 
+import math
+import mmap
 from collections.abc import Sequence
 from functools import cache
 from typing import Any
@@ -58,6 +60,17 @@ def in_one_block(arrays: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
         if array.dtype.names or array.any():  # pages of zeros that are never written take no memory
             copy[...] = array
     return [copies[key] for key in keys]
+
+
+def sparse_zeros(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Return zeros of which little will be written: memory is taken page by page, and by small pages."""
+    n_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+    if n_bytes == 0:
+        return np.zeros(shape, dtype)
+    memory = mmap.mmap(-1, n_bytes)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        memory.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(memory, dtype).reshape(shape)
 
 
 def _elements(item: Any) -> Any:

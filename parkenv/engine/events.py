@@ -47,6 +47,7 @@ from parkenv.engine.kernel import (
     write_clock,
 )
 from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report_view
+from parkenv.engine.policy import LEAVE, TAKE_SLOT
 from parkenv.engine.records import (
     BALKED,
     GAVE_UP,
@@ -76,10 +77,6 @@ from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
 needed; Python must compute the forecast of the car `pending`; a compiled policy chose an unknown action; more room for
 reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
-LEAVE = -1
-"""Action of compiled policies: give up and park elsewhere."""
-TAKE_SLOT = 16
-"""Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
 _ON_TICK = 1e-9  # fraction of a tick
 _DEPARTURES_FIRST = 1 << 62
 

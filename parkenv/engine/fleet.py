@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.compiled.memory import address_of
+from parkenv.compiled.memory import address_of, sparse_zeros
 from parkenv.engine.events import (
     FINISHED,
     NEEDS_FORECAST,
@@ -236,7 +236,7 @@ class Fleet:
             **times,
         }
         goals = self._weighted("goal_weights", self.demand.goal_weights, len(self.scenario.lot.goals))
-        self.scenarios = tuple(self.scenario.replace(goal=goal) for goal in goals) or (self.scenario,)
+        self.scenarios = tuple(self.scenario.at_goal(goal) for goal in goals) or (self.scenario,)
         lot = self.scenario.lot
         self._weighted("entry_weights", self.demand.entry_weights, len(lot.entries))
         entry = None if self.demand.entry_weights else self.scenario.entry
@@ -416,7 +416,8 @@ class Fleet:
         size = sum(len(one.records) for one in self._pool)
         n = min(max(_FIRST_CHUNK, size), max(len(self._cars) - size, 1))
         searches = Searches(self._tables, n, self.full_belief, self._most_observed)
-        moves = np.zeros((n, self.scenario.lot.n_vertices), np.uint8)
+        # A route may pass the street where it begins once more.
+        moves = sparse_zeros((n, 2 * self.scenario.lot.n_vertices), np.uint8)
         searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
         self._pool.append(searches)
         self._moves.append(moves)

@@ -1,8 +1,8 @@
 """Compiled policies: how compiled code decides for a car of a fleet, and what it may know for that.
 
 A compiled policy is a function `(address of the FLEET record, index of the car) -> action`, called by its address.
-Actions are those of `parkenv/Search-v2`, and `LEAVE` and `TAKE_SLOT + slot` of `parkenv.engine.events`. The functions
-below give a policy what an agent's observation holds: position, actions, the last observation of each slot.
+Actions are those of `parkenv/Search-v2`, and `LEAVE` and `TAKE_SLOT + slot`. The functions below give a policy what an
+agent's observation holds: position, actions, the last observation of each slot.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from parkenv.belief.slot_belief import (
 )
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_address, float64s, int32s, int64s, uint8s
-from parkenv.engine.kernel import belief_now, parking_cost_s
+from parkenv.engine.kernel import belief_now, forecast_of, parking_cost_s
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -40,6 +40,11 @@ from parkenv.engine.records import (
 )
 from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
+
+LEAVE = -1
+"""Action of compiled policies: give up and park elsewhere."""
+TAKE_SLOT = 16
+"""Action of compiled policies: `TAKE_SLOT + slot` attempts to park there at once, without the drive."""
 
 
 class PolicyData:
@@ -117,7 +122,7 @@ def car_of(address: int, number: int) -> Any:
 def search_of(address: int) -> Any:
     """Return the SEARCH record at an address, `search` of a CAR record, of which a policy reads `vertex`.
 
-    It may change the array at `moves`, (n_vertices,) uint8, which holds anything at first.
+    It may change the array at `moves`, (2 n_vertices,) uint8, which holds anything at first.
     """
     return search_at(address, 0)
 
@@ -153,6 +158,21 @@ def arrival_cost_s(search: Any, slot: int) -> float:
     return float(float64s(scenario_at(search.scenario, 0).walk_s)[slot] + parking_cost_s(search, slot))
 
 
+@inlined
+def least_zone_cost_s(search: Any, n_zones: int) -> float:
+    """Return the least that the car's own stay costs in any zone, s, where slots have prices."""
+    least_s, zone_cost_s = np.inf, float64s(search.zone_cost_s)
+    for zone in range(n_zones):
+        least_s = min(least_s, zone_cost_s[zone])
+    return least_s
+
+
+@inlined
+def forecast(search: Any, slot: int) -> float:
+    """Return the forecast P(taken) of a slot, rounded as in the observation."""
+    return float(np.float32(forecast_of(search, slot)[0]))
+
+
 # ---- what was observed
 
 
@@ -176,7 +196,7 @@ def recent_state(search: Any, slot: int) -> int:
     if search.reserved != UNGUIDED:
         return OBSERVED_FREE if slot == search.reserved else OBSERVED_TAKEN
     column = np.int64(int32s(search.columns)[slot])
-    if not slot_at(search.slots, column).observed:
+    if column == SENTINEL or not slot_at(search.slots, column).observed:
         return UNOBSERVED
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     prior = np.float32(block.prior[i])

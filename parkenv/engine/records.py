@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at
+from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at, sparse_zeros
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
@@ -156,7 +156,7 @@ SEARCH = _with_costs(
         ("chosen_entry", np.int64),
         ("chosen_day", np.int64),
         ("chosen_second", np.float64),
-        # Number of the car in its fleet, where slots are shared; (n_vertices,) uint8 moves to the target of its
+        # Number of the car in its fleet, where slots are shared; (2 n_vertices,) uint8 moves to the target of its
         # compiled policy, the last one first; the slot that a guidance system has reserved for it, `NO_SLOT`, or
         # `UNGUIDED`.
         ("car", np.int64),
@@ -203,6 +203,8 @@ SLOT = np.dtype(
 )
 """A slot with a column: true state as in CURSOR; whether it was observed, was last observed taken, was passed."""
 
+SPARSE_SLOTS = 4096
+"""Slots from which the tables of searches take memory only where they are written."""
 BLOCK_BITS = 3
 BLOCK_SIZE = 1 << BLOCK_BITS
 BLOCK = np.dtype(
@@ -308,10 +310,11 @@ CAR = _with_costs(
         # Sums of the search, complete when it has ended.
         *_SUMS,
         # Its SEARCH record, 0 unless searching. For compiled policies: the target slot, or -1; how many of the moves to
-        # it are left.
+        # it are left; until when the search is expected to last, walk and price included, s since its beginning.
         ("search", ADDRESS),
         ("target", np.int64),
         ("n_moves", np.int64),
+        ("expected_s", np.float64),
     ],
     costs=COST_FIELDS[0],
 )
@@ -436,7 +439,11 @@ class ScenarioRecords:
 
     def __init__(self, scenarios: Sequence[Scenario] | Sequence[SearchProblem]) -> None:
         self._kept: list[Any] = []
+        self._kept_at: dict[
+            tuple[int, str], tuple[Any, int]
+        ] = {}  # arrays that scenarios share, and copies of them
         self._models: list[CompiledModel] = []
+        self._model_at: dict[tuple[int, int], tuple[PriorModel, int]] = {}
         self.scenarios: tuple[Any, ...] = tuple(scenarios)
         self.records = np.zeros(len(scenarios), SCENARIO)
         for record, scenario in zip(self.records, scenarios, strict=True):
@@ -473,10 +480,14 @@ class ScenarioRecords:
         self._kept, self._models = copies, models
 
     def _keep(self, values: ArrayLike, dtype: Any = np.float64) -> int:
-        array = np.ascontiguousarray(values, dtype)
-        array.flags.writeable = False
-        self._kept.append(array)
-        return address_of(array, dtype)
+        """Keep an array, once if several scenarios share it, and return its address."""
+        key = id(values), str(np.dtype(dtype))
+        if key not in self._kept_at:
+            array = np.ascontiguousarray(values, dtype)
+            array.flags.writeable = False
+            self._kept.append(array)
+            self._kept_at[key] = values, address_of(array, dtype)
+        return self._kept_at[key][1]
 
     def _write_problem(self, record: np.void, scenario: SearchProblem) -> None:
         lot, masks = scenario.lot, scenario.action_masks
@@ -519,12 +530,15 @@ class ScenarioRecords:
             record["prior_kind"], record["prior"] = PROCESS_KIND, address
 
     def _address_of(self, model: PriorModel, scenario: Scenario) -> int:
-        """Keep the records of a model and return their address; 0 without records."""
-        compiled = model.compiled(scenario.arrival)
-        if compiled is None:
-            return 0
-        self._models.append(compiled)
-        return address_of(compiled.record, compiled.record.dtype)
+        """Keep the records of a model, once if scenarios share it, and return their address; 0 without records."""
+        key = id(model), id(scenario.arrival)
+        if key not in self._model_at:
+            compiled = model.compiled(scenario.arrival)
+            if compiled is not None:
+                self._models.append(compiled)
+            address = 0 if compiled is None else address_of(compiled.record, compiled.record.dtype)
+            self._model_at[key] = model, address
+        return self._model_at[key][1]
 
 
 def _arrays_in(kept: Sequence[Any]) -> Iterator[NDArray[Any]]:
@@ -570,10 +584,11 @@ class Searches:
         self._worlds: dict[int, World] = {}  # made in Python, by search
         self.scenarios = scenarios
         self.records = np.zeros(n, SEARCH)
-        self.slots = np.zeros((n, m + 1), SLOT)
-        self._blocks = np.zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
-        # Zeros stand for the sentinel; the system allocates no memory for pages that are never written.
-        self._columns = np.zeros((n, m), np.int32)
+        # Zeros stand for the sentinel. A search observes a small part of a large lot.
+        zeros = np.zeros if m < SPARSE_SLOTS else sparse_zeros
+        self.slots = zeros((n, m + 1), SLOT)
+        self._blocks = zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
+        self._columns = zeros((n, m), np.int32)
         self.external_forecast = np.zeros((n, 2, m) if external else (0, 2, 0))
         self.day_error = np.zeros((n, 2), np.float32)
         # Padding past the last slot of a smaller lot: taken, constant, never observed.

@@ -25,6 +25,16 @@ from parkenv.world.traffic import Traffic
 
 KMH = 1 / 3.6  # 1 km/h in m/s
 
+_OF_ALL_GOALS = (
+    "parking_cost_s",
+    "move_s",
+    "edges",
+    "action_masks",
+    "slots_in_view",
+    "sight_lines",
+    "sensor_rates",
+)
+"""Cached properties of a problem that do not depend on its goal."""
 EDGE = np.dtype([("target", np.int64), ("seconds", np.float64), ("metres", np.float64)], align=True)
 """Result of an action at a vertex: the vertex that it leads to, s, m.
 
@@ -256,6 +266,12 @@ class SearchProblem:
     def public(self) -> SearchProblem:
         """Return the part that agents may know."""
         return self
+
+    def at_goal(self, goal: int) -> Self:
+        """Return the problem of another goal; it shares all tables that do not depend on the goal."""
+        other = self.replace(goal=goal)
+        vars(other).update({name: getattr(self, name) for name in _OF_ALL_GOALS})
+        return other
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed and validated.

@@ -9,13 +9,13 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import UNOBSERVED, SlotBelief
+from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED, SlotBelief
 from parkenv.engine.policy import CompiledPolicy, PolicyData
 from parkenv.errors import InputError
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
-from planners.heuristics.policies import TargetPolicy
+from planners.heuristics.policies import TargetPolicy, UsualPolicy
 from planners.heuristics.rules import (
     FIRST_FREE,
     GREEDY_DRIVE,
@@ -26,6 +26,7 @@ from planners.heuristics.rules import (
     heuristic_tables,
     keeps_target,
 )
+from planners.heuristics.streets import choose_place, street_tables, takes_slot
 
 
 @dataclass
@@ -35,6 +36,8 @@ class GreedyState:
     moves: NDArray[np.uint8]
     target: int = NO_SLOT
     n_moves: int = 0
+    # until when `usual` expects to search, walk and pay, s since the beginning
+    expected_s: float = 0.0
 
 
 class TargetAgent(SearchAgent[GreedyState]):
@@ -61,7 +64,7 @@ class TargetAgent(SearchAgent[GreedyState]):
     def begin(self, observation: Observation, belief: SlotBelief) -> GreedyState:
         """Start without a target."""
         del observation, belief
-        return GreedyState(np.zeros(self.problem.lot.n_vertices, np.uint8))
+        return GreedyState(np.zeros(2 * self.problem.lot.n_vertices, np.uint8))
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
         """Keep the target while it is a candidate, else choose another one; park on arrival."""
@@ -72,6 +75,12 @@ class TargetAgent(SearchAgent[GreedyState]):
             memory.target, memory.n_moves = choose_route(
                 tables.address, 0, 0, vertex, target, memory.moves, memory.n_moves
             )
+        return self._next_action(vertex, memory)
+
+    def _next_action(self, vertex: int, memory: GreedyState) -> int:
+        """Go on to the target, or park there; wait where there is none."""
+        if memory.target == NO_SLOT:
+            return self.wait(vertex)
         if memory.n_moves == 0:
             return PARK
         memory.n_moves -= 1
@@ -148,6 +157,42 @@ class FirstFreeAgent(TargetAgent):
             raise InputError(
                 f"within_m is {within_m}, want at least {least_m:.1f}, the shortest walk of the lot"
             )
+
+
+class UsualAgent(TargetAgent):
+    """`usual`: drives to the place that is cheapest by its experience, the forecast, and on from there if it is full.
+
+    A place is one side of a street between two junctions, or a garage. Its cost is the drive there, divided by the
+    chance that it has a free slot, and the arrival cost (`planners.heuristics.streets`). A free slot that the driver
+    passes is taken if the search would then end no later than planned.
+    """
+
+    name: ClassVar[str] = "usual"
+
+    @cached_property
+    def _tables(self) -> PolicyData:
+        return street_tables([self.problem])
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: GreedyState) -> int:
+        """Keep the target until it is observed taken; park on arrival, or before in a slot that is good enough."""
+        states, vertex, target = belief.recent_state, int(observation["vertex"]), memory.target
+        tables = self._tables
+        tables.arrays["states"][:] = states
+        if target == NO_SLOT or states[target] == OBSERVED_TAKEN:
+            tables.arrays["p_occupied"][:], tables.arrays["forecast"][:] = belief.p_occupied, belief.forecast
+            memory.target, memory.n_moves, index_s = choose_place(
+                tables.address, 0, 0, vertex, target, memory.moves, memory.n_moves
+            )
+            memory.expected_s = belief.time + index_s
+        if memory.target != NO_SLOT and takes_slot(
+            tables.address, 0, 0, vertex, memory.expected_s - belief.time
+        ):
+            return PARK
+        return self._next_action(vertex, memory)
+
+    def compiled_policy(self) -> CompiledPolicy:
+        """Return the policy that decides as this agent for the cars of a fleet, without Python."""
+        return UsualPolicy()
 
 
 class RandomAgent(SearchAgent[np.random.Generator]):

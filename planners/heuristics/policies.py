@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from parkenv.belief.slot_belief import UNOBSERVED
-from parkenv.compiled.memory import uint8_array
+import numpy as np
+
+from parkenv.belief.slot_belief import OBSERVED_TAKEN, UNOBSERVED
+from parkenv.compiled.memory import uint8_array, uint8s
 from parkenv.engine.policy import (
+    LEAVE,
     CompiledPolicy,
     PolicyData,
     car_of,
@@ -31,6 +34,7 @@ from planners.heuristics.rules import (
     keeps_target,
     tables_at,
 )
+from planners.heuristics.streets import choose_place, street_tables, streets_at, takes_slot
 
 _N_ACTIONS = PARK + 1
 
@@ -47,10 +51,33 @@ def decide_by_rule(address: int, number: int) -> int:
         car.target, car.n_moves = choose_route(
             data, car.place, car.search, search.vertex, target, moves, car.n_moves
         )
+        if car.target == NO_SLOT:
+            return LEAVE
     if car.n_moves == 0:
         return PARK
     car.n_moves -= 1
     return int(moves[car.n_moves])
+
+
+@kernel
+def decide_usual(address: int, number: int) -> int:
+    """Drive to one place after another, and through it, and park in a free slot that is good enough."""
+    car = car_of(address, number)
+    data, search, target = policy_data(address, car), search_of(car.search), car.target
+    time = np.float64(search.clock[1])
+    if target == NO_SLOT or recent_state(search, target) == OBSERVED_TAKEN:
+        n_vertices = streets_at(data, 0).n_slots + streets_at(data, 0).n_junctions
+        moves = uint8_array(search.moves, (2 * n_vertices,))
+        car.target, car.n_moves, index_s = choose_place(
+            data, car.place, car.search, search.vertex, target, moves, car.n_moves
+        )
+        car.expected_s = time + index_s
+        if car.target == NO_SLOT:
+            return LEAVE
+    if car.n_moves == 0 or takes_slot(data, car.place, car.search, search.vertex, car.expected_s - time):
+        return PARK
+    car.n_moves -= 1
+    return int(uint8s(search.moves)[car.n_moves])
 
 
 class TargetPolicy(CompiledPolicy):
@@ -72,6 +99,20 @@ class TargetPolicy(CompiledPolicy):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return TargetPolicy, (self.name, self.heuristic, self.within_m)
+
+
+class UsualPolicy(CompiledPolicy):
+    """The compiled policy of `UsualAgent`."""
+
+    def __init__(self) -> None:
+        super().__init__("usual", decide_usual)
+
+    def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
+        """Return the streets of the lot."""
+        return street_tables(problems)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return UsualPolicy, ()
 
 
 @kernel
@@ -97,6 +138,7 @@ POLICIES = {
         TargetPolicy("greedy-drive", GREEDY_DRIVE),
         TargetPolicy("greedy-total", GREEDY_TOTAL),
         TargetPolicy("first-free", FIRST_FREE),
+        UsualPolicy(),
         CompiledPolicy("random", decide_random),
     )
 }

@@ -3,7 +3,8 @@
 Each rule is written here once. Agents (`planners.heuristics.agents`) and compiled policies of fleets
 (`planners.heuristics.policies`) call it, so they decide alike in every situation.
 
-A slot is a candidate unless it was recently observed taken. Slots are ranked by the drive, or by arrival cost
+A slot is a candidate unless it was recently observed taken, or the driver may not park there: then its arrival cost is
+infinite. Slots are ranked by the drive, or by arrival cost
 (`SearchProblem.arrival_cost_s`): the walk, and the price where slots have one. In a fleet it is that of the car's own
 stay.
 
@@ -149,17 +150,19 @@ def choose_route(
         search: address of the SEARCH record whose tables hold what was observed; 0: those of the heuristic do.
         vertex: where the car is.
         target: the target so far, or `NO_SLOT`.
-        moves: (n_vertices,) the moves to the target, the last one first; changed in place.
+        moves: (2 n_vertices,) the moves to the target, the last one first; changed in place.
         n_moves: how many there are.
 
     Returns:
-        The target, and the number of moves to it.
+        The target, and the number of moves to it; `NO_SLOT` and 0 where the driver may park in no slot in reach.
     """
     tables = tables_at(address, 0)
     chosen = _choose_target(tables, place, search, vertex, target)
     if chosen == NO_SLOT:
         chosen = _likeliest_target(tables, place, search, vertex)
-    if chosen == target and _state(tables, search, target) != OBSERVED_TAKEN:
+    if chosen == NO_SLOT:
+        return NO_SLOT, 0
+    if chosen == target and state_of(tables, search, target) != OBSERVED_TAKEN:
         return target, n_moves
     n_moves, v = 0, np.int64(chosen)
     while v != vertex:
@@ -174,7 +177,8 @@ def choose_route(
 
 
 @inlined_rule
-def _state(tables: Any, search: int, slot: int) -> int:
+def state_of(tables: Any, search: int, slot: int) -> int:
+    """Return the recent state of a slot."""
     return int(recent_state(search_of(search), slot) if search else uint8s(tables.states)[slot])
 
 
@@ -202,7 +206,7 @@ def _expected_cost_s(tables: Any, place: int, slot: int) -> float:
 
 
 @inlined_rule
-def _cost_s(tables: Any, place: int, search: int, slot: int) -> float:
+def cost_of(tables: Any, place: int, search: int, slot: int) -> float:
     """Return the arrival cost of a slot for the car's own stay, s."""
     if search and has_own_price(search_of(search)):
         return float(arrival_cost_s(search_of(search), slot))
@@ -216,7 +220,7 @@ def _near_s(tables: Any, place: int, search: int) -> float:
     For a car's own stay it rises by what the lowest price does.
     """
     slot = np.int64(tables.least_price)
-    more_s = _cost_s(tables, place, search, slot) - _expected_cost_s(tables, place, slot)
+    more_s = cost_of(tables, place, search, slot) - _expected_cost_s(tables, place, slot)
     return float(float64s(tables.near_s)[place] + more_s)
 
 
@@ -230,13 +234,13 @@ def _choose_target(tables: Any, place: int, search: int, vertex: int, previous: 
         near_s = _near_s(tables, place, search)
         for i in range(_n_known(tables, search)):
             slot = _known_slot(search, i)
-            is_near = _cost_s(tables, place, search, slot) <= near_s
-            if is_near and _state(tables, search, slot) == OBSERVED_FREE:
+            is_near = cost_of(tables, place, search, slot) <= near_s
+            if is_near and state_of(tables, search, slot) == OBSERVED_FREE:
                 found = _nearest(tables, place, search, vertex, True, near_s, BY_DRIVE)
                 if found != NO_SLOT:
                     return int(found)
                 break
-        if previous != NO_SLOT and _state(tables, search, previous) != OBSERVED_TAKEN:
+        if previous != NO_SLOT and state_of(tables, search, previous) != OBSERVED_TAKEN:
             return previous
     if tables.heuristic == GREEDY_DRIVE:
         return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE_THEN_COST))
@@ -256,11 +260,11 @@ def _likeliest_target(tables: Any, place: int, search: int, vertex: int) -> int:
     _search_everywhere(tables, place, search, vertex)
     seconds, best, least = float64s(tables.seconds), NO_SLOT, np.inf
     for slot in range(tables.n_slots):
-        if slot != vertex and seconds[slot] < np.inf:
+        if slot != vertex and seconds[slot] < np.inf and cost_of(tables, place, search, slot) < np.inf:
             p = _p_occupied(tables, search, slot)
             if p < least:
                 best, least = slot, p
-    if best == NO_SLOT and vertex < tables.n_slots:
+    if best == NO_SLOT and vertex < tables.n_slots and cost_of(tables, place, search, vertex) < np.inf:
         return vertex
     return best
 
@@ -270,17 +274,17 @@ def _cheapest(tables: Any, place: int, search: int, vertex: int) -> int:
     """Return the candidate with the lowest arrival cost; among equals, the one with the shortest drive."""
     seconds, least, lowest = float64s(tables.seconds), np.inf, np.inf
     for slot in range(tables.n_slots):
-        cost_s = _cost_s(tables, place, search, slot)
-        if cost_s < least and _state(tables, search, slot) != OBSERVED_TAKEN:
+        cost_s = cost_of(tables, place, search, slot)
+        if cost_s < least and state_of(tables, search, slot) != OBSERVED_TAKEN:
             least = cost_s
     found = int(_nearest(tables, place, search, vertex, False, least, BY_DRIVE))
     if found == NO_SLOT and least < np.inf:
         # It cannot be reached: among those that can.
         _search_everywhere(tables, place, search, vertex)
         for slot in range(tables.n_slots):
-            if seconds[slot] == np.inf or _state(tables, search, slot) == OBSERVED_TAKEN:
+            cost_s = cost_of(tables, place, search, slot)
+            if max(cost_s, seconds[slot]) == np.inf or state_of(tables, search, slot) == OBSERVED_TAKEN:
                 continue
-            cost_s = _cost_s(tables, place, search, slot)
             if found == NO_SLOT or (cost_s, seconds[slot]) < (lowest, seconds[found]):
                 found, lowest = slot, cost_s
     return found
@@ -323,9 +327,9 @@ def _nearest(
         size = pop(keys, vertices, size)
         if far > seconds[v]:
             continue
-        cost_s = _cost_s(tables, place, search, v) if v < tables.n_slots else np.inf
-        if v < tables.n_slots and cost_s <= limit_s:
-            state = _state(tables, search, v)
+        cost_s = cost_of(tables, place, search, v) if v < tables.n_slots else np.inf
+        if v < tables.n_slots and cost_s <= limit_s and cost_s < np.inf:
+            state = state_of(tables, search, v)
             value = far
             if order == BY_TOTAL:
                 value = cost_s + (far if state == OBSERVED_FREE else UNOBSERVED_DETOUR * far)

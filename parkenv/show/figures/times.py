@@ -29,6 +29,7 @@ AGENT_COLORS = {
     "greedy-drive": "#d55e00",
     "greedy-total": "#ddcc77",
     "first-free": "#009e73",
+    "usual": "#88ccee",
     "random": "#8c8c8c",
     "oracle": "#000000",
     "belief": "#cc79a7",

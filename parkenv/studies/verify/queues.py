@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.memory import int64s
-from parkenv.engine.events import LEAVE, TAKE_SLOT
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.kernel import is_shared_slot_taken, is_slot_open
-from parkenv.engine.policy import CompiledPolicy
+from parkenv.engine.policy import LEAVE, TAKE_SLOT, CompiledPolicy
 from parkenv.engine.records import LEFT, PARKED, car_at, fleet_at
 from parkenv.lots.generators import grid_lot
 from parkenv.studies.verify.line import THESIS_SPEEDS, Line

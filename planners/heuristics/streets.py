@@ -1,0 +1,437 @@
+"""The rule of `usual`, compiled: which street to try next, by what it costs and how likely it is full.
+
+A *place* is a run of slots on one side of a street, between two junctions and in one zone, or a counted facility. The
+rule is Pandora's (Weitzman 1979), with places as boxes that take a drive to open: a place where n slots were not
+observed yet, each taken with the forecast p, has a free one with q = 1 - p^n, and its index is c + d / q, with the
+arrival cost c and the drive d there. The driver goes to the place of the lowest index, and through it; it takes a free
+slot on its way that costs no more than what is left of that index, and goes on to the next place where one is full.
+
+Places are searched over junctions instead of slots, in a fraction of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.memory import (
+    ADDRESS,
+    float64_array,
+    float64s,
+    int32_array,
+    int32s,
+    int64s,
+    record_at,
+    uint8s,
+)
+from parkenv.engine.policy import PolicyData, forecast, has_own_price, least_zone_cost_s, search_of
+from parkenv.world.lot import MOVES, ParkingLot
+from parkenv.world.scenario import SearchProblem
+from planners.heuristics.rules import (
+    GREEDY_DRIVE,
+    choose_route,
+    cost_of,
+    heuristic_tables,
+    inlined_rule,
+    rule,
+    state_of,
+)
+
+_N_MOVES = len(MOVES)
+_NONE = -1
+
+STREETS = np.dtype(
+    [
+        # TABLES of `greedy-drive`, for where no place is left.
+        ("plain", ADDRESS),
+        ("n_slots", np.int64),
+        ("n_zones", np.int64),
+        ("n_junctions", np.int64),
+        ("n_streets", np.int64),
+        ("n_places", np.int64),
+        # The drive graph, (n_vertices, 4): int32 vertex that each move leads to; float64 its cost, s.
+        ("neighbors", ADDRESS),
+        ("move_s", ADDRESS),
+        # (n_junctions, 4) int32 street that each move of a junction enters, or -1.
+        ("street_of", ADDRESS),
+        # By street, one direction each: int32 junctions at its ends, as vertices; float64 its length, s; uint8 the move
+        # that leaves it; (n_streets + 1,) int32 its first position among the slots, and its first place.
+        ("start", ADDRESS),
+        ("end", ADDRESS),
+        ("length_s", ADDRESS),
+        ("last_move", ADDRESS),
+        ("first", ADDRESS),
+        ("first_place", ADDRESS),
+        # By position, street by street in the order of the drive: int32 slot; int32 street; float64 drive from the
+        # beginning of the street, s; uint8 move that leads there. By slot: int32 its position.
+        ("slots", ADDRESS),
+        ("street_at", ADDRESS),
+        ("along_s", ADDRESS),
+        ("move_into", ADDRESS),
+        ("position", ADDRESS),
+        # (n_places + 1,) int32 first position of each place; (n_places,) int64 its zone; (n_goals, n_places) float64
+        # lower bound on the arrival cost of its slots, s, without and with the price of the expected stay.
+        ("place_first", ADDRESS),
+        ("place_zone", ADDRESS),
+        ("place_walk_s", ADDRESS),
+        ("place_cost_s", ADDRESS),
+        # By goal: (n_slots,) float64 arrival costs, s; float64, the least of the two bounds, s.
+        ("arrival_cost_s", ADDRESS),
+        ("least_walk_s", ADDRESS),
+        ("least_cost_s", ADDRESS),
+        # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken), and its forecast.
+        ("states", ADDRESS),
+        ("p_occupied", ADDRESS),
+        ("forecast", ADDRESS),
+        # Of the last search: by junction, float64 drive, s, inf where it did not arrive; int32 the street by which it
+        # is reached, and the position on it from which that was entered, -1 for its beginning; (n_junctions + 1,)
+        # int32, how many junctions it reached, and then these.
+        ("seconds", ADDRESS),
+        ("via", ADDRESS),
+        ("via_from", ADDRESS),
+        ("reached", ADDRESS),
+        # A heap: (n_streets + 8,) float64 keys, int32 junctions.
+        ("keys", ADDRESS),
+        ("vertices", ADDRESS),
+        # Best place so far: its index, s; int32 position of the target, its street, position from which that is
+        # entered.
+        ("best_s", np.float64),
+        ("best", np.int64),
+        ("best_from", np.int64),
+    ],
+    align=True,
+)
+"""The streets of a lot, and work space."""
+streets_at = record_at(STREETS)
+
+
+def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
+    """Return the streets of a lot, for the problem of each goal."""
+    lot, plain = problems[0].lot, heuristic_tables(GREEDY_DRIVE, problems, None)
+    streets = _streets(lot, np.asarray(problems[0].move_cost_s))
+    n_junctions, n_streets = lot.n_vertices - lot.n_slots, len(streets["start"])
+    first = streets["place_first"][:-1]
+    # Rounding must not lift a bound above the cost.
+    bounds = [
+        np.minimum.reduceat(np.array(costs_s)[:, streets["slots"]], first, axis=1) - 1e-6
+        for costs_s in (
+            [one.walk_s + lot.slot_parking_cost_s for one in problems],
+            plain.arrays["arrival_cost_s"],
+        )
+    ]
+    numbers = {
+        "plain": plain.address,
+        "n_slots": lot.n_slots,
+        "n_zones": len(lot.zones),
+        "n_junctions": n_junctions,
+        "n_streets": n_streets,
+        "n_places": len(first),
+    }
+    arrays: dict[str, NDArray[Any]] = {
+        **{
+            name: plain.arrays[name]
+            for name in ("neighbors", "move_s", "arrival_cost_s", "states", "p_occupied")
+        },
+        **streets,
+        "place_zone": lot.zone_of_slot[streets["slots"][first]],
+        **dict(zip(("place_walk_s", "place_cost_s"), bounds, strict=True)),
+        **dict(zip(("least_walk_s", "least_cost_s"), (bound.min(axis=1) for bound in bounds), strict=True)),
+        "forecast": np.zeros(lot.n_slots),
+        "seconds": np.full(n_junctions, np.inf),
+        "via": np.zeros(n_junctions, np.int32),
+        "via_from": np.zeros(n_junctions, np.int32),
+        "reached": np.zeros(n_junctions + 1, np.int32),
+        "keys": np.zeros(n_streets + 2 * _N_MOVES),
+        "vertices": np.zeros(n_streets + 2 * _N_MOVES, np.int32),
+    }
+    return PolicyData(STREETS, numbers, arrays, kept=plain)
+
+
+def _streets(lot: ParkingLot, move_s: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+    """Return the streets of a lot as arrays of `STREETS`."""
+    n, neighbors = lot.n_slots, lot.neighbors
+    # On from each slot: to a junction, else to the slot that lies in the same direction; not across the street.
+    turn = np.cos(lot.vertex_yaw[:n, None] - lot.vertex_yaw[neighbors[:n]])
+    likeness = np.where(neighbors[:n] >= n, 2.0, np.where(neighbors[:n] >= 0, turn, -np.inf))
+    onward = likeness.argmax(axis=1)
+    kind = np.stack([lot.zone_of_slot, lot.facility_of_slot], axis=1)
+    rows: dict[str, list[Any]] = {
+        name: [] for name in ("start", "end", "length_s", "last_move", "first", "first_place")
+    }
+    at: dict[str, list[Any]] = {name: [] for name in ("slots", "street_at", "along_s", "move_into")}
+    place_first, street_of = list[int](), np.full((lot.n_vertices - n, _N_MOVES), _NONE, np.int32)
+    for junction, move in np.argwhere(neighbors[n:] >= 0).tolist():
+        street, v, seconds = len(rows["start"]), n + junction, 0.0
+        street_of[junction, move] = street
+        rows["start"].append(v)
+        rows["first"].append(len(at["slots"]))
+        rows["first_place"].append(len(place_first))
+        before = _NONE
+        while True:
+            seconds += move_s[v, move]
+            v = int(neighbors[v, move])
+            if v >= n:
+                break
+            if before == _NONE or (kind[v] != kind[before]).any():
+                place_first.append(len(at["slots"]))
+            for name, value in (
+                ("slots", v),
+                ("street_at", street),
+                ("along_s", seconds),
+                ("move_into", move),
+            ):
+                at[name].append(value)
+            before, move = v, int(onward[v])
+        for name, value in (("end", v), ("length_s", seconds), ("last_move", move)):
+            rows[name].append(value)
+    rows["first"].append(len(at["slots"]))
+    rows["first_place"].append(len(place_first))
+    place_first.append(len(at["slots"]))
+    kinds = {"length_s": np.float64, "along_s": np.float64, "last_move": np.uint8, "move_into": np.uint8}
+    made = {name: np.array(values, kinds.get(name, np.int32)) for name, values in (rows | at).items()}
+    position = np.zeros(n, np.int32)
+    position[made["slots"]] = np.arange(len(made["slots"]))
+    return made | {
+        "street_of": street_of,
+        "place_first": np.array(place_first, np.int32),
+        "position": position,
+    }
+
+
+@rule
+def choose_place(
+    address: int, goal: int, search: int, vertex: int, target: int, moves: NDArray[np.uint8], n_moves: int
+) -> tuple[int, int, float]:
+    """Choose the slot to drive to, the last one in its place that may be free, and plan the way through the place.
+
+    Args:
+        address: address of the STREETS record.
+        goal: index of the problem.
+        search: address of the SEARCH record whose tables hold what was observed; 0: the record's own arrays do.
+        vertex: where the car is.
+        target: the target so far, or `NO_SLOT`.
+        moves: (2 n_vertices,) the moves to the target, the last one first; changed in place.
+        n_moves: how many there are.
+
+    Returns:
+        The target, or `NO_SLOT`; the number of moves to it; the index of its place, s. If no place may have a free
+        slot, they are those of `greedy-drive`, and an infinite index.
+    """
+    streets = streets_at(address, 0)
+    _search_places(streets, goal, search, vertex)
+    if streets.best == _NONE:
+        chosen, n_moves = choose_route(streets.plain, goal, search, vertex, target, moves, n_moves)
+        return chosen, n_moves, np.inf
+    return (
+        int(int32s(streets.slots)[streets.best]),
+        _plan_moves(streets, vertex, moves),
+        float(streets.best_s),
+    )
+
+
+@rule
+def takes_slot(address: int, goal: int, search: int, slot: int, left_s: float) -> bool:
+    """Return whether a driver takes the slot that it passes: free, and for no more than what is left of the index, s.
+
+    Other arguments are as for `choose_place`.
+    """
+    streets = streets_at(address, 0)
+    if slot >= streets.n_slots or state_of(streets, search, slot) != OBSERVED_FREE:
+        return False
+    cost_s = cost_of(streets, goal, search, slot)
+    return bool(cost_s <= left_s and cost_s < np.inf)
+
+
+@inlined_rule
+def _forecast(streets: Any, search: int, slot: int) -> float:
+    return float(forecast(search_of(search), slot) if search else float64s(streets.forecast)[slot])
+
+
+@inlined_rule
+def _least_cost_s(streets: Any, goal: int, search: int) -> float:
+    """Return a lower bound on the driver's arrival cost of any slot, s."""
+    if search and has_own_price(search_of(search)):
+        return float(
+            float64s(streets.least_walk_s)[goal] + least_zone_cost_s(search_of(search), streets.n_zones)
+        )
+    return float(float64s(streets.least_cost_s)[goal])
+
+
+@inlined_rule
+def _bound_s(streets: Any, goal: int, search: int, k: int) -> float:
+    """Return a lower bound on the driver's arrival cost of the slots of a place, s."""
+    if search and has_own_price(search_of(search)):
+        zone_cost_s = float64s(search_of(search).zone_cost_s)[int64s(streets.place_zone)[k]]
+        return float(float64s(streets.place_walk_s)[streets.n_places * goal + k] + zone_cost_s)
+    return float(float64s(streets.place_cost_s)[streets.n_places * goal + k])
+
+
+@rule
+def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
+    """Find the place of the lowest index from a vertex (Dijkstra's algorithm over the junctions)."""
+    n, seconds, reached = streets.n_slots, float64s(streets.seconds), int32s(streets.reached)
+    street_of, end, length_s = int32s(streets.street_of), int32s(streets.end), float64s(streets.length_s)
+    room = streets.n_streets + 2 * _N_MOVES
+    keys, vertices = float64_array(streets.keys, (room,)), int32_array(streets.vertices, (room,))
+    least_s = _least_cost_s(streets, goal, search)
+    for i in range(1, reached[0] + 1):
+        seconds[reached[i]] = np.inf
+    reached[0] = 0
+    streets.best_s, streets.best = np.inf, _NONE
+    size = 0
+    if vertex >= n:
+        seconds[vertex - n], reached[0], reached[1] = 0.0, 1, vertex - n
+        size = push(keys, vertices, size, 0.0, vertex - n)
+    else:
+        # On along the street, or across it.
+        here = np.int64(int32s(streets.position)[vertex])
+        size = _enter(streets, goal, search, here, 0.0, keys, vertices, size)
+        for move in range(_N_MOVES):
+            v = np.int64(int32s(streets.neighbors)[vertex * _N_MOVES + move])
+            if 0 <= v < n and not _follows(streets, here, v):
+                there = np.int64(int32s(streets.position)[v])
+                drive_s = float64s(streets.move_s)[vertex * _N_MOVES + move]
+                size = _enter(streets, goal, search, there, drive_s, keys, vertices, size)
+    while size > 0:
+        far, junction = keys[0], np.int64(vertices[0])
+        if far + least_s >= streets.best_s:
+            break
+        size = pop(keys, vertices, size)
+        if far > seconds[junction]:
+            continue
+        for move in range(_N_MOVES):
+            street = np.int64(street_of[junction * _N_MOVES + move])
+            if street != _NONE:
+                _look_along(streets, goal, search, street, _NONE, far)
+                size = _reach(
+                    streets, end[street] - n, street, _NONE, far + length_s[street], keys, vertices, size
+                )
+
+
+@inlined_rule
+def _follows(streets: Any, position: int, slot: int) -> bool:
+    """Return whether a slot is the next one along a street."""
+    after, street = position + 1, int32s(streets.street_at)[position]
+    return bool(after < int32s(streets.first)[street + 1] and int32s(streets.slots)[after] == slot)
+
+
+@rule
+def _enter(
+    streets: Any,
+    goal: int,
+    search: int,
+    position: int,
+    drive_s: float,
+    keys: NDArray[np.float64],
+    vertices: NDArray[np.int32],
+    size: int,
+) -> int:
+    """Begin a search amid a street; returns the size of the heap."""
+    street, before_s = np.int64(int32s(streets.street_at)[position]), float64s(streets.along_s)[position]
+    _look_along(streets, goal, search, street, position, drive_s - before_s)
+    end_s = drive_s - before_s + float64s(streets.length_s)[street]
+    junction = np.int64(int32s(streets.end)[street] - streets.n_slots)
+    return int(_reach(streets, junction, street, position, end_s, keys, vertices, size))
+
+
+@inlined_rule
+def _reach(
+    streets: Any,
+    junction: int,
+    street: int,
+    position: int,
+    far: float,
+    keys: NDArray[np.float64],
+    vertices: NDArray[np.int32],
+    size: int,
+) -> int:
+    """Note that a street, entered at a position or -1, leads to a junction; returns the size of the heap."""
+    seconds, reached = float64s(streets.seconds), int32s(streets.reached)
+    if far >= seconds[junction]:
+        return size
+    if seconds[junction] == np.inf:
+        reached[0] += 1
+        reached[reached[0]] = junction
+    seconds[junction] = far
+    int32s(streets.via)[junction], int32s(streets.via_from)[junction] = street, position
+    return int(push(keys, vertices, size, far, junction))
+
+
+@rule
+def _look_along(streets: Any, goal: int, search: int, street: int, position: int, before_s: float) -> None:
+    """Compare the places along a street with the best one.
+
+    Args:
+        streets: the STREETS record.
+        goal: index of the problem.
+        search: address of the SEARCH record, or 0.
+        street: the street.
+        position: the first position that counts; -1: all.
+        before_s: drive to the beginning of the street, s.
+    """
+    place_first, slots = int32s(streets.place_first), int32s(streets.slots)
+    along_s = float64s(streets.along_s)
+    for k in range(int32s(streets.first_place)[street], int32s(streets.first_place)[street + 1]):
+        first, end = np.int64(max(place_first[k], position)), np.int64(place_first[k + 1])
+        if first >= end:
+            continue
+        if not before_s + along_s[first] + _bound_s(streets, goal, search, k) < streets.best_s:
+            continue
+        n_open, first_open, last_open = 0, _NONE, _NONE
+        for i in range(first, end):
+            slot = np.int64(slots[i])
+            state = state_of(streets, search, slot)
+            if state == OBSERVED_FREE:
+                cost_s = cost_of(streets, goal, search, slot)
+                _compare(streets, before_s + along_s[i] + cost_s, i, position)
+            elif state != OBSERVED_TAKEN:
+                n_open, last_open = n_open + 1, i
+                first_open = i if first_open == _NONE else first_open
+        if n_open > 0:
+            slot = np.int64(slots[(first_open + last_open) // 2])
+            drive_s = before_s + (along_s[first_open] + along_s[last_open]) / 2.0
+            q = 1.0 - _forecast(streets, search, slot) ** n_open
+            if q > 0.0:
+                _compare(streets, cost_of(streets, goal, search, slot) + drive_s / q, last_open, position)
+
+
+@inlined_rule
+def _compare(streets: Any, index_s: float, target: int, position: int) -> None:
+    if index_s < streets.best_s:
+        streets.best_s, streets.best, streets.best_from = index_s, target, position
+
+
+@rule
+def _plan_moves(streets: Any, vertex: int, moves: NDArray[np.uint8]) -> int:
+    """Write the moves to the best place, the last one first; returns their number."""
+    move_into, first, via = uint8s(streets.move_into), int32s(streets.first), int32s(streets.via)
+    position, begin, n_moves = np.int64(streets.best), np.int64(streets.best_from), 0
+    street = np.int64(int32s(streets.street_at)[position])
+    while True:
+        before = begin if begin != _NONE else np.int64(first[street]) - 1
+        while position > before:
+            moves[n_moves] = move_into[position]
+            position, n_moves = position - 1, n_moves + 1
+        if begin != _NONE:
+            break
+        junction = np.int64(int32s(streets.start)[street] - streets.n_slots)
+        if junction + streets.n_slots == vertex:
+            return n_moves
+        begin, street = np.int64(int32s(streets.via_from)[junction]), np.int64(via[junction])
+        moves[n_moves] = uint8s(streets.last_move)[street]
+        n_moves += 1
+        position = np.int64(first[street + 1]) - 1
+    entered = np.int64(int32s(streets.slots)[begin])
+    if entered != vertex:
+        best_s = np.inf
+        for move in range(_N_MOVES):
+            edge = vertex * _N_MOVES + move
+            if int32s(streets.neighbors)[edge] == entered and float64s(streets.move_s)[edge] < best_s:
+                best_s, moves[n_moves] = float64s(streets.move_s)[edge], move
+        n_moves += 1
+    return n_moves
