@@ -1,7 +1,9 @@
 """What a day with many cars tells: blocks, lanes and hours, in which no car, metre or coin is lost."""
 
 import json
+import re
 
+import jsonschema
 import numpy as np
 import pytest
 from small_lots import features
@@ -9,15 +11,24 @@ from small_lots import features
 from parkenv import ParkingLot, fleet
 from parkenv.engine.records import STATES
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE
+from parkenv.show.report.page import SCHEMA
+from parkenv.show.report.town_map import town_data
+from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE, Blocks
+from parkenv.world.facility import Facility
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Two days in a small lot of two zones, one with a price, in which some cars find no slot."""
+    """Two days in a small lot with a kerb and two zones, one with a price, in which some cars find no slot."""
     folder, plain = tmp_path_factory.mktemp("blocks"), packaged_lot("mini")
     zone = np.where(plain.walk_m() <= np.median(plain.walk_m()), "centre", "")
-    write_lot(ParkingLot(**features(plain) | {"slot_zone": zone}), folder / "zoned.geojson")
+    supply = {
+        "facilities": (Facility("Mill Street", "kerb"),),
+        "slot_facility": np.where(
+            np.cumsum(zone == "centre") <= 3, np.where(zone == "", "", "Mill Street"), ""
+        ),
+    }
+    write_lot(ParkingLot(**features(plain) | {"slot_zone": zone} | supply), folder / "zoned.geojson")
     spec = {
         "lot": str(folder / "zoned.geojson"),
         "costs": {"prices": {"centre": 3.0}},
@@ -34,6 +45,14 @@ def run(tmp_path_factory):
         world.run(agents)
         cars.append(world.cars)
     return found, cars
+
+
+BLOCKS_OF_RUN = {
+    ("Mill Street", "kerb", "centre", 3),
+    ("centre", "zone", "centre", 2),
+    ("other", "zone", "other", 5),
+    (NOWHERE, NOWHERE, NOWHERE, 0),
+}
 
 
 def columns(run, table):
@@ -62,9 +81,11 @@ def test_blocks_hold_all_cars_attempts_seconds_metres_and_coins(run):
         for hour, parked in zip(hours["hour"], hours["parked"], strict=True):
             until = inside & (blocks["hour"] <= hour)
             assert (blocks["arrivals"] - blocks["departures"])[until].sum() == parked
-        centre = blocks["block"] == "centre"
+        centre = blocks["zone"] == "centre"
         assert blocks["paid"][centre].sum() == pytest.approx(blocks["paid"].sum())
-        assert set(blocks["slots"][centre]) == {5}
+        assert {
+            *zip(blocks["block"], blocks["type"], blocks["zone"], blocks["slots"], strict=True)
+        } == BLOCKS_OF_RUN
 
 
 def test_detours_of_lanes_are_those_of_cars(run):
@@ -86,3 +107,57 @@ def test_tables_are_read_as_they_were_written_and_the_last_of_two_equal_lines_co
         table.append(folder, rows[:1], sync=False)
         assert json.dumps(table.read(folder)) == json.dumps(rows)
         table.write(folder, rows)
+
+
+def test_zones_are_groups_of_blocks(run):
+    zones = {row["zone"]: row for row in run[0].summary["zones"]}
+    days = columns(run, BLOCKS)
+    assert {name: row["slots"] for name, row in zones.items()} == {"centre": 5, "other": 5}
+    for name, row in zones.items():
+        its = [day["zone"] == name for day in days]
+        assert row["parked_a_day"] == np.mean(
+            [day["arrivals"][i].sum() for day, i in zip(days, its, strict=True)]
+        )
+        taken = [np.nansum((day["occupancy"] * day["slots"])[i]) for day, i in zip(days, its, strict=True)]
+        hours = [
+            np.isfinite(day["occupancy"][i & (day["block"] == "centre")]).sum()
+            for day, i in zip(days, its, strict=True)
+        ]
+        if name == "centre":
+            assert row["occupancy"] == pytest.approx(np.mean(np.divide(taken, hours)) / 5)
+
+
+def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
+    text = (run[0].folder / "fleet.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'id="report-data">(.*?)</script>', text, flags=re.DOTALL)[1])
+    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
+    (shown,), (town,) = data["maps"], data["towns"]
+    assert [block["name"] for block in town["blocks"]] == ["Mill Street", "centre", "other"]
+    assert town["blocks"][0]["rules"] == "3 an hour"
+    days = columns(run, BLOCKS)
+    for number, block in enumerate(town["blocks"]):
+        for i, hour in enumerate(shown["hours"]):
+            its = [
+                day["arrivals"][(day["block"] == block["name"]) & (day["hour"] == hour)].sum() for day in days
+            ]
+            assert shown["blocks"]["arrivals"][number][i] == np.mean(its)
+    for cars in zip(*shown["states"].values(), strict=True):
+        assert sum(cars) == pytest.approx(np.mean([len(its) for its in run[1]]))
+    assert len(text) < 300_000
+    assert not re.findall(r"https?://(?!www.w3.org)", text)
+
+
+def test_a_counted_facility_is_a_block_of_its_capacity_and_a_square_at_its_place():
+    plain = packaged_lot("mini")
+    garage = Facility("other", "garage", capacity=600, xy=(30.0, 12.0))
+    lot = ParkingLot(**features(plain) | {"facilities": (garage,)})
+    blocks = Blocks.of(lot)
+    assert blocks.names == ("other (garage)", "other (zone)")
+    assert blocks.slots.tolist() == [600, 10]
+    about = [{"name": name} for name in blocks.names]
+    square, slots = town_data(lot, about, blocks.of_slot)["blocks"]
+    assert square["at"] == [30.0, 12.0]
+    corners = np.array(square["areas"][0][0]).reshape(-1, 2)
+    np.testing.assert_allclose(corners.mean(axis=0), garage.xy)
+    assert np.ptp(corners, axis=0) == pytest.approx([60.0, 60.0], abs=0.1)
+    assert 1 <= len(slots["areas"]) <= 4

@@ -2,7 +2,9 @@
 
 import json
 import time
+from dataclasses import replace
 
+import numpy as np
 import pytest
 from chromium import SOCKETS, every, one, painted, screen
 from command_line import parkenv
@@ -12,7 +14,10 @@ from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
 from parkenv.cli.report import make_report
+from parkenv.lots import packaged_lot, write_lot
 from parkenv.studies.study import ExecutionSpec
+from parkenv.world.facility import Facility
+from parkenv.world.tariff import Price, Zone
 
 pytestmark = SOCKETS
 
@@ -222,6 +227,92 @@ def test_a_day_with_many_cars_is_played(browser, tmp_path):
     ]
     assert all(abs(car - colors[0]) > 50 for car in colors[1:])
     assert browser.get_log("browser") == []
+
+
+@pytest.mark.slow
+def test_a_day_on_a_map_is_played_and_its_blocks_tell_their_day(browser, tmp_path):
+    lot = packaged_lot("campus")
+    near = np.argsort(lot.walk_m())
+    names = np.full(lot.n_slots, "", dtype="U16")
+    names[near[:60]], names[near[60:100]] = "Mill Street", "Station"
+    supply = {
+        "facilities": (Facility("Mill Street", "kerb", "inner"), Facility("Station", "lot")),
+        "slot_facility": names,
+        "zone_rules": {"inner": Zone("inner", Price(2.0)), "other": Zone("other")},
+    }
+    write_lot(replace(lot, **supply), tmp_path / "town.geojson")
+    command = ["fleet", "--lot", "town.geojson", "--hours", "08:00-11:00", "--arrivals-per-hour", "60,120", "--knows",
+               "own", "-n", "1", "--jobs", "1", "--out", "out"]  # fmt: skip
+    assert parkenv(*command, cwd=tmp_path).returncode == 0
+    screen(browser, 1280)
+    browser.get((tmp_path / "out" / "fleet.html").as_uri())
+    data = json.loads(one(browser, "#report-data").get_attribute("textContent"))
+    town, shown = data["towns"][0], data["maps"][0]
+    canvas = one(browser, "canvas.town")
+    assert painted(browser, "canvas.town") > 20
+
+    def heading():
+        return one(browser, ".about h3").text
+
+    assert heading() == town["name"]
+
+    def told(block):
+        cells = [cell.text for cell in every(browser, ".about tbody td:nth-child(3)")]
+        cars = [
+            row[hour] for hour in range(len(shown["hours"])) for row in [shown["blocks"]["arrivals"][block]]
+        ]
+        return cells == [f"{value:.0f}" for value in cars]
+
+    # A click on a block, and one beside all of them.
+    x0, y0, x1, y1 = town["bounds"]
+    width, height = canvas.rect["width"], canvas.rect["height"]
+    scale = min(width / (x1 - x0 + 10), height / (y1 - y0 + 10))
+    for block in (0, 1):
+        x, y = town["blocks"][block]["at"]
+        across, up = scale * (x - (x0 + x1) / 2), scale * (y - (y0 + y1) / 2)
+        ActionChains(browser).move_to_element_with_offset(canvas, round(across), round(-up)).click().perform()
+        assert heading() == town["blocks"][block]["name"]
+        assert told(block)
+    assert one(browser, ".about .quiet").text == "lot · zone other · 40 spaces"
+    # The keyboard chooses, zooms, moves and steps; the hour at hand is marked.
+    choice = one(browser, "#map-block")
+    choice.send_keys("Mill")
+    assert heading() == "Mill Street"
+    assert "2 an hour" in one(browser, ".about .quiet").text
+    canvas.send_keys("0")
+    whole = painted_bytes(browser)
+    canvas.send_keys("+" + Keys.ARROW_RIGHT)
+    assert painted_bytes(browser) != whole
+    canvas.send_keys("0")
+    assert painted_bytes(browser) == whole
+    canvas.send_keys(Keys.ESCAPE)
+    assert heading() == town["name"]
+    slider = one(browser, "#town input[type=range]")
+    one(browser, "#town button[title^='To the start']").click()
+    for hour in range(3):
+        one(browser, "#town .step-on").click()
+        assert float(slider.get_attribute("value")) == 3600 * (hour + 0.5)
+        assert one(browser, ".about tr.now td").text == f"{8 + hour:02}:00"
+        searching = shown["states"]["searching"][hour]
+        assert f"{searching:.0f} searching" in one(browser, "#town .counts").text
+    assert painted_bytes(browser) != whole
+    # Another setting, and revenue instead of occupancy.
+    one(browser, "#map-setting").send_keys("120")
+    before = painted_bytes(browser)
+    one(browser, "#map-measure").send_keys("rev")
+    assert painted_bytes(browser) != before
+    for dark in (False, True):
+        screen(browser, 390, 844, dark=dark)
+        browser.get((tmp_path / "out" / "fleet.html").as_uri())
+        assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+        assert painted(browser, "canvas.town") > 20
+        # The slider is below the map, before the block.
+        assert one(browser, "#town .time").rect["y"] < one(browser, ".about").rect["y"]
+    assert browser.get_log("browser") == []
+
+
+def painted_bytes(page):
+    return page.execute_script("return document.querySelector('canvas.town').toDataURL()")
 
 
 CHANNELS = """

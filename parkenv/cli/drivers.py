@@ -95,7 +95,7 @@ class Fleet(AgentStudyCommand):
     study: FleetStudy = FleetStudy()
     out: Path = option(
         Path("results/fleet"),
-        "Folder for experiment.json, days.csv, blocks.csv, lanes.csv, hours.csv, summary.json and figures.",
+        "Folder for experiment.json, days.csv, blocks.csv, lanes.csv, hours.csv, summary.json, fleet.html and figures.",
         short="-o",
     )
 
@@ -211,7 +211,7 @@ def _cells(row: Row, *, mixed: bool) -> list[str]:
         f"{row['cruising_share']:.0%}",
         f"{row['occupancy']:.0%}" + (f" (counted {counted:.0%})" if is_known(counted) else ""),
         _interval(row, "price_of_anarchy", ".3f"),
-        f"{row['price_over_bound']:.3f}",
+        _number(row["price_over_bound"], ".3f"),
     ]
 
 

@@ -217,13 +217,13 @@ class LotScene:
         entries = Marks(self.entries, ARROWHEAD, "entry", (2.4, 2.4), px=13.0)
         return {
             "name": lot.name,
-            "bounds": _rounded(np.array(lot.bounds())),
+            "bounds": rounded(np.array(lot.bounds())),
             "slot_ids": list(lot.slot_ids),
-            "slots": [_rounded(corners) for corners in self.slots],
-            "vertices": [_rounded(xy) for xy in lot.vertex_xy],
+            "slots": [rounded(corners) for corners in self.slots],
+            "vertices": [rounded(xy) for xy in lot.vertex_xy],
             "yaw": [round(float(a), 3) for a in lot.vertex_yaw],
-            "goals": [_rounded(xy) for xy in lot.goals],
-            "ground": [_layer_data(layer) for layer in (*self.ground(), entries)],
+            "goals": [rounded(xy) for xy in lot.goals],
+            "ground": [layer_data(layer) for layer in (*self.ground(), entries)],
         }
 
 
@@ -232,27 +232,28 @@ def building_layers(buildings: Sequence[FloatArray], walls: Sequence[FloatArray]
     return [Areas([[ring] for ring in buildings], "building"), Lines(walls, "wall", 0.3, (1.0, 4.0))]
 
 
-def _layer_data(layer: Layer) -> dict[str, Any]:
+def layer_data(layer: Layer, digits: int = 2) -> dict[str, Any]:
     """Return a layer for a page: its kind, its colour's name, and its numbers."""
     data: dict[str, Any] = {"color": layer.color, "opacity": layer.opacity}
     if isinstance(layer, Areas):
-        return data | {"areas": [[_rounded(ring) for ring in rings] for rings in layer.polygons]}
+        return data | {"areas": [[rounded(ring, digits) for ring in rings] for rings in layer.polygons]}
     if isinstance(layer, Lines):
         dash = list(layer.dash) if layer.dash else []
-        lines = [_rounded(points) for points in layer.lines]
+        lines = [rounded(points, digits) for points in layer.lines]
         return data | {"lines": lines, "width": layer.width, "px": layer.px[0], "dash": dash}
     size = np.broadcast_to(np.asarray(layer.size), (1, 2))
-    shape = _rounded(layer.shape * size[0])
+    shape = rounded(layer.shape * size[0])
     return data | {
-        "marks": [_rounded(pose) for pose in layer.poses],
+        "marks": [rounded(pose) for pose in layer.poses],
         "shape": shape,
         "length": size[0, 0],
         "px": layer.px,
     }
 
 
-def _rounded(values: FloatArray) -> list[float]:
-    return [round(float(v), 2) for v in values.ravel()]
+def rounded(values: FloatArray, digits: int = 2) -> list[float]:
+    """Return numbers for a page, from the first row on."""
+    return [round(float(v), digits) for v in values.ravel()]
 
 
 def _entries(lot: ParkingLot) -> FloatArray:

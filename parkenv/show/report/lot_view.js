@@ -1,19 +1,24 @@
 // A lot from above on a canvas: the static layer is drawn once for each size, moving things on top of it.
 
+/** Return 256 colours between those of a list in the style sheet. */
+function scaleOf(list) {
+  const anchors = list.split(",").map((hex) => hex.trim()).map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)));
+  return Array.from({ length: 256 }, (_, value) => {
+    const at = (value / 255) * (anchors.length - 1);
+    const i = Math.min(Math.floor(at), anchors.length - 2);
+    return `rgb(${anchors[i].map((a, c) => Math.round(a + (at - i) * (anchors[i + 1][c] - a))).join(" ")})`;
+  });
+}
+
 /** The colours of the page's theme, from the style sheet. */
 const palette = {
   read() {
     const style = getComputedStyle(document.documentElement);
-    for (const name of ["ground", "asphalt", "paint", "building", "wall", "parked", "glass", "car", "goal", "halo", "ink", "soft", "view", "card", "entry", "failed", "queue", "member", "other", "resident"]) {
+    for (const name of ["ground", "asphalt", "paint", "building", "wall", "parked", "glass", "car", "goal", "halo", "ink", "soft", "view", "card", "entry", "failed", "queue", "member", "other", "resident", "cruise"]) {
       this[name] = style.getPropertyValue(`--${name}`).trim();
     }
-    const anchors = style.getPropertyValue("--belief").split(",").map((hex) => hex.trim()).map((hex) => [1, 3, 5].map((i) => parseInt(hex.slice(i, i + 2), 16)));
-    this.anchors = anchors;
-    this.belief = Array.from({ length: 256 }, (_, value) => {
-      const at = (value / 255) * (anchors.length - 1);
-      const i = Math.min(Math.floor(at), anchors.length - 2);
-      return `rgb(${anchors[i].map((a, c) => Math.round(a + (at - i) * (anchors[i + 1][c] - a))).join(" ")})`;
-    });
+    this.belief = scaleOf(style.getPropertyValue("--belief"));
+    this.taken = scaleOf(style.getPropertyValue("--taken"));
   },
 };
 
@@ -62,13 +67,15 @@ class LotView {
     this.ground = null;
   }
 
+  /** Return what is shown: the whole lot, or in follow mode the surroundings of a place. */
+  viewpoint(place) {
+    if (!this.follow || !place) return this.whole;
+    return { scale: Math.max(this.width / AROUND / 1.25, this.whole.scale), x: place[0], y: place[1] };
+  }
+
   /** Begin a frame; in follow mode, around a place. */
   begin(place) {
-    this.at = this.whole;
-    if (this.follow && place) {
-      const scale = Math.max(this.width / AROUND / 1.25, this.whole.scale);
-      this.at = { scale, x: place[0], y: place[1] };
-    }
+    this.at = this.viewpoint(place);
     const context = this.context;
     if (this.follow) {
       this.toMetres(context);

@@ -37,6 +37,11 @@ if (data.worlds.length) {
   const replay = new SearchReplay(part("search-replay"), data);
   repaint.push(() => replay.redraw());
 }
+if (data.maps.length) {
+  part("town").hidden = false;
+  const map = new TownMap(part("town-map"), data);
+  repaint.push(() => map.redraw());
+}
 if (data.fleets.length) {
   part("crowd").hidden = false;
   const replay = new FleetReplay(part("fleet-replay"), data);

@@ -27,7 +27,7 @@ SCHEMA = Path(__file__).with_name("report.schema.json")
 """JSON schema of the data in a page."""
 SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_track.js",
-    "search_replay.js", "drive_replay.js", "fleet_replay.js", "page.js",
+    "search_replay.js", "drive_replay.js", "fleet_replay.js", "town_map.js", "page.js",
 )  # fmt: skip
 """Scripts of the page, in order of dependence."""
 GAME_SCRIPTS = ("numbers.js", "lot_view.js", "player.js", "search_track.js", "game_search.js", "game.js")
@@ -81,17 +81,18 @@ def page_data(
         kind: kind of the run: compare, survey, demo, train, ...
         page: what is said about it.
         summary: its `command`, `version` and `seed`.
-        recordings: what is replayed: a `lot`, and on it a `world` with searches, a `drive`, or a day of a `fleet`.
+        recordings: what is replayed: a `lot`, and on it a `world` with searches, a `drive`, or a day of a `fleet`; or a
+            `town`, and a `map` of its day.
         notes: notes for the reader, such as why there is no replay.
     """
-    lots: list[Any] = []
+    grounds: dict[str, list[Any]] = {"lot": [], "town": []}
 
-    def placed(name: str) -> list[dict[str, Any]]:
+    def placed(name: str, on: str = "lot") -> list[dict[str, Any]]:
         found = [recording for recording in recordings if name in recording]
         for recording in found:
-            if recording["lot"] not in lots:
-                lots.append(recording["lot"])
-        return [{**recording[name], "lot": lots.index(recording["lot"])} for recording in found]
+            if recording[on] not in grounds[on]:
+                grounds[on].append(recording[on])
+        return [{**recording[name], on: grounds[on].index(recording[on])} for recording in found]
 
     return {
         "format": FORMAT,
@@ -109,10 +110,12 @@ def page_data(
         "terms": terms_data(),
         "learning": list(page.learning),
         "tables": list(page.tables),
-        "lots": lots,
         "worlds": placed("world"),
         "drives": placed("drive"),
         "fleets": placed("fleet"),
+        "maps": placed("map", "town"),
+        "lots": grounds["lot"],
+        "towns": grounds["town"],
     }
 
 

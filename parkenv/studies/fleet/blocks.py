@@ -86,10 +86,29 @@ class Blocks:
 
     @classmethod
     def of(cls, lot: ParkingLot) -> Self:
-        """Return the blocks of a lot."""
-        of_slot = lot.zone_of_slot
-        types = ("zone",) * len(lot.zones)
-        return cls(lot.zones, types, lot.zones, np.bincount(of_slot), of_slot)
+        """Return the blocks of a lot: facilities in their order, one for each of their zones, then zones."""
+        # Slots without a facility come last.
+        facility = np.where(lot.facility_of_slot < 0, len(lot.facilities), lot.facility_of_slot)
+        pairs, of_slot = np.unique(
+            np.stack([facility, lot.zone_of_slot], axis=1), axis=0, return_inverse=True
+        )
+        several = np.bincount(pairs[:, 0]) > 1
+        names, types = [], []
+        for number, zone in pairs.tolist():
+            if number == len(lot.facilities):
+                names.append(lot.zones[zone])
+                types.append("zone")
+            else:
+                its = lot.facilities[number]
+                names.append(f"{its.name}, {lot.zones[zone]}" if several[number] else its.name)
+                types.append(its.kind)
+        twice = {name for name in names if names.count(name) > 1} if len({*names}) < len(names) else {NOWHERE}
+        names = [
+            f"{name} ({kind})" if name in twice else name for name, kind in zip(names, types, strict=True)
+        ]
+        zones = tuple(lot.zones[zone] for zone in pairs[:, 1])
+        slots = np.bincount(of_slot, lot.capacity).astype(np.int64)
+        return cls(tuple(names), tuple(types), zones, slots, of_slot)
 
 
 def has_zones(scenario: Scenario) -> bool:

@@ -13,12 +13,15 @@ from scipy.sparse.csgraph import dijkstra
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.engine.fleet import Fleet
 from parkenv.studies.fleet.blocks import has_zones, paid
-from parkenv.studies.fleet.clairvoyant_bound import ParkingDay
+from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.setting import BY_HOUR
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import HOUR_S
+
+MOST_PAIRS = 5_000_000
+"""Pairs of a car and a slot up to which a day has a clairvoyant bound."""
 
 
 class Roads:
@@ -67,6 +70,16 @@ class Roads:
         """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster."""
         rows = np.searchsorted(self._entries, fleet.cars["entry"])
         return np.asarray((self._alone_s[rows] + fleet.zone_cost_s()).min(axis=1))
+
+    def clairvoyant_s(self, fleet: Fleet) -> float:
+        """Return the clairvoyant bound of the day of a fleet that has been reset, s, for all cars together.
+
+        It is NaN where it would take longer than the day itself, and for counted facilities: it is a bound for slots.
+        """
+        lot = self._problem.lot
+        if len(fleet.cars) * lot.n_slots > MOST_PAIRS or (lot.capacity > 1).any():
+            return float("nan")
+        return clairvoyant_bound_s(self.parking_day(fleet))
 
     def parking_day(self, fleet: Fleet) -> ParkingDay:
         """Return the day of a fleet that has been reset: its cars to come, and when its residents leave."""

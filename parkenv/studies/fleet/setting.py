@@ -71,7 +71,7 @@ Demanded = Annotated[float | str, BeforeValidator(rate_of), WithJsonSchema(_NUMB
 KINDS = {
     **dict.fromkeys(("scenario", "agents", "knows"), TEXT),
     **dict.fromkeys(("day", "cars"), WHOLE),
-    **dict.fromkeys(("members_s", "others_s", "counted_occupancy"), NUMBER_OR_NAN),
+    **dict.fromkeys(("members_s", "others_s", "counted_occupancy", "clairvoyant_s"), NUMBER_OR_NAN),
     **dict.fromkeys(BY_HOUR, NUMBERS),
     **dict.fromkeys(CAR_LISTS, wholes()),
     "arrivals_per_hour": Kind(_WANTED, rate_of),

@@ -47,6 +47,7 @@ from parkenv.studies.fleet.setting import (
 from parkenv.studies.results import CsvTable, Results, Row, Table
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
+from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
     from parkenv.engine.fleet import Fleet
@@ -311,14 +312,13 @@ class FleetStudy(Study):
         import numpy as np
 
         from parkenv.studies.fleet.blocks import Blocks, Tally, day_rows
-        from parkenv.studies.fleet.clairvoyant_bound import clairvoyant_bound_s
         from parkenv.studies.fleet.measures import car_lists, day_measures, filling
         from parkenv.world.occupancy.process import Arrival
 
         fleet, agents = self.fleet(setting)
         fleet.reset(self.seed, day)
         roads = self._roads[setting.scenario]
-        bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
+        bound_s = roads.clairvoyant_s(fleet)
         window, occupancy = fleet.scenario.arrival, fleet.scenario.occupancy
         times = fleet.begin + np.arange(0.0, window.end_s - window.start_s, SAMPLE_S)
         taken, tally = [], Tally(fleet, roads)
@@ -413,7 +413,7 @@ class FleetStudy(Study):
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
         prices = {
-            name: {zone: its.tariff.per_hour.get(zone, 0.0) for zone in its.lot.zones}
+            name: {zone.name: float(zone.price.amount(its.priced_at_s, HOUR_S)) for zone in its.zone_rules}
             for name, its in self.built.items()
         }
         return {
@@ -434,11 +434,12 @@ class FleetStudy(Study):
         return f"{'; '.join(lots)}, {plural(self.days, 'day')}"
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: a picture of each scenario."""
+        """See `Study`: a picture of each scenario, and a page with maps."""
         from parkenv.files.file_names import file_name
         from parkenv.show.figures.fleet import save_fleet_figure, save_zones_figure
         from parkenv.show.plurals import plural
-        from parkenv.studies.fleet.blocks import BLOCKS, by_hour, has_zones
+        from parkenv.studies.fleet.blocks import BLOCKS, TABLES, by_hour, has_zones
+        from parkenv.studies.fleet.day_map import write_map_page
         from parkenv.studies.fleet.measures import looks_s
 
         tasks: list[Task[object]] = [
@@ -452,9 +453,11 @@ class FleetStudy(Study):
             )
             for name, scenario in self.built.items()
         ]
+        rows = {table.file: list(result.results.rows(table).values()) for table in TABLES}
+        tasks.append(partial(write_map_page, self, result.summary, rows, result.folder))
         for setting in self.shown_settings:
             scenario = self.built[setting.scenario]
-            days = [row for row in result.results.rows(BLOCKS).values() if setting.holds(row)]
+            days = [row for row in rows[BLOCKS.file] if setting.holds(row)]
             if has_zones(scenario) and days:
                 name = "zones" if len(self.built) == 1 else f"zones_{setting.scenario}"
                 title = f"{setting.scenario}: zones, {setting.agent.label}, {rate_text(setting.arrivals_per_hour)}"
@@ -505,6 +508,7 @@ class FleetStudy(Study):
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""
+        from parkenv.studies.fleet.day_map import DayMaps
         from parkenv.studies.fleet.day_replay import FleetReplay
 
-        return [FleetReplay(self, folder)]
+        return [DayMaps(self, folder), FleetReplay(self, folder)]

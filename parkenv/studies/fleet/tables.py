@@ -144,7 +144,7 @@ def day_means(days: Sequence[Row], measures: Iterable[str], with_interval: Colle
 
 def _ratio(name: str, pairs: Pairs, column: str) -> Row:
     """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
-    if not pairs:
+    if not pairs or any(math.isnan(theirs[column]) for _, theirs in pairs):
         return columns_of(name, (math.nan, math.nan, math.nan))
     mine, theirs = (
         [day[name] * day["cars"] for day in days]

@@ -1,0 +1,157 @@
+"""Maps of the days of a study of many cars, for its pages: blocks and lanes by hour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.engine.records import STATES
+from parkenv.show.report.page import page_data, write_page
+from parkenv.show.report.town_map import town_data
+from parkenv.studies.fleet.blocks import ALL, BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
+from parkenv.studies.fleet.setting import Setting
+from parkenv.studies.report import Again, Recording
+from parkenv.studies.report_options import ReportOptions
+from parkenv.studies.results import Row, without_nan
+from parkenv.world.scenario import Scenario
+from parkenv.world.tariff import HOUR_S, PUBLIC, Zone
+
+if TYPE_CHECKING:
+    from parkenv.studies.fleet.study import FleetStudy
+
+MAP_PAGE = "fleet.html"
+MOST_MAPS = 6
+MOST_NUMBERS = 1_500_000
+"""Numbers of all maps of a page: with more, it would load slowly."""
+Rows = Mapping[str, Sequence[Row]]
+"""Rows of each of `TABLES`, by its file."""
+
+
+class DayMaps(NamedTuple):
+    """The maps of a study of many cars.
+
+    Attributes:
+        study: the study.
+        folder: folder of the run.
+    """
+
+    study: FleetStudy
+    folder: Path
+
+    def again(self, options: ReportOptions) -> Again:
+        """See `Replay`: nothing runs again, the maps are in the tables of the run."""
+        del options
+        rows = {table.file: table.read(self.folder) for table in TABLES}
+        return Again([partial(dict, recording) for recording in map_recordings(self.study, rows)])
+
+
+def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) -> None:
+    """Write the page with tables and maps of a run, without days that are played again."""
+    told = without_nan(summary)
+    page = page_data("fleet", study.page(told, folder), told, map_recordings(study, rows))
+    write_page(page, folder / MAP_PAGE)
+
+
+def map_recordings(study: FleetStudy, rows: Rows) -> list[Recording]:
+    """Return `town` and `map` of `report.schema.json` of some settings, those to be shown first."""
+    shown = study.shown_settings
+    chosen = [*shown, *(one for one in study.fleet_settings if one not in shown)][:MOST_MAPS]
+    towns = {name: _town(study.built[name]) for name in {setting.scenario for setting in chosen}}
+    made: list[Recording] = []
+    for setting in chosen:
+        its = {file: [row for row in of_table if setting.holds(row)] for file, of_table in rows.items()}
+        if its[BLOCKS.file]:
+            made.append(
+                {"town": towns[setting.scenario], "map": _map(study.built[setting.scenario], setting, its)}
+            )
+    numbers = np.cumsum([len(one["town"]["blocks"]) * len(one["map"]["hours"]) * 6 for one in made])
+    return [one for one, so_far in zip(made, numbers, strict=True) if so_far <= max(MOST_NUMBERS, numbers[0])]
+
+
+def _town(scenario: Scenario) -> dict[str, Any]:
+    lot, blocks = scenario.lot, Blocks.of(scenario.lot)
+    rules = {zone.name: rules_text(zone) for zone in scenario.zone_rules}
+    about = [
+        {"name": name, "type": kind, "zone": zone, "slots": slots, "rules": rules[zone]}
+        for name, kind, zone, slots in zip(
+            blocks.names, blocks.types, blocks.zones, blocks.slots.tolist(), strict=True
+        )
+    ]
+    return town_data(lot, about, blocks.of_slot)
+
+
+def rules_text(zone: Zone) -> str:
+    """Return the rules of a zone in words; empty if everyone may park there for nothing.
+
+    Examples:
+        >>> from parkenv.world.tariff import Price
+        >>> rules_text(Zone("inner", Price(2.0, free_s=900.0), max_stay_s=7200.0))
+        '2 an hour, 15 min free; up to 2 h'
+    """
+    price, said = zone.price, []
+    if price.steps:
+        table = ", ".join(f"{amount:g} up to {_time_text(stay_s)}" for stay_s, amount in price.steps)
+        said.append(f"{table}{f', then {price.per_hour:g} an hour' if price.per_hour else ''}")
+    elif price.per_hour:
+        said.append(f"{price.per_hour:g} an hour")
+    if said:
+        said[0] += f", {_time_text(price.free_s)} free" if price.free_s else ""
+        said[0] += f", at most {price.daily_cap:g} a day" if price.daily_cap is not None else ""
+        said[0] += f", {price.charged}" if price.charged else ""
+    if price.per_kwh:
+        said.append(f"{price.per_kwh:g} a kWh")
+    if zone.max_stay_s is not None:
+        said.append(f"up to {_time_text(zone.max_stay_s)}")
+    if zone.hours is not None:
+        said.append(f"open {zone.hours}")
+    if PUBLIC not in zone.users:
+        said.append(f"for {', '.join(zone.users)}")
+    return "; ".join(said)
+
+
+def _time_text(seconds: float) -> str:
+    return f"{seconds / HOUR_S:g} h" if seconds >= HOUR_S else f"{seconds / 60.0:g} min"
+
+
+def _map(scenario: Scenario, setting: Setting, rows: Rows) -> dict[str, Any]:
+    names, hours, means = by_hour(rows[BLOCKS.file], "block")
+    # Cars that arrive late park after the last look at the slots.
+    known = np.isfinite(means["occupancy"]).any(axis=0)
+    order = [names.index(name) for name in Blocks.of(scenario.lot).names]
+    hours = np.array(hours)[known].tolist()
+    grid = {name: values[order][:, known] for name, values in means.items()}
+    with np.errstate(invalid="ignore", divide="ignore"):
+        grid |= {name: grid[name] / grid["parked"] for name in ("search_s", "walk_s")}
+    digits = {"occupancy": 3, "arrivals": 2, "refused": 2, "search_s": 0, "walk_s": 0, "paid": 2}
+    return {
+        **setting.columns,
+        "days": len(rows[BLOCKS.file]),
+        "hours": hours,
+        "blocks": {name: without_nan(np.round(grid[name], digit).tolist()) for name, digit in digits.items()},
+        "lanes": _cruised(rows[LANES.file], hours),
+        "states": {state: _mean_states(rows[HOURS.file], state, hours) for state in STATES},
+    }
+
+
+def _cruised(rows: Sequence[Row], hours: Sequence[int]) -> list[list[int]]:
+    """Return lanes in which cars cruise, with the metres in each hour, means over days."""
+    metres: dict[int, FloatArray] = {}
+    for row in rows:
+        for lane, hour, cruised in zip(row["lane"], row["hour"], row["cruised_m"], strict=True):
+            if hour in hours and cruised:
+                metres.setdefault(lane, np.zeros(len(hours)))[hours.index(hour)] += cruised / len(rows)
+    return [[lane, *np.round(its).astype(int).tolist()] for lane, its in sorted(metres.items())]
+
+
+def _mean_states(rows: Sequence[Row], state: str, hours: Sequence[int]) -> list[float]:
+    """Return the mean number of cars in a state at the end of each hour; a day that is over stays as it is."""
+    days = []
+    for row in rows:
+        its = [count for count, purpose in zip(row[state], row["purpose"], strict=True) if purpose == ALL]
+        days.append([its[min(hour - row["hour"][0], len(its) - 1)] for hour in hours])
+    return [round(float(cars), 1) for cars in np.mean(days, axis=0)]
