@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from numbers import Integral, Real
 from typing import Any
@@ -84,7 +84,20 @@ def require_one_of(name: str, value: object, known: Collection[object]) -> None:
         InputError: it is not.
     """
     if value not in known:
-        raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known))}")
+        raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known)) or 'none'}")
+
+
+def reset_options(options: object, known: Collection[str]) -> dict[str, Any]:
+    """Return the options of a call of `reset` by name; None stands for no options.
+
+    Raises:
+        InputError: it is no dictionary, or an option is unknown.
+    """
+    if not isinstance(options, Mapping | None):
+        raise InputError(f"options is {options!r:.60}, want a dictionary or None")
+    for name in options or ():
+        require_one_of("option of reset", name, known)
+    return dict(options or {})
 
 
 def require_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:

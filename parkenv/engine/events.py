@@ -78,7 +78,6 @@ needed; Python must compute the forecast of the car `pending`; a compiled policy
 reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
 _ON_TICK = 1e-9  # fraction of a tick
-_DEPARTURES_FIRST = 1 << 62
 
 
 # ---- from Python
@@ -92,7 +91,7 @@ def begin_world_at(address: int) -> None:
     clear_live_map(fleet)
     clear_lanes(fleet)
     fleet.time = fleet.arrival
-    fleet.n_events = fleet.event_number = fleet.next_car = 0
+    fleet.n_steps_to_end = fleet.n_departures = fleet.event_number = fleet.next_car = 0
     fleet.first_ready = fleet.n_ready = 0
     fleet.pending = NO_CAR
     fleet.n_searching = fleet.n_parked = fleet.n_gone = fleet.n_decisions = 0
@@ -117,7 +116,7 @@ def advance_at(address: int, until: float) -> int:
             return NEEDS_REPORTS
         if fleet.step_capacity > 0 and fleet.n_kept_steps == fleet.step_capacity:
             return NEEDS_STEPS
-        if not (fleet.next_car < fleet.n_cars or fleet.n_events > 0) and fleet.n_ready == 0:
+        if fleet.next_car == fleet.n_cars and fleet.n_steps_to_end + fleet.n_departures + fleet.n_ready == 0:
             break
         if fleet.n_ready > 0 and not _is_due(fleet, fleet.time):
             number = int64s(fleet.ready)[fleet.first_ready]
@@ -171,62 +170,84 @@ def init_forecast_at(address: int) -> None:
 
 @inlined
 def _is_due(fleet: Any, time: float) -> bool:
-    """Return whether the next event is not after a time, s."""
-    if fleet.n_events > 0 and float64s(fleet.event_times)[0] <= time:
-        return True
-    return bool(fleet.next_car < fleet.n_cars and car_at(fleet.cars, fleet.next_car).arrival <= time)
+    """Return whether the next event is not after a time, s; there must be one, if that is infinite."""
+    return bool(min(_next_arrival(fleet), _next_departure(fleet), _next_end(fleet)) <= time)
 
 
 @inlined
 def _next_event(fleet: Any) -> int:
-    """Carry out the next event; returns a negative number if Python must help first or after it."""
-    if fleet.next_car < fleet.n_cars:
-        arrival = car_at(fleet.cars, fleet.next_car).arrival
-        if fleet.n_events > 0:
-            first_s, first = float64s(fleet.event_times)[0], np.int64(int32s(fleet.event_cars)[0])
-            departs = car_at(fleet.cars, first).state == PARKED
-            arrives = first_s > arrival or (first_s == arrival and not departs)
-        else:
-            arrives = True
-        if arrives:
-            if fleet.n_free == 0:
-                return NEEDS_SEARCH
-            _pass_time(fleet, arrival)
-            return int(_arrive(fleet))
-    number = np.int64(int32s(fleet.event_cars)[0])
-    _pass_time(fleet, float64s(fleet.event_times)[0])
+    """Carry out the next event; returns a negative number if Python must help first or after it.
+
+    Of events at the same time, departures come first, then arrivals, and then ends of steps in the order in which they
+    were added.
+    """
+    arrival, departure, end = _next_arrival(fleet), _next_departure(fleet), _next_end(fleet)
+    if arrival < departure and arrival <= end:
+        if fleet.n_free == 0:
+            return NEEDS_SEARCH
+        _pass_time(fleet, arrival)
+        return int(_arrive(fleet))
+    _pass_time(fleet, min(departure, end))
     fleet.reservations_stale = True
-    times, cars, ranks = _events_of(fleet)
-    fleet.n_events = pop(times, cars, fleet.n_events, ranks)
-    if car_at(fleet.cars, number).state == PARKED:
+    if departure <= end:
+        number = np.int64(int32s(fleet.departing_cars)[0])
+        times, cars, ranks = _heap(fleet, fleet.departure_times, fleet.departing_cars)
+        fleet.n_departures = pop(times, cars, fleet.n_departures, ranks)
         _depart(fleet, number)
     else:
+        number = np.int64(int32s(fleet.step_cars)[0])
+        times, cars, ranks = _heap(fleet, fleet.step_times, fleet.step_cars)
+        fleet.n_steps_to_end = pop(times, cars, fleet.n_steps_to_end, ranks)
         _reach(fleet, number)
     return 0
 
 
 @inlined
-def _push_event(fleet: Any, time: float, number: int) -> None:
-    """Add the end of a car's step, or the departure of a parked car.
-
-    Of events at the same time, departures come first, and then the first one added.
-    """
-    is_parked = car_at(fleet.cars, number).state == PARKED
-    int64s(fleet.event_ranks)[number] = fleet.event_number - (_DEPARTURES_FIRST if is_parked else 0)
-    fleet.event_number += 1
-    times, cars, ranks = _events_of(fleet)
-    fleet.n_events = push(times, cars, fleet.n_events, time, number, ranks)
+def _next_arrival(fleet: Any) -> float:
+    """Return when the next car arrives, infinite if none does; s since Monday 00:00, as below."""
+    return float(car_at(fleet.cars, fleet.next_car).arrival if fleet.next_car < fleet.n_cars else np.inf)
 
 
 @inlined
-def _events_of(fleet: Any) -> tuple[FloatArray, NDArray[np.int32], IntArray]:
-    """Return the heap of events: times, cars, and the order of equal times by car."""
+def _next_departure(fleet: Any) -> float:
+    """Return when the next car leaves its slot, infinite if none does."""
+    return float(float64s(fleet.departure_times)[0] if fleet.n_departures > 0 else np.inf)
+
+
+@inlined
+def _next_end(fleet: Any) -> float:
+    """Return when the next step of a car is over, infinite if no car is on its way."""
+    return float(float64s(fleet.step_times)[0] if fleet.n_steps_to_end > 0 else np.inf)
+
+
+@inlined
+def _add_departure(fleet: Any, time: float, number: int) -> None:
+    """Let a parked car leave its slot at a time, s."""
+    times, cars, ranks = _heap(fleet, fleet.departure_times, fleet.departing_cars)
+    _rank(fleet, number)
+    fleet.n_departures = push(times, cars, fleet.n_departures, time, number, ranks)
+
+
+@inlined
+def _add_end(fleet: Any, time: float, number: int) -> None:
+    """Let the step of a car be over at a time, s."""
+    times, cars, ranks = _heap(fleet, fleet.step_times, fleet.step_cars)
+    _rank(fleet, number)
+    fleet.n_steps_to_end = push(times, cars, fleet.n_steps_to_end, time, number, ranks)
+
+
+@inlined
+def _rank(fleet: Any, number: int) -> None:
+    """Let the event of a car come after those at the same time that were added before."""
+    int64s(fleet.event_ranks)[number] = fleet.event_number
+    fleet.event_number += 1
+
+
+@inlined
+def _heap(fleet: Any, times: int, cars: int) -> tuple[FloatArray, NDArray[np.int32], IntArray]:
+    """Return a heap of events, whose arrays have these addresses: times, cars, the order of equal times by car."""
     n = fleet.n_cars
-    return (
-        float64_array(fleet.event_times, (n,)),
-        int32_array(fleet.event_cars, (n,)),
-        int64_array(fleet.event_ranks, (n,)),
-    )
+    return float64_array(times, (n,)), int32_array(cars, (n,)), int64_array(fleet.event_ranks, (n,))
 
 
 @inlined
@@ -308,7 +329,7 @@ def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None
         _round_up(fleet, search)
     car.queued_s += search.step_drive_s - before
     block_lane(fleet, search.previous_vertex, search.time, number)
-    _push_event(fleet, search.time, number)
+    _add_end(fleet, search.time, number)
 
 
 @inlined
@@ -364,7 +385,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         if car.shares:
             report_slot(fleet, car.slot, True, 1.0, 0.0, 1.0)
         _end_search(fleet, number, PARKED)
-        _push_event(fleet, fleet.time + car.stay_s, number)
+        _add_departure(fleet, fleet.time + car.stay_s, number)
         return True
     if fleet.tick_s > 0.0:
         _round_up(fleet, search)
@@ -373,7 +394,7 @@ def act(fleet: Any, number: int, action: int) -> bool:
         block_lane(fleet, search.vertex, search.time, number)
     else:
         release_slot(fleet, car)
-    _push_event(fleet, search.time, number)
+    _add_end(fleet, search.time, number)
     if fleet.step_capacity > 0:
         _keep_step(fleet, search, number, origin)
     return True

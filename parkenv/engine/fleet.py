@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import dijkstra
 
+from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import world_key
 from parkenv.compiled.memory import address_of, sparse_zeros
 from parkenv.engine.events import (
@@ -257,6 +258,8 @@ class Fleet:
         self._pool: list[Searches] = []
         self._moves: list[NDArray[np.uint8]] = []
         self._row: dict[int, tuple[Searches, int]] = {}
+        self._copiers: dict[int, tuple[Callable[[], NDArray[Any]], ...]] = {}
+        self._copy_masks = [mask.copy for mask in self.scenario.action_masks]
         self._cars = np.zeros(0, CAR)
         self._record["background"] = BACKGROUNDS.index(background)
         self._record["max_steps"] = max_steps
@@ -339,6 +342,7 @@ class Fleet:
             record["world"] = self._made.address
         self._write_cars(key, midnight, arrival_s)
         self._memory.clear()
+        self._advance, self._act = entry_point(advance_at, 0, 0.0), entry_point(act_at, 0, 0)
         begin_world_at(self._address)
         raise_error()
 
@@ -367,6 +371,8 @@ class Fleet:
         cars["ended_at"] = cars["left_at"] = np.inf
         self._cars = cars
         self._drivers = self._drivers_in(plans)
+        # Looking up fields takes a tenth of a decision in Python.
+        self._states, self._vertices, self._addresses = cars["state"], cars["vertex"], cars["search"]
         capacity = max(n, sum(len(one.records) for one in self._pool))
         self._record["n_cars"], self._record["n_free"] = n, 0
         if self.scenario.has_rules:
@@ -380,8 +386,10 @@ class Fleet:
         self._keep(
             {
                 "cars": cars,
-                "event_times": np.zeros(n),
-                "event_cars": np.zeros(n, np.int32),
+                "step_times": np.zeros(n),
+                "step_cars": np.zeros(n, np.int32),
+                "departure_times": np.zeros(n),
+                "departing_cars": np.zeros(n, np.int32),
                 "event_ranks": np.zeros(n, np.int64),
                 "ready": np.zeros(n, np.int64),
                 "free_searches": np.zeros(capacity, np.int64),
@@ -421,7 +429,10 @@ class Fleet:
         searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
         self._pool.append(searches)
         self._moves.append(moves)
-        self._row |= {searches.address + row * SEARCH.itemsize: (searches, row) for row in range(n)}
+        rows = {searches.address + row * SEARCH.itemsize: (searches, row) for row in range(n)}
+        self._row |= rows
+        if self.full_belief:
+            self._copiers |= {address: searches.copiers(row) for address, (_, row) in rows.items()}
         self._add_free(searches)
 
     def keep_steps(self) -> None:
@@ -476,7 +487,7 @@ class Fleet:
                 raise InputError(
                     f"car {car}: its agent at {self.time - self.begin:.1f} s: {error}"
                 ) from error
-            if self._cars["state"][car] != SEARCHING:
+            if self._states[car] != SEARCHING:
                 memory.pop(car, None)
 
     def next_decision(self, until: float = math.inf) -> int | None:
@@ -484,7 +495,7 @@ class Fleet:
 
         Compiled policies decide in between.
         """
-        while (car := self.next_car(until)) is not None and self._cars["state"][car] != SEARCHING:
+        while (car := self.next_car(until)) is not None and self._states[car] != SEARCHING:
             self.release()
         return car
 
@@ -493,8 +504,9 @@ class Fleet:
         if not len(self._cars):
             raise ResetNeeded("the fleet has no world yet: call reset() first")
         while True:
-            status = int(advance_at(self._address, until))
-            raise_error()
+            status: int = self._advance(self._address, until)
+            if not self._world:
+                raise_error()
             if status >= 0:
                 return status
             if status in (FINISHED, PAUSED):
@@ -525,7 +537,7 @@ class Fleet:
         Raises:
             InputError: an action that is none of the five.
         """
-        act_at(self._address, action_number(action))
+        self._act(self._address, action_number(action))
 
     def release(self) -> None:
         """Drop the car from `next_car` whose search is over; its observation is gone."""
@@ -611,22 +623,22 @@ class Fleet:
 
     def observation(self, car: int) -> dict[str, Any]:
         """Return what a searching car observed last, as in `parkenv/Search-v2`."""
-        searches, row = self._search_of(car)
-        record = searches.records[row]
-        vertex = record["vertex"]
-        scenario = self.scenarios[self._cars["place"][car]]
+        address, vertex = self._search_of(car), self._vertices[car]
+        time, p_occupied, belief, step_observed, day_error = self._copiers[address]
         observation = {
-            "vertex": np.int64(vertex),
-            "time": record["clock"].copy(),
-            "p_occupied": searches.p_occupied[row].copy(),
-            "belief": searches.belief[row].reshape(-1).copy(),
-            "step_observed": searches.step_observed[row].reshape(-1).copy(),
-            "day_error": searches.day_error[row].copy(),
-            "action_mask": scenario.action_masks[vertex].copy(),
+            "vertex": vertex,
+            "time": time(),
+            "p_occupied": p_occupied(),
+            "belief": belief(),
+            "step_observed": step_observed(),
+            "day_error": day_error(),
+            "action_mask": self._copy_masks[vertex](),
         }
         if self._reserves:
-            mine = np.arange(scenario.lot.n_slots) == record["reserved"]
-            observation["reserved"] = mine.astype(np.int8) - np.int8(record["reserved"] == UNGUIDED)
+            searches, row = self._row[address]
+            reserved = searches.records["reserved"][row]
+            mine = np.arange(len(self.slots)) == reserved
+            observation["reserved"] = mine.astype(np.int8) - np.int8(reserved == UNGUIDED)
         if self.leaving_soon_s > 0.0:
             observation["leaving"] = self._leaving_in_view(int(vertex))
         if self.scenario.has_rules:
@@ -640,14 +652,13 @@ class Fleet:
 
         `parkenv.engine.local_observation` describes it.
         """
-        searches, row = self._search_of(car)
+        address = self._search_of(car)
         if k not in self._surroundings:
             self._surroundings[k] = Surroundings.of(self.scenarios, k)
         around = self._surroundings[k]
         local = np.empty(FIRST_NEAR + PER_NEAR * k, np.float32)
-        observe_surroundings_at(searches.address + row * SEARCH.itemsize, around, local)
-        scenario = self.scenarios[self._cars["place"][car]]
-        return {"local": local, "action_mask": scenario.action_masks[searches.records["vertex"][row]].copy()}
+        observe_surroundings_at(address, around, local)
+        return {"local": local, "action_mask": self._copy_masks[self._vertices[car]]()}
 
     def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
         """Return which slots in view of a vertex hold a car that shows that it leaves, (n_slots,)."""
@@ -672,20 +683,21 @@ class Fleet:
 
     def outcome(self, car: int) -> StepOutcome:
         """Return the result of a car's last step."""
-        searches, row = self._search_of(car)
+        address = self._search_of(car)
         place = self.scenarios[self._cars["place"][car]].name
-        reward, over, _, info = read_step(place, step_result_at(searches.address + row * SEARCH.itemsize))
+        reward, over, _, info = read_step(place, step_result_at(address))
+        searches, row = self._row[address]
         begun = bool(searches.records["n_steps"][row])
         return StepOutcome(begun, reward, info["parked"], over, info)
 
-    def _search_of(self, car: int) -> tuple[Searches, int]:
-        """Return the searches that hold a car's record, and its row there."""
-        address = int(self._cars["search"][car])
+    def _search_of(self, car: int) -> int:
+        """Return the address of the SEARCH record of a car that searches."""
+        address = int(self._addresses[car])
         if address == 0:
             raise InputError(f"car {car} is {self.state_names()[car]}, want one that searches")
         if not self.full_belief:
             raise InputError("observations are kept only if a kind of driver has no policy")
-        return self._row[address]
+        return address
 
     @property
     def cars(self) -> NDArray[np.void]:

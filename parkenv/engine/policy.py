@@ -199,11 +199,12 @@ def recent_state(search: Any, slot: int) -> int:
     if column == SENTINEL or not slot_at(search.slots, column).observed:
         return UNOBSERVED
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
-    prior = np.float32(block.prior[i])
-    state = observed_state(prior, np.float32(block.p_observed[i]))
+    state, p_observed = OBSERVED_TAKEN, block.p_observed[i]
+    if p_observed < 1.0:
+        state = observed_state(np.float32(block.prior[i]), np.float32(p_observed))
     if state == OBSERVED_TAKEN:
         observed_at = np.float32(block.observed_at[i] - search.arrival)
         is_old = may_have_decayed(np.float32(block.decay_rate[i]), search.clock[1], observed_at)
-        if is_old and np.float32(belief_now(search, column)) == prior:
+        if is_old and np.float32(belief_now(search, column)) == np.float32(block.prior[i]):
             return UNOBSERVED
     return int(state)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -351,13 +351,16 @@ drives from and to; whether it is a failed attempt. A car that does not act at t
 FLEET = np.dtype(
     [
         *SHARED_WORLD_FIELDS,
-        # The events to come, at most one of each car: its step is over, or it leaves its slot. A heap of (n_cars,)
-        # float64 times, s, and int32 cars; by car, (n_cars,) int64, the order of events at the same time; how many
-        # there are; number of the next one.
-        ("event_times", ADDRESS),
-        ("event_cars", ADDRESS),
+        # The events to come, at most one of each car: its step is over, or it leaves its slot. For both a heap of
+        # (n_cars,) float64 times, s, and int32 cars, and how many there are. By car, (n_cars,) int64, the order of
+        # events at the same time; number of the next event.
+        ("step_times", ADDRESS),
+        ("step_cars", ADDRESS),
+        ("n_steps_to_end", np.int64),
+        ("departure_times", ADDRESS),
+        ("departing_cars", ADDRESS),
+        ("n_departures", np.int64),
         ("event_ranks", ADDRESS),
-        ("n_events", np.int64),
         ("event_number", np.int64),
         # Beginning of the day, s since Monday 00:00; index of the day among the scenario's; the time now.
         ("midnight", np.float64),
@@ -614,6 +617,14 @@ class Searches:
         self.p_occupied, self.belief = p_occupied, belief
         self._write_addresses("p_occupied", p_occupied)
         self._write_addresses("belief", belief)
+
+    def copiers(self, search: int) -> tuple[Callable[[], NDArray[Any]], ...]:
+        """Return what copies a search's `clock`, `p_occupied`, `belief`, `step_observed` and `day_error`; flat arrays.
+
+        Bound methods: looking them up would take a tenth of a step.
+        """
+        parts = (self.p_occupied, self.belief, self.step_observed, self.day_error)
+        return (self.records["clock"][search].copy, *(part[search].reshape(-1).copy for part in parts))
 
     def complete_arrival(self, search: int) -> None:
         """Add what only Python can make for a search that has just begun: its world, its forecast."""

@@ -11,6 +11,9 @@ from parkenv.errors import InputError, require_number, require_one_of, require_w
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.week import DAY_S, WEEK_S
 
+START_OPTIONS = ("place", "entry", "arrival")
+"""Names of the options of `reset` that say how an episode begins."""
+
 
 def choose_start(searches: Searches, index: int, episode: int, options: Mapping[str, Any]) -> None:
     """Let the next episode of a search, with this number, begin as `options` of `reset` say; the rest is drawn.
@@ -19,15 +22,14 @@ def choose_start(searches: Searches, index: int, episode: int, options: Mapping[
         searches: the searches.
         index: number of the search; its record holds the seed.
         episode: number of the episode.
-        options: `place`, name or index of the scenario; `entry`, index among the scenario's; `arrival`, s since Monday
-            00:00 or a text such as "Tue 08:30", on a weekday of the scenario's; one of several such days is drawn.
+        options: some of `START_OPTIONS`: `place`, name or index of the scenario; `entry`, index among the scenario's;
+            `arrival`, s since Monday 00:00 or a text such as "Tue 08:30", on a weekday of the scenario's; one of
+            several such days is drawn.
 
     Raises:
-        InputError: an unknown option, a value out of range, or an entry or arrival of several scenarios without place.
+        InputError: a value out of range, or an entry or arrival of several scenarios without place.
     """
     scenarios, record = searches.scenarios.scenarios, searches.records[index]
-    for name in options:
-        require_one_of("option of reset", name, ("place", "entry", "arrival"))
     place, names = options.get("place", 0 if len(scenarios) == 1 else None), [one.name for one in scenarios]
     if place is None or isinstance(place, str):
         require_one_of("option place", place, names)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium as gym
@@ -10,6 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import seed_state
 from parkenv.engine.kernel import (
     begin_search_at,
@@ -26,9 +28,9 @@ from parkenv.engine.local_observation import (
 )
 from parkenv.engine.records import ScenarioRecords, Searches
 from parkenv.engine.spaces import action_number, space_of
-from parkenv.engine.starts import choose_start
+from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError, require_one_of
+from parkenv.errors import InputError, require_one_of, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.world.lot import ACTIONS
 from parkenv.world.occupancy.python_functions import raise_error
@@ -41,7 +43,7 @@ OBSERVATIONS = ("full", "occupancy", "local")
 BELIEF_PARTS = ("belief", "step_observed")
 """What `occupancy` leaves out."""
 _REBUILT = {
-    "searches", "scenario", "_state", "_address", "_copies", "_place", "_step", "_copy_mask", "_copy_masks",
+    "searches", "scenario", "_state", "_address", "_copiers", "_place", "_step", "_copy_mask", "_copy_masks",
     "_seeded_with", "_begun", "_over",
 }  # fmt: skip
 
@@ -229,10 +231,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.render_mode = render_mode
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = space_of(self.scenarios)
-        self._without: tuple[str, ...] = ()
+        self._is_full = observation == "full"
         self._around: Surroundings | None = None
         if observation == "occupancy":
-            self._without = BELIEF_PARTS
             self.observation_space = spaces.Dict(
                 {name: one for name, one in self.observation_space.items() if name not in BELIEF_PARTS}
             )
@@ -247,14 +248,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.searches = Searches(ScenarioRecords(self.scenarios), 1, full_belief=True)
         self._address, self._needs_python = self.searches.address, self.searches.needs_python
         self._state = SearchState(self.searches)
-        # Bound methods that copy the parts of an observation: looking them up takes a tenth of a step.
-        self._copies = (
-            self.searches.records["clock"][0].copy,
-            self.searches.p_occupied[0].copy,
-            self.searches.belief[0].reshape(-1).copy,
-            self.searches.step_observed[0].reshape(-1).copy,
-            self.searches.day_error[0].copy,
-        )
+        self._copiers = self.searches.copiers(0)
         self._copy_masks = [[mask.copy for mask in one.action_masks] for one in self.scenarios]
         self._place = -1
         self._enter_place()
@@ -268,7 +262,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             return
         self._place, self.scenario = place, self.scenarios[place]
         self._name = self.scenario.name
-        self._step = self._stepper()
         self._copy_mask = self._copy_masks[place]
         self._close_window()
 
@@ -292,6 +285,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.searches.restore(state.arrays)
         self._state.path = list(state.path)
         self._enter_place()
+        self._step = self._stepper()
         self._begun, self._over = True, self._state.over
 
     def __getstate__(self) -> dict[str, Any]:
@@ -309,6 +303,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start an episode; see the class for seeds and options."""
+        starts = reset_options(options, START_OPTIONS)
         super().reset(seed=seed)
         if self.np_random_seed < 0:
             # `np_random` was set by hand: its seed is not known.
@@ -318,13 +313,14 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if seed is not None or self._seeded_with != self.np_random_seed:
             self._seeded_with = self.np_random_seed
             record["seed_state"] = seed_state(self.np_random_seed)
-        if options:
-            choose_start(self.searches, 0, int(record["episode"]), options)
+        if starts:
+            choose_start(self.searches, 0, int(record["episode"]), starts)
         begin_search_at(self._address)
         if self.searches.needs_python:
             self.searches.complete_arrival(0)
             init_external_forecast_at(self._address)
         self._enter_place()
+        self._step = self._stepper()
         self._begun, self._over = True, False
         self._state.path = [self._state.vertex]
         if self.render_mode == "human":
@@ -350,9 +346,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
         """Return what acts and observes: (address of the search, action) -> numbers named by `STEP_RESULT`."""
-        step: Callable[[int, int], tuple[Any, ...]]
-        step = step_exact_at if self.scenario.sensor_model.perfect else step_noisy_at
-        return step
+        return _compiled_step(self.scenario.sensor_model.perfect)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""
@@ -399,12 +393,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer = None
 
     def _observation(self, vertex: int) -> dict[str, Any]:
-        if self._around is not None:
-            local = np.empty(self.observation_space["local"].shape or (), np.float32)
-            observe_surroundings_at(self._address, self._around, local)
-            return {"local": local, "action_mask": self._copy_mask[vertex]()}
-        time, p_occupied, belief, step_observed, day_error = self._copies
-        observation = {
+        if not self._is_full:
+            return self._smaller_observation(vertex)
+        time, p_occupied, belief, step_observed, day_error = self._copiers
+        return {
             "vertex": self._vertices[vertex],
             "time": time(),
             "p_occupied": p_occupied(),
@@ -413,6 +405,20 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             "day_error": day_error(),
             "action_mask": self._copy_mask[vertex](),
         }
-        for name in self._without:
-            del observation[name]
-        return observation
+
+    def _smaller_observation(self, vertex: int) -> dict[str, Any]:
+        mask = self._copy_mask[vertex]()
+        if self._around is not None:
+            local = np.empty(self.observation_space["local"].shape or (), np.float32)
+            observe_surroundings_at(self._address, self._around, local)
+            return {"local": local, "action_mask": mask}
+        time, p_occupied, _, _, day_error = self._copiers
+        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": p_occupied()}
+        return {**observation, "day_error": day_error(), "action_mask": mask}
+
+
+@cache
+def _compiled_step(exact: bool) -> Callable[[int, int], tuple[Any, ...]]:
+    """Return the function that steps a search whose sensor is exact or not."""
+    step: Callable[[int, int], tuple[Any, ...]] = entry_point(step_exact_at if exact else step_noisy_at, 0, 0)
+    return step

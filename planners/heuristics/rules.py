@@ -138,7 +138,7 @@ def keeps_target(heuristic: int, target: int, state: int) -> bool:
     return heuristic not in (FIRST_FREE, GREEDY_TOTAL) or state == OBSERVED_FREE
 
 
-@rule
+@inlined_rule
 def choose_route(
     address: int, place: int, search: int, vertex: int, target: int, moves: NDArray[np.uint8], n_moves: int
 ) -> tuple[int, int]:
@@ -227,28 +227,34 @@ def _near_s(tables: Any, place: int, search: int) -> float:
 # ---- the choice
 
 
-@rule
+@inlined_rule
 def _choose_target(tables: Any, place: int, search: int, vertex: int, previous: int) -> int:
     """Return the slot to drive to; `NO_SLOT` if every slot in reach was observed taken."""
+    if tables.heuristic == GREEDY_GOAL:
+        return int(_cheapest(tables, place, search, vertex))
     if tables.heuristic == FIRST_FREE:
-        near_s = _near_s(tables, place, search)
-        for i in range(_n_known(tables, search)):
-            slot = _known_slot(search, i)
-            is_near = cost_of(tables, place, search, slot) <= near_s
-            if is_near and state_of(tables, search, slot) == OBSERVED_FREE:
-                found = _nearest(tables, place, search, vertex, True, near_s, BY_DRIVE)
-                if found != NO_SLOT:
-                    return int(found)
-                break
-        if previous != NO_SLOT and state_of(tables, search, previous) != OBSERVED_TAKEN:
-            return previous
-    if tables.heuristic == GREEDY_DRIVE:
-        return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE_THEN_COST))
-    if tables.heuristic == GREEDY_TOTAL:
-        return int(_nearest(tables, place, search, vertex, False, np.inf, BY_TOTAL))
-    if tables.heuristic == FIRST_FREE and previous != NO_SLOT:
-        return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE))
-    return int(_cheapest(tables, place, search, vertex))
+        return int(_first_free(tables, place, search, vertex, previous))
+    order = BY_DRIVE_THEN_COST if tables.heuristic == GREEDY_DRIVE else BY_TOTAL
+    return int(_nearest(tables, place, search, vertex, False, np.inf, order))
+
+
+@rule
+def _first_free(tables: Any, place: int, search: int, vertex: int, previous: int) -> int:
+    """Return the nearest free slot near the goal; without one the target so far, the first one near the goal."""
+    near_s = _near_s(tables, place, search)
+    for i in range(_n_known(tables, search)):
+        slot = _known_slot(search, i)
+        is_near = cost_of(tables, place, search, slot) <= near_s
+        if is_near and state_of(tables, search, slot) == OBSERVED_FREE:
+            found = _nearest(tables, place, search, vertex, True, near_s, BY_DRIVE)
+            if found != NO_SLOT:
+                return int(found)
+            break
+    if previous == NO_SLOT:
+        return int(_cheapest(tables, place, search, vertex))
+    if state_of(tables, search, previous) != OBSERVED_TAKEN:
+        return previous
+    return int(_nearest(tables, place, search, vertex, False, np.inf, BY_DRIVE))
 
 
 @rule
@@ -327,16 +333,16 @@ def _nearest(
         size = pop(keys, vertices, size)
         if far > seconds[v]:
             continue
-        cost_s = cost_of(tables, place, search, v) if v < tables.n_slots else np.inf
-        if v < tables.n_slots and cost_s <= limit_s and cost_s < np.inf:
+        if v < tables.n_slots and (limit_s == np.inf or cost_of(tables, place, search, v) <= limit_s):
             state = state_of(tables, search, v)
-            value = far
-            if order == BY_TOTAL:
-                value = cost_s + (far if state == OBSERVED_FREE else UNOBSERVED_DETOUR * far)
-            first = v < best if order != BY_DRIVE_THEN_COST or cost_s == best_cost_s else cost_s < best_cost_s
-            counts = state == OBSERVED_FREE or not (only_free or state == OBSERVED_TAKEN)
-            if counts and (value < best_s or (value == best_s and first)):
-                best, best_s, best_cost_s = int(v), value, cost_s
+            if state == OBSERVED_FREE or not (only_free or state == OBSERVED_TAKEN):
+                value, cost_s = far, cost_of(tables, place, search, v)
+                if order == BY_TOTAL:
+                    value = cost_s + (far if state == OBSERVED_FREE else UNOBSERVED_DETOUR * far)
+                by_cost = order == BY_DRIVE_THEN_COST and cost_s != best_cost_s
+                first = cost_s < best_cost_s if by_cost else v < best
+                if cost_s < np.inf and (value < best_s or (value == best_s and first)):
+                    best, best_s, best_cost_s = int(v), value, cost_s
         for edge in range(v * _N_MOVES, (v + 1) * _N_MOVES):
             u, after = np.int64(neighbors[edge]), far + move_s[edge]
             if u >= 0 and after < seconds[u]:
