@@ -474,7 +474,7 @@ def test_a_start_in_collision_is_refused_and_a_free_one_is_taken():
     taken = CAR.at_rear_axle(np.array([*lot.slot_xy[other], lot.slot_yaw[other]]))
     with pytest.raises(InputError, match="the car touches a parked car there, want a free pose"):
         env.reset(seed=0, options={"start": taken})
-    with pytest.raises(InputError, match="reset has no option begin"):
+    with pytest.raises(InputError, match="option of reset is 'begin', want one of start"):
         env.reset(options={"begin": free})
 
 

@@ -103,6 +103,8 @@ def test_calls_out_of_order_are_refused(name):
     action = np.zeros(2, np.float32) if "Drive" in name else 3
     with pytest.raises(ResetNeeded):
         env.step(action)
+    with pytest.raises(InputError, match="options is 3, want a dictionary or None"):
+        env.unwrapped.reset(options=3)
     env.reset(seed=0)
     env.step(action)
     env.close()

@@ -28,7 +28,7 @@ def test_a_study_runs_without_a_folder_and_its_result_holds_the_files():
     result = run(TOY)
     assert result.rows == [{"power": 2, "sum": 55}, {"power": 3, "sum": 225}]
     assert result.complete
-    assert result.summary["command"] == ["parkenv", "toy"]
+    assert result.summary["command"] == ["parkenv", "run", "experiment.json"]
     folder = result.folder
     assert {"powers.csv", "summary.json", "settings.json", "experiment.json", "done.txt"} <= {
         *files_of(folder)

@@ -178,11 +178,11 @@ def cost_tables(rows: list[Row]) -> list[Table]:
     for row in rows:
         grid = grids.setdefault((row["scenario"], row["v_walk_kmh"], row["v_drive_kmh"]), {})
         grid.setdefault(row["agent"], {})[row["failure_cost_s"]] = _seconds(row["total_s"])
-    tables = []
+    tables, short = [], _short_labels(row["agent"] for row in rows)
     for (name, walk, drive), grid in grids.items():
         costs = sorted({cost for cells in grid.values() for cost in cells})
         title = f"{name}: mean total time, s, by failure cost, s; walk {walk:g} km/h, drive {drive:g} km/h"
-        cells = ((agent, *(its.get(cost, "") for cost in costs)) for agent, its in grid.items())
+        cells = ((short[agent], *(its.get(cost, "") for cost in costs)) for agent, its in grid.items())
         tables.append(make_table(title, ("agent", *(f"{cost:g}" for cost in costs)), cells))
     return tables
 

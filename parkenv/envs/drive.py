@@ -29,7 +29,7 @@ from parkenv.envs.drive_observation import (
     obstacle_map,
     scan_plane,
 )
-from parkenv.errors import InputError
+from parkenv.errors import InputError, reset_options
 from parkenv.lots import load_lot
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import Traffic
@@ -256,14 +256,12 @@ length and width over the car's |
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Start a new episode; see the class for seeds and options."""
+        given = reset_options(options, ("start",))
         super().reset(seed=seed)
-        unknown = set(options or ()) - {"start"}
-        if unknown:
-            raise InputError(f"reset has no option {', '.join(sorted(unknown))}, want start or none")
         self._episode = 0 if seed is not None else self._episode + 1
         _ = self.np_random  # draws a seed if none was given
         key = world_key(self.np_random_seed, self._episode)
-        task = self.tasks.draw(int(key), (options or {}).get("start"))
+        task = self.tasks.draw(int(key), given.get("start"))
         self._state = DriveState(key, task, task.start.copy(), np.random.default_rng([int(key), 1]))
         self._state.trail.append(tuple(task.start[:3].tolist()))
         self._enter(self._state)

@@ -30,7 +30,7 @@ from parkenv.engine.records import (
     scenario_at,
     search_at,
 )
-from parkenv.errors import InputError
+from parkenv.errors import InputError, reset_options
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.cost_terms import METRICS
 from parkenv.world.demand import Demand, TownDemand
@@ -143,8 +143,7 @@ class FleetVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]])
         self, *, seed: int | Sequence[int | None] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, NDArray[Any]], dict[str, Any]]:
         """Begin a day of every world, in its middle; see the class. There are no options."""
-        if options:
-            raise InputError(f"reset takes no options, got {', '.join(options)}")
+        reset_options(options, ())
         if seed is None or isinstance(seed, (int, np.integer)):
             super().reset(seed=None if seed is None else int(seed))
         if seed is None and (self._days < 0).all():

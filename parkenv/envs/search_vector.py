@@ -26,10 +26,10 @@ from parkenv.engine.batch import (
 )
 from parkenv.engine.local_observation import NEAR_SLOTS
 from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
-from parkenv.engine.starts import choose_start
+from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import BELIEF_PARTS, OBSERVATIONS
-from parkenv.errors import InputError, require_whole
+from parkenv.errors import InputError, require_whole, reset_options
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios, require_changes
 from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
@@ -235,7 +235,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         Raises:
             InputError: an unknown option, or a number of seeds that differs from the number of environments.
         """
-        starts = dict(options or {})
+        starts = reset_options(options, (*START_OPTIONS, "reset_mask"))
         which = self._chosen(starts.pop("reset_mask", None))
         if seed is not None and not isinstance(seed, (Sequence, np.ndarray)):
             require_whole("seed", seed)

@@ -129,7 +129,9 @@ class RunFolder:
     @property
     def again(self) -> list[str]:
         """The words of a command that repeats the run in a folder beside it; its own if it may replace the run."""
-        words = [str(word) for word in self.summary["command"]]
+        words = [
+            str(self.path / SPEC_FILE) if word == SPEC_FILE else str(word) for word in self.summary["command"]
+        ]
         if self.kind not in STUDIES or {"--resume", "--overwrite"} & set(words):
             return words
         out, path = ("--out", "-o"), self.path if self.path.name else self.path.resolve()

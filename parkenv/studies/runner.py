@@ -130,7 +130,7 @@ def run(
         overwrite: replace the results of another run.
         progress: called as rows finish; see `Progress`.
         workers: where tasks run, if not as the study says; results do not depend on it.
-        command: command line to record in the summary.
+        command: command line to record in the summary; by default the one that runs the specification in the folder.
 
     Raises:
         InputError: the study cannot be run, or the folder cannot be used.
@@ -153,7 +153,7 @@ def run(
     with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
         results = Results(path, _tables_of(study))
         results.workers, results.progress = used, progress
-        results.command = tuple(command or ("parkenv", study.kind))
+        results.command = tuple(command or ("parkenv", "run", SPEC_FILE))
         settings, continues = results.claim(
             study.settings(), study.kind, resume=resume, overwrite=overwrite, goes_on=study.goes_on
         )
