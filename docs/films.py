@@ -1,6 +1,6 @@
 """The films of the environments' pages and of the game: `python docs/films.py [NAME ...]` makes them in docs/pictures.
 
-The game is played in Chromium, driven by selenium (extra dev).
+The game and the map of the town are shown in Chromium, driven by selenium (extra dev).
 """
 
 import io
@@ -8,6 +8,7 @@ import json
 import subprocess
 import sys
 import tempfile
+from contextlib import contextmanager
 from pathlib import Path
 
 import cv2
@@ -103,22 +104,35 @@ for (const name of ["pointerdown", "pointerup"]) game.dispatchEvent(new PointerE
 """
 
 
-def play(targets=("C10", "A19", "A19")):
-    """Film a game in which a person goes to some slots, parks in the last one, and sees the agents' drives."""
-    from PIL import Image
+@contextmanager
+def browser_at(width, height, folder):
+    """A headless Chromium with a window of this size, px; its profile is in a folder."""
     from selenium import webdriver
 
+    options = webdriver.ChromeOptions()
+    for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"):
+        options.add_argument(flag)
+    with webdriver.Chrome(options=options) as browser:
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        yield browser
+
+
+def shot(browser):
+    """What is in the window, (h, w, 3)."""
+    from PIL import Image
+
+    return np.array(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
+
+
+def play(targets=("C10", "A19", "A19")):
+    """Film a game in which a person goes to some slots, parks in the last one, and sees the agents' drives."""
     with tempfile.TemporaryDirectory() as folder:
         page, frames = Path(folder) / "play.html", []
         subprocess.run(
             ["parkenv", "play", "--html", "--worlds", "10", "--seed", "5", "--out", page], check=True
         )
-        options = webdriver.ChromeOptions()
-        for flag in ("--headless=new", "--no-sandbox", "--disable-gpu", f"--user-data-dir={folder}/profile"):
-            options.add_argument(flag)
-        with webdriver.Chrome(options=options) as browser:
-            size = {"width": 1040, "height": 600, "deviceScaleFactor": 1, "mobile": False}
-            browser.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+        with browser_at(1040, 600, folder) as browser:
             # The page's clock stands still between frames.
             browser.execute_cdp_cmd("Page.addScriptToEvaluateOnNewDocument", {"source": CLOCK})
             browser.get(page.as_uri())
@@ -130,9 +144,7 @@ def play(targets=("C10", "A19", "A19")):
                 for _ in range(n):
                     for _ in range(2):
                         browser.execute_script("pass(50)")
-                    frames.append(
-                        np.array(Image.open(io.BytesIO(browser.get_screenshot_as_png())).convert("RGB"))
-                    )
+                    frames.append(shot(browser))
 
             def shoot_until(script, most=160):
                 for _ in range(most):
@@ -155,13 +167,45 @@ def play(targets=("C10", "A19", "A19")):
     return frames
 
 
+ONLY_MAP = """
+const others = ".bar, .head, .controls, h2, main > section:not(#town), .legend, .hint, .small";
+for (const element of document.querySelectorAll(others)) element.remove();
+document.querySelector("main").style.padding = "0.7rem";
+document.documentElement.style.overflow = "hidden";
+window.dispatchEvent(new Event("resize"));
+"""
+GO_TO = """
+const slider = document.querySelector("#town input[type=range]");
+slider.value = arguments[0];
+slider.dispatchEvent(new Event("input"));
+return Number(slider.max);
+"""
+
+
+def town():
+    """Film the map of a day in the town, a frame for every quarter of an hour."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = ["fleet", "--scenario", "town", "--agents", "usual", "--knows", "own", "-n", "1"]
+        subprocess.run(["parkenv", *command, "--out", f"{folder}/town"], check=True)
+        with browser_at(1040, 760, folder) as browser:
+            browser.get(Path(folder, "town/fleet.html").as_uri())
+            browser.execute_script(ONLY_MAP)
+            end = browser.execute_script(GO_TO, 0)
+            frames = []
+            for second in np.arange(1800.0, end - 1799.0, 900.0):
+                browser.execute_script(GO_TO, second)
+                frames.append(shot(browser))
+    return frames + frames[-1:] * 8
+
+
 FILMS = {
     "search": (search, 6), "search-vector": (search_vector, 6), "search-sensors": (search_sensors, 4),
     "drive": (drive, 10), "play": (play, 10),
+    "town": (town, 8),
 }  # fmt: skip
 
 if __name__ == "__main__":
     for name in sys.argv[1:] or FILMS:
         film, fps = FILMS[name]
-        file = "play_campus.gif" if name == "play" else f"env_{name}.gif"
+        file = {"play": "play_campus.gif", "town": "town.gif"}.get(name, f"env_{name}.gif")
         save_film(film(), Path(__file__).parent / "pictures" / file, fps=fps, colors=128)

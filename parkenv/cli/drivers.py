@@ -13,7 +13,7 @@ from parkenv.show.plurals import plural
 from parkenv.studies.commute.study import Commute as CommuteStudy
 from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown_changes
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.fleet.tables import ONE_DAY, departures
+from parkenv.studies.fleet.tables import ONE_DAY, departures, unreached
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.cost_terms import COST_TERMS
 
@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from parkenv.studies.runner import Result
+
+MOST_SHOWN = 15
+"""Blocks of which the terminal tells."""
 
 
 class Commute(AgentStudyCommand):
@@ -139,13 +142,14 @@ class Fleet(AgentStudyCommand):
         for row in shown_changes(changes):
             if row["change"] == "scenario":
                 console.print(sentence(row), soft_wrap=True)
-        for line in departures(result.summary["hours"], result.rows):
+        told = unreached(result.summary["reach"], result.rows)
+        for line in [*told, *departures(result.summary["hours"], result.rows)]:
             console.print(line, soft_wrap=True)
 
 
 def _show_money(console: Console, result: Result, names: dict[str, str]) -> None:
     """Print what the total time is made of, and who pays where."""
-    setting, zones = names.values(), result.summary["zones"]
+    setting, zones = names.values(), result.summary["zones"] or result.summary["blocks"]
     terms = [term for term in COST_TERMS if not term.optional or any(row[term.field] for row in result.rows)]
     fields = [*(term.field for term in terms), "queued_s"]
     headings = [*setting, *(term.label for term in terms), "of it in queues"]
@@ -159,29 +163,38 @@ def _show_money(console: Console, result: Result, names: dict[str, str]) -> None
         for row in result.rows
     ]
     console.print(make_table("What the total time is made of, s a car", headings, cells))
-    if zones:
-        headings = [
-            *setting, "zone", "slots", "price/h", "slots taken", "cars a day", "of all", "refused", "search s",
-            "paid a day [95 %]", "paid a car",
-        ]  # fmt: skip
-        console.print(
-            make_table("Zones", headings, ([*_setting(row, names), *_zone_cells(row)] for row in zones))
-        )
+    for what in ("purpose", "zone", "block"):
+        rows = result.summary[f"{what}s"]
+        _show_places(console, what, rows, names)
 
 
-def _zone_cells(row: Row) -> list[str]:
-    return [
-        row["zone"],
-        str(row["slots"]),
-        f"{row['price']:g}",
-        f"{row['occupancy']:.0%}",
-        f"{row['parked_a_day']:.0f}",
-        f"{row['share_parked']:.0%}",
-        f"{row['refused_a_day']:.0f}",
-        _number(row["search_s"], ".1f"),
-        _interval(row, "paid_a_day", ".2f"),
-        _number(row["paid_a_car"], ".2f"),
-    ]
+def _show_places(console: Console, what: str, rows: Sequence[Row], names: dict[str, str]) -> None:
+    """Print what happens on a day to the cars of each purpose, in each zone, or in the blocks with the most cars."""
+    if not rows:
+        return
+    title = f"{what}s".capitalize()
+    if len({row[what] for row in rows}) > MOST_SHOWN:
+        title = f"The {MOST_SHOWN} blocks with the most cars, of {len({row[what] for row in rows})}"
+        cars = sorted(rows, key=lambda row: -row["parked_a_day"])
+        shown = list(dict.fromkeys(row[what] for row in cars))[:MOST_SHOWN]
+        rows = [row for row in rows if row[what] in shown]
+    is_place = what != "purpose"
+    headings = [
+        *names.values(), what, *(["slots", "price/h"] if is_place else []), "slots taken", "cars a day", "of all",
+        *(["refused"] if is_place else ["no slot found"]), "search s", "walk s",
+        "paid a day [95 %]" if any(interval_of(row, "paid_a_day") for row in rows) else "paid a day", "paid a car",
+    ]  # fmt: skip
+    cells = [
+        [
+            *_setting(row, names), row[what], *([str(row["slots"]), f"{row['price']:g}"] if is_place else []),
+            _number(row["occupancy"], ".0%"), f"{row['parked_a_day']:.0f}", f"{row['share_parked']:.0%}",
+            f"{row['refused_a_day']:.0f}" if is_place else _number(row["balked_fraction"], ".1%"),
+            _number(row["search_s"], ".1f"), _number(row["walk_s"], ".1f"), _interval(row, "paid_a_day", ".2f"),
+            _number(row["paid_a_car"], ".2f"),
+        ]
+        for row in rows
+    ]  # fmt: skip
+    console.print(make_table(title, headings, cells))
 
 
 def _setting_columns(rows: Sequence[Row]) -> dict[str, str]:

@@ -149,6 +149,10 @@ _KNOWN = {
         Column("price_over_bound", "price over the bound", digits=3, help="Total time over the clairvoyant bound"),
         Column("before", "instead of"),
         Column("prices", "prices"),
+        Column("block", "block", help="A facility, or the slots of a zone that belong to none"),
+        Column("type", "type"),
+        Column("purpose", "purpose"),
+        Column("refused_a_day", "refused a day", digits=0, help="Failed attempts: taken, or full"),
         Column("zone", "zone", help="Of changes: where the cars parked before; – for all cars"),
         Column("cars_a_day", "cars a day", digits=0),
         Column("paid", "paid a car", digits=2, help="In the currency of the prices; mean over all cars"),
@@ -175,7 +179,8 @@ _KNOWN = {
 }  # fmt: skip
 _ORDER = (
     "scenario", "blind", "map", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh",
-    "v_drive_kmh", "after", "before", "prices", "zone", "agent", "agents", "arrivals_per_hour", "knows", "share",
+    "v_drive_kmh", "after", "before", "prices", "purpose", "block", "type", "zone",
+    "agent", "agents", "arrivals_per_hour", "knows", "share",
     "hour", "seed",
     "change_s", "members_change_s", "others_change_s", "paid_change", "better_off", "worse_off", "total_s", "median_s",
     "gave_up_fraction", "difference_s", "gap_to_exact",

@@ -194,7 +194,7 @@ class TownMap {
     this.settingChoice = make("select", { id: "map-setting" }, ...settings.map((name, i) => make("option", { value: i }, name)));
     this.settingChoice.addEventListener("change", () => this.open(Number(this.settingChoice.value), this.player.seconds));
     this.measureChoice = make("select", { id: "map-measure" });
-    this.measureChoice.addEventListener("change", () => { this.measure = this.measureChoice.value; this.draw(); });
+    this.measureChoice.addEventListener("change", () => { this.measure = this.measureChoice.value; this.scale = this.most(); this.draw(); });
     this.blockChoice = make("select", { id: "map-block" });
     this.blockChoice.addEventListener("change", () => this.choose(this.blockChoice.value === "" ? null : Number(this.blockChoice.value), true));
     const labelled = (text, choice) => make("label", {}, `${text} `, choice);
@@ -246,6 +246,7 @@ class TownMap {
     const known = Object.keys(MEASURES).filter((name) => name === "occupancy" || this.day.recorded.blocks[name].some((its) => its.some((value) => value > 0)));
     if (!known.includes(this.measure)) this.measure = "occupancy";
     this.measureChoice.replaceChildren(...known.map((name) => make("option", { value: name, selected: name === this.measure }, MEASURES[name].label)));
+    this.scale = this.most();
     this.layStrip();
     this.player.load(this.day.duration, this.day.hours.map((_, i) => HOUR * (i + 0.5)));
     const { occupancy } = this.day.every;
@@ -301,7 +302,6 @@ class TownMap {
 
   draw() {
     const { day, view, player: { seconds } } = this;
-    this.scale = this.most();
     const value = (block) => day.at(day.course(this.measure, block), seconds);
     const cruised = (lane) => (day.cruised.has(lane) ? day.at(day.cruised.get(lane), seconds) / view.lengths[lane] : 0);
     view.paint((block) => this.colorOf(value(block)), cruised, day.busy, this.chosen);
@@ -360,7 +360,7 @@ class TownMap {
     const minutes = (seconds) => (seconds === null ? "–" : written(seconds / 60, 1));
     const [taken, cars] = [value("occupancy"), value("arrivals")];
     const count = (number) => written(number, number > 0 && number < 9.95 && !Number.isInteger(number) ? 1 : 0);
-    const cells = [clockOf(from), taken === null ? "–" : `${written(100 * taken, 0)} %`, count(cars), count(value("refused")), minutes(value("search_s")), minutes(value("walk_s")), this.pays() ? written(value("paid"), 2) : null];
+    const cells = [clockOf(from), taken === null ? "–" : `${written(100 * taken, 0)} %`, count(cars), count(value("refused")), minutes(value("search_s")), minutes(value("walk_s")), this.pays() ? written(value("paid"), value("paid") < 100 ? 2 : 0) : null];
     return make("tr", {}, ...cells.filter((text) => text !== null).map((text) => make("td", {}, text)));
   }
 

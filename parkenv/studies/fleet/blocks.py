@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.jit import compiled
 from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import BALKED, GAVE_UP, SEARCHING, STATES, STEP, TRUNCATED
 from parkenv.files.csv_tables import NUMBER_OR_NAN, TEXT, WHOLE
@@ -59,7 +60,7 @@ HOURS = LongTable("hours.csv", _DAY, ("purpose", "hour"), STATES, _KINDS)
 TABLES = (BLOCKS, LANES, HOURS)
 MEANS = (
     "occupancy", "parked_a_day", "share_parked", "refused_a_day", "search_s", "walk_s", "cruised_m", "paid_a_day",
-    "paid_a_car",
+    "paid_a_car", "balked_fraction",
 )  # fmt: skip
 """Columns of a zone, a block or a purpose that are means over days."""
 OF_CARS = ("search_s", "walk_s", "cruised_m")
@@ -135,37 +136,62 @@ class Tally:
         roads: its shortest drives.
 
     Attributes:
-        metres: by hour, (2, n_lanes) float64, m: driven, and cruised.
+        metres: (n_hours, n_lanes, 2) float64, m, from the first hour of the day on: driven, and cruised.
         refused: (k, 3) int64, failed attempts: car, slot, hour.
     """
 
     def __init__(self, fleet: Fleet, roads: Roads) -> None:
         self._fleet, self._roads = fleet, roads
         self._open = np.zeros(0, STEP)
-        self.metres: dict[int, FloatArray] = {}
+        self._direct_m, self._driven_m = np.full(len(fleet.cars), np.nan), np.zeros(len(fleet.cars))
+        self.metres = np.zeros((0, len(fleet.scenario.lot.lanes), 2))
         self.refused = np.zeros((0, 3), np.int64)
         fleet.keep_steps()
 
     def update(self) -> None:
         """Count the steps since the last call; those of cars that still search are counted later."""
-        steps = np.concatenate([self._open, self._fleet.take_steps()])
-        searches = self._fleet.cars["state"][steps["car"]] == SEARCHING
-        self._open, steps = steps[searches], steps[~searches]
         fleet, lot = self._fleet, self._fleet.scenario.lot
-        steps = steps[np.argsort(steps["car"], kind="stable")]
-        car, origin, vertex, failed = (steps[name] for name in ("car", "origin", "vertex", "failed"))
-        column = (lot.neighbors[origin] == vertex[:, None]).argmax(axis=1)
-        lane, hour = self._roads.lane_of_edge[origin, column], hour_of(fleet, steps["begin"])
-        driven = np.where(origin == vertex, 0.0, lot.edge_length[origin, column])
-        so_far = np.cumsum(driven)
-        so_far -= (so_far - driven)[np.searchsorted(car, car)]
-        ended, number = np.unique(car, return_inverse=True)
-        cruised = np.clip(so_far - self._roads.direct_m(fleet.cars[ended])[number], 0.0, driven)
-        for now in np.unique(hour).tolist():
-            its = hour == now
-            sums = [np.bincount(lane[its], metres[its], len(lot.lanes)) for metres in (driven, cruised)]
-            self.metres[now] = self.metres.get(now, np.zeros((2, len(lot.lanes)))) + sums
-        self.refused = np.concatenate([self.refused, np.stack([car, vertex, hour], axis=1)[failed]])
+        new = np.flatnonzero((fleet.cars["state"] > SEARCHING) & np.isnan(self._direct_m))
+        self._direct_m[new] = self._roads.direct_m(fleet.cars[new])
+        first, last = hour_of(fleet, np.array([fleet.begin, fleet.time])).tolist()
+        more = np.zeros((max(last + 1 - first - len(self.metres), 0), *self.metres.shape[1:]))
+        self.metres = np.concatenate([self.metres, more])
+        steps, since = np.concatenate([self._open, fleet.take_steps()]), fleet.begin // HOUR_S * HOUR_S
+        graph = lot.neighbors, lot.edge_length, self._roads.lane_of_edge
+        _add_metres(steps, since, *graph, self._direct_m, self._driven_m, self.metres)
+        searches = np.isnan(self._direct_m[steps["car"]])
+        failed = steps[steps["failed"] & ~searches]
+        hour = hour_of(fleet, failed["begin"])
+        self.refused = np.concatenate(
+            [self.refused, np.stack([failed["car"], failed["vertex"], hour], axis=1)]
+        )
+        self._open = steps[searches]
+
+
+@compiled(error_model="numpy")
+def _add_metres(
+    steps: NDArray[np.void],
+    since: float,
+    neighbors: NDArray[np.int32],
+    edge_length: FloatArray,
+    lane_of_edge: IntArray,
+    direct_m: FloatArray,
+    driven_m: FloatArray,
+    metres: FloatArray,
+) -> None:
+    """Add the steps of cars whose shortest drive is known to `metres`, by hour and lane, and to `driven_m`, by car."""
+    for step in steps:
+        origin, car = step.origin, step.car
+        if origin == step.vertex or np.isnan(direct_m[car]):
+            continue
+        for k in range(neighbors.shape[1]):
+            if neighbors[origin, k] == step.vertex:
+                length, hour = edge_length[origin, k], int((step.begin - since) // 3600.0)
+                driven_m[car] += length
+                lane = metres[hour, lane_of_edge[origin, k]]
+                lane[0] += length
+                lane[1] += min(max(driven_m[car] - direct_m[car], 0.0), length)
+                break
 
 
 def hour_of(fleet: Fleet, time: FloatArray) -> IntArray:
@@ -188,8 +214,7 @@ def day_rows(
     """
     ends = hour_of(fleet, np.array([fleet.begin, times[-1], fleet.cars["ended_at"].max()]))
     hours = np.arange(ends[0], ends.max() + 1)
-    of_lanes = [tally.metres.get(hour, np.zeros((2, len(fleet.scenario.lot.lanes)))) for hour in hours]
-    driven, cruised = np.array(of_lanes).transpose(1, 2, 0).round(1)
+    driven, cruised = tally.metres.transpose(2, 1, 0).round(1)
     lane, hour = np.nonzero(driven)
     return {
         BLOCKS.file: _block_row(fleet, blocks, tally, cruised_m, times, taken, hours),
@@ -212,45 +237,69 @@ def _block_row(
     taken: IntArray,
     hours: IntArray,
 ) -> Row:
-    cars, first = fleet.cars, hours[0]
-    purpose, parked, n_blocks = np.zeros(len(cars), np.int64), cars["slot"] >= 0, len(blocks.names)
+    cars, first, n_blocks = fleet.cars, hours[0], len(blocks.names)
+    names, purpose = purposes_of(fleet)
+    parked, arrives = cars["slot"] >= 0, of_cars(fleet, "parked_at", -1) < 0
     block = np.where(parked, blocks.of_slot[cars["slot"]], n_blocks)
-    leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], -np.inf)
-    shape = n_blocks + 1, 1, len(hours)
-    ended = block, purpose, hour_of(fleet, cars["ended_at"]) - first
-    arrivals = _sums(shape, ended)
+    leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], np.inf)
+    shape = n_blocks + 1, len(names), len(hours)
+    ended = block[arrives], purpose[arrives], hour_of(fleet, cars["ended_at"][arrives]) - first
+    leaving = np.isfinite(leaves)
     car, slot, hour = tally.refused.T
-    refused = _sums(shape, (blocks.of_slot[slot], purpose[car], hour - first))
-    left = np.where(np.isfinite(leaves), leaves, fleet.begin - HOUR_S)
-    departures = _sums(shape, (block, purpose, hour_of(fleet, left) - first))
     search_s, walk_s = cars["ended_at"] - cars["arrival"], cars["walk_s"]
-    of_cars = [
-        np.divide(sums, arrivals, out=np.full(shape, np.nan), where=arrivals > 0).round(2)
-        for sums in (_sums(shape, ended, values) for values in (search_s, walk_s, cruised_m))
+    arrivals, refused, departures, *sums = (
+        _with_all(_sums(shape, at, values))
+        for at, values in (
+            (ended, None),
+            ((blocks.of_slot[slot], purpose[car], hour - first), None),
+            ((block[leaving], purpose[leaving], hour_of(fleet, leaves[leaving]) - first), None),
+            *((ended, values[arrives]) for values in (search_s, walk_s, cruised_m, paid(fleet))),
+        )
+    )
+    means = [
+        np.divide(its, arrivals, out=np.full(arrivals.shape, np.nan), where=arrivals > 0).round(2)
+        for its in sums[:-1]
     ]
-    occupancy = np.full(shape, np.nan)
+    # Cars of each purpose in each block at each look; with residents of the background, there may be more in all.
     looks = hour_of(fleet, times) - first
-    in_block = np.array([np.bincount(blocks.of_slot, row, n_blocks) for row in taken])
+    comes, goes = (np.searchsorted(times, its[parked]) for its in (cars["ended_at"], leaves))
+    at = n_blocks + 1, len(names), len(times) + 1
+    change = _sums(at, (block[parked], purpose[parked], comes)) - _sums(
+        at, (block[parked], purpose[parked], goes)
+    )
+    there = _with_all(np.cumsum(change, axis=2)[..., :-1])
+    there[:-1, 0] = np.array([np.bincount(blocks.of_slot, row, n_blocks) for row in taken]).T
+    occupancy = np.full(arrivals.shape, np.nan)
     for hour in np.unique(looks):
-        occupancy[:-1, 0, hour] = in_block[looks == hour].mean(axis=0) / blocks.slots
-    there = (arrivals + refused + departures > 0) | (occupancy > 0.0)
-    there[:-1, 0] = True
-    b, p, h = np.nonzero(there)
-    names, types, zones = (np.array([*its, NOWHERE]) for its in (blocks.names, blocks.types, blocks.zones))
-    counts = (
-        its[there]
-        for its in (occupancy, arrivals, refused, departures, *of_cars, _sums(shape, ended, paid(fleet)))
-    )
+        occupancy[:-1, :, hour] = there[:-1, :, looks == hour].mean(axis=2) / blocks.slots[:, None]
+    shown = (arrivals + refused + departures > 0) | (occupancy > 0.0)
+    shown[:-1, 0] = True
+    b, p, h = np.nonzero(shown)
+    about = (np.array([*its, NOWHERE])[b] for its in (blocks.names, blocks.types, blocks.zones))
+    block_name, kind, zone = about
+    numbers = (its[shown] for its in (occupancy, arrivals, refused, departures, *means, sums[-1]))
+    purpose_name = np.array(names if len(names) == 1 else (ALL, *names))[p]
     return _row(
-        BLOCKS,
-        names[b],
-        np.array([ALL])[p],
-        hours[h],
-        types[b],
-        zones[b],
-        np.append(blocks.slots, 0)[b],
-        *counts,
+        BLOCKS, block_name, purpose_name, hours[h], kind, zone, np.append(blocks.slots, 0)[b], *numbers
     )
+
+
+def purposes_of(fleet: Fleet) -> tuple[tuple[str, ...], IntArray]:
+    """Return the purposes of a fleet's drivers, `ALL` if there is one, and the number of that of each car."""
+    names, purpose = tuple(one.name for one in fleet.demand.purposes), of_cars(fleet, "purpose", -1)
+    several = len(names) > 1 and (purpose >= 0).all()
+    return names if several else (ALL,), np.maximum(purpose, 0)
+
+
+def of_cars(fleet: Fleet, name: str, default: float) -> NDArray[Any]:
+    """Return a field of the cars of a fleet, or where they have none, a default value."""
+    known = name in (fleet.cars.dtype.names or ())
+    return np.array(fleet.cars[name]) if known else np.full(len(fleet.cars), default, type(default))
+
+
+def _with_all(sums: NDArray[Any]) -> NDArray[Any]:
+    """Return sums by block, purpose and hour with those of all purposes first, if there are several."""
+    return sums if sums.shape[1] == 1 else np.concatenate([sums.sum(axis=1, keepdims=True), sums], axis=1)
 
 
 def _sums(shape: tuple[int, ...], at: Sequence[IntArray], values: FloatArray | None = None) -> NDArray[Any]:
@@ -262,21 +311,27 @@ def _sums(shape: tuple[int, ...], at: Sequence[IntArray], values: FloatArray | N
 
 
 def _hour_row(fleet: Fleet, hours: IntArray) -> Row:
-    cars, ends = fleet.cars, fleet.begin // DAY_S * DAY_S + HOUR_S * (hours + 1)
+    """Return the row of `HOURS`: all cars, then those of each purpose if there are several."""
+    ends = fleet.begin // DAY_S * DAY_S + HOUR_S * (hours + 1)
+    names, purpose = purposes_of(fleet)
+    groups = [(ALL, slice(None))]
+    groups += [(name, purpose == number) for number, name in enumerate(names) if name != ALL]
 
     def until(times: FloatArray) -> IntArray:
         return np.searchsorted(np.sort(times), ends, side="right")
 
-    parks = cars["slot"] >= 0
-    arrived, ended, left = (
-        until(cars["arrival"]),
-        until(cars["ended_at"]),
-        until((cars["ended_at"] + cars["stay_s"])[parks]),
-    )
-    gone = [until(cars["ended_at"][cars["state"] == state]) for state in (GAVE_UP, BALKED, TRUNCATED)]
-    parked = until(cars["ended_at"][parks]) - left
-    counts = len(cars) - arrived, arrived - ended, parked, left, *gone
-    return _row(HOURS, np.full(len(hours), ALL), hours, *counts)
+    counts = []
+    for _, which in groups:
+        cars = fleet.cars[which]
+        parks = cars["slot"] >= 0
+        arrived, ended = until(cars["arrival"]), until(cars["ended_at"])
+        left = until((cars["ended_at"] + cars["stay_s"])[parks])
+        gone = [until(cars["ended_at"][cars["state"] == state]) for state in (GAVE_UP, BALKED, TRUNCATED)]
+        parked = until(cars["ended_at"][parks]) - left
+        counts.append([len(cars) - arrived, arrived - ended, parked, left, *gone])
+    columns = np.concatenate(counts, axis=1)
+    purposes = np.repeat([name for name, _ in groups], len(hours))
+    return _row(HOURS, purposes, np.tile(hours, len(groups)), *columns)
 
 
 def summarize_blocks(
@@ -296,14 +351,15 @@ def summarize_blocks(
     for row in rows:
         for name, its in _day_by(row, by).items():
             days.setdefault((*(row[column] for column in SETTING_COLUMNS), name), []).append(its)
-    made, known = [], ("block", "type", "zone", "slots")
+    made, known = [], () if by == "purpose" else ("block", "type", "zone", "slots")
     with_interval = MEANS if len({key[-1] for key in days}) <= MOST_WITH_INTERVALS else ()
     for key, of_days in days.items():
         about: Row = dict(zip((*SETTING_COLUMNS, by), key, strict=True))
         about |= {name: of_days[0][name] for name in known if name in of_days[0]}
         if "zone" in about:
             about["price"] = prices.get(about["scenario"], {}).get(about["zone"], 0.0)
-        made.append(about | day_means(of_days, MEANS, with_interval))
+        measures = MEANS if by == "purpose" else MEANS[:-1]
+        made.append(about | day_means(of_days, measures, with_interval))
     return made
 
 
@@ -321,6 +377,7 @@ def _day_by(row: Row, by: str) -> dict[str, Row]:
             **{name: grid[name].sum(axis=1) / cars for name in OF_CARS},
             "paid_a_day": grid["paid"].sum(axis=1),
             "paid_a_car": grid["paid"].sum(axis=1) / parked,
+            "balked_fraction": 1.0 - parked / cars,
         }
     found = {name: {c: values[i].item() for c, values in columns.items()} for i, name in enumerate(names)}
     if by == "block":

@@ -241,7 +241,7 @@ def is_known(value: float | None) -> bool:
 
 def interval_of(row: Row, name: str) -> tuple[float, float] | None:
     """Return the 95 % interval of a column, None where there is none."""
-    low, high = row[f"{name}_ci95"]
+    low, high = row.get(f"{name}_ci95", (None, None))
     return (low, high) if is_known(low) and is_known(high) else None
 
 
@@ -251,8 +251,20 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
     Each has a `label`, a `value` in words, and for a change the shares `better` and `worse`, if they are known.
     """
     if not (chosen := [row for row in shown_changes(changes) if not row["zone"]]):
-        return [
+        totals = [
             {"label": ", ".join(place(row)), "value": f"{row['total_s']:.1f} s a car"} for row in rows[:most]
+        ]
+        if len(rows) != 1:
+            return totals
+        (row,) = rows
+        return [
+            *totals,
+            {
+                "label": "from the entry to a space, or to giving up",
+                "value": f"{row['search_s'] / 60.0:.1f} min",
+            },
+            {"label": "of the cars find no slot", "value": f"{row['balked_fraction']:.1%}"},
+            {"label": "of all metres are cruised", "value": f"{row['cruising_share']:.0%}"},
         ]
     made = []
     for row in chosen[:most]:

@@ -14,6 +14,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
+from parkenv.studies.fleet.blocks import of_cars
 from parkenv.studies.fleet.setting import Setting, rate_text
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
 from parkenv.studies.report_options import ReportOptions
@@ -45,7 +46,7 @@ class FleetReplay(NamedTuple):
     folder: Path
 
     def again(self, options: ReportOptions) -> Again:
-        """See `Replay`; lots with too many slots, and days with too many cars, are left out."""
+        """See `Replay`; lots with too many slots or counted ones, and days with too many cars, are left out."""
         study = self.study
         agents = options.chosen_agents([setting.agent.label for setting in study.fleet_settings])
         numbers = options.chosen_numbers(range(study.days))
@@ -53,6 +54,8 @@ class FleetReplay(NamedTuple):
             return Again(
                 notes=[f"the lot has {n} slots, more than the {MOST_SLOTS} that are drawn: no replay"]
             )
+        if any((scenario.lot.capacity > 1).any() for scenario in study.built.values()):
+            return Again(notes=["counted facilities have no slots to draw: no replay; the map has them"])
         settings = [one for one in study.fleet_settings if one.agent.label in agents]
         rows = study.table.read(self.folder)
         crowded = {row["arrivals_per_hour"] for row in rows if row["cars"] > MOST_CARS}
@@ -84,7 +87,7 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
     residents = fleet.slots["leaves_at"].copy()
     fleet.run(agents)
     cars, begin = fleet.cars, fleet.begin
-    mean_s = float(cars["total_s"].mean())
+    mean_s = float(cars["total_s"][of_cars(fleet, "parked_at", -1) < 0].mean())
     before = counted.get(study.keys(setting, day)[0])
     agrees = None if before is None else abs(before - mean_s) <= AGREES_S
     differences = []

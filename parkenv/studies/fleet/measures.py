@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.engine.fleet import Fleet
-from parkenv.studies.fleet.blocks import has_zones, paid
+from parkenv.studies.fleet.blocks import has_zones, of_cars, paid
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.setting import BY_HOUR
 from parkenv.world.cost_terms import COST_FIELDS
@@ -41,9 +41,6 @@ class Roads:
         self._entries, self._metres, self._drive_s = entries, metres, metres / problem.v_drive
         self._problem, self._cost_s = problem, problem.walk_s + lot.slot_parking_cost_s
         self.first_slot_m = float(metres.min(axis=1).mean())
-        free_s, zones = self._drive_s + self._cost_s, range(len(lot.zones))
-        # By entry and zone, without prices.
-        self._alone_s = np.stack([free_s[:, lot.zone_of_slot == zone].min(axis=1) for zone in zones], axis=1)
 
     def direct_m(self, cars: NDArray[np.void]) -> FloatArray:
         """Return the shortest drive of cars from their entries to their slots, (n,) m; 0 without a slot."""
@@ -67,17 +64,49 @@ class Roads:
         return found.reshape(lot.neighbors.shape)
 
     def alone_s(self, fleet: Fleet) -> FloatArray:
-        """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster."""
-        rows = np.searchsorted(self._entries, fleet.cars["entry"])
-        return np.asarray((self._alone_s[rows] + fleet.zone_cost_s()).min(axis=1))
+        """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster.
+
+        A car that may park nowhere pays the give-up penalty.
+        """
+        cars, lot = fleet.cars, self._problem.lot
+        rows, free_s = np.searchsorted(self._entries, cars["entry"]), np.zeros((len(cars), len(lot.zones)))
+        factor = of_cars(fleet, "walks", 1.0)
+        for place, walks in sorted({*zip(cars["place"].tolist(), factor.tolist(), strict=True)}):
+            its = (cars["place"] == place) & (factor == walks)
+            cost_s = fleet.scenarios[place].walk_s * walks + lot.slot_parking_cost_s
+            by_zone = [
+                (self._drive_s[:, lot.zone_of_slot == zone] + cost_s[lot.zone_of_slot == zone]).min(axis=1)
+                for zone in range(len(lot.zones))
+            ]
+            free_s[its] = np.stack(by_zone, axis=1)[rows[its]]
+        least_s = (free_s + fleet.zone_cost_s()).min(axis=1)
+        return np.where(np.isfinite(least_s), least_s, self._problem.give_up_s)
+
+    def reach(self, patience_s: float) -> tuple[float, float]:
+        """Return the share of all spaces that cars from an entry reach within their patience, and when they reach 95 %.
+
+        Means over the entries; the second in s.
+        """
+        spaces = np.tile(self._problem.lot.capacity, (len(self._entries), 1))
+        order = np.argsort(self._drive_s, axis=None)
+        share = np.cumsum(spaces.ravel()[order]) / spaces.sum()
+        drive_s = self._drive_s.ravel()[order]
+        within = np.searchsorted(drive_s, patience_s, side="right")
+        return float(share[within - 1]) if within else 0.0, float(drive_s[np.searchsorted(share, 0.95)])
 
     def clairvoyant_s(self, fleet: Fleet) -> float:
         """Return the clairvoyant bound of the day of a fleet that has been reset, s, for all cars together.
 
-        It is NaN where it would take longer than the day itself, and for counted facilities: it is a bound for slots.
+        It is NaN where it would take longer than the day itself, and where it does not hold: with several goals,
+        counted facilities, or cars that are parked at first.
         """
         lot = self._problem.lot
-        if len(fleet.cars) * lot.n_slots > MOST_PAIRS or (lot.capacity > 1).any():
+        holds = (
+            len(fleet.scenarios) == 1
+            and (lot.capacity == 1).all()
+            and (of_cars(fleet, "parked_at", -1) < 0).all()
+        )
+        if len(fleet.cars) * lot.n_slots > MOST_PAIRS or not holds:
             return float("nan")
         return clairvoyant_bound_s(self.parking_day(fleet))
 
@@ -125,7 +154,8 @@ def day_measures(
         filled: of `filling`, while cars arrived.
         clairvoyant_s: lower bound on the total time of all cars together, s.
     """
-    cars, amounts = fleet.cars, paid(fleet)
+    arrives = of_cars(fleet, "parked_at", -1) < 0
+    cars, amounts, members = fleet.cars[arrives], paid(fleet)[arrives], members[arrives]
     times, parked = cars["total_s"], cars["slot"] >= 0
     cruised_m = roads.cruised_m(cars)
     driven_m = float(cars["driven_m"].sum())
@@ -145,7 +175,7 @@ def day_measures(
         **filled,
         "members_s": _mean(times[members]),
         "others_s": _mean(times[~members]),
-        "bound_s": float(roads.alone_s(fleet).mean()),
+        "bound_s": float(roads.alone_s(fleet)[arrives].mean()),
         "clairvoyant_s": clairvoyant_s / len(cars),
         **{name: float(cars[name].mean()) for name in COST_FIELDS},
         "paid": float(amounts.mean()),
@@ -155,11 +185,12 @@ def day_measures(
 
 def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     """Return `CAR_LISTS` of a day whose searches are all over, as texts."""
-    cars, lot = fleet.cars, fleet.scenario.lot
+    arrives, lot = of_cars(fleet, "parked_at", -1) < 0, fleet.scenario.lot
+    cars, members = fleet.cars[arrives], members[arrives]
     lists = {"total_cs": 100.0 * cars["total_s"], "member": members}
     if has_zones(fleet.scenario):
         zone = np.where(cars["slot"] >= 0, 1 + lot.zone_of_slot[cars["slot"]], 0)
-        lists |= {"zone": zone, "paid_cents": 100.0 * paid(fleet)}
+        lists |= {"zone": zone, "paid_cents": 100.0 * paid(fleet)[arrives]}
     return {name: " ".join(map(str, np.rint(values).astype(int).tolist())) for name, values in lists.items()}
 
 

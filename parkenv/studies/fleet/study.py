@@ -69,6 +69,8 @@ USUAL, MINDS_PRICES = "greedy-drive", "greedy-total"
 OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
 """Fields of the specification that all settings have in common."""
 PICTURE = "fleet.png"
+MOST_BLOCKS = 60
+"""Rows of blocks up to which the page has a table of them."""
 
 
 class FleetStudy(Study):
@@ -88,7 +90,9 @@ class FleetStudy(Study):
     table_titles: ClassVar = {
         "changes": "What changes for whom",
         "rows": "Results",
+        "purposes": "Purposes, a day",
         "zones": "Zones, a day",
+        "blocks": "Blocks, a day",
         "hours": "Occupancy by hour, simulated and as counted",
     }
 
@@ -325,7 +329,7 @@ class FleetStudy(Study):
         try:
             for time in times:
                 fleet.run(agents, until=float(time))
-                taken.append(fleet.taken())
+                taken.append(getattr(fleet, "counts", fleet.taken)())
                 tally.update()
             fleet.run(agents)
             tally.update()
@@ -336,7 +340,7 @@ class FleetStudy(Study):
         if follows and (occupancy.recorded or isinstance(setting.arrivals_per_hour, str)):
             counted = occupancy.course(Arrival(fleet.begin, fleet.day.date), times).occupied
         members = fleet.cars["kind"] == 0
-        filled = filling(times, np.array([looked_at.mean() for looked_at in taken]), counted)
+        filled = filling(times, np.sum(taken, axis=1) / fleet.scenario.lot.capacity.sum(), counted)
         measured = day_measures(fleet, roads, members, filled, bound_s)
         lists = car_lists(fleet, members) if self._lists_cars else {}
         row = {**setting.columns, "day": day}
@@ -400,7 +404,7 @@ class FleetStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.fleet.blocks import BLOCKS, has_zones, summarize_blocks
+        from parkenv.studies.fleet.blocks import ALL, BLOCKS, has_zones, summarize_blocks
         from parkenv.studies.fleet.changes import summarize_changes
         from parkenv.studies.fleet.tables import summarize_days, summarize_hours
 
@@ -409,7 +413,10 @@ class FleetStudy(Study):
         for table in self.all_tables[1:]:
             results.put_in_order(keys, table)
         blocks = results.rows(BLOCKS)
-        zoned = [row for key in keys if (row := blocks.get(key)) and has_zones(self.built[row["scenario"]])]
+        shown = [blocks[key] for key in keys if key in blocks]
+        zoned = [row for row in shown if has_zones(self.built[row["scenario"]])]
+        grouped = [row for row in shown if self.built[row["scenario"]].lot.facilities]
+        mixed = [row for row in shown if set(row["purpose"]) != {ALL}]
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
         prices = {
@@ -423,7 +430,29 @@ class FleetStudy(Study):
             "changes": summarize_changes(days, prices),
             "hours": summarize_hours(days, int(first)),
             "zones": summarize_blocks(zoned, "zone", prices),
+            "blocks": summarize_blocks(grouped, "block", prices),
+            "purposes": summarize_blocks(mixed, "purpose"),
+            "reach": self._reach(),
         }
+
+    def _reach(self) -> list[Row]:
+        """Return what share of the spaces of each scenario cars reach within their patience."""
+        import numpy as np
+
+        rows: list[Row] = []
+        for name, scenario in self.built.items():
+            patience_s = self.patience_s
+            if scenario.demand is not None:
+                purposes = [one for one in scenario.demand.purposes if one.expected]
+                patience_s = float(
+                    np.average(
+                        [one.patience.mean_s for one in purposes], weights=[one.expected for one in purposes]
+                    )
+                )
+            share, most_s = self._roads[name].reach(patience_s)
+            its = {"patience_s": patience_s, "v_drive_kmh": 3.6 * scenario.v_drive}
+            rows.append({"scenario": name, **its, "share_reached": share, "most_reached_s": most_s})
+        return rows
 
     @property
     def title(self) -> str:
@@ -470,7 +499,7 @@ class FleetStudy(Study):
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: what competition costs, for each agent and demand."""
         from parkenv.studies.fleet.changes import sentence, shown_changes
-        from parkenv.studies.fleet.tables import ONE_DAY, departures
+        from parkenv.studies.fleet.tables import ONE_DAY, departures, unreached
 
         shown: dict[tuple[Any, ...], Row] = {}
         for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
@@ -494,6 +523,7 @@ class FleetStudy(Study):
             findings.append(f"{finding}.")
         findings += [sentence(row) for row in changes if row["change"] == "knows"]
         findings += [ONE_DAY] if all(row["days"] == 1 for row in summary["rows"]) else []
+        findings += unreached(summary["reach"], summary["rows"])
         return findings + departures(summary["hours"], summary["rows"])
 
     @classmethod
@@ -502,7 +532,9 @@ class FleetStudy(Study):
         from parkenv.show.report.tables import OF_FLEETS, tables_of
         from parkenv.studies.fleet.changes import headlines
 
-        tables = tables_of(summary, cls.table_titles, OF_FLEETS)
+        # Of a town with many streets the map tells, and blocks.csv.
+        blocks = summary["blocks"] if len(summary["blocks"]) <= MOST_BLOCKS else []
+        tables = tables_of({**summary, "blocks": blocks}, cls.table_titles, OF_FLEETS)
         large = headlines(summary["rows"], summary["changes"])
         return super().page(summary, folder)._replace(tables=tables, headlines=large)
 

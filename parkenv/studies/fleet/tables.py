@@ -15,6 +15,8 @@ ASSIGNED = "reserve"
 COUNTS = "counted_occupancy"
 FAR = 0.03
 """Difference between simulated and counted occupancy that is said."""
+ROOM, NOTICED = 0.9, 0.02
+"""Occupancy below which there is room, and share of the cars that find none from which that is said."""
 WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
 """Measures whose summary has a 95 % interval over days."""
 DIFFERENCES = {
@@ -86,6 +88,29 @@ def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
             means = {"occupancy": float(mine.mean()), COUNTS: float(theirs.mean())}
             rows.append(its | means | columns_of("excess", mean_interval(mine - theirs)))
     return rows
+
+
+def unreached(reach: Sequence[Row], rows: Sequence[Row]) -> list[str]:
+    """Say of a town that is too large for the patience of its drivers why they find no slot although many are free.
+
+    Args:
+        reach: `scenario`, `patience_s`, `v_drive_kmh`, `share_reached`, `most_reached_s`, see `Roads.reach`.
+        rows: of `summarize_days`.
+    """
+    said = []
+    for its in reach:
+        gone = [row for row in rows if row["scenario"] == its["scenario"] and row["occupancy"] < ROOM]
+        most = max(gone, key=lambda row: row["balked_fraction"], default=None)
+        if most is None or most["balked_fraction"] < NOTICED or its["share_reached"] > 1.0 - NOTICED:
+            continue
+        minutes, most_minutes = its["patience_s"] / 60.0, math.ceil(its["most_reached_s"] / 60.0)
+        said.append(
+            f"On {its['scenario']} {most['balked_fraction']:.0%} of the cars find no slot while "
+            f"{most['occupancy']:.0%} of the spaces are taken: their patience of {minutes:.0f} min counts from where "
+            f"they enter the lot, and at {its['v_drive_kmh']:.0f} km/h {its['share_reached']:.0%} of the spaces are "
+            f"within it. 95% are within {most_minutes} min (--patience-min, or patience_s of a purpose)."
+        )
+    return said
 
 
 def departures(hours: Sequence[Row], rows: Sequence[Row]) -> list[str]:
