@@ -155,6 +155,9 @@ class Import(Command):
     """Outlines of parking spaces are enough: without roads in the file, rows, aisles and ways between are inferred.
 
     With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`) and a contact sheet.
+    With --town, a whole town becomes one lot: streets, kerbs, car parks and garages with prices and rules, entries at
+    its edge, and goals with weights of demand. A table of its facilities is written beside it (.csv): name, kind,
+    capacity, and whether the map says the capacity (tag, drawn) or a rule.
 
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
     """
@@ -164,6 +167,7 @@ class Import(Command):
         parkenv lot import slots.csv --out lot.geojson --entry 0,0 --goal 40,25
         parkenv lot import spaces.geojson --entry auto --goal auto --out lot.geojson
         parkenv lot import town.geojson --split --out lots
+        parkenv lot import town.osm.pbf --town --out town.geojson --picture town.png
         """
 
     place: Place
@@ -194,6 +198,7 @@ class Import(Command):
     split: bool = option(
         False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
     )
+    town: bool = option(False, "Import a whole town as one lot; entries and goals are those of the map.")
     least: int = option(10, "Number of spaces of the smallest car park, with --split.", ge=2)
     out: Path = option(
         ..., "Lot file to write, or folder with --split.", short="-o", takes="FILE.geojson|DIR"
@@ -202,10 +207,16 @@ class Import(Command):
     @model_validator(mode="after")
     def _split_alone(self) -> Self:
         points = [point for point in (*self.goal, *self.entry) if point != AUTO]
+        if self.split and self.town:
+            raise PydanticCustomError("whole", "--split and --town: want one of them")
         if self.split and (points or self.bounds or self.picture):
             raise PydanticCustomError(
                 "whole",
                 "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture",
+            )
+        if self.town and (self.entry or self.goal or self.bounds or self.disabled):
+            raise PydanticCustomError(
+                "whole", "--town reads the whole map, want no --entry, --goal, --bounds, --disabled"
             )
         return self
 
@@ -227,20 +238,26 @@ class Import(Command):
         """See `Command`."""
         if self.split:
             with writing_into(self.out):
-                self._import_town()
+                self._import_car_parks()
             return
         from parkenv.files.atomic_write import check_writable
-        from parkenv.lots import import_lot, write_lot
+        from parkenv.files.csv_tables import write_csv
+        from parkenv.lots import import_lot, import_town, write_lot
         from parkenv.lots.formats.geojson import check_lot_output
         from parkenv.lots.quality import Provenance
+        from parkenv.lots.town.draft import TABLE
 
         check_lot_output(self.out)
+        table = self.out.with_suffix(".csv")
+        if self.town:
+            check_writable(table)
         if self.picture is not None:
             if self.picture.suffix.lower() != ".png":
                 raise InputError(f"--picture {self.picture}: want a name that ends in .png")
             check_writable(self.picture)
         console = make_console(soft_wrap=True)
-        draft = import_lot(self.place, self._options)
+        town = import_town(self.place) if self.town else None
+        draft = town.draft if town is not None else import_lot(self.place, self._options)
         for line in draft.found:
             console.print(line)
         for guess in draft.guesses:
@@ -249,8 +266,12 @@ class Import(Command):
             console.print(f"left out: {left}", style="yellow")
         if self.picture is not None:
             from parkenv.show.figures.lot_import import save_import_picture
+            from parkenv.show.figures.town_import import save_town_picture
 
-            save_import_picture(draft, self.picture)
+            if town is not None:
+                save_town_picture(town, self.picture)
+            else:
+                save_import_picture(draft, self.picture)
             console.print(f"Picture: {self.picture}")
         try:
             lot = draft.lot()
@@ -258,9 +279,12 @@ class Import(Command):
             raise InputError(f"{self.place}: {error}") from error
         provenance = Provenance(self.place.name, draft.guesses, draft.issues) if draft.guesses else None
         write_lot(lot, self.out, provenance)
+        if town is not None:
+            write_csv(table, TABLE, town.facilities)
+            console.print(f"Facilities: {table}")
         console.print(f"Wrote {self.out}. {_summary(lot)}")
 
-    def _import_town(self) -> None:
+    def _import_car_parks(self) -> None:
         from parkenv.files.atomic_write import write_together
         from parkenv.studies.lots.town_import import import_town_lots
 

@@ -9,6 +9,7 @@ from parkenv.lots.formats.contents import LotProblem
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import city_lot, grid_lot
 from parkenv.lots.lot_files import import_lot, load_lot, packaged_lot, read_lot
+from parkenv.lots.town.draft import import_town
 
 __all__ = [
     "PACKAGED_LOTS",
@@ -17,6 +18,7 @@ __all__ = [
     "city_lot",
     "grid_lot",
     "import_lot",
+    "import_town",
     "load_lot",
     "packaged_lot",
     "read_lot",

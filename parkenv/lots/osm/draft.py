@@ -56,8 +56,7 @@ from parkenv.lots.osm.outline_draft import outline_draft
 from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
 from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
 from parkenv.lots.osm.rows import ARRANGEMENTS, without_overlaps
-from parkenv.lots.osm.spaces import is_parking_area, is_space, split_space, usable_spaces
-from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
+from parkenv.lots.osm.spaces import is_parking_area, is_space, slots_by_rank, split_space, usable_spaces
 from parkenv.world.drive_graph import SLOT_REACH
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
@@ -131,7 +130,7 @@ def map_frame(elements: Sequence[OsmElement]) -> LocalFrame:
         InputError: the elements are too far apart for one plane.
     """
     parking = [e for e in elements if _is_parking(e)]
-    _refuse_far_away(parking)
+    refuse_far_away(parking)
     return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
 
 
@@ -182,7 +181,7 @@ class _OsmImporter:
                 "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
                 "parking:left, parking:right or parking:both"
             )
-        _refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
+        refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
         self.frame = frame or LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
         self.box = options.box(self.frame)
         box = None if self.box is None else shapely.box(*self.box)
@@ -242,27 +241,14 @@ class _OsmImporter:
         owners, names, polygons = zip(*parts, strict=True)
         self.blocked += [area.polygon for area in kept]
 
-        # Prefer an aisle to another service road, and that to a street, even if these are nearer.
-        left = np.arange(len(polygons))
-        array = np.array(polygons, dtype=np.object_)
-        for rank in Rank:
-            near = network.lanes_of([road for road in self.roads if road.rank <= rank])
-            if not len(left) or not near:
-                continue
-            slots = slots_from_polygons(array[left], near)
-            mouth = slots.mouths()
-            to_lane = nearest_on_lanes(near, mouth)[0] - mouth
-            reached = np.hypot(to_lane[:, 0], to_lane[:, 1]) <= SLOT_REACH
-            found = np.flatnonzero(reached)
-            reached_ids = left[found]
+        left = set(range(len(names)))
+        for rank, index, slots in slots_by_rank(np.array(polygons, dtype=np.object_), self.roads):
+            found = index.tolist()
             self.mapped.add(
-                [owners[i] for i in reached_ids],
-                [names[i] for i in reached_ids],
-                slots[found],
-                [int(rank)] * len(found),
+                [owners[i] for i in found], [names[i] for i in found], slots, [int(rank)] * len(found)
             )
-            left = left[~reached]
-        for i in left:
+            left.difference_update(found)
+        for i in sorted(left):
             self._leave_out(NO_AISLE, names[i])
 
     def fill_outlines(self) -> None:
@@ -466,7 +452,7 @@ def _is_parking(element: OsmElement) -> bool:
     )
 
 
-def _refuse_far_away(elements: Sequence[OsmElement]) -> None:
+def refuse_far_away(elements: Sequence[OsmElement]) -> None:
     """Raise an error for a map of more than one place: a plane cannot preserve distances across a continent."""
     positions = np.concatenate([line for e in elements for line in e.lines])
     order = len(positions) // 2

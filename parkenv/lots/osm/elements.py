@@ -35,7 +35,7 @@ from parkenv.lots.formats.positions import Positions
 OSM_ID = re.compile(r"(node|way|relation)/-?\d+")
 MAPPED_KEYS = ("amenity", "highway", "building", "entrance")
 """Keys that distinguish elements of OpenStreetMap from other GeoJSON."""
-KEYS = (*MAPPED_KEYS, "noexit")
+KEYS = (*MAPPED_KEYS, "noexit", "shop", "office", "craft", "healthcare", "tourism", "leisure")
 """Keys of the elements that an import reads."""
 MOST_ELEMENTS = 5_000_000
 """Maximum number of nodes, ways and relations of one file: a city of a million people."""

@@ -40,6 +40,7 @@ CORNER_CLEARANCE = 5.0
 DRIVEWAY_CLEARANCE = 1.0  # distance from the edge of a joining service road to the first car, m
 SHORTEST_KERB_SLOT = 5.0
 """Smallest slot length, m, if a tagged capacity needs more slots than fit at the usual length."""
+ROUNDING = 1e-6  # m, shorter intervals are none
 STRAIGHT_ON = np.radians(30.0)
 """Largest angle between an arm and the street at which the arm continues the street."""
 
@@ -73,7 +74,7 @@ def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
         return Kerb(orientation, whole_number(tag("parking", ":capacity")), kind == "lane")
 
     old = tag("parking:lane")
-    if old is None or old in ("no", "none", "separate"):
+    if old is None or old in ("no", "none", "separate", "drawn_separately"):
         return None
     condition = tag("parking:condition")
     if old in FORBIDDEN or condition in FORBIDDEN:
@@ -100,7 +101,7 @@ def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float,
     """
     how = ARRANGEMENTS[kerb.orientation]
     total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
-    free = _free_intervals(total, closed)
+    free = free_intervals(total, closed)
     parallel = how.angle == 0.0
     least = SHORTEST_KERB_SLOT if parallel and kerb.capacity is not None else how.pitch
     depth = how.width if parallel else how.length * float(np.sin(how.angle))
@@ -126,13 +127,14 @@ def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float,
     return Slots.joined(rows) if rows else NO_SLOTS
 
 
-def _free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def free_intervals(total: float, closed: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    """Return what is left of the length of a road between closed intervals, start and end in m from its start."""
     free, start = [], 0.0
     for begin, end in sorted(closed):
-        if begin > start:
+        if min(begin, total) - start > ROUNDING:
             free.append((start, min(begin, total)))
         start = max(start, end)
-    if start < total:
+    if total - start > ROUNDING:
         free.append((start, total))
     return free
 

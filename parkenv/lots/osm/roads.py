@@ -13,6 +13,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH
 
 STREET_WIDTH = {
+    "motorway": 7.5,
     "trunk": 7.5,
     "primary": 7.0,
     "secondary": 7.0,
@@ -71,18 +72,32 @@ class Road:
         return any(key.startswith("parking:") for key in self.tags)
 
 
-def road_of(element_id: str, tags: Mapping[str, str], points: FloatArray) -> Road | str | None:
-    """Create a road from a way; returns a reason if the road is left out, None if the way is not a road."""
+def road_of(
+    element_id: str, tags: Mapping[str, str], points: FloatArray, *, town: bool = False
+) -> Road | str | None:
+    """Create a road from a way; returns a reason if the road is left out, None if the way is not a road.
+
+    Args:
+        element_id: such as `way/123`.
+        tags: tags of the way.
+        points: (k, 2) m.
+        town: whether all that cars drive on counts: motorways, tunnels, and private ways to private parking.
+    """
     kind = tags.get("highway", "").removesuffix("_link")
-    if kind not in STREET_WIDTH or tags.get("area") == "yes":
+    if kind not in STREET_WIDTH or tags.get("area") == "yes" or (kind == "motorway" and not town):
         return None
     service = tags.get("service")
     if kind == "service" and service in NOT_FOR_PARKING:
         return f"roads with service={service}"
-    reason = closed_to_cars(tags) or off_the_ground(tags)
+    reason = closed_to_cars(tags)
+    if town and kind == "service" and reason is not None and reason.endswith("=private"):
+        reason = None
+    if not town or kind == "service":
+        reason = reason or off_the_ground(tags)
     if reason:
         return f"roads with {reason}"
-    oneway = tags.get("oneway", "yes" if tags.get("junction") in ("roundabout", "circular") else "no")
+    as_built = kind == "motorway" or tags.get("junction") in ("roundabout", "circular")
+    oneway = tags.get("oneway", "yes" if as_built else "no")
     turned = oneway in ("-1", "reverse")
     step = np.diff(points, axis=0)
     points = points[np.r_[True, np.hypot(step[:, 0], step[:, 1]) > 0.01]]

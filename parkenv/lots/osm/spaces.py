@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
+from parkenv.lots.generators import Slots
 from parkenv.lots.osm.buildings import Area
 from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.osm.roads import closed_to_cars, off_the_ground, whole_number
-from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, whole_number
+from parkenv.lots.slot_polygons import nearest_on_lanes, slots_from_polygons
+from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Lane
 
 CAR_SPACES = ("normal", "yes", "car", "parent", "parents", "women", "woman", "customers", "residents")
@@ -77,6 +80,27 @@ def _why_no_slot(
     if whole_number(tags.get("capacity")) in (None, 0) and float(shapely.area(polygon)) > LARGEST_SPACE:
         return f"spaces larger than {LARGEST_SPACE:g} m² without a capacity"
     return None
+
+
+def slots_by_rank(
+    polygons: NDArray[np.object_], roads: Sequence[Road]
+) -> Iterator[tuple[Rank, NDArray[np.intp], Slots]]:
+    """Yield the slots of outlines, (n,) polygons, that open to roads of each rank, and their indices.
+
+    A slot prefers an aisle to another service road, and that to a street, even if these are nearer.
+    """
+    left = np.arange(len(polygons))
+    for rank in Rank:
+        near = [Lane(road.points, road.oneway) for road in roads if road.rank <= rank]
+        if not len(left) or not near:
+            continue
+        slots = slots_from_polygons(polygons[left], near)
+        mouth = slots.mouths()
+        to_lane = nearest_on_lanes(near, mouth)[0] - mouth
+        reached = np.hypot(to_lane[:, 0], to_lane[:, 1]) <= SLOT_REACH
+        found = np.flatnonzero(reached)
+        yield rank, left[found], slots[found]
+        left = left[~reached]
 
 
 def split_space(

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from parkenv.lots import write_lot
 from parkenv.lots.draft import ImportOptions
-from parkenv.lots.osm.town import LEAST_SPACES, import_town
+from parkenv.lots.osm.car_parks import LEAST_SPACES, import_car_parks
 from parkenv.lots.quality import Provenance
 from parkenv.show.figures.contact_sheet import save_contact_sheets
 from parkenv.show.plurals import plural
@@ -40,17 +40,17 @@ def import_town_lots(
     Args:
         place: the file of the town.
         folder: where the lots go.
-        options: see `import_town`.
+        options: see `import_car_parks`.
         least: number of spaces of the smallest car park.
         progress: called as car parks are finished.
 
     Raises:
-        InputError: see `import_town`.
+        InputError: see `import_car_parks`.
     """
     rows: list[Row] = []
     lots = []
     done = counted(progress, "car parks")
-    for park in import_town(place, options, least):
+    for park in import_car_parks(place, options, least):
         row: Row = {"lot": park.name, "spaces": park.spaces, "slots": 0, "lanes": 0}
         if park.draft is None:
             row |= {"result": "refused", "error_probability": None, "reason": park.reason}

@@ -35,7 +35,9 @@ class CarPark:
     reason: str = ""  # why there is none
 
 
-def import_town(path: str | Path, options: ImportOptions, least: int = LEAST_SPACES) -> Iterator[CarPark]:
+def import_car_parks(
+    path: str | Path, options: ImportOptions, least: int = LEAST_SPACES
+) -> Iterator[CarPark]:
     """Yield the car parks of a town, the largest first.
 
     Args:

@@ -1,0 +1,1 @@
+"""Towns from OpenStreetMap: streets, kerbs, car parks, garages, their rules, and what attracts demand."""

@@ -1,0 +1,489 @@
+"""Import a whole town from OpenStreetMap: streets, kerbs, car parks and garages with their rules, goals and entries.
+
+- Streets: `parkenv.lots.town.streets`; kerbs: `kerbs`; goals: `attraction`.
+- Car parks whose spaces are drawn (`amenity=parking_space`) are slots. Others are counted: as many cars as `capacity`
+  says, else by `capacity`'s rules of area and levels. Where more are tagged than drawn, the others are counted, too.
+- A garage (`parking=multi-storey`, `underground`, `rooftop`) has a barrier that takes 10 s a car, 30 s to a space when
+  it is empty and 120 s when it is full, and a full sign. It is entered at its `amenity=parking_entrance`, else at the
+  nearest street, as car parks are.
+- Rules (`fee`, `charge`, `maxstay`, `access`, `capacity:disabled`, `capacity:charging`) become zones, named after the
+  kind of facility and the rule (`zones`).
+- Buildings are no walls: a town is searched without sensors.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError, naming
+from parkenv.files.file_names import is_plain
+from parkenv.lots.draft import LeftOut, LotDraft
+from parkenv.lots.generators import NO_SLOTS, Slots
+from parkenv.lots.infer.spaces import to_rectangle
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.buildings import Area, areas_of, is_building
+from parkenv.lots.osm.draft import MAPPED_OVERLAP, NO_AISLE, RULE_OVERLAP, cut_elements, refuse_far_away
+from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
+from parkenv.lots.osm.outlines import CORRIDOR
+from parkenv.lots.osm.roads import Rank, off_the_ground
+from parkenv.lots.osm.rows import without_overlaps
+from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots_by_rank, split_space
+from parkenv.lots.slot_polygons import nearest_on_lanes
+from parkenv.lots.town.attraction import PURPOSES, find_goals
+from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of, tagged_capacity
+from parkenv.lots.town.kerbs import STRIPS, KerbSide, kerb_sides, strip_side
+from parkenv.lots.town.streets import read_streets
+from parkenv.lots.town.zones import Rules, rules_of, zones_of
+from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
+from parkenv.world.facility import FACILITY_REACH, Facility
+from parkenv.world.lot import Lane
+
+GATE_S = 10.0  # s that the barrier of a garage takes for a car
+INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
+"""Seconds from the entry of a counted facility to a space, when it is empty and when it is full."""
+ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
+SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
+RESERVED_PLACES = ("disabled", "charging")
+"""Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
+CLOSED = ("no", "military", "forestry", "agricultural")
+"""Values of `access` of parking that no car in town may use."""
+
+
+TABLE = ("name", "kind", "capacity", "capacity_from", "rule", "zone", "slots", "tagged", "element")
+"""Columns of the table of facilities: `capacity_from` is tag, drawn or rule, `rule` which one; `slots` of the capacity
+are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb with its side."""
+
+
+@dataclass(frozen=True, eq=False)
+class TownDraft:
+    """The draft of a town, and a table of its facilities.
+
+    Attributes:
+        draft: the lot.
+        facilities: a row for each facility, with the columns of `TABLE`.
+    """
+
+    draft: LotDraft
+    facilities: list[dict[str, Any]]
+
+
+def import_town(path: str | Path) -> TownDraft:
+    """Draft a town from an OpenStreetMap file; see the module for the rules.
+
+    Raises:
+        InputError: the file is damaged or has another format, has no street or no parking, or is too large for a plane.
+    """
+    path = Path(path)
+    place = read_map(path)
+    with naming(path):
+        town = _Town(place_name(path), place)
+        town.read_drawn()
+        town.read_kerbs()
+        town.read_counted()
+        return town.draft()
+
+
+@dataclass(eq=False)
+class _Row:
+    """A facility: its line in the table, its rules, and what makes it."""
+
+    name: str
+    kind: str
+    rules: Rules
+    capacity_from: str
+    rule: str
+    element: str
+    tagged: int | None = None
+    slots: Slots = NO_SLOTS  # drawn ones
+    slot_rules: list[Rules] = field(default_factory=list)
+    counted: list[tuple[str, int, Rules]] = field(
+        default_factory=list
+    )  # name, places and rules of counted parts
+    xy: tuple[float, float] | None = None
+
+
+class _Town:
+    """The state of an import."""
+
+    def __init__(self, name: str, place: OsmMap) -> None:
+        self.name, self.place = name, place
+        elements = place.elements
+        streets = [e for e in elements if "highway" in e.tags and not e.is_node]
+        if not streets:
+            raise InputError("no street in it, want ways with the tag highway")
+        refuse_far_away(streets)
+        self.frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
+        self.left_out: dict[str, list[str]] = defaultdict(list)
+        self.streets, self.closed_roads = read_streets(elements, self.frame)
+        self.roads = self.streets.roads_kept()
+        self.lines = linestrings([road.points for road in self.roads])
+        self.tree = shapely.STRtree(self.lines)
+        self.buildings = self._areas(elements, is_building)
+        self.parking = [a for a in self._areas(elements, is_parking_area) if self._is_open(a.element)]
+        self.rows: list[_Row] = []
+        self.names: set[str] = set()
+        self.used: set[int] = set()  # parking areas whose places are slots
+
+    def _areas(self, elements: Sequence[OsmElement], wanted: Any) -> list[Area]:
+        found = areas_of(elements, self.frame, wanted, mended=True)
+        return [a for a in found if shapely.area(a.polygon) > 0.0]
+
+    def _is_open(self, element: OsmElement) -> bool:
+        """Whether any car in town may use a car park; else it is listed."""
+        tags = element.tags
+        reason = f"access={tags['access']}" if tags.get("access") in CLOSED else None
+        if tags.get("parking") in ("construction", "disused", "abandoned"):
+            reason = f"parking={tags['parking']}"
+        if reason is not None:
+            self.left_out[f"parking with {reason}"].append(element.id)
+        return reason is None
+
+    def _named(self, tags: Any, element_id: str) -> str:
+        """Return a name that no other facility has."""
+        name = str(tags.get("name", ""))
+        name = name if name and is_plain(name) else element_id
+        if name in self.names:
+            name = f"{name} ({element_id})"
+        self.names.add(name)
+        return name
+
+    # ---- supply ----
+
+    def read_drawn(self) -> None:
+        """Read the spaces that are drawn one by one, grouped by the car park around them, else by their distance."""
+        spaces = []
+        for area in self._areas(self.place.elements, is_space):
+            tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
+            reason = off_the_ground(tags) or (
+                f"access={tags['access']}" if tags.get("access") in CLOSED else None
+            )
+            if kind not in CAR_SPACES and rules_of(tags).users == "public":
+                reason = f"parking_space={kind}"
+            if area.element.cut:
+                reason = "an outline that the edge of the map cuts"
+            if reason is None:
+                spaces.append(area)
+            else:
+                self.left_out[f"spaces with {reason}"].append(area.element.id)
+        lanes = [Lane(road.points, road.oneway) for road in self.roads if road.rank < Rank.STREET]
+        parts = [
+            (area, *part)
+            for area in spaces
+            for part in split_space(area.element, to_rectangle(area.polygon), lanes)
+        ]
+        if not parts:
+            return
+        polygons = np.array([polygon for _, _, polygon in parts], dtype=np.object_)
+        owner = self._owners(polygons)
+        left = set(range(len(parts)))
+        groups: dict[int, tuple[list[Slots], list[Rules]]] = defaultdict(lambda: ([], []))
+        for _, index, slots in slots_by_rank(polygons, self.roads):
+            left.difference_update(index.tolist())
+            for k in np.unique(owner[index]).tolist():
+                mine = owner[index] == k
+                groups[k][0].append(slots[mine])
+                groups[k][1].extend(rules_of(parts[i][0].element.tags) for i in index[mine].tolist())
+        for i in sorted(left):
+            self.left_out[NO_AISLE].append(parts[i][1])
+        self.used = {k for k in groups if k < len(self.parking)}
+        for k, (drawn, rules) in sorted(groups.items()):
+            inside = (
+                self.parking[k].element
+                if k in self.used
+                else parts[int(np.flatnonzero(owner == k)[0])][0].element
+            )
+            whole = rules_of(inside.tags) if k in self.used else Rules()
+            row = _Row(self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id)
+            row.slots = Slots.joined(drawn)
+            # A space without rules of its own has those of its car park.
+            row.slot_rules = [own if own != Rules() else whole for own in rules]
+            row.tagged = tagged_capacity(inside.tags) if k in self.used else None
+            more = (row.tagged or 0) - len(row.slots)
+            if more > 0:
+                row.xy = self._entrance(self.parking[k].polygon, [])
+                row.counted = [(f"{row.name}, not drawn", more, whole)]
+                row.capacity_from = "tag"
+            self.rows.append(row)
+
+    def _owners(self, polygons: Any) -> Any:
+        """Return the car park around each space, or a number beyond those for a group of spaces near each other."""
+        near = shapely.STRtree(polygons).query(polygons, predicate="dwithin", distance=SAME_CAR_PARK)
+        owner = len(self.parking) + component_labels(near.T, len(polygons))
+        if self.parking:
+            tree = shapely.STRtree([a.polygon for a in self.parking])
+            space, park = tree.query(shapely.point_on_surface(polygons), predicate="intersects")
+            owner[space[::-1]] = park[::-1]
+        return owner
+
+    def read_kerbs(self) -> None:
+        """Read the kerbs: those drawn as areas, those tagged on streets, and those by rule."""
+        sides: list[tuple[KerbSide, str]] = []
+        for k, area in enumerate(self.parking):
+            if area.element.tags.get("parking") in STRIPS and k not in self.used:
+                side = strip_side(area, self.roads, self.tree)
+                if side is not None:
+                    self.used.add(k)
+                    sides.append((side, area.element.tags.get("name", "")))
+        crossings = [
+            e.lines[0] for e in self.place.elements if e.is_node and e.tags.get("highway") == "crossing"
+        ]
+        at = self.frame.to_xy(np.concatenate([np.empty((0, 2)), *crossings]))
+        sides += [(side, "") for side in kerb_sides(self.roads, at, self.buildings, self.left_out)]
+        corridors = shapely.buffer(
+            self.lines, [CORRIDOR * road.half_width for road in self.roads], cap_style="flat"
+        )
+        # Several runs of one way are one kerb.
+        whole: dict[str, _Row] = {}
+        for side, given in sides:
+            row = whole.get(side.id)
+            if row is None:
+                title = given or (
+                    f"{side.street} ({side.id})" if side.street and is_plain(side.street) else side.id
+                )
+                row = whole[side.id] = _Row(
+                    self._named({"name": title}, side.id),
+                    "kerb",
+                    side.rules,
+                    side.capacity_from,
+                    side.rule,
+                    side.id,
+                    side.tagged,
+                )
+            row.slots = Slots.joined([row.slots, side.slots])
+        rows = list(whole.values())
+        slots = Slots.joined([row.slots for row in rows] or [NO_SLOTS])
+        of = np.repeat(np.arange(len(rows)), [len(row.slots) for row in rows])
+        blocked = np.zeros(len(slots), bool)
+        blocked[shapely.STRtree(corridors).query(slots.boxes(shrink=0.05), predicate="intersects")[0]] = True
+        drawn = Slots.joined([*(row.slots for row in self.rows), NO_SLOTS])
+        boxes = np.concatenate([drawn.boxes(MAPPED_OVERLAP), slots.boxes(RULE_OVERLAP)])
+        kept = without_overlaps(boxes)[len(drawn) :] & ~blocked
+        lost = np.bincount(of[~kept], minlength=len(rows))
+        self.left_out["kerbs with fewer places, because of streets and other places"] += [
+            rows[k].element for k in np.flatnonzero(lost).tolist()
+        ]
+        for k, row in enumerate(rows):
+            row.slots = slots[np.flatnonzero((of == k) & kept)]
+            row.slot_rules = [row.rules] * len(row.slots)
+        self.rows += [row for row in rows if len(row.slots)]
+
+    def read_counted(self) -> None:
+        """Read the car parks and garages whose places are counted."""
+        entrances = [
+            self.frame.to_xy(e.lines[0])[0]
+            for e in self.place.elements
+            if e.is_node and e.tags.get("amenity") == "parking_entrance"
+        ]
+        points = [
+            (e, shapely.Point(self.frame.to_xy(e.lines[0])[0]), None)
+            for e in self.place.elements
+            if e.is_node and is_parking_area(e) and self._is_open(e)
+        ]
+        outlines = [
+            (a.element, a.polygon, float(shapely.area(a.polygon)))
+            for k, a in enumerate(self.parking)
+            if k not in self.used
+        ]
+        for element, shape, area in (*outlines, *points):
+            tags = element.tags
+            rule = rule_of(tags)
+            kind = "garage" if rule in GARAGES else "lot"
+            rules = rules_of(tags)
+            if rule == "boxes" and rules.users == "public":
+                rules = replace(rules, users="private")
+            xy = self._entrance(shape, entrances if kind == "garage" else [])
+            if xy is None:
+                self.left_out[f"parking farther than {FACILITY_REACH:g} m from every street"].append(
+                    element.id
+                )
+                continue
+            said = tagged_capacity(tags)
+            capacity = said or expected_capacity(rule, area, levels_of(tags))
+            row = _Row(
+                self._named(tags, element.id),
+                kind,
+                rules,
+                "tag" if said else "rule",
+                "" if said else rule,
+                element.id,
+                said,
+            )
+            row.xy = xy
+            rest = capacity
+            for users in RESERVED_PLACES:
+                n = tagged_capacity(tags, f"capacity:{users}") or 0
+                if 0 < n < rest:
+                    row.counted.append((f"{row.name}, {users}", n, replace(rules, users=users)))
+                    rest -= n
+            row.counted.insert(0, (row.name, rest, rules))
+            self.rows.append(row)
+
+    def _entrance(
+        self, shape: shapely.Geometry, entrances: Sequence[FloatArray]
+    ) -> tuple[float, float] | None:
+        """Return where a facility is entered; None if no street is near."""
+        if entrances:
+            away = shapely.distance(shape, shapely.points(np.array(entrances)))
+            if away.min() <= ENTRANCE_WITHIN:
+                shape = shapely.Point(entrances[int(away.argmin())])
+        index, distance = self.tree.query_nearest(shape, return_distance=True, all_matches=False)
+        if not len(index) or distance[0] > FACILITY_REACH - SLOT_REACH:
+            return None
+        at = shapely.get_coordinates(shapely.shortest_line(shape, self.lines[int(index[0])]))[0]
+        return float(at[0]), float(at[1])
+
+    # ---- the town ----
+
+    def draft(self) -> TownDraft:
+        """Assemble lanes, slots, facilities, zones, entries and goals."""
+        if not self.rows:
+            raise InputError("no parking in it: no kerb, no car park and no garage beside its streets")
+        parts = [row.slots for row in self.rows]
+        slots = Slots.joined(parts)
+        mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
+        lanes = self.streets.lanes(mouths)
+        of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
+        zone = [rules.zone(row.kind).name for row in self.rows for rules in row.slot_rules]
+        slots = replace(
+            slots,
+            zone=np.array(zone, np.str_),
+            facility=np.array([self.rows[k].name for k in of.tolist()], np.str_),
+        )
+        serial = np.arange(len(of)) - np.repeat(
+            np.cumsum([0, *map(len, parts)])[:-1], [len(part) for part in parts]
+        )
+        ids = [f"{self.rows[k].element}-{i + 1}" for k, i in zip(of.tolist(), serial.tolist(), strict=True)]
+        to_lane = nearest_on_lanes(lanes, slots.mouths())[0] - slots.mouths()
+        near = np.hypot(*to_lane.T) <= SLOT_REACH
+        self.left_out[NO_AISLE] += [ids[i] for i in np.flatnonzero(~near).tolist()]
+        index = np.flatnonzero(near)
+        slots, ids = slots[index], [ids[i] for i in index.tolist()]
+        filled = set(slots.facility.tolist())
+        facilities = [f for row in self.rows for f in _facilities(row, filled)]
+        used = [
+            (row.kind, rules)
+            for row in self.rows
+            for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
+        ]
+        entries, traffic = self.streets.entries()
+        goals, weights = find_goals(self.place.elements, self.buildings, self.frame, self.tree)
+        draft = LotDraft(
+            name=self.name,
+            slot_ids=tuple(ids),
+            slots=slots,
+            slot_source=tuple(self.rows[k].capacity_from for k in of[index].tolist()),
+            lanes=tuple(lanes),
+            entries=entries,
+            goals=goals,
+            outlines=tuple(
+                shapely.get_coordinates(shapely.get_exterior_ring(part))
+                for a in self.parking
+                for part in shapely.get_parts(a.polygon)
+            ),
+            missing=tuple(self._missing(entries, goals)),
+            frame=self.frame,
+            facilities=tuple(facilities),
+            zone_rules=zones_of(used),
+            goal_weights=weights,
+            entry_weights=dict.fromkeys(PURPOSES, traffic),
+        ).searchable()
+        rows = _table(self.rows, draft)
+        listed = [LeftOut(reason, tuple(names)) for reason, names in self.left_out.items() if names]
+        left_out = (
+            *self.place.left_out,
+            *self.closed_roads,
+            *self.streets.unconnected(),
+            *listed,
+            *draft.left_out,
+        )
+        found = (*self._found(rows, draft), *cut_elements(self.place.elements))
+        guesses = tuple(_guesses(rows, draft))
+        return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
+
+    def _missing(self, entries: FloatArray, goals: FloatArray) -> Iterator[str]:
+        if not len(entries):
+            yield "no entry: no street crosses the edge of the map"
+        if not len(goals):
+            yield "no goal: no building and no point of interest in it; export buildings and shops, too"
+
+    def _found(self, rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
+        whole, connected = self.streets.length.sum() / 1e3, self.streets.connected_share()
+        yield f"streets: {whole:.0f} km, {connected:.1%} of them connected; lanes: {len(draft.lanes)}"
+        for kind in ("kerb", "lot", "garage"):
+            mine = [row for row in rows if row["kind"] == kind]
+            places = {
+                source: sum(r["capacity"] for r in mine if r["capacity_from"] == source)
+                for source in ("tag", "drawn", "rule")
+            }
+            listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
+            yield f"{kind}s: {len(mine):,}, places: {sum(places.values()):,}" + (
+                f" ({listed})" if listed else ""
+            )
+        yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
+        yield f"goals: {len(draft.goals)}, of buildings and points of interest"
+        yield f"zones: {', '.join(draft.zone_rules)}"
+        yield f"frame: {self.frame}"
+
+
+def _facilities(row: _Row, filled: set[str]) -> Iterator[Facility]:
+    """Yield the facilities of a row of the table: one for drawn slots, one for each counted part."""
+    if len(row.slots) and row.name in filled:
+        yield Facility(row.name, row.kind, row.rules.zone(row.kind).name)
+    for name, capacity, rules in row.counted if row.xy is not None else ():
+        yield Facility(
+            name,
+            row.kind,
+            rules.zone(row.kind).name,
+            capacity,
+            row.xy,
+            GATE_S if row.kind == "garage" else 0.0,
+            INSIDE_S.get(row.kind, INSIDE_S["lot"]),
+            "sign" if row.kind == "garage" else "nothing",
+        )
+
+
+def _table(rows: Sequence[_Row], draft: LotDraft) -> list[dict[str, Any]]:
+    """Return the table of facilities, those of the draft."""
+    names, count = np.unique(draft.slots.facility, return_counts=True)
+    slots = dict(zip(names.tolist(), count.tolist(), strict=True))
+    counted = {facility.name: facility.capacity for facility in draft.facilities}
+    table = []
+    for row in rows:
+        places = slots.get(row.name, 0) + sum(counted.get(name, 0) for name, _, _ in row.counted)
+        if places:
+            zone = row.rules.zone(row.kind).name
+            drawn = slots.get(row.name, 0)
+            values = (
+                row.name,
+                row.kind,
+                places,
+                row.capacity_from,
+                row.rule,
+                zone,
+                drawn,
+                row.tagged,
+                row.element,
+            )
+            table.append(dict(zip(TABLE, values, strict=True)))
+    return table
+
+
+def _guesses(rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
+    rules: dict[str, list[int]] = defaultdict(list)
+    for row in rows:
+        if row["rule"]:
+            rules[f"{row['kind']}s by the rule of {row['rule']}"].append(row["capacity"])
+    for rule, places in rules.items():
+        yield f"{rule}: {len(places):,}, places: {sum(places):,}"
+    assumed = [zone for zone in draft.zone_rules if " paid" in zone]
+    if assumed:
+        price = draft.zone_rules[assumed[0]].price.per_hour
+        yield f"price where the map says only that there is a fee: {price:g} an hour"

@@ -1,0 +1,321 @@
+"""The streets of a town: the part in which every way leads back, where cars come in, and the lanes.
+
+Streets are cut at their junctions into pieces. Those from which cars can drive on to every other one are kept: what a
+fence or a missing junction parts from them is left out. Beyond the edge of the map streets go on: where a one-way
+street leaves it or enters it, and where the edge parts streets from the others, a way to the nearest street that
+crosses the edge within 600 m is assumed. Service roads that lead to no parking are dropped. Turn restrictions are not
+applied: a junction is one vertex of the drive graph, whichever arm a car comes from. Speeds are not read: all drive at
+the scenario's speed.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+import shapely
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components
+
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.errors import InputError
+from parkenv.lots.draft import LeftOut
+from parkenv.lots.infer.network import limit_junctions
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.elements import OsmElement
+from parkenv.lots.osm.roads import Rank, Road, road_of
+from parkenv.world.drive_graph import linestrings, node_labels
+from parkenv.world.lot import MOVES, Lane
+
+ENTRY_WEIGHT = {
+    "motorway": 16.0,
+    "trunk": 12.0,
+    "primary": 8.0,
+    "secondary": 4.0,
+    "tertiary": 2.0,
+    "unclassified": 1.0,
+    "residential": 0.5,
+}
+"""How much traffic a street brings into town, by its class; others 0.25. Assumed: each class has twice the next."""
+THROUGH = ("motorway", "trunk", "primary", "secondary", "tertiary")
+"""Classes of streets that do not end in a town: where they end, the map does."""
+AT_EDGE = 50.0  # distance, m, from the hull of all streets within which streets that end leave the map
+BEYOND = "beyond"  # ids of the ways beyond the edge begin with it
+LONGEST_BEYOND = 600.0  # m, longest way beyond the edge of the map that is assumed
+
+
+@dataclass(frozen=True, eq=False)
+class Streets:
+    """The roads of a town, cut into pieces at junctions.
+
+    Args:
+        roads: the roads that cars may drive, whole ways.
+        cut: ids of the ways that the edge of the map cuts.
+
+    Raises:
+        InputError: no road, or none that leads back.
+    """
+
+    roads: tuple[Road, ...]
+    cut: frozenset[str] = frozenset()
+
+    road: IntArray = field(init=False)  # (n,) of each piece
+    span: IntArray = field(init=False)  # (n, 2) first and last point of the piece on its road
+    nodes: IntArray = field(init=False)  # (n, 2) junction at its start and at its end
+    length: FloatArray = field(init=False)  # (n,) m
+    kept: BoolArray = field(init=False)  # (n,) whether it belongs to the connected part
+    node_xy: FloatArray = field(init=False)  # (n_nodes, 2) m
+
+    def __post_init__(self) -> None:
+        if not self.roads:
+            raise InputError("no street that cars may drive in it")
+        count = np.array([len(road.points) for road in self.roads])
+        xy = np.concatenate([road.points for road in self.roads])
+        label, of = node_labels(xy), np.repeat(np.arange(len(count)), count)
+        last = np.cumsum(count) - 1
+        is_node = np.bincount(label)[label] > 1
+        is_node[last] = is_node[last - count + 1] = True
+        at = np.flatnonzero(is_node)
+        same = of[at[:-1]] == of[at[1:]]
+        first, end = at[:-1][same], at[1:][same]
+        run = np.r_[0.0, np.cumsum(np.hypot(*np.diff(xy, axis=0).T))]
+        node_xy = np.empty((label.max() + 1, 2))
+        node_xy[label[::-1]] = xy[::-1]
+        road = of[first]
+        offset = (last - count + 1)[road]
+        values = {
+            "road": road,
+            "span": np.stack([first - offset, end - offset], axis=1),
+            "nodes": np.stack([label[first], label[end]], axis=1),
+            "length": run[end] - run[first],
+            "node_xy": node_xy,
+        }
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+        part = self._parts("strong")
+        inside = part[self.nodes[:, 0]] == part[self.nodes[:, 1]]
+        metres = np.bincount(part[self.nodes[inside, 0]], self.length[inside], minlength=part.max() + 1)
+        if not metres.any():
+            raise InputError("no street in it leads back to where it began: all are one-way")
+        object.__setattr__(self, "kept", inside & (part[self.nodes[:, 0]] == int(metres.argmax())))
+
+    def _graph(self, links: Iterable[tuple[int, int]] = ()) -> csr_array[np.float64]:
+        """Return which junction leads to which, also by further links, (n_nodes, n_nodes)."""
+        a, b = self.nodes.T
+        back, more = ~self.oneway, np.array(list(links), np.int64).reshape(-1, 2)
+        source, target = np.r_[a, b[back], more[:, 0]], np.r_[b, a[back], more[:, 1]]
+        n = len(self.node_xy)
+        return csr_array((np.ones(len(source)), (source, target)), shape=(n, n))
+
+    def _parts(self, connection: Literal["weak", "strong"]) -> IntArray:
+        """Label the junctions by the part of the network that they belong to."""
+        return np.asarray(connected_components(self._graph(), connection=connection)[1], np.int64)
+
+    @property
+    def oneway(self) -> BoolArray:
+        """Whether each piece is one-way, (n,) bool."""
+        return np.array([road.oneway for road in self.roads])[self.road]
+
+    def points(self, piece: int) -> FloatArray:
+        """Return the points of a piece, (k, 2) m."""
+        first, last = self.span[piece].tolist()
+        points: FloatArray = self.roads[self.road[piece]].points[first : last + 1]
+        return points
+
+    def connected_share(self) -> float:
+        """Return the share of the drivable length that is in one part, 0 to 1."""
+        real = ~self._is_beyond
+        return float(self.length[self.kept & real].sum() / self.length[real].sum())
+
+    @property
+    def _is_beyond(self) -> BoolArray:
+        return np.array([road.id.startswith(BEYOND) for road in self.roads])[self.road]
+
+    def unconnected(self) -> Iterable[LeftOut]:
+        """Yield what is not connected: parts of their own by their longest street, and streets of no return."""
+        part = self._parts("weak")[self.nodes[:, 0]]
+        main = part[self.kept][0]
+        apart: dict[int, list[int]] = {}
+        for piece in np.flatnonzero(part != main).tolist():
+            apart.setdefault(int(part[piece]), []).append(piece)
+        if apart:
+            metres = {k: self.length[pieces].sum() for k, pieces in apart.items()}
+            names = (
+                f"{self._name(max(apart[k], key=lambda p: self.length[p]))} {metres[k]:.0f} m"
+                for k in sorted(apart, key=lambda k: -metres[k])
+            )
+            yield LeftOut("parts of the streets that are not connected to the others", tuple(names))
+        alone = np.flatnonzero((part == main) & ~self.kept)
+        if len(alone):
+            longest = alone[np.argsort(-self.length[alone])].tolist()
+            named = tuple(dict.fromkeys(map(self._name, longest)))
+            yield LeftOut("streets from which no way leads back, or that none leads to", named)
+
+    def _name(self, piece: int) -> str:
+        road = self.roads[self.road[piece]]
+        return str(road.tags.get("name", road.id))
+
+    def _edge(self) -> tuple[FloatArray, BoolArray, BoolArray]:
+        """Return where streets leave the map: their traffic, 0 elsewhere, whether cars come in, and leave, (n_nodes,).
+
+        That is where the edge cuts them, where one of a class that leads on ends, and where another one ends near the
+        hull of all streets; one-way streets do not end, and may be farther from it.
+        """
+        real = np.flatnonzero(~self._is_beyond)
+        n = len(self.node_xy)
+        users = np.bincount(self.nodes[real].ravel(), minlength=n)
+        hull = shapely.concave_hull(shapely.multipoints(self.node_xy), ratio=0.4)
+        away = np.asarray(shapely.distance(shapely.points(self.node_xy), shapely.boundary(hull)))
+        traffic, enters, leaves = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
+        for piece in real.tolist():
+            road = self.roads[self.road[piece]]
+            kind = road.tags["highway"].removesuffix("_link")
+            for end, node in enumerate(self.nodes[piece].tolist()):
+                near = away[node] <= AT_EDGE * (4 if road.oneway else 1)
+                if users[node] == 1 and (near or kind in THROUGH or road.id in self.cut):
+                    traffic[node] = ENTRY_WEIGHT.get(kind, 0.25) if road.rank is Rank.STREET else 0.0
+                    enters[node] = end == 0 or not road.oneway
+                    leaves[node] = end == 1 or not road.oneway
+        return traffic, enters, leaves
+
+    def ways_beyond(self) -> list[Road]:
+        """Return the ways beyond the edge of the map that are assumed, so that every way leads back."""
+        _, enters, leaves = self._edge()
+        start = int(self.nodes[self.kept][0, 0])
+        links: dict[tuple[int, int], None] = {}
+        while True:
+            graph = self._graph(links)
+            reached, returns = np.zeros((2, len(self.node_xy)), bool)
+            reached[breadth_first_order(graph, start, return_predecessors=False)] = True
+            returns[breadth_first_order(graph.T.tocsr(), start, return_predecessors=False)] = True
+            count = len(links)
+            links |= dict.fromkeys(self._nearest(leaves & ~returns, enters & returns))
+            links |= dict.fromkeys((a, b) for b, a in self._nearest(enters & ~reached, leaves & reached))
+            if len(links) == count:
+                break
+        tags = {"highway": "road", "parking:both": "no"}
+        return [
+            Road(f"{BEYOND}/{i + 1}", tags, self.node_xy[list(ends)], Rank.STREET, True, False)
+            for i, ends in enumerate(links)
+        ]
+
+    def _nearest(self, here: BoolArray, there: BoolArray) -> Iterable[tuple[int, int]]:
+        """Yield pairs of the junctions here and the nearest one there, if it is near enough for a way beyond."""
+        to = np.flatnonzero(there)
+        for node in np.flatnonzero(here).tolist() if len(to) else ():
+            away = np.hypot(*(self.node_xy[to] - self.node_xy[node]).T)
+            if away.min() <= LONGEST_BEYOND:
+                yield node, int(to[away.argmin()])
+
+    def entries(self) -> tuple[FloatArray, FloatArray]:
+        """Return where cars come in from beyond the map, (n, 2) m, and how much traffic each street brings, (n,).
+
+        From a one-way street that is not connected, cars come in where it meets the connected part.
+        """
+        traffic, enters, _ = self._edge()
+        inside = np.zeros(len(self.node_xy), bool)
+        inside[self.nodes[self.kept].ravel()] = True
+        onward: dict[int, list[int]] = {}
+        for piece in np.flatnonzero(~self.kept).tolist():
+            a, b = self.nodes[piece].tolist()
+            onward.setdefault(a, []).append(b)
+            if not self.roads[self.road[piece]].oneway:
+                onward.setdefault(b, []).append(a)
+        brought: dict[int, float] = {}
+        for edge in np.flatnonzero(enters & (traffic > 0.0)).tolist():
+            queue, seen = deque([edge]), {edge}
+            while queue:
+                node = queue.popleft()
+                if inside[node]:
+                    brought[node] = max(brought.get(node, 0.0), float(traffic[edge]))
+                    continue
+                fresh = [other for other in onward.get(node, ()) if other not in seen]
+                seen.update(fresh)
+                queue.extend(fresh)
+        nodes = sorted(brought)
+        return self.node_xy[nodes], np.array([brought[node] for node in nodes])
+
+    def roads_kept(self) -> list[Road]:
+        """Return the connected part as roads, each a run of pieces of one way."""
+        return [replace(self.roads[k], points=points) for k, points in self._runs(self.kept, set())]
+
+    def lanes(self, mouths: FloatArray) -> list[Lane]:
+        """Return the lanes: the connected part without service roads that lead to none of the mouths, (n, 2) m.
+
+        Ways are cut at junctions with more than four ways out, so that `limit_junctions` can split these.
+        """
+        kept = self._useful(mouths)
+        a, b = self.nodes[kept].T
+        back = ~self.oneway[kept]
+        ways_out = np.bincount(np.r_[a, b[back]], minlength=len(self.node_xy))
+        crowded = set(np.flatnonzero(ways_out > len(MOVES)).tolist())
+        return limit_junctions(
+            [Lane(points, self.roads[k].oneway) for k, points in self._runs(kept, crowded)]
+        )
+
+    def _runs(self, kept: BoolArray, cuts: set[int]) -> list[tuple[int, FloatArray]]:
+        """Join consecutive pieces of one road: its index and its points, cut at some junctions."""
+        runs: list[tuple[int, list[FloatArray]]] = []
+        before = -1
+        for piece in np.flatnonzero(kept).tolist():
+            follows = before == piece - 1 and self.road[piece] == self.road[before]
+            if follows and int(self.nodes[piece, 0]) not in cuts:
+                runs[-1][1].append(self.points(piece)[1:])
+            else:
+                runs.append((int(self.road[piece]), [self.points(piece)]))
+            before = piece
+        return [(k, np.concatenate(parts)) for k, parts in runs]
+
+    def _useful(self, mouths: FloatArray) -> BoolArray:
+        """Return the pieces kept, without dead ends of service roads that are nearest to no mouth, (n,) bool."""
+        kept = self.kept.copy()
+        index = np.flatnonzero(kept)
+        lines = linestrings([self.points(piece) for piece in index.tolist()])
+        needed = np.zeros(len(kept), bool)
+        if len(mouths):
+            _, nearest = shapely.STRtree(lines).query_nearest(shapely.points(mouths))
+            needed[index[nearest]] = True
+        is_street = np.array([road.rank is Rank.STREET for road in self.roads])[self.road]
+        at: dict[int, set[int]] = {}
+        for piece in index.tolist():
+            for node in self.nodes[piece].tolist():
+                at.setdefault(node, set()).add(piece)
+        loose = deque(at)
+        while loose:
+            node = loose.popleft()
+            if len(at[node]) != 1:
+                continue
+            (piece,) = at[node]
+            if is_street[piece] or needed[piece]:
+                continue
+            kept[piece] = False
+            for end in self.nodes[piece].tolist():
+                at[end].discard(piece)
+                loose.append(end)
+        return kept
+
+
+def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, list[LeftOut]]:
+    """Return the streets of a map, motorways and tunnels among them, and the roads left out.
+
+    Raises:
+        InputError: see `Streets`.
+    """
+    roads: list[Road] = []
+    left_out: dict[str, list[str]] = {}
+    for element in elements:
+        if element.is_node or "highway" not in element.tags:
+            continue
+        for line in element.lines:
+            road = road_of(element.id, element.tags, frame.to_xy(line), town=True)
+            if isinstance(road, str):
+                left_out.setdefault(road, []).append(element.id)
+            elif road is not None:
+                roads.append(road)
+    cut = frozenset(element.id for element in elements if element.cut)
+    listed = [LeftOut(reason, tuple(dict.fromkeys(ids))) for reason, ids in left_out.items()]
+    streets = Streets(tuple(roads), cut)
+    return Streets((*roads, *streets.ways_beyond()), cut), listed

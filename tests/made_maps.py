@@ -1,0 +1,125 @@
+"""Maps drawn in metres and written in the formats of OpenStreetMap."""
+
+import json
+from dataclasses import dataclass, field
+from xml.sax.saxutils import quoteattr
+
+from parkenv.lots.draft import ImportOptions
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.lot_files import import_lot
+
+FREIBURG = LocalFrame(lon=7.85, lat=48.0)
+AISLE = {"highway": "service", "service": "parking_aisle"}
+SERVICE = {"highway": "service"}
+STREET = {"highway": "residential", "name": "Hauptstraße"}
+SPACE = {"amenity": "parking_space"}
+
+
+@dataclass
+class Map:
+    """A map drawn in metres, written in any of the formats. Equal points are one node."""
+
+    nodes: dict[tuple[float, float], dict[str, str]] = field(default_factory=dict)
+    ways: list[tuple[list[tuple[float, float]], dict[str, str]]] = field(default_factory=list)
+    areas: list[tuple[list[int], list[int], dict[str, str]]] = field(default_factory=list)
+
+    def node(self, x, y, **tags):
+        self.nodes.setdefault((x, y), {}).update(tags)
+        return self
+
+    def way(self, points, tags, **more):
+        for point in points:
+            self.node(*point)
+        self.ways.append((points, {**tags, **more}))
+        return self
+
+    def box(self, x0, y0, x1, y1, tags, **more):
+        return self.way([(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)], tags, **more)
+
+    def area(self, outer, inner, **tags):
+        """A multipolygon of ways, by their numbers from 1."""
+        self.areas.append((outer, inner, {"type": "multipolygon", **tags}))
+        return self
+
+    def places(self):
+        lonlat = FREIBURG.to_lonlat(list(self.nodes)).round(7).tolist()
+        number = {point: i + 1 for i, point in enumerate(self.nodes)}
+        return number, {number[point]: at for point, at in zip(self.nodes, lonlat, strict=True)}
+
+    def xml(self):
+        number, at = self.places()
+
+        def tags(values):
+            return "".join(f"<tag k={quoteattr(k)} v={quoteattr(v)}/>" for k, v in values.items())
+
+        lines = ['<?xml version="1.0" encoding="UTF-8"?>', '<osm version="0.6" generator="a test">']
+        for point, values in self.nodes.items():
+            lon, lat = at[number[point]]
+            lines.append(f'<node id="{number[point]}" lat="{lat}" lon="{lon}">{tags(values)}</node>')
+        for i, (points, values) in enumerate(self.ways):
+            refs = "".join(f'<nd ref="{number[point]}"/>' for point in points)
+            lines.append(f'<way id="{i + 1}">{refs}{tags(values)}</way>')
+        for i, (outer, inner, values) in enumerate(self.areas):
+            members = "".join(
+                f'<member type="way" ref="{way}" role="{role}"/>'
+                for role, ways in (("outer", outer), ("inner", inner))
+                for way in ways
+            )
+            lines.append(f'<relation id="{i + 1}">{members}{tags(values)}</relation>')
+        return "\n".join([*lines, "</osm>"])
+
+    def overpass(self, *, geometry):
+        number, at = self.places()
+
+        def position(i):
+            return {"lat": at[i][1], "lon": at[i][0]}
+
+        elements = [
+            {"type": "node", "id": number[point], **position(number[point]), "tags": tags}
+            for point, tags in self.nodes.items()
+        ]
+        way_nodes = {}
+        for i, (points, tags) in enumerate(self.ways):
+            refs = way_nodes[i + 1] = [number[point] for point in points]
+            way = {"type": "way", "id": i + 1, "nodes": refs, "tags": tags}
+            if geometry:
+                way["geometry"] = [position(ref) for ref in refs]
+            elements.append(way)
+        for i, (outer, inner, tags) in enumerate(self.areas):
+            members = [
+                {"type": "way", "ref": ref, "role": role}
+                | ({"geometry": list(map(position, way_nodes[ref]))} if geometry else {})
+                for role, refs in (("outer", outer), ("inner", inner))
+                for ref in refs
+            ]
+            elements.append({"type": "relation", "id": i + 1, "members": members, "tags": tags})
+        if geometry:
+            elements = [e for e in elements if e["type"] != "node" or e["tags"]]
+        return json.dumps({"version": 0.6, "generator": "Overpass API", "elements": elements})
+
+    def geojson(self, *, flat=True):
+        """As osmtogeojson writes it: closed ways are polygons unless they are roads."""
+        number, at = self.places()
+        features = []
+
+        def feature(name, tags, shape, coordinates):
+            kind, _, digits = name.partition("/")
+            own = {"@id": name, **tags} if flat else {"type": kind, "id": digits, "tags": tags}
+            geometry = {"type": shape, "coordinates": coordinates}
+            features.append({"type": "Feature", "id": name, "properties": own, "geometry": geometry})
+
+        for i, (points, tags) in enumerate(self.ways):
+            line = [at[number[point]] for point in points]
+            if points[0] == points[-1] and "highway" not in tags:
+                feature(f"way/{i + 1}", tags, "Polygon", [line])
+            else:
+                feature(f"way/{i + 1}", tags, "LineString", line)
+        for point, tags in self.nodes.items():
+            if tags:
+                feature(f"node/{number[point]}", tags, "Point", at[number[point]])
+        return json.dumps({"type": "FeatureCollection", "features": features})
+
+    def draft(self, tmp_path, **options):
+        path = tmp_path / "place.osm"
+        path.write_text(self.xml(), encoding="utf-8")
+        return import_lot(path, ImportOptions(**options))

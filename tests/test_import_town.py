@@ -1,0 +1,373 @@
+"""Towns from OpenStreetMap: what a small map gives by tags and by rules, and what real extracts give."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from command_line import parkenv
+from made_maps import AISLE, SERVICE, SPACE, STREET, Map
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv.lots import import_town, read_lot, write_lot
+from parkenv.lots.osm.elements import read_map
+from parkenv.lots.town.capacity import RULES, expected_capacity, tagged_capacity
+from parkenv.lots.town.kerbs import PLACES_PER_METRE
+from parkenv.lots.town.streets import ENTRY_WEIGHT
+from parkenv.lots.town.zones import PRICE, Rules, kerb_rules, rules_of
+from parkenv.world.tariff import Hours
+
+TOWNS = Path(__file__).parents[2] / "shared" / "data" / "towns"
+EXTRACTS = sorted((TOWNS / "osm").glob("*.osm.*"))
+
+
+HOUSE_ROWS = (-20, 20, 180, 220, 380, 420)
+
+
+def grid(**tags):
+    """Three streets of 400 m each way, 200 m apart, with houses along them, and a shop; all leave the map."""
+    place = Map()
+    for y in (0, 200, 400):
+        place.way([(-100, y), (0, y), (200, y), (400, y), (500, y)], {"highway": "residential"}, **tags)
+    for x in (0, 200, 400):
+        place.way([(x, -100), (x, 0), (x, 200), (x, 400), (x, 500)], {"highway": "residential"}, **tags)
+    for along in range(-90, 500, 40):
+        for beside in HOUSE_ROWS:
+            place.box(along, beside - 8, along + 16, beside + 8, {"building": "house"})
+            place.box(beside - 8, along, beside + 8, along + 16, {"building": "house"})
+    return place.node(100, 215, shop="bakery")
+
+
+def draft(place, tmp_path):
+    path = tmp_path / "town.osm"
+    path.write_text(place.xml(), encoding="utf-8")
+    return import_town(path)
+
+
+def row_of(town, name):
+    (row,) = (row for row in town.facilities if row["name"] == name)
+    return row
+
+
+def left_out(town):
+    return {left.reason: left.ids for left in town.draft.left_out}
+
+
+# ---- streets ----
+
+
+def test_streets_are_one_part_and_what_is_apart_is_named(tmp_path):
+    """A street far from the others, and a one-way street that leads far away, are left out by name."""
+    place = grid().way([(2500, 1400), (2550, 1400)], STREET, name="Inselweg")
+    place.way([(500, 0), (2500, 0)], STREET, oneway="yes", name="Fernweg")
+    town = draft(place, tmp_path)
+    assert left_out(town)["parts of the streets that are not connected to the others"] == ("Inselweg 50 m",)
+    assert left_out(town)["streets from which no way leads back, or that none leads to"] == ("Fernweg",)
+    lot = town.draft.lot()
+    matrix = dijkstra(lot.drive_matrix(), indices=np.arange(0, lot.n_slots, 97))
+    assert np.isfinite(matrix).all()
+    assert len(lot.entries) == 11  # of twelve streets, cars only leave by one
+
+
+def test_entries_weigh_by_the_class_of_their_street(tmp_path):
+    place = grid().way([(400, 400), (700, 700)], {"highway": "primary"})
+    lot = draft(place, tmp_path).draft.lot()
+    farthest = np.argmax(np.hypot(*(lot.entries - lot.entries.mean(axis=0)).T))
+    assert lot.entry_weights["shoppers"][farthest] == ENTRY_WEIGHT["primary"]
+    assert sorted(lot.entry_weights["shoppers"])[:-1] == [ENTRY_WEIGHT["residential"]] * (
+        len(lot.entries) - 1
+    )
+
+
+def test_dual_carriageways_are_joined_beyond_the_edge(tmp_path):
+    """Where both halves of a main road leave the map, cars come back."""
+    place = grid()
+    place.way([(500, 0), (900, 0)], {"highway": "primary"}, oneway="yes")
+    place.way([(900, 20), (500, 20), (400, 0)], {"highway": "primary"}, oneway="yes")
+    town = draft(place, tmp_path)
+    assert "100.0% of them connected" in town.draft.found[0]
+    assert town.draft.lot().entries[:, 0].max() > town.draft.goals[:, 0].max() + 300
+
+
+def test_junctions_of_many_streets_can_be_driven(tmp_path):
+    """Seven streets meet in one place; the graph has four moves a vertex."""
+    place = grid()
+    for x, y in ((60, 300), (100, 280), (140, 300)):
+        place.way([(200, 200), (x, y)], {"highway": "living_street"})
+    assert draft(place, tmp_path).draft.lot().n_slots > 0
+
+
+# ---- kerbs ----
+
+
+def test_untagged_streets_have_as_many_places_as_their_class(tmp_path):
+    """200 m of a street between two crossings: 10.1 m are free at each corner."""
+    lot = draft(grid(), tmp_path).draft.lot()
+    assert all(facility.kind == "kerb" for facility in lot.facilities)
+    crossings, arms = 9, 4
+    free = 2 * 6 * 600.0 - crossings * arms * 2 * (3.0 + 2.1 + 5.0)
+    assert lot.n_slots == pytest.approx(PLACES_PER_METRE["residential"] * free, rel=0.06)
+
+
+def test_where_no_house_stands_an_untagged_street_has_no_places(tmp_path):
+    place = grid().way([(500, 0), (1500, 0)], {"highway": "residential"})
+    (long,) = [way for way in place.ways if way[0][-1] == (1500, 0)]
+    name = f"way/{place.ways.index(long) + 1}"
+    places = sum(
+        row["capacity"] for row in draft(place, tmp_path).facilities if row["element"].startswith(name)
+    )
+    assert places <= 2 * 60.0 * PLACES_PER_METRE["residential"]
+
+
+@pytest.mark.parametrize(
+    ("tags", "kinds"),
+    [
+        ({"parking:both": "no"}, {}),
+        ({"parking:lane:both": "no_parking"}, {}),
+        ({"parking:left": "no", "parking:right": "lane"}, {"right"}),
+        ({"parking:lane:left": "parallel", "parking:lane:right": "no_stopping"}, {"left"}),
+    ],
+)
+def test_tagged_kerbs_are_what_both_schemes_say(tmp_path, tags, kinds):
+    town = draft(grid(**tags).box(90, 90, 110, 100, {"amenity": "parking"}), tmp_path)
+    sides = {row["element"].split()[-1] for row in town.facilities if row["kind"] == "kerb"}
+    assert sides == set(kinds)
+
+
+def test_a_tagged_capacity_of_a_kerb_is_kept(tmp_path):
+    town = draft(
+        grid(**{"parking:right": "lane", "parking:right:capacity": "31", "parking:left": "no"}), tmp_path
+    )
+    assert {(row["capacity"], row["capacity_from"], row["tagged"]) for row in town.facilities} == {
+        (31, "tag", 31)
+    }
+
+
+def test_kerbs_drawn_as_areas_are_slots_of_their_street(tmp_path):
+    place = grid(**{"parking:both": "no"})
+    place.box(40, 3, 120, 5, {"amenity": "parking", "parking": "street_side", "capacity": "12"})
+    (row,) = draft(place, tmp_path).facilities
+    assert (row["kind"], row["capacity"], row["slots"], row["capacity_from"]) == ("kerb", 12, 12, "tag")
+
+
+# ---- car parks and garages ----
+
+
+def test_places_are_as_tagged_else_by_area_and_levels(tmp_path):
+    place = grid(**{"parking:both": "no"})
+    place.box(
+        20, 20, 60, 60, {"amenity": "parking", "name": "P1", "capacity": "77", "capacity:disabled": "4"}
+    )
+    place.box(80, 20, 120, 60, {"amenity": "parking", "name": "P2", "access": "private"})
+    garage = {
+        "amenity": "parking",
+        "name": "P3",
+        "parking": "multi-storey",
+        "building:levels": "3",
+        "fee": "yes",
+    }
+    place.box(140, 20, 180, 60, garage)
+    place.node(160, 62, amenity="parking_entrance").node(230, 230, amenity="parking", name="P4")
+    town = draft(place, tmp_path)
+    lot = town.draft.lot()
+    facilities = {facility.name: facility for facility in lot.facilities}
+    assert [row_of(town, name)["capacity"] for name in ("P1", "P2", "P3", "P4")] == [
+        77,
+        expected_capacity("surface", 1600.0, None),
+        expected_capacity("multi-storey", 1600.0, 3.0),
+        RULES["surface"].typical,
+    ]
+    assert [row_of(town, name)["capacity_from"] for name in ("P1", "P2")] == ["tag", "rule"]
+    assert (facilities["P1"].capacity, facilities["P1, disabled"].capacity) == (73, 4)
+    assert lot.zone_rules[facilities["P1, disabled"].zone].users == ("disabled",)
+    assert lot.zone_rules[facilities["P2"].zone].users == ("private",)
+    assert (facilities["P3"].kind, facilities["P3"].known) == ("garage", "sign")
+    assert lot.zone_rules[facilities["P3"].zone].price.per_hour == PRICE
+    entrance = town.draft.frame.to_xy(town.draft.frame.to_lonlat([facilities["P3"].xy]))[0]
+    assert np.hypot(*(entrance - lot.goals[0])) < 1000
+
+
+def test_drawn_spaces_are_slots_and_what_is_not_drawn_is_counted(tmp_path):
+    place = grid(**{"parking:both": "no"})
+    place.way([(20, 0), (20, 60)], SERVICE).way([(20, 30), (60, 30)], AISLE)
+    place.box(15, 20, 65, 45, {"amenity": "parking", "name": "Markt", "capacity": "20", "maxstay": "2 hours"})
+    for k in range(8):
+        place.box(
+            22 + 2.5 * k, 33, 24.5 + 2.5 * k, 38, SPACE, **({"parking_space": "disabled"} if k == 0 else {})
+        )
+    town = draft(place, tmp_path)
+    row, lot = row_of(town, "Markt"), town.draft.lot()
+    assert (row["capacity"], row["slots"], row["tagged"]) == (20, 8, 20)
+    zones = [lot.zone_rules[name] for name in lot.slot_zone[:8]]
+    assert [zone.users for zone in zones] == [("disabled",), *[("public",)] * 7]
+    assert zones[1].max_stay_s == 7200.0
+
+
+def test_parking_that_no_street_reaches_is_left_out(tmp_path):
+    place = (
+        grid()
+        .box(1000, 1000, 1040, 1040, {"amenity": "parking"})
+        .box(90, 90, 95, 95, {"amenity": "parking", "access": "no"})
+    )
+    town = draft(place, tmp_path)
+    assert "parking farther than 150 m from every street" in left_out(town)
+    assert "parking with access=no" in left_out(town)
+
+
+@pytest.mark.parametrize(
+    ("text", "capacity"), [("12", 12), ("> 110", 110), ("ca. 60", 60), ("many", None), ("", None)]
+)
+def test_capacities_are_read_with_what_stands_around_them(text, capacity):
+    assert tagged_capacity({"capacity": text}) == capacity
+
+
+# ---- rules ----
+
+
+@pytest.mark.parametrize(
+    ("tags", "rules"),
+    [
+        ({}, Rules()),
+        ({"fee": "no", "maxstay": "30 min"}, Rules(max_stay_s=1800.0)),
+        ({"fee": "yes"}, Rules(per_hour=PRICE, assumed=True)),
+        ({"fee": "Mo-Fr 09:00-18:00"}, Rules(per_hour=PRICE, charged="Mo-Fr 09:00-18:00", assumed=True)),
+        ({"fee": "yes", "charge": "1.50 EUR/hour"}, Rules(per_hour=1.5)),
+        ({"charge": "0,50 €/30 minutes"}, Rules(per_hour=1.0)),
+        ({"access": "customers", "maxstay": "30 days"}, Rules("customers")),
+        ({"access": "private"}, Rules("private")),
+    ],
+)
+def test_fees_stays_and_access_become_rules(tags, rules):
+    assert rules_of(tags) == rules
+    zone = rules.zone("lot")
+    assert (zone.users, zone.max_stay_s) == ((rules.users,), rules.max_stay_s)
+    assert zone.price.charged == (Hours.parse(rules.charged) if rules.charged else None)
+
+
+@pytest.mark.parametrize(
+    ("tags", "rules"),
+    [
+        (
+            {"parking:right:fee": "yes", "parking:right:maxstay": "2 hours"},
+            Rules(per_hour=PRICE, max_stay_s=7200.0, assumed=True),
+        ),
+        ({"parking:both:restriction": "loading_only"}, Rules("delivery")),
+        ({"parking:both:access": "permit"}, Rules("permit")),
+        ({"parking:condition:right": "residents"}, Rules("permit")),
+        ({"parking:condition:both": "ticket;residents"}, Rules(per_hour=PRICE, assumed=True)),
+        (
+            {"parking:condition:both": "ticket", "parking:condition:both:time_interval": "Mo-Sa 08:00-20:00"},
+            Rules(per_hour=PRICE, charged="Mo-Sa 08:00-20:00", assumed=True),
+        ),
+        ({"parking:left:fee": "yes"}, Rules()),
+    ],
+)
+def test_rules_of_kerbs_are_read_from_both_schemes(tags, rules):
+    assert kerb_rules(tags, "right") == rules
+
+
+# ---- demand ----
+
+
+def test_goals_weigh_by_what_stands_there(tmp_path):
+    lot = draft(grid(), tmp_path).draft.lot()
+    assert set(lot.goal_weights) == {"residents", "commuters", "shoppers", "visitors", "deliveries"}
+    assert len(lot.goals) <= 100
+    # The only shop: all shoppers go to its goal.
+    assert (lot.goal_weights["shoppers"] > 0).sum() == 1
+    houses = 2 * 15 * len(HOUSE_ROWS)
+    assert lot.goal_weights["residents"].sum() == pytest.approx(houses * 16 * 16 * 2 / 1e3, rel=0.02)
+
+
+# ---- the whole way ----
+
+
+def test_a_town_comes_back_from_its_file_and_the_command_writes_its_table(tmp_path):
+    place = grid().box(20, 20, 60, 60, {"amenity": "parking", "name": "P1", "fee": "yes", "capacity": "77"})
+    path, out = tmp_path / "town.osm", tmp_path / "out" / "town.geojson"
+    out.parent.mkdir()
+    path.write_text(place.xml(), encoding="utf-8")
+    done = parkenv("lot", "import", path, "--town", "--out", out, "--picture", tmp_path / "town.png")
+    assert done.returncode == 0, done.stderr
+    town = import_town(path)
+    write_lot(town.draft.lot(), tmp_path / "again.geojson")
+    assert read_lot(out) == read_lot(tmp_path / "again.geojson") == town.draft.lot()
+    with out.with_suffix(".csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert sum(int(row["capacity"]) for row in rows) == read_lot(out).capacity.sum()
+    assert {row["capacity_from"] for row in rows} == {"tag", "rule"}
+    assert json.loads(out.read_text(encoding="utf-8"))["import"]["guesses"]
+    assert (tmp_path / "town.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("place", "message"),
+    [
+        (Map().box(0, 0, 9, 9, {"amenity": "parking"}), "no street in it"),
+        (Map().way([(0, 0), (90, 0)], STREET, oneway="yes"), "no street in it leads back"),
+        (grid(**{"parking:both": "no"}), "no parking in it"),
+    ],
+)
+def test_what_is_no_town_is_refused_in_one_line(tmp_path, place, message):
+    path = tmp_path / "town.osm"
+    path.write_text(place.xml(), encoding="utf-8")
+    done = parkenv("lot", "import", path, "--town", "--out", tmp_path / "town.geojson")
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert [p.name for p in tmp_path.iterdir()] == ["town.osm"]
+
+
+def test_a_town_is_no_place_of_entries_and_car_parks(tmp_path):
+    for option in (("--split",), ("--entry", "0,0"), ("--bounds", "0,0,9,9")):
+        done = parkenv(
+            "lot", "import", tmp_path / "a.osm", "--town", *option, "--out", tmp_path / "a.geojson"
+        )
+        assert done.returncode == 2
+        assert "--town" in done.stderr
+
+
+# ---- real towns ----
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not EXTRACTS, reason="the extracts of OpenStreetMap, which README of shared/data names, are not here"
+)
+@pytest.mark.parametrize("path", EXTRACTS, ids=lambda path: path.name.split("_")[0])
+def test_real_extracts_become_towns(path):
+    pytest.importorskip("osmium", reason="the extra osm is not installed")
+    town = import_town(path)
+    lot = town.draft.lot()
+    assert float(town.draft.found[0].split("km, ")[1].split("%")[0]) >= 95.0
+    elements = {e.id: e.tags for e in read_map(path).elements if e.tags.get("amenity") == "parking"}
+    listed = {row["element"] for row in town.facilities} & set(elements)
+    lost = {name for left in town.draft.left_out for name in left.ids}
+    assert len(listed) >= 0.95 * len(elements)
+    assert set(elements) - listed <= lost
+    for row in town.facilities:
+        said = tagged_capacity(elements.get(row["element"], {}))
+        if said and row["kind"] != "kerb":
+            assert row["capacity"] >= said, row
+            assert row["capacity"] == said or row["capacity_from"] == "drawn"
+    assert sum(row["capacity"] for row in town.facilities) == lot.capacity.sum()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not (TOWNS / "neukoelln_kerb").exists(), reason="the kerbs of Neukölln are not here")
+def test_the_rule_of_kerbs_holds_where_all_are_known():
+    from parkenv.lots.builders.parking_rules import fit_kerbs, kerb_table
+
+    roads, free, places = kerb_table(TOWNS / "neukoelln_kerb")
+    assert places.sum() == pytest.approx(43_863, rel=0.01)
+    kind = [road.tags["highway"] for road in roads]
+    _, street = np.unique([road.tags.get("name", road.id) for road in roads], return_inverse=True)
+    half = street % 2 == 0
+    for chosen in (half, ~half):
+        rule = fit_kerbs(roads, free, places, chosen)
+        expected = np.array([rule.get(name, 0.0) for name in kind]) * free
+        judged = ~chosen
+        assert expected[judged].sum() == pytest.approx(places[judged].sum(), rel=0.1)
+        by_street = [np.bincount(street[judged], values[judged]) for values in (expected, places)]
+        assert np.corrcoef(by_street)[0, 1] > 0.85
