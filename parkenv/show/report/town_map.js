@@ -105,7 +105,28 @@ class TownView extends LotView {
       context.fillStyle = colorOf(chosen) ?? palette.wall;
       context.fill(this.blocks[chosen], "evenodd");
     }
+    this.drawSigns();
     this.drawScale();
+  }
+
+  /** Write P on car parks and garages that are large enough in the picture. */
+  drawSigns() {
+    const { context } = this;
+    context.setTransform(this.ratio, 0, 0, this.ratio, 0, 0);
+    context.textAlign = "center";
+    context.textBaseline = "middle";
+    context.fillStyle = palette.halo;
+    for (const { type, at, slots } of this.town.blocks) {
+      const side = Math.sqrt(6 * slots) * this.at.scale;
+      if (type === "kerb" || type === "zone" || side < 14) continue;
+      const [x, y] = this.toPixels(at);
+      if (x < 0 || y < 0 || x > this.width || y > this.height) continue;
+      context.font = `700 ${Math.min(Math.round(0.62 * side), 30)}px system-ui, sans-serif`;
+      context.fillText("P", x, y + 1);
+    }
+    context.textAlign = "start";
+    context.textBaseline = "alphabetic";
+    this.toMetres(context);
   }
 }
 

@@ -449,9 +449,8 @@ class FleetStudy(Study):
                         [one.patience.mean_s for one in purposes], weights=[one.expected for one in purposes]
                     )
                 )
-            share, most_s = self._roads[name].reach(patience_s)
             its = {"patience_s": patience_s, "v_drive_kmh": 3.6 * scenario.v_drive}
-            rows.append({"scenario": name, **its, "share_reached": share, "most_reached_s": most_s})
+            rows.append({"scenario": name, **its, **self._roads[name].reach(patience_s)})
         return rows
 
     @property

@@ -94,14 +94,21 @@ def unreached(reach: Sequence[Row], rows: Sequence[Row]) -> list[str]:
     """Say of a town that is too large for the patience of its drivers why they find no slot although many are free.
 
     Args:
-        reach: `scenario`, `patience_s`, `v_drive_kmh`, `share_reached`, `most_reached_s`, see `Roads.reach`.
+        reach: `scenario`, `patience_s`, `v_drive_kmh`, and `Roads.reach`.
         rows: of `summarize_days`.
     """
     said = []
     for its in reach:
         gone = [row for row in rows if row["scenario"] == its["scenario"] and row["occupancy"] < ROOM]
         most = max(gone, key=lambda row: row["balked_fraction"], default=None)
-        if most is None or most["balked_fraction"] < NOTICED or its["share_reached"] > 1.0 - NOTICED:
+        if most is None or most["balked_fraction"] < NOTICED:
+            continue
+        if its["entries_cut_off"]:
+            said.append(
+                f"On {its['scenario']}, most spaces cannot be reached from {its['entries_cut_off']} of the "
+                f"{its['entries']} entries: look at the streets there (parkenv lot show --graph)."
+            )
+        if its["share_reached"] > 1.0 - NOTICED:
             continue
         minutes, most_minutes = its["patience_s"] / 60.0, math.ceil(its["most_reached_s"] / 60.0)
         said.append(
