@@ -62,7 +62,7 @@ class Neighborhood:
         table, own_rate = RoadTable.over(neighbors, problem.move_cost_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
         own_rate[slots[own]] = rates.seen[own]
-        cost_s = problem.arrival_cost_s[vertices[:n_slots]]
+        cost_s = problem.finite_cost_s[vertices[:n_slots]]
         return cls(vertices, n_slots, whole, entry, table, starts, views, own_rate, cost_s)
 
     @property

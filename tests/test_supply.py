@@ -165,7 +165,7 @@ def test_who_may_park_where_and_when():
     assert evening.tolist() == [0.0, 0.0, np.inf]
     free = scenario.replace(tariff=Tariff({"inner": 0.0}), stay_s=1800.0)
     assert free.parking_cost_s[-1] == 0.0
-    assert free.replace(walk_back=True).arrival_cost_s[-1] == 2 * free.arrival_cost_s[-1]
+    assert free.replace(walk_back=True).walk_s[-1] == 2 * free.walk_s[-1]
     with pytest.raises(InputError, match="did you mean 'permit-a'"):
         scenario.replace(classes=("permit",))
 

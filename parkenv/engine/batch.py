@@ -20,6 +20,7 @@ from parkenv.engine.belief_memory import BeliefMemory
 from parkenv.engine.kernel import (
     arrive,
     init_prior,
+    observe_live,
     refresh_belief,
     step_cost_s,
     sum_of_costs,
@@ -39,7 +40,7 @@ from parkenv.engine.records import (
     search_at,
 )
 from parkenv.engine.spaces import space_of
-from parkenv.world.occupancy.kernel import PROCESS_KIND, inlined, kernel, prefetch_forecast
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import EDGE
 
 _LINE = 64  # bytes of a cache line
@@ -210,6 +211,9 @@ def arrive_all(address: int, which: BoolArray) -> None:
             search = search_at(address, e)
             search.episode += 1
             arrive(search)
+            scenario = scenario_at(search.scenario, 0)
+            if scenario.n_live > 0 and scenario.prior_kind != EXTERNAL_KIND:
+                observe_live(search)
 
 
 @inlined

@@ -6,6 +6,9 @@ after which cars observe. Then the cars that have to decide do so one after anot
 ended. A decision acts at once: of two cars before the same slot the first gets it, the second has a failed attempt.
 The next moment is that of the next event.
 
+A counted facility is one slot: a car that parks there stands in line before its barrier, drives inside, and then its
+search ends.
+
 A car that manoeuvres, or stands, blocks the vertex where it is. A car that would reach a blocked vertex waits before
 it, and blocks the vertex that it comes from, so queues grow backwards. Cars that leave soon show it by their lights; a
 car that stands before such a slot holds it against others, until it drives on.
@@ -30,7 +33,6 @@ from parkenv.compiled.memory import (
     int32s,
     int64_array,
     int64s,
-    prefetch,
 )
 from parkenv.engine.kernel import (
     SCENARIO_BYTES,
@@ -43,6 +45,7 @@ from parkenv.engine.kernel import (
     init_prior,
     leaves_soon,
     observe,
+    publish_count,
     refresh_belief,
     sum_of_costs,
     write_clock,
@@ -51,9 +54,6 @@ from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report
 from parkenv.engine.policy import LEAVE, TAKE_SLOT
 from parkenv.engine.records import (
     BALKED,
-    BLOCK,
-    BLOCK_BITS,
-    CAR,
     GAVE_UP,
     LEFT,
     N_ACTIONS,
@@ -62,12 +62,10 @@ from parkenv.engine.records import (
     NO_SLOT,
     PARKED,
     RESERVE_KNOWLEDGE,
-    SEARCH,
     SEARCHING,
-    SHARED_SLOT,
-    SLOT,
     TRUNCATED,
     car_at,
+    counted_at,
     fleet_at,
     scenario_at,
     search_at,
@@ -76,7 +74,6 @@ from parkenv.engine.records import (
 )
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
-from parkenv.world.scenario import EDGE
 
 (
     FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,
@@ -85,11 +82,6 @@ from parkenv.world.scenario import EDGE
 needed; Python must compute the forecast of the car `pending`; a compiled policy chose an unknown action; more room for
 reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
-_MANY_STEPS = 64  # cars on their way, from which on their data does not stay in the cache
-_SEARCH_AT = int(CAR.fields["search"][1])  # type: ignore[index]
-_LINE = 64  # bytes of a cache line
-CAR_BYTES, SEARCH_BYTES, SLOT_BYTES = CAR.itemsize, SEARCH.itemsize, SLOT.itemsize
-BLOCK_BYTES, SHARED_BYTES, EDGE_BYTES = BLOCK.itemsize, SHARED_SLOT.itemsize, EDGE.itemsize
 _ON_TICK = 1e-9  # fraction of a tick
 
 
@@ -110,6 +102,23 @@ def begin_world_at(address: int) -> None:
     fleet.n_searching = fleet.n_parked = fleet.n_gone = fleet.n_decisions = 0
     fleet.searching_s = fleet.parked_s = 0.0
     fleet.n_kept_steps = 0
+    while fleet.next_car < fleet.n_cars and car_at(fleet.cars, fleet.next_car).parked_at >= 0:
+        _stand(fleet, fleet.next_car)
+        fleet.next_car += 1
+
+
+@kernel
+def _stand(fleet: Any, number: int) -> None:
+    """Let a car stand in its slot when the world begins."""
+    car = car_at(fleet.cars, number)
+    car.state, car.slot, car.ended_at = PARKED, car.parked_at, fleet.time
+    if car.slot >= fleet.first_counted:
+        counted_at(fleet.counted, car.slot - fleet.first_counted).n_cars += 1
+    else:
+        shared = shared_slot_at(fleet.slots, car.slot)
+        shared.car, shared.leaves_at = number, fleet.time + car.stay_s
+    fleet.n_parked += 1
+    _add_departure(fleet, fleet.time + car.stay_s, number)
 
 
 @kernel
@@ -211,33 +220,8 @@ def _next_event(fleet: Any) -> int:
         number = np.int64(int32s(fleet.step_cars)[0])
         times, cars, ranks = _heap(fleet, fleet.step_times, fleet.step_cars)
         fleet.n_steps_to_end = pop(times, cars, fleet.n_steps_to_end, ranks)
-        if fleet.n_steps_to_end >= _MANY_STEPS:
-            _prefetch_next(fleet)
         _reach(fleet, number)
     return 0
-
-
-@inlined
-def _prefetch_next(fleet: Any) -> None:
-    """Load what the next steps need: in a town, much of the time would be waiting for memory."""
-    cars = int32s(fleet.step_cars)
-    for i in range(3, 7):
-        prefetch(fleet.cars + CAR_BYTES * np.int64(cars[i]) + _SEARCH_AT)
-    for i in range(1, 3):
-        address = car_at(fleet.cars, np.int64(cars[i])).search
-        for line in range(0, SEARCH_BYTES, _LINE):
-            prefetch(address + line)
-    search = search_at(car_at(fleet.cars, np.int64(cars[0])).search, 0)
-    scenario, vertex, block = scenario_at(search.scenario, 0), search.vertex, search.n_columns >> BLOCK_BITS
-    prefetch(scenario.edges + EDGE_BYTES * N_ACTIONS * vertex)
-    prefetch(search.slots + SLOT_BYTES * search.n_columns)
-    for line in range(0, BLOCK_BYTES, _LINE):
-        prefetch(search.blocks + BLOCK_BYTES * block + line)
-    first = int64s(scenario.view_starts)[vertex]
-    if first < int64s(scenario.view_starts)[vertex + 1]:
-        slot = int64s(scenario.viewed)[first]
-        prefetch(search.columns + 4 * slot)
-        prefetch(fleet.slots + SHARED_BYTES * slot)
 
 
 @inlined
@@ -308,6 +292,7 @@ def _arrive(fleet: Any) -> int:
     fleet.reservations_stale = True
     search = search_at(car.search, 0)
     search.place, search.car = car.place, number
+    search.walks, search.n_forbidden = car.walks, car.n_forbidden
     search.zone_cost_s = fleet.zone_cost_s
     if fleet.zone_cost_s != 0:
         search.zone_cost_s += 8 * fleet.n_zones * number
@@ -333,6 +318,11 @@ def _reach(fleet: Any, number: int) -> None:
     """End the step of a car: it observes, and is asked again unless its search is over."""
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
+    if search.parked:
+        complete_step(search)
+        _end_search(fleet, number, PARKED)
+        _add_departure(fleet, fleet.time + car.stay_s, number)
+        return
     until = blocked_until(fleet, car, number)
     if until > fleet.time:
         _queue(fleet, car, search, number, until)
@@ -380,8 +370,13 @@ def _inform(fleet: Any, number: int) -> None:
 @inlined
 def _depart(fleet: Any, number: int) -> None:
     car = car_at(fleet.cars, number)
-    shared_slot_at(fleet.slots, car.slot).car = NO_CAR
-    block_lane(fleet, car.slot, fleet.time + fleet.manoeuvre_s, number)
+    if car.slot >= fleet.first_counted:
+        counted = counted_at(fleet.counted, car.slot - fleet.first_counted)
+        publish_count(counted, fleet.time)
+        counted.n_cars -= 1
+    else:
+        shared_slot_at(fleet.slots, car.slot).car = NO_CAR
+        block_lane(fleet, car.slot, fleet.time + fleet.manoeuvre_s, number)
     if car.shares:
         report_slot(fleet, car.slot, False, 1.0, 0.0, 0.0)
     car.state, car.left_at = LEFT, fleet.time
@@ -414,6 +409,9 @@ def act(fleet: Any, number: int, action: int) -> bool:
     car.queues_since = np.inf
     drive_or_park(search, action)
     car.stands, car.vertex = search.vertex == car.vertex, search.vertex
+    if search.parked and search.vertex >= fleet.first_counted:
+        _enter_facility(fleet, car, search, number)
+        return True
     if search.parked:
         complete_step(search)
         shared = shared_slot_at(fleet.slots, search.vertex)
@@ -436,6 +434,31 @@ def act(fleet: Any, number: int, action: int) -> bool:
     if fleet.step_capacity > 0:
         _keep_step(fleet, search, number, origin)
     return True
+
+
+@kernel
+def _enter_facility(fleet: Any, car: Any, search: Any, number: int) -> None:
+    """Let a car into a counted facility with room: it waits before the barrier, and drives to a space inside.
+
+    Its place counts as taken from now on; its stay begins, and its search ends, when it has reached the space.
+    """
+    counted = counted_at(fleet.counted, search.vertex - fleet.first_counted)
+    publish_count(counted, fleet.time)
+    empty_s, full_s = counted.inside_s[0], counted.inside_s[1]
+    inside_s = empty_s + (full_s - empty_s) * (counted.n_cars / counted.capacity)
+    counted.n_cars += 1
+    car.slot, search.previous_vertex = search.vertex, search.vertex
+    if car.shares:
+        is_full = counted.n_cars >= counted.capacity
+        report_slot(fleet, car.slot, is_full, 1.0, 0.0, 1.0 if is_full else 0.0)
+    opens = max(fleet.time, counted.gate_free_at)
+    counted.gate_free_at = opens + counted.gate_s
+    car.queued_s += opens - fleet.time
+    search.step_drive_s = opens - fleet.time + counted.gate_s + inside_s
+    search.time = fleet.time + search.step_drive_s
+    if fleet.tick_s > 0.0:
+        _round_up(fleet, search)
+    _add_end(fleet, search.time, number)
 
 
 @inlined

@@ -43,6 +43,7 @@ from parkenv.engine.policy import CompiledPolicy
 from parkenv.engine.records import (
     BACKGROUNDS,
     CAR,
+    COUNTED,
     DUE,
     FLEET,
     LIVE_SLOT,
@@ -64,6 +65,7 @@ from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import CarPlans, Demand, TownDemand
+from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.occupancy.kernel import LOG_KIND, RECORDED_DAY, SHARED_KIND, draw_arrival
 from parkenv.world.occupancy.process import Arrival
 from parkenv.world.occupancy.python_functions import raise_error
@@ -163,7 +165,8 @@ class Fleet:
     | `reserved` | `Box(-1, 1, (n_slots,), int8)` | 1: reserved for this car; -1: it knows of none | `reserve` |
     | `leaving` | `Box(0, 1, (n_slots,), int8)` | slots in view whose cars leave soon | `leaving_soon_s` |
     | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
-    | `stay_s` | `Box(0, inf, (1,), float32)` | the car's own stay, s, which it pays for | prices |
+    | `stay_s` | `Box(0, inf, (1,), float32)` | the car's own stay, s, which it pays for | rules of zones |
+    | `driver` | `Box(0, inf, (6,), float64)` | its `Drivers`, and the factor of its walk | rules of zones |
 
     With one car, `Demand(Headways(1))` and the background `process`, the fleet is `parkenv/Search-v2` to the last bit.
 
@@ -259,7 +262,7 @@ class Fleet:
         self._moves: list[NDArray[np.uint8]] = []
         self._row: dict[int, tuple[Searches, int]] = {}
         self._copiers: dict[int, tuple[Callable[[], NDArray[Any]], ...]] = {}
-        self._copy_masks = [mask.copy for mask in self.scenario.action_masks]
+        self._copy_masks = [mask.copy for mask in self.scenario.graph_masks]
         self._cars = np.zeros(0, CAR)
         self._record["background"] = BACKGROUNDS.index(background)
         self._record["max_steps"] = max_steps
@@ -267,6 +270,7 @@ class Fleet:
             self._record[name] = value
         self.sees_cars, self.leaving_soon_s = bool(sees_cars), float(leaving_soon_s)
         self._record["n_slots"], self._record["n_vertices"] = lot.n_slots, lot.n_vertices
+        self._record["first_counted"] = lot.n_slots - np.count_nonzero(lot.is_counted)
         self._record["scenarios"] = self._tables.records.ctypes.data
         self.slots = np.zeros(lot.n_slots, SHARED_SLOT)
         cost_s = np.array([one.arrival_cost_s for one in self.scenarios])
@@ -276,7 +280,12 @@ class Fleet:
             "blocked_until": np.zeros(lot.n_vertices),
             "blocked_by": np.zeros(lot.n_vertices, np.int64),
             "by_cost": np.argsort(cost_s, axis=1, kind="stable").astype(np.int64),
+            "counted": _counted(lot),
         }
+        if self.scenario.has_rules:
+            # Where a car may park depends on its driver.
+            self._masks = np.ascontiguousarray(self.scenario.graph_masks, np.uint8)
+            self._tables.records["action_masks"] = address_of(self._masks, self._masks.dtype)
         work["policy_data"] = self._policy_data()
         self._kept: dict[str, NDArray[Any]] = {}
         self._keep(work)
@@ -348,8 +357,8 @@ class Fleet:
 
     def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
         plans = self.demand.draw(key, arrival_s, len(self._entries), self.day)
-        if plans.parked.any() or plans.walks_back.any():
-            raise InputError("Demand.parked and Demand.walks_back are not for fleets yet")
+        if plans.parked.any():
+            raise InputError("Demand.parked is not for fleets yet")
         n = len(plans.arrival_s)
         cars = np.zeros(n, CAR)
         cars["arrival"] = midnight + plans.arrival_s
@@ -367,6 +376,8 @@ class Fleet:
         cars["policy"] = np.array(policies, np.int64)[cars["kind"]]
         cars["knows"] = np.array([KNOWLEDGE.index(kind.knows) for kind in self.drivers])[cars["kind"]]
         cars["shares"] = np.array([kind.shares for kind in self.drivers])[cars["kind"]]
+        cars["purpose"], cars["parked_at"] = plans.purpose, NO_CAR
+        cars["walks"] = 1.0 if self.scenario.walk_back else np.where(plans.walks_back, 2.0, 1.0)
         cars["state"], cars["slot"] = DUE, NO_CAR
         cars["ended_at"] = cars["left_at"] = np.inf
         self._cars = cars
@@ -375,14 +386,19 @@ class Fleet:
         self._states, self._vertices, self._addresses = cars["state"], cars["vertex"], cars["search"]
         capacity = max(n, sum(len(one.records) for one in self._pool))
         self._record["n_cars"], self._record["n_free"] = n, 0
-        if self.scenario.has_rules:
+        self._record["zone_cost_s"] = 0
+        if self.scenario.has_rules or (cars["walks"] != 1.0).any():
             drivers = self.drivers_of(slice(None))
             if not np.isfinite(self.scenario.zone_price(drivers)).all():
                 raise InputError(
                     "Demand.stays: a stay is infinite, want finite ones where parking has a price"
                 )
-            self._keep({"zone_cost_s": self.scenario.zone_cost_s(drivers)})
-            self._record["n_zones"] = len(self.scenario.lot.zones)
+            zone_cost_s, lot = self.scenario.zone_cost_s(drivers), self.scenario.lot
+            self._keep({"zone_cost_s": zone_cost_s})
+            self._record["n_zones"] = len(lot.zones)
+            slots_in = np.bincount(lot.zone_of_slot, minlength=len(lot.zones))
+            cars["n_forbidden"] = np.isinf(zone_cost_s) @ slots_in
+        self._require_room(cars["parked_at"][cars["parked_at"] >= 0])
         self._keep(
             {
                 "cars": cars,
@@ -570,7 +586,8 @@ class Fleet:
         """Assign free slots to the searching cars of the guidance system, at the least total time."""
         cars = self._cars
         members = np.flatnonzero((cars["state"] == SEARCHING) & (cars["knows"] == KNOWLEDGE.index("reserve")))
-        free = np.flatnonzero(~self.taken())
+        room = np.minimum(self.scenario.lot.capacity - self.counts(), len(members))
+        free = np.repeat(np.arange(len(room)), np.maximum(room, 0))
         reserved = np.full(len(members), NO_SLOT)
         if len(free):
             cost_s = np.array([self._time_to_slots(int(car))[free] for car in members])
@@ -593,8 +610,20 @@ class Fleet:
 
     def arrival_cost_s(self, car: int) -> NDArray[np.float64]:
         """Return what arriving in each slot costs a car, (n_slots,) s: walk, and parking for its own stay."""
-        problem = self.scenarios[self._cars["place"][car]]
-        return np.asarray(problem.walk_s + problem.parking_cost_of(self.drivers_of(car)))
+        problem, walks = self.scenarios[self._cars["place"][car]], self._cars["walks"][car]
+        return np.asarray(
+            problem.walk_s * walks + problem.parking_cost_of(self.drivers_of(car)) + problem.enter_s
+        )
+
+    def _require_room(self, parked_at: NDArray[np.int64]) -> None:
+        """Require room for the cars that stand in slots when the world begins."""
+        lot = self.scenario.lot
+        over = np.flatnonzero(np.bincount(parked_at, minlength=lot.n_slots) > lot.capacity)
+        if len(over):
+            raise InputError(
+                f"parked: {np.count_nonzero(parked_at == over[0])} cars begin in slot {lot.slot_ids[over[0]]!r:.40}, "
+                f"want at most {lot.capacity[over[0]]}"
+            )
 
     def zone_cost_s(self) -> NDArray[np.float64]:
         """Return what parking in each zone costs each car, (n_cars, n_zones) s; see `SearchProblem.zone_cost_s`."""
@@ -617,6 +646,7 @@ class Fleet:
             further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
         if self.scenario.has_rules:
             further["stay_s"] = spaces.Box(0.0, np.inf, (1,), np.float32)
+            further["driver"] = spaces.Box(0.0, np.inf, (6,), np.float64)
         if self.sees_cars:
             further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
         return spaces.Dict(dict(space.items()) | further)
@@ -632,7 +662,7 @@ class Fleet:
             "belief": belief(),
             "step_observed": step_observed(),
             "day_error": day_error(),
-            "action_mask": self._copy_masks[vertex](),
+            "action_mask": self._mask(car, vertex),
         }
         if self._reserves:
             searches, row = self._row[address]
@@ -643,6 +673,7 @@ class Fleet:
             observation["leaving"] = self._leaving_in_view(int(vertex))
         if self.scenario.has_rules:
             observation["stay_s"] = np.float32(self._cars["stay_s"][[car]])
+            observation["driver"] = np.array([*self.drivers_of(car), self._cars["walks"][car]], np.float64)
         if self.sees_cars:
             observation["cars"] = self._cars_in_view(car, int(vertex))
         return observation
@@ -658,7 +689,14 @@ class Fleet:
         around = self._surroundings[k]
         local = np.empty(FIRST_NEAR + PER_NEAR * k, np.float32)
         observe_surroundings_at(address, around, local)
-        return {"local": local, "action_mask": self._copy_masks[self._vertices[car]]()}
+        return {"local": local, "action_mask": self._mask(car, self._vertices[car])}
+
+    def _mask(self, car: int, vertex: int) -> NDArray[np.int8]:
+        """Return the actions that a car has at a vertex, (5,): those of the graph, and parking where it may."""
+        mask: NDArray[np.int8] = self._copy_masks[vertex]()
+        if mask[PARK] and self.scenario.has_rules:
+            mask[PARK] = np.isfinite(self._kept["zone_cost_s"][car, self.scenario.lot.zone_of_slot[vertex]])
+        return mask
 
     def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
         """Return which slots in view of a vertex hold a car that shows that it leaves, (n_slots,)."""
@@ -727,6 +765,12 @@ class Fleet:
         )
         return CarPoses(xy[ahead] + share[:, None] * step, yaw)
 
+    def counts(self) -> NDArray[np.int64]:
+        """Return how many cars are in each slot now, (n_slots,): at most 1, but for counted facilities."""
+        counts, counted = self.taken().astype(np.int64), self._kept["counted"]["n_cars"]
+        counts[len(counts) - len(counted) :] = counted
+        return counts
+
     def taken(self) -> NDArray[np.bool_]:
         """Return whether each slot is taken now, (n_slots,)."""
         taken = np.zeros(len(self.slots), np.bool_)
@@ -765,6 +809,16 @@ class Fleet:
     def __reduce__(self) -> tuple[Callable[..., Fleet], tuple[Any, ...]]:
         """Copies and pickles are fleets before their first reset: records hold addresses of this process."""
         return partial(Fleet, **self._options), (self.scenario, self.demand)
+
+
+def _counted(lot: ParkingLot) -> NDArray[Any]:
+    """Return the COUNTED records of a lot's counted facilities."""
+    facilities = [facility for facility in lot.facilities if facility.is_counted]
+    counted = np.zeros(len(facilities), COUNTED)
+    for record, facility in zip(counted, facilities, strict=True):
+        for name in ("capacity", "gate_s", "inside_s", "delay_s"):
+            record[name] = getattr(facility, name)
+    return counted
 
 
 def drive_times(problem: SearchProblem, vertex: int) -> NDArray[np.float64]:

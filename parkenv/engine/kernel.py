@@ -8,6 +8,7 @@ Functions named `..._at` take an address: that of a record of `Searches`, where 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -45,6 +46,7 @@ from parkenv.engine.records import (
     SENTINEL,
     UNGUIDED,
     block_at,
+    counted_at,
     edge_at,
     scenario_at,
     search_at,
@@ -59,6 +61,9 @@ from parkenv.world.occupancy.kernel import EXTERNAL_KIND, LOG_KIND, PROCESS_KIND
 from parkenv.world.week import DAY_S, WEEK_HOURS
 from parkenv.world.week_hours import hour_of_week
 
+_LOGISTIC = 1.702  # the logistic law of z times this is closest to the normal one
+_SURE = 8.0  # standard deviations beyond which a facility is surely full, or not
+_ABOVE = 1e-3  # how far above its forecast a facility is at least whose count says that it is full
 STEP_RESULT = ("reward", *REWARD_TERMS, *METRICS, "over", "vertex")
 """Names of the numbers that a step returns; metrics are those of the episode so far."""
 
@@ -122,11 +127,11 @@ def step_exact_at(address: int, action: int) -> tuple[Any, ...]:
 
 @kernel
 def step_noisy_at(address: int, action: int) -> tuple[Any, ...]:
-    """Take a valid action with a noisy sensor; returns as `step_result`."""
+    """Take a valid action with a noisy sensor, or live counts; returns as `step_result`."""
     search = search_at(address, 0)
     drive_or_park(search, action)
     if not search.parked:
-        observe_noisy(search)
+        observe_otherwise(search)
     result: tuple[Any, ...] = complete_step(search)
     return result
 
@@ -278,6 +283,7 @@ def arrive(search: Any) -> None:
     if search.chosen_entry > 0:
         entry = search.chosen_entry - 1
     search.chosen_place = search.chosen_entry = search.chosen_day = 0
+    search.n_forbidden = scenario.n_forbidden
     enter(search, key, day, arrival, midnight, int64s(scenario.entries)[entry])
 
 
@@ -286,7 +292,7 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
     """Begin a search of the record's scenario at a time and a vertex, without observations.
 
     Args:
-        search: a SEARCH record with `scenario` and `place`.
+        search: a SEARCH record with `scenario`, `place` and `n_forbidden`.
         key: key of the world.
         day: index of the weekday or recorded day among the scenario's.
         arrival: s since Monday 00:00.
@@ -309,7 +315,9 @@ def enter(search: Any, key: np.uint64, day: int, arrival: float, midnight: float
     search.total_s = search.driven_m = search.walked_m = 0.0
     search.n_observed_free = search.n_expected_free = 0.0
     search.failed_parks = search.slots_passed = search.n_steps = search.n_observed = 0
-    search.n_last_observed_taken = search.n_step_observed = 0
+    search.n_step_observed = 0
+    # Slots in which the driver may not park are as good as taken.
+    search.n_last_observed_taken = search.n_forbidden
     search.remembered_slot, search.reserved = NO_SLOT, UNGUIDED
     _write_day_error(search)
 
@@ -366,15 +374,20 @@ def drive_or_park(search: Any, action: int) -> None:
     elif action == PARK and vertex < scenario.n_slots:
         column = column_of(search, vertex)
         taken = is_taken(search, column, search.time)
-        if taken:
-            search.failed_parks += 1
-            search.step_failed_s = scenario.failure_s
+        if search.n_forbidden > 0 and is_forbidden(search, vertex):
+            search.step_drive_s = scenario.wait_s
         else:
-            search.parked = True
-            search.step_walk_s = float64s(scenario.walk_s)[vertex]
-            search.step_parking_cost_s = parking_cost_s(search, vertex)
-            search.walked_m = float64s(scenario.walk_m)[vertex]
-        observe_attempt(search, column, taken)
+            if taken:
+                search.failed_parks += 1
+                search.step_failed_s = scenario.failure_s
+            else:
+                search.parked = True
+                search.step_walk_s = float64s(scenario.walk_s)[vertex] * search.walks
+                search.step_parking_cost_s = parking_cost_s(search, vertex)
+                search.walked_m = float64s(scenario.walk_m)[vertex] * search.walks
+                if scenario.enter_s != 0:
+                    search.step_drive_s += float64s(scenario.enter_s)[vertex]
+            observe_attempt(search, column, taken)
     search.time += search.step_drive_s + search.step_failed_s
     search.n_steps += 1
 
@@ -387,6 +400,12 @@ def parking_cost_s(search: Any, slot: int) -> float:
         return float(float64s(scenario.parking_cost_s)[slot])
     zone = int64s(scenario.zone_of_slot)[slot]
     return float(float64s(scenario.lot_cost_s)[slot] + float64s(search.zone_cost_s)[zone])
+
+
+@inlined
+def is_forbidden(search: Any, slot: int) -> bool:
+    """Return whether the driver may not park in a slot."""
+    return bool(parking_cost_s(search, slot) == np.inf)
 
 
 @inlined
@@ -435,7 +454,91 @@ def observe(search: Any) -> None:
     if scenario_at(search.scenario, 0).exact_sensor:
         observe_exact(search)
     else:
+        observe_otherwise(search)
+
+
+@kernel
+def observe_otherwise(search: Any) -> None:
+    """Observe the slots in view with a noisy sensor, or with live counts beside."""
+    if scenario_at(search.scenario, 0).n_live == 0:
         observe_noisy(search)
+        return
+    if scenario_at(search.scenario, 0).no_errors:
+        observe_exact(search)
+    else:
+        observe_noisy(search)
+    observe_live(search)
+
+
+@kernel
+def observe_live(search: Any) -> None:
+    """Take in the live counts of facilities; those in view are known exactly.
+
+    A full facility is an observation of a taken slot, another one of a free slot, with P(full) on arrival there. Where
+    that is above the forecast although there is room, the forecast rises to it.
+    """
+    scenario, live = scenario_at(search.scenario, 0), int64s(scenario_at(search.scenario, 0).live)
+    for i in range(scenario.n_live):
+        slot = live[i]
+        column = column_of(search, slot)
+        record, k = slot_at(search.slots, column), column & (BLOCK_SIZE - 1)
+        block = block_at(search.blocks, column >> BLOCK_BITS)
+        in_view = record.observed and block.observed_at[k] == search.time
+        if in_view or (search.n_forbidden > 0 and is_forbidden(search, slot)):
+            continue
+        if scenario.world_kind != SHARED_KIND:
+            taken = is_taken(search, column, search.time)
+            set_belief(search, column, taken, 1.0 if taken else 0.0)
+            continue
+        world = shared_world_at(search.world, 0)
+        counted = counted_at(world.counted, slot - world.first_counted)
+        publish_count(counted, search.time)
+        age_s = search.time - counted.period * counted.delay_s if counted.delay_s > 0.0 else 0.0
+        n_vertices = scenario.n_vertices
+        ahead_s = age_s + float64s(scenario.live_drive_s)[n_vertices * i + search.vertex]
+        forecast, _ = forecast_of(search, slot)
+        p = p_full(forecast, counted.published, counted.capacity, scenario.turnover * ahead_s)
+        taken = counted.published >= counted.capacity
+        block.prior[k] = forecast if taken else max(forecast, p)
+        if search.belief != 0:
+            float32s(search.belief)[FORECAST * search.width + slot] = block.prior[k]
+        set_belief(search, column, taken, max(p, forecast + _ABOVE * (1.0 - forecast)) if taken else p)
+
+
+@kernel
+def p_full(forecast: float, count: float, capacity: float, age: float) -> float:
+    """Return P(a counted facility is full) some time after its count was taken.
+
+    Each car leaves at rate 1 and new ones come as fast as they would fill the facility on average, so the count
+    reverts to its mean: it is binomial of what stays, e^-age, plus Poisson of what has come. Its law is taken as
+    normal, and the normal one as logistic (error below 0.01); the mean is the one at which a facility is full as often
+    as the forecast says. At age 0 the count decides, and in the long run the forecast.
+
+    Args:
+        forecast: P(full) without a count, in (0, 1).
+        count: number of cars.
+        capacity: number of cars that fit.
+        age: time since then, in mean stays.
+    """
+    forecast = min(max(forecast, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY)
+    z = math.log(forecast / (1.0 - forecast)) / _LOGISTIC
+    root = 0.5 * (z + math.sqrt(z * z + 4.0 * (capacity - 0.5)))
+    stay = math.exp(-age)
+    mean = count * stay + root * root * (1.0 - stay)
+    variance = (1.0 - stay) * (count * stay + root * root)
+    above = mean - capacity + 0.5
+    if variance <= 0.0 or abs(above) > _SURE * math.sqrt(variance):
+        return 1.0 if above > 0.0 else 0.0
+    return 1.0 / (1.0 + math.exp(-_LOGISTIC * above / math.sqrt(variance)))
+
+
+@inlined
+def publish_count(counted: Any, time: float) -> None:
+    """Publish the count of a facility as of the last time when that was due; call before it changes."""
+    if counted.delay_s == 0.0:
+        counted.published = counted.n_cars
+    elif math.floor(time / counted.delay_s) > counted.period:
+        counted.published, counted.period = counted.n_cars, math.floor(time / counted.delay_s)
 
 
 @inlined
@@ -607,7 +710,10 @@ def write_belief(search: Any) -> None:
         slot, i = slot_at(slots, column).slot, column & (BLOCK_SIZE - 1)
         block = block_at(blocks, column >> BLOCK_BITS)
         p_occupied[slot] = block.p_occupied[i]
-        belief[P_OBSERVED * width + slot] = block.p_observed[i]
+        belief[FORECAST * width + slot], belief[P_OBSERVED * width + slot] = (
+            block.prior[i],
+            block.p_observed[i],
+        )
         belief[OBSERVED_AT * width + slot] = block.observed_at[i] - arrival
 
 
@@ -653,6 +759,10 @@ def add_column(search: Any, slot: int) -> int:
     record.observed = record.observed_taken = record.passed = False
     block, i = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
     prior, rate = forecast_of(search, slot)
+    if search.n_forbidden > 0 and is_forbidden(search, slot):
+        record.occupied = record.observed_taken = True
+        record.valid_until = np.inf
+        prior, rate = 1.0, 0.0
     block.prior[i] = block.p_observed[i] = block.p_occupied[i] = prior
     block.decay_rate[i], block.observed_at[i] = rate, search.arrival + NEVER_OBSERVED
     return int(column)
@@ -698,11 +808,19 @@ def forecast_of(search: Any, slot: int) -> tuple[float, float]:
     return min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY), rate
 
 
-@kernel
+@inlined
 def init_prior(search: Any) -> None:
-    """Initialise the full belief, if it is kept, with the forecast of every slot."""
-    if search.belief == 0:
-        return
+    """Initialise the full belief, if it is kept, with the forecast of every slot; take in live counts."""
+    if search.belief != 0:
+        _init_full_prior(search)
+    if scenario_at(search.scenario, 0).n_live > 0:
+        observe_live(search)
+        refresh_belief(search)
+
+
+@kernel
+def _init_full_prior(search: Any) -> None:
+    """Initialise the full belief with the forecast of every slot."""
     scenario, width = scenario_at(search.scenario, 0), search.width
     belief, p_occupied, n = float32s(search.belief), float32s(search.p_occupied), scenario.n_slots
     if scenario.prior_kind == PROCESS_KIND:
@@ -710,6 +828,10 @@ def init_prior(search: Any) -> None:
     else:
         for slot in range(n):
             belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot] = forecast_of(search, slot)
+    if search.n_forbidden > 0:
+        for slot in range(n):
+            if is_forbidden(search, slot):
+                belief[FORECAST * width + slot], belief[DECAY_RATE * width + slot] = 1.0, 0.0
     for slot in range(n):
         p_occupied[slot] = belief[P_OBSERVED * width + slot] = belief[FORECAST * width + slot]
         belief[OBSERVED_AT * width + slot] = NEVER_OBSERVED
@@ -753,6 +875,9 @@ def is_shared_slot_taken(address: int, slot: int, time: float) -> bool:
         time: s since Monday 00:00.
     """
     world = shared_world_at(address, 0)
+    if slot >= world.first_counted:
+        counted = counted_at(world.counted, slot - world.first_counted)
+        return bool(counted.n_cars >= counted.capacity)
     shared = shared_slot_at(world.slots, slot)
     if shared.car != NO_CAR:
         return True
@@ -796,7 +921,13 @@ def empty_shared_slots(address: int) -> None:
         shared = shared_slot_at(world.slots, slot)
         shared.sojourn, shared.valid_until = 0, -np.inf
         shared.car, shared.held_by, shared.leaves_at = NO_CAR, NO_CAR, -np.inf
-        if world.background == RESIDENTS_BACKGROUND and _background_state(world, slot, shared, world.arrival):
+        if slot >= world.first_counted:
+            counted = counted_at(world.counted, slot - world.first_counted)
+            counted.n_cars = counted.published = 0
+            counted.gate_free_at = counted.period = -np.inf
+        elif world.background == RESIDENTS_BACKGROUND and _background_state(
+            world, slot, shared, world.arrival
+        ):
             shared.leaves_at = worlds.find_end_of_stay(
                 world.world_kind, world.world, world, slot, shared, world.arrival
             )

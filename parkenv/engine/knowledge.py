@@ -13,7 +13,7 @@ import numpy as np
 
 from parkenv.belief.slot_belief import decay_to_prior
 from parkenv.compiled.memory import float64s, int32s, int64s
-from parkenv.engine.kernel import add_observed, column_of, is_slot_open, set_belief_of
+from parkenv.engine.kernel import add_observed, column_of, is_taken, set_belief_of
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -55,7 +55,8 @@ def report_view(fleet: Any, search: Any) -> None:
         column = np.int64(columns[viewed[i]])
         record = slot_at(search.slots, column)
         block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
-        if record.observed and block.observed_at[k] == search.time:
+        # What the driver may not use counts as taken for it, but not for others.
+        if record.observed and block.observed_at[k] == search.time and record.valid_until < np.inf:
             taken, p = bool(record.observed_taken), block.p_observed[k]
             report_slot(fleet, viewed[i], taken, hit_rate[i], false_alarm_rate[i], p)
 
@@ -107,8 +108,9 @@ def inform(fleet: Any, number: int) -> None:
     elif car.knows == FULL_KNOWLEDGE:
         search.n_step_observed = 0
         for slot in range(fleet.n_slots):
-            taken = not is_slot_open(search.world, slot, number, fleet.time)
-            set_belief_of(search, column_of(search, slot), taken, 1.0 if taken else 0.0, search.time)
+            column = column_of(search, slot)
+            taken = is_taken(search, column, fleet.time)
+            set_belief_of(search, column, taken, 1.0 if taken else 0.0, search.time)
             add_observed(search, slot, taken, 1.0, 0.0)
 
 
@@ -121,6 +123,8 @@ def _inform_by_map(fleet: Any, car: Any, search: Any) -> None:
         if live.time < since or live.time == -np.inf:
             continue
         column = column_of(search, slot)
+        if slot_at(search.slots, column).valid_until == np.inf:
+            continue  # The driver may not park there, whatever others say.
         block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
         hit_rate, false_alarm_rate = live.hit_rate, live.false_alarm_rate
         if live.time >= search.arrival:

@@ -320,7 +320,7 @@ def _is_observed(search: Any, column: int) -> bool:
 
 @inlined
 def _arrival_cost_s(scenario: Any, slot: int) -> float:
-    """Walk from a slot to the goal plus its parking cost, s."""
+    """Walk from a slot to the goal plus its parking cost, s; the time inside a counted facility does not count."""
     return float(float64s(scenario.walk_s)[slot] + float64s(scenario.parking_cost_s)[slot])
 
 
@@ -399,7 +399,7 @@ def _view_s(problem: SearchProblem) -> NDArray[np.float32]:
     starts, slots = problem.slots_in_view
     viewer = np.repeat(np.arange(problem.lot.n_vertices), np.diff(starts))
     away = problem.lot.vertex_xy[slots] - problem.lot.vertex_xy[viewer]
-    seconds = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.arrival_cost_s[slots]
+    seconds = np.hypot(away[:, 0], away[:, 1]) / problem.v_drive + problem.finite_cost_s[slots]
     return seconds.astype(np.float32)
 
 
@@ -407,7 +407,7 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
     """For one lot: the number of slots of each row, and the arrays from `numbers` to `samples` but `starts`."""
     lot = problem.lot
     n = lot.n_vertices
-    neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.arrival_cost_s
+    neighbors, move_s, walk_s = lot.neighbors, problem.move_s, problem.finite_cost_s
     near, near_s, near_move, ahead, ahead_s = _nearest(neighbors, move_s, lot.n_slots, k)
     total_s = ahead_s + np.where(ahead >= 0, walk_s[ahead], np.inf)
     order = np.argsort(total_s, axis=2, kind="stable")

@@ -24,7 +24,7 @@ from parkenv.belief.slot_belief import (
 )
 from parkenv.compiled.keyed_random import POLICY_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_address, float64s, int32s, int64s, uint8s
-from parkenv.engine.kernel import belief_now, forecast_of, parking_cost_s
+from parkenv.engine.kernel import belief_now, forecast_of, is_forbidden, parking_cost_s
 from parkenv.engine.records import (
     BLOCK_BITS,
     BLOCK_SIZE,
@@ -38,6 +38,7 @@ from parkenv.engine.records import (
     search_at,
     slot_at,
 )
+from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import inlined
 from parkenv.world.scenario import SearchProblem
 
@@ -135,9 +136,11 @@ def policy_data(address: int, car: Any) -> int:
 
 @inlined
 def is_allowed(search: Any, action: int) -> bool:
-    """Return whether the graph has an action where the car is."""
+    """Return whether the car may take an action where it is: the graph has it, and the driver may park there."""
     masks = uint8s(scenario_at(search.scenario, 0).action_masks)
-    return bool(masks[search.vertex * N_ACTIONS + action])
+    if not masks[search.vertex * N_ACTIONS + action]:
+        return False
+    return bool(action != PARK or search.n_forbidden == 0 or not is_forbidden(search, search.vertex))
 
 
 @inlined
@@ -148,14 +151,18 @@ def draw_uniform(search: Any) -> float:
 
 @inlined
 def has_own_price(search: Any) -> bool:
-    """Return whether slots have prices, which a car pays for its own stay."""
+    """Return whether arriving costs the car something else than the scenario's driver: zones have rules."""
     return bool(search.zone_cost_s != 0)
 
 
 @inlined
 def arrival_cost_s(search: Any, slot: int) -> float:
-    """Return what arriving in a slot costs the car, s: walk, and parking for its own stay."""
-    return float(float64s(scenario_at(search.scenario, 0).walk_s)[slot] + parking_cost_s(search, slot))
+    """Return what arriving in a slot costs the car, s, as `Fleet.arrival_cost_s`: time inside, walk, own stay."""
+    scenario = scenario_at(search.scenario, 0)
+    cost_s = float64s(scenario.walk_s)[slot] * search.walks + parking_cost_s(search, slot)
+    if scenario.enter_s != 0:
+        cost_s += float64s(scenario.enter_s)[slot]
+    return float(cost_s)
 
 
 @inlined

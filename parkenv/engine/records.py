@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.csgraph import dijkstra
 
-from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at, sparse_zeros, zeros_on_lines
+from parkenv.compiled.arrays import IntArray
+from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at, sparse_zeros
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
@@ -29,11 +31,17 @@ N_ACTIONS = PARK + 1
 SCENARIO = np.dtype(
     [
         ("n_slots", np.int64),
+        ("n_vertices", np.int64),
+        # Whether slots in view are observed without error, and whether that is all that is observed.
+        ("no_errors", np.bool_),
         ("exact_sensor", np.bool_),
         ("failure_s", np.float64),
         ("give_up_s", np.float64),
         # Whether a search ends once every slot was last observed taken.
         ("leave_full_lot", np.bool_),
+        # Cost of a move that the graph does not have, s; number of slots in which the scenario's driver may not park.
+        ("wait_s", np.float64),
+        ("n_forbidden", np.int64),
         # Arrival window and entries: seconds of the day; (n_weekdays,) int64; (n_entries,) int64 vertices.
         ("window_start", np.float64),
         ("window_end", np.float64),
@@ -52,6 +60,14 @@ SCENARIO = np.dtype(
         ("lot_cost_s", ADDRESS),
         # (n_slots,) int64 tariff zone of each slot.
         ("zone_of_slot", ADDRESS),
+        # (n_slots,) float64 expected time from the entry of a counted facility to a space, s, or 0 without any.
+        ("enter_s", ADDRESS),
+        # Facilities with a live count: how many; (n_live,) int64 slots; (n_live, n_vertices) float64 drive from each
+        # vertex, s; expected departures of a car, 1/s.
+        ("n_live", np.int64),
+        ("live", ADDRESS),
+        ("live_drive_s", ADDRESS),
+        ("turnover", np.float64),
         # Slots in view of vertex v are viewed[view_starts[v]] to viewed[view_starts[v + 1]], excluded; int64 both.
         ("view_starts", ADDRESS),
         ("viewed", ADDRESS),
@@ -74,7 +90,17 @@ _TABLES = tuple(
     name
     for name in SCENARIO.names or ()
     if SCENARIO[name] == ADDRESS
-    and name not in ("n_slots", "n_weekdays", "n_entries", "world_kind", "prior_kind")
+    and name
+    not in (
+        "n_slots",
+        "n_vertices",
+        "n_weekdays",
+        "n_entries",
+        "world_kind",
+        "prior_kind",
+        "n_forbidden",
+        "n_live",
+    )
 )
 N_REGIONS = 4
 
@@ -119,8 +145,9 @@ _PROGRESS = [
     # free, or -1.
     ("free_by_region", np.float64, (N_REGIONS,)),
     ("remembered_slot", np.int64),
-    # Index of the search's scenario.
+    # Index of the search's scenario; number of slots in which the driver may not park.
     ("place", np.int64),
+    ("n_forbidden", np.int64),
 ]
 _EPISODES = [("episode", np.int64), ("seed_state", np.uint64), ("clock", np.float32, (2,))]
 
@@ -162,8 +189,10 @@ SEARCH = _with_costs(
         ("car", np.int64),
         ("moves", ADDRESS),
         ("reserved", np.int64),
-        # (n_zones,) float64, s, what the car's own stay costs in each zone; 0: that of the scenario's expected stay.
+        # (n_zones,) float64, s, what the car's own stay costs in each zone, infinite where the driver may not park; 0:
+        # that of the scenario's driver. Factor of the walk: 2 where the way back counts.
         ("zone_cost_s", ADDRESS),
+        ("walks", np.float64),
         # Data of the search: its SCENARIO record; BLOCK records; SLOT records; (n_slots,) int32 columns; (2, width)
         # float64 forecast and decay rate of an external prior, or 0; (2,) float32 day error of the forecast; the
         # record of the world: PROCESS, RECORDED_DAY, FUNCTIONS or SHARED_WORLD.
@@ -236,6 +265,9 @@ SHARED_WORLD_FIELDS = [
     # (n_slots,) SHARED_SLOT records.
     ("n_slots", np.int64),
     ("slots", ADDRESS),
+    # Index of the first slot that stands for a counted facility, and COUNTED records of these.
+    ("first_counted", np.int64),
+    ("counted", ADDRESS),
     *WORLD_FIELDS,
     ("background", np.int64),
     # The scenario's own world: its kind; the PROCESS or FUNCTIONS record, or the RECORDED_DAY of the day.
@@ -248,7 +280,8 @@ its address.
 
 A slot is taken if a car of the fleet stands in it, or else by the *background*: nobody; residents, who were parked when
 the world began, leave once and are followed by cars of the fleet only; or the scenario's own world, in which
-other cars come and go all day.
+other cars come and go all day. The slot of a counted facility is taken if as many cars of the fleet as fit are inside,
+or before its barrier; it has no background.
 """
 
 SHARED_SLOT = np.dtype(
@@ -263,7 +296,25 @@ SHARED_SLOT = np.dtype(
 """A shared slot: the car of the fleet in it or `NO_CAR`; when that car, or else the resident, leaves or has left, s;
 the car that waits for it, or `NO_CAR`; cursor of the background."""
 
+COUNTED = np.dtype(
+    [
+        ("capacity", np.int64),
+        ("n_cars", np.int64),
+        ("gate_s", np.float64),
+        ("inside_s", np.float64, (2,)),
+        ("gate_free_at", np.float64),
+        ("delay_s", np.float64),
+        ("published", np.int64),
+        ("period", np.float64),
+    ],
+    align=True,
+)
+"""A counted facility: how many cars fit, and are inside or before its barrier; seconds at the barrier, and from there
+to a space when empty and when full; when the barrier is free, s; how often its live count is published, s, 0: at once;
+the count published last, and in which period since the beginning of the week."""
+
 shared_world_at, shared_slot_at = record_at(SHARED_WORLD), record_at(SHARED_SLOT)
+counted_at = record_at(COUNTED)
 
 # ---- cars, and their world
 
@@ -288,6 +339,12 @@ CAR = _with_costs(
         ("arrival", np.float64),
         ("stay_s", np.float64),
         ("patience_s", np.float64),
+        # Its purpose; factor of the walk; slot in which it stands when the world begins, or -1; number of slots in
+        # which it may not park.
+        ("purpose", np.int64),
+        ("walks", np.float64),
+        ("parked_at", np.int64),
+        ("n_forbidden", np.int64),
         # The driver: address of the compiled policy, or 0 if Python decides; what it knows.
         ("policy", ADDRESS),
         ("knows", np.int64),
@@ -371,7 +428,7 @@ FLEET = np.dtype(
         ("n_cars", np.int64),
         ("cars", ADDRESS),
         ("next_car", np.int64),
-        # (n_cars, n_zones) float64, s, what each car's stay costs in each zone; 0 without prices.
+        # (n_cars, n_zones) float64, s, what each car's stay costs in each zone; 0 without rules of zones.
         ("zone_cost_s", ADDRESS),
         ("n_zones", np.int64),
         # Cars to decide, in order: a ring of n_cars int64.
@@ -447,6 +504,7 @@ class ScenarioRecords:
         ] = {}  # arrays that scenarios share, and copies of them
         self._models: list[CompiledModel] = []
         self._model_at: dict[tuple[int, int], tuple[PriorModel, int]] = {}
+        self._drives: dict[tuple[int, float], int] = {}
         self.scenarios: tuple[Any, ...] = tuple(scenarios)
         self.records = np.zeros(len(scenarios), SCENARIO)
         for record, scenario in zip(self.records, scenarios, strict=True):
@@ -496,12 +554,19 @@ class ScenarioRecords:
         lot, masks = scenario.lot, scenario.action_masks
         starts, viewed = scenario.slots_in_view
         rates = scenario.sensor_rates
+        live = scenario.live_slots
         numbers = {
             "n_slots": lot.n_slots,
-            "exact_sensor": scenario.sensor_model.perfect,
+            "n_vertices": lot.n_vertices,
+            "no_errors": scenario.sensor_model.perfect,
+            "exact_sensor": scenario.observes_exactly,
             "failure_s": scenario.failure_s,
             "give_up_s": scenario.give_up_s,
             "leave_full_lot": True,
+            "wait_s": scenario.wait_s,
+            "n_forbidden": int(np.isinf(scenario.parking_cost_s).sum()),
+            "n_live": len(live),
+            "turnover": 1.0 / max(scenario.stay_s, 1.0),
             "edges": self._keep(scenario.edges, EDGE),
             "action_masks": self._keep(masks, np.uint8),
             "walk_s": self._keep(scenario.walk_s),
@@ -515,8 +580,23 @@ class ScenarioRecords:
             "hit_rate": self._keep(rates.hit),
             "false_alarm_rate": self._keep(rates.false_alarm),
         }
+        if lot.is_counted.any():
+            numbers["enter_s"] = self._keep(scenario.enter_s)
+        if len(live):
+            numbers |= {
+                "live": self._keep(live, np.int64),
+                "live_drive_s": self._live_drive_s(scenario, live),
+            }
         for name, value in numbers.items():
             record[name] = value
+
+    def _live_drive_s(self, scenario: SearchProblem, live: IntArray) -> int:
+        """Keep how long cars drive from each vertex to facilities with a live count; once for all goals of a lot."""
+        key = id(scenario.lot), scenario.v_drive
+        if key not in self._drives:
+            metres = dijkstra(scenario.lot.drive_matrix().T.tocsr(), indices=live)
+            self._drives[key] = self._keep(metres / scenario.v_drive)
+        return self._drives[key]
 
     def _write_world(self, record: np.void, scenario: Scenario) -> None:
         entries = scenario.lot.entry_vertices
@@ -586,9 +666,9 @@ class Searches:
         self.needs_python = external or bool((scenarios.records["world"] == 0).any())
         self._worlds: dict[int, World] = {}  # made in Python, by search
         self.scenarios = scenarios
-        self.records = zeros_on_lines((n,), SEARCH)
+        self.records = np.zeros(n, SEARCH)
         # Zeros stand for the sentinel. A search observes a small part of a large lot.
-        zeros = zeros_on_lines if m < SPARSE_SLOTS else sparse_zeros
+        zeros = np.zeros if m < SPARSE_SLOTS else sparse_zeros
         self.slots = zeros((n, m + 1), SLOT)
         self._blocks = zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
         self._columns = zeros((n, m), np.int32)
@@ -602,6 +682,7 @@ class Searches:
         k = most_observed_in(scenarios.scenarios) if most_observed is None else most_observed
         self.step_observed = np.zeros((n, 4, k) if full_belief and k > 0 else (0, 4, 0), np.float32)
         self.records["width"], self.records["most_observed"], self.records["n_step_used"] = m, k, k
+        self.records["walks"] = 1.0
         self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
         self.records["n_places"] = len(scenarios.records)
         self._find_scenarios()

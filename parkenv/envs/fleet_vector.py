@@ -19,6 +19,7 @@ from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.kernel import step_cost_s
 from parkenv.engine.local_observation import local_space
 from parkenv.engine.network import Layer, NetworkPolicy, observe_locally
+from parkenv.engine.policy import is_allowed
 from parkenv.engine.records import (
     CAR,
     N_ACTIONS,
@@ -27,7 +28,6 @@ from parkenv.engine.records import (
     TRUNCATED,
     car_at,
     fleet_at,
-    scenario_at,
     search_at,
 )
 from parkenv.errors import InputError, reset_options
@@ -339,6 +339,5 @@ def _next_learner(fleet: Any, first: int) -> int:
 
 @kernel
 def _write_mask(search: Any, mask: NDArray[np.int8]) -> None:
-    masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     for action in range(N_ACTIONS):
-        mask[action] = masks[search.vertex * N_ACTIONS + action]
+        mask[action] = is_allowed(search, action)

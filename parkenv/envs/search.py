@@ -346,7 +346,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
         """Return what acts and observes: (address of the search, action) -> numbers named by `STEP_RESULT`."""
-        return _compiled_step(self.scenario.sensor_model.perfect)
+        return _compiled_step(self.scenario.observes_exactly)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""

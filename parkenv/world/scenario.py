@@ -71,6 +71,7 @@ class SearchProblem:
         priced_at_s: clock time that prices and hours count from, s since Monday 00:00; in a fleet it is each car's
             arrival.
         classes: classes of users that the driver belongs to, beside `public`.
+        kwh: kWh that the car takes where it can charge.
         walk_back: whether the walk from the goal back to the car counts, too.
 
     Raises:
@@ -90,6 +91,7 @@ class SearchProblem:
     value_of_time: float = VALUE_OF_TIME
     priced_at_s: float = 34 * HOUR_S
     classes: tuple[str, ...] = ()
+    kwh: float = 0.0
     walk_back: bool = False
 
     def __post_init__(self) -> None:
@@ -103,7 +105,7 @@ class SearchProblem:
         self.tariff.require_zones(self.lot.zones, self.lot.name)
         for name in ("v_drive", "v_walk", "wait_s", "value_of_time"):
             require_number(name, getattr(self, name), above=0.0)
-        for name in ("failure_s", "give_up_s", "stay_s", "priced_at_s"):
+        for name in ("failure_s", "give_up_s", "stay_s", "priced_at_s", "kwh"):
             require_number(name, getattr(self, name), least=0.0)
         object.__setattr__(self, "classes", tuple(self.classes))
         self.class_bits(self.classes)
@@ -115,8 +117,25 @@ class SearchProblem:
 
     @cached_property
     def arrival_cost_s(self) -> FloatArray:
-        """Cost of arriving in each slot, (n_slots,) s: walk plus parking cost."""
-        return _read_only(self.walk_s + self.parking_cost_s)
+        """Cost of arriving in each slot, (n_slots,) s: `enter_s`, walk and parking; infinite where it is forbidden."""
+        return _read_only(self.walk_s + self.parking_cost_s + self.enter_s)
+
+    @cached_property
+    def finite_cost_s(self) -> FloatArray:
+        """`arrival_cost_s` for arithmetic: slots in which the driver may not park, believed taken, are the dearest."""
+        allowed = np.isfinite(self.arrival_cost_s)
+        if allowed.all():
+            return self.arrival_cost_s
+        dearest = max(self.give_up_s, float(self.arrival_cost_s[allowed].max(initial=0.0)))
+        return _read_only(np.where(allowed, self.arrival_cost_s, dearest))
+
+    @cached_property
+    def enter_s(self) -> FloatArray:
+        """Expected time from the entry of each counted facility to a space, (n_slots,) s: barrier, half-full inside."""
+        facilities = [facility for facility in self.lot.facilities if facility.is_counted]
+        enter_s = np.zeros(self.lot.n_slots)
+        enter_s[self.lot.n_slots - len(facilities) :] = [f.gate_s + sum(f.inside_s) / 2 for f in facilities]
+        return _read_only(enter_s)
 
     @cached_property
     def parking_cost_s(self) -> FloatArray:
@@ -127,7 +146,7 @@ class SearchProblem:
     def driver(self) -> Drivers:
         """The driver of the search."""
         bits = self.class_bits(self.classes)
-        return Drivers(self.stay_s, self.priced_at_s, self.value_of_time, bits)
+        return Drivers(self.stay_s, self.priced_at_s, self.value_of_time, bits, self.kwh)
 
     def class_bits(self, classes: Iterable[str]) -> int:
         """Return the number that stands for classes of users in `Drivers`; `public` is always among them.
@@ -218,6 +237,16 @@ class SearchProblem:
 
     @cached_property
     def action_masks(self) -> NDArray[np.int8]:
+        """(n_vertices, 5), 1 if the driver may take the action: that of the graph, parking where it is allowed."""
+        forbidden = np.flatnonzero(np.isinf(self.parking_cost_s))
+        if not len(forbidden):
+            return self.graph_masks
+        masks = self.graph_masks.copy()
+        masks[forbidden, PARK] = 0
+        return _read_only(masks)
+
+    @cached_property
+    def graph_masks(self) -> NDArray[np.int8]:
         """(n_vertices, 5), 1 if the graph has the action: an edge to drive along, or a slot to park in."""
         masks = np.zeros((self.lot.n_vertices, len(ACTIONS)), dtype=np.int8)
         masks[:, :PARK] = self.lot.neighbors >= 0
@@ -226,17 +255,38 @@ class SearchProblem:
 
     @cached_property
     def slots_in_view(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Slots in view, as (starts, slots): for vertex v `slots[starts[v]:starts[v + 1]]`, ascending."""
+        """Slots in view, as (starts, slots): for vertex v `slots[starts[v]:starts[v + 1]]`, ascending.
+
+        Counted facilities without a sign are in view of no vertex.
+        """
         tree = cKDTree(self.lot.vertex_xy)
         # A slot's own vertex counts even at a range of 0.
         pairs = tree.query_pairs(self.sensor_model.view_range, output_type="ndarray")
         own = np.arange(self.lot.n_slots)
         viewer = np.concatenate([pairs[:, 0], pairs[:, 1], own])
         slot = np.concatenate([pairs[:, 1], pairs[:, 0], own])
-        viewer, slot = viewer[slot < self.lot.n_slots], slot[slot < self.lot.n_slots]
+        shown = np.arange(self.lot.n_vertices) < self.lot.n_slots
+        shown[self._counted("nothing")] = False
+        viewer, slot = viewer[shown[slot]], slot[shown[slot]]
         order = np.lexsort((slot, viewer))
         starts = np.searchsorted(viewer[order], np.arange(self.lot.n_vertices + 1))
         return _read_only(starts.astype(np.int64)), _read_only(slot[order].astype(np.int64))
+
+    @property
+    def live_slots(self) -> NDArray[np.int64]:
+        """Slots of counted facilities with a live count."""
+        return self._counted("live")
+
+    @property
+    def observes_exactly(self) -> bool:
+        """Whether slots in view are observed without error, and nothing is known of others."""
+        return self.sensor_model.perfect and not len(self.live_slots)
+
+    def _counted(self, known: str) -> NDArray[np.int64]:
+        """Return the slots of counted facilities of which drivers know so much."""
+        facilities = [facility for facility in self.lot.facilities if facility.is_counted]
+        there = np.flatnonzero([facility.known == known for facility in facilities])
+        return self.lot.n_slots - len(facilities) + there
 
     def in_view(self, vertex: int) -> NDArray[np.int64]:
         """Return the slots in view of a vertex, ascending."""
@@ -262,6 +312,19 @@ class SearchProblem:
     def sensor_rates(self) -> SensorRates:
         """Sensor rates for each of `slots_in_view`."""
         return SensorRates(*map(_read_only, self.sensor_model.rates(*self.sight_lines)))
+
+    def of_driver(self, driver: Drivers, walks: float = 1.0) -> Self:
+        """Return the problem of another driver, whose walk counts `walks` times as often."""
+        stay_s, priced_at_s, value_of_time, classes, kwh = (float(np.asarray(value)) for value in driver)
+        names = [name for i, name in enumerate(self.lot.classes) if i and int(classes) >> i & 1]
+        return self.replace(
+            stay_s=stay_s,
+            priced_at_s=priced_at_s,
+            value_of_time=value_of_time,
+            kwh=kwh,
+            classes=tuple(names),
+            walk_back=self.walk_back or walks > 1.0,
+        )
 
     def public(self) -> SearchProblem:
         """Return the part that agents may know."""

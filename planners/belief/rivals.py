@@ -72,7 +72,7 @@ class BeliefRivalsAgent(BeliefAgent):
         self.arrivals_per_hour = arrivals_per_hour
         lot = self.problem.lot
         drive_m = dijkstra(lot.drive_matrix(), indices=np.unique(lot.entry_vertices), min_only=True)
-        rival_s = drive_m[: lot.n_slots] / self.problem.v_drive + self.problem.arrival_cost_s
+        rival_s = drive_m[: lot.n_slots] / self.problem.v_drive + self.problem.finite_cost_s
         self._order = np.argsort(rival_s, kind="stable")
 
     def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:

@@ -321,8 +321,7 @@ def _successors(keys: IntArray, lot: _SmallLot) -> IntArray:
 @compiled
 def _weigh_days(before: FloatArray, seen: int, free: int, lot: _SmallLot, after: FloatArray) -> None:
     """Multiply the weights of the days by the probability of observing `free` of the slots `seen` on each."""
-    for day in range(len(before)):
-        after[day] = before[day]
+    after[:] = before
     for s in range(len(lot.cost_s)):
         if (seen >> s) & 1:
             for d in range(len(before)):
@@ -347,8 +346,7 @@ def _back_up(
     for i in range(levels[level], levels[level + 1]):
         seen, vertex, free = _state(keys[i], n)
         # With a single day, what was observed says nothing, and dominated free slots are missing from `free`.
-        for d in range(len(day)):
-            day[d] = lot.day_chance[d]
+        day[:] = lot.day_chance
         if len(day) > 1:
             _weigh_days(lot.day_chance, seen, free, lot, day)
             day /= day.sum()

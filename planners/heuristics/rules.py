@@ -103,7 +103,7 @@ def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m
     lot, costs_s = problems[0].lot, np.array([one.arrival_cost_s for one in problems], np.float64)
     n, room = lot.n_vertices, _N_MOVES * lot.n_vertices + 1
     near_s = [
-        np.median(cost_s) if within_m is None else within_m / one.v_walk
+        np.median(cost_s[np.isfinite(cost_s)]) if within_m is None else within_m / one.v_walk
         for one, cost_s in zip(problems, costs_s, strict=True)
     ]
     least_price = int(problems[0].parking_cost_s.argmin())

@@ -32,7 +32,7 @@ def discount(problem: SearchProblem) -> float:
     edges = problem.move_cost_s[problem.lot.neighbors >= 0]
     shortest = max(min(float(edges.min(initial=np.inf)), problem.wait_s), SHORTEST_S)
     return max(
-        USUAL_DISCOUNT, 1.0 - shortest / (problem.give_up_s + float(problem.arrival_cost_s.max()) + 1.0)
+        USUAL_DISCOUNT, 1.0 - shortest / (problem.give_up_s + float(problem.finite_cost_s.max()) + 1.0)
     )
 
 
@@ -129,8 +129,8 @@ class ParkingMDP:
         p_free = np.zeros(n)
         p_free[:n_slots] = 1.0 - np.asarray(p_occupied, dtype=np.float64)
         # Junctions have no slots: their cost must not raise r_max.
-        arrival_cost_s = np.full(n, problem.arrival_cost_s.max())
-        arrival_cost_s[:n_slots] = problem.arrival_cost_s
+        arrival_cost_s = np.full(n, problem.finite_cost_s.max())
+        arrival_cost_s[:n_slots] = problem.finite_cost_s
         return cls(
             neighbors=problem.lot.neighbors.astype(np.int64),
             move_s=problem.move_cost_s,

@@ -25,7 +25,7 @@ from parkenv.world.demand import (
     PoissonArrivals,
     TownDemand,
 )
-from parkenv.world.scenario import Scenario
+from parkenv.world.scenario import Drivers, Scenario
 from parkenv.world.week import HOUR_S
 from planners.agent import ClairvoyantAgent, make_agent
 from planners.heuristics import POLICIES
@@ -67,7 +67,7 @@ def policy_of(
 
             sampled = agent.card.algorithm != "dqn"
             return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
-    if isinstance(agent, LearnedAgent) or not scenario.tariff:
+    if isinstance(agent, LearnedAgent) or not scenario.has_rules:
         return None, agent  # learned agents observe costs themselves
     return None, AgentsByStay(spec, scenario, known)
 
@@ -87,7 +87,8 @@ class AgentsByStay:
     def predict(self, observation: Any, state: Any = None) -> tuple[Any, Any]:
         """Return the action of the car's agent, which is made at its first decision, and the next state."""
         if state is None:
-            own = self._scenario.replace(stay_s=float(observation["stay_s"][0]))
+            *driver, walks = observation["driver"]
+            own = self._scenario.of_driver(Drivers(*driver), walks)
             state = make_agent(self._spec.name, own, **self._options), None
         agent, memory = state
         action, memory = agent.predict(observation, memory)

@@ -1,0 +1,248 @@
+"""Counted facilities in the engine: barrier, time inside, full signs and live counts; drivers who may not park."""
+
+from dataclasses import replace
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from scipy.stats import binom, poisson
+from test_supply import GARAGE, town
+
+from parkenv import InputError, make_scenario
+from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.engine.kernel import p_full
+from parkenv.engine.records import GAVE_UP, PARKED, SEARCHING
+from parkenv.lots import grid_lot
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.drivers import policy_of
+from parkenv.studies.simulate import simulate
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, ListedArrivals, PoissonArrivals
+from parkenv.world.lot import PARK, ParkingLot
+from parkenv.world.tariff import Price, Zone
+from planners import make_agent
+from planners.heuristics.policies import POLICIES
+
+GREEDY = DriverKind(policy=POLICIES["greedy-drive"])
+
+
+def garage_alone(**facility):
+    """A lane, and a garage beside it with room for five cars and nothing else."""
+    grid = grid_lot(1, 1)
+    garage = replace(
+        GARAGE,
+        **{"zone": "", "capacity": 5, "gate_s": 0.0, "inside_s": (0.0, 0.0), "xy": (1.0, 5.0)} | facility,
+    )
+    empty = np.zeros(0)
+    lot = ParkingLot(
+        "garage", (), empty, empty, empty, empty, empty, grid.lanes, grid.entries, grid.goals, facilities=(garage,)
+    )  # fmt: skip
+    return make_scenario(lot)
+
+
+def run(scenario, demand, kind=GREEDY, **options):
+    fleet = Fleet(scenario, demand, background="none", drivers=[kind], **options)
+    fleet.reset(seed=3)
+    fleet.run()
+    return fleet
+
+
+def parked_in(fleet, slot):
+    """Cars in a slot, or before its barrier."""
+    cars = fleet.cars
+    return np.count_nonzero((cars["slot"] == slot) & np.isin(cars["state"], (PARKED, SEARCHING)))
+
+
+@pytest.mark.parametrize("known", ["nothing", "sign", "live"])
+def test_a_garage_refuses_as_erlang_says(known):
+    """Poisson arrivals that leave when it is full, exponential stays: Erlang's loss formula, whatever drivers know."""
+    hours, load, capacity = 600, 4.0, 5
+    demand = Demand(PoissonArrivals(6 * load, 0.0, hours * 3600.0), ExponentialTime(600.0))
+    cars = run(garage_alone(capacity=capacity, known=known), demand).cars
+    blocking = load**capacity / np.prod(np.arange(1, capacity + 1))
+    blocking /= sum(load**k / np.prod(np.arange(1, k + 1)) for k in range(capacity + 1))
+    refused = cars["state"] == GAVE_UP
+    # Refusals cluster: days of 24 hours are the sample.
+    day_of_car = (cars["arrival"] - cars["arrival"][0]) // 86400.0
+    days = np.array([refused[day_of_car == day].mean() for day in range(hours // 24)])
+    assert len(cars) > 13_000
+    assert days.mean() == pytest.approx(blocking, abs=4.0 * days.std() / np.sqrt(len(days)))
+    assert days.std() / np.sqrt(len(days)) < 0.01
+
+
+def test_cars_stand_in_line_before_the_barrier():
+    scenario = garage_alone(gate_s=20.0, inside_s=(30.0, 80.0))
+    fleet = run(scenario, Demand(ListedArrivals((0.0, 1.0, 2.0, 3.0)), ConstantTime(7200.0)))
+    cars, alone_s = fleet.cars, fleet.cars["ended_at"][0] - fleet.cars["arrival"][0]
+    inside_s = 30.0 + 50.0 * np.arange(4) / 5
+    # Each passes 20 s after the one before it, and drives on inside as far as that is full.
+    np.testing.assert_allclose(np.diff(cars["ended_at"] - inside_s), 20.0)
+    np.testing.assert_allclose(cars["queued_s"], 19.0 * np.arange(4))
+    np.testing.assert_allclose(cars["drive_s"], cars["ended_at"] - cars["arrival"])
+    np.testing.assert_allclose(cars["total_s"], cars["drive_s"] + cars["walk_s"])
+    assert alone_s == pytest.approx(50.0 + 0.0, abs=15.0)
+    assert scenario.enter_s.tolist() == [20.0 + 55.0]
+    fleet.run(until=cars["ended_at"][0] + 7200.0)
+    assert fleet.counts().tolist() == [3]
+
+
+@pytest.mark.parametrize("gate_s", [0.0, 15.0])
+def test_every_car_is_somewhere(gate_s):
+    """Counts of facilities are those of the cars in them, and never above capacity; cars are conserved."""
+    garage = replace(GARAGE, capacity=6, gate_s=gate_s, zone="")
+    lot = town(
+        facilities=(garage, replace(GARAGE, name="P2", capacity=2, xy=(5.0, 9.0), zone="", known="nothing")),
+        slot_facility=(),
+        zone_rules={},
+    )
+    demand = Demand(PoissonArrivals(60.0, 0.0, 6 * 3600.0), ExponentialTime(900.0), ConstantTime(240.0))
+    fleet = Fleet(make_scenario(lot), demand, background="none", drivers=[GREEDY], leave_full_lot=False)
+    fleet.reset(seed=2)
+    full = 0
+    for minute in range(1, 480):
+        fleet.run(until=fleet.begin + 60.0 * minute)
+        totals, counts = fleet.totals, fleet.counts()
+        assert sum(totals[name] for name in ("due", "searching", "parked", "gone")) == len(fleet.cars)
+        assert [parked_in(fleet, slot) for slot in range(lot.n_slots)] == counts.tolist()
+        assert (counts <= lot.capacity).all()
+        assert (fleet.taken() == (counts == lot.capacity)).all()
+        full += counts[-2] == 6
+    assert 0 < full < 479
+    assert fleet.cars["failed_parks"].sum() > 0
+    assert (np.sort(fleet.cars["state"]) > SEARCHING).all()
+
+
+class Began(Demand):
+    """Three cars that stand in slots when the world begins, and one that comes."""
+
+    slots = (10, 10, 0)
+
+
+def test_cars_may_stand_there_when_the_world_begins(monkeypatch):
+    scenario = make_scenario(town(zone_rules={}))
+    draw = Fleet._require_room
+
+    def stand(fleet, _):
+        cars = fleet._cars
+        cars["parked_at"][:3] = Began.slots
+        draw(fleet, cars["parked_at"][:3])
+
+    monkeypatch.setattr(Fleet, "_require_room", stand)
+    fleet = run(scenario, Demand(ListedArrivals((0.0, 0.0, 0.0, 60.0)), ConstantTime(600.0)))
+    assert fleet.cars["slot"][:3].tolist() == [10, 10, 0]
+    assert (fleet.cars["total_s"][:3] == 0.0).all()
+    assert fleet.counts()[[0, 10]].tolist() == [1, 2]
+    fleet.run(until=fleet.begin + 599.0)
+    assert fleet.totals["parked"] == 4.0
+    fleet.run(until=fleet.begin + 601.0)
+    assert fleet.totals["gone"] == 3.0
+    assert fleet.counts()[10] == 0
+    Began.slots = (0, 0, 1)
+    with pytest.raises(InputError, match="2 cars begin in slot 'A1', want at most 1"):
+        fleet.reset()
+
+
+# ---- who may not park
+
+
+FORBIDDEN = {"inner": Zone("inner", Price(1.0)), "permit": Zone("permit", users=("permit-a",))}
+
+
+@pytest.mark.parametrize(
+    "agent", ["first-free", "greedy-drive", "greedy-total", "greedy-goal", "mdp", "belief"]
+)
+def test_nobody_parks_where_the_driver_may_not(agent):
+    """In fleets with compiled policies and agents in Python, and in single searches."""
+    scenario = make_scenario(town(zone_rules=FORBIDDEN))
+    demand = Demand(
+        PoissonArrivals(60.0, 8 * 3600.0, 10 * 3600.0), ExponentialTime(900.0), ConstantTime(600.0)
+    )
+    policy, own = policy_of(AgentSpec(name=agent), scenario)
+    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=policy)])
+    fleet.reset(seed=1)
+    fleet.run([own])
+    zones = np.array(scenario.lot.zones)[scenario.lot.zone_of_slot[fleet.cars["slot"]]]
+    parked = fleet.cars["slot"] >= 0
+    assert parked.sum() > 20
+    assert "permit" not in zones[parked]
+    assert np.isfinite(fleet.cars["total_s"]).all()
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    driver = make_agent(agent, scenario)
+    for seed in range(5):
+        result = simulate(env, driver, seed)
+        assert not result.info["parked"] or scenario.lot.slot_zone[env.unwrapped.state.vertex] != "permit"
+
+
+def test_forbidden_slots_are_as_good_as_taken():
+    scenario = make_scenario(town(zone_rules=FORBIDDEN))
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    observation, _ = env.reset(seed=0)
+    forbidden = scenario.lot.slot_zone == "permit"
+    assert (observation["p_occupied"][forbidden] == 1.0).all()
+    assert (observation["p_occupied"][~forbidden] < 1.0).all()
+    assert scenario.action_masks[:10, PARK].tolist() == (~forbidden[:10]).tolist()
+    assert np.isinf(scenario.arrival_cost_s[forbidden]).all()
+    # An attempt there is no attempt: the car waits.
+    while env.unwrapped.state.vertex != 0:
+        env.step(way_to(scenario.lot, env.unwrapped.state.vertex, 0))
+    _, reward, terminated, _, info = env.step(PARK)
+    assert not terminated
+    assert reward == -scenario.wait_s
+    assert info["failed_parks"] == 0
+    allowed = gym.make("parkenv/Search-v2", scenario=scenario.replace(classes=("permit-a",)))
+    assert (allowed.reset(seed=0)[0]["p_occupied"] < 1.0).all()
+
+
+# ---- what drivers know
+
+
+@pytest.mark.parametrize("capacity", [20, 300])
+@pytest.mark.parametrize("age", [0.01, 0.1, 1.0])
+def test_a_count_tells_how_full_it_will_be(capacity, age):
+    """Against the exact law of M/M/∞: those that stay are binomial, those that come Poisson."""
+    for load in (0.9, 1.0):
+        mean, stay = load * capacity, np.exp(-age)
+        long_run = float(poisson.sf(capacity - 1, mean))
+        for count in (capacity // 2, capacity - 2, capacity):
+            left = binom.pmf(np.arange(count + 1), count, stay)
+            exact = left @ poisson.sf(capacity - 1 - np.arange(count + 1), mean * (1.0 - stay))
+            assert p_full(long_run, count, capacity, age) == pytest.approx(exact, abs=0.06)
+        assert p_full(long_run, capacity - 1, capacity, 0.0) == 0.0
+        assert p_full(long_run, capacity, capacity, 0.0) == 1.0
+        assert p_full(long_run, 0, capacity, 50.0) == pytest.approx(long_run, abs=1e-6)
+
+
+def first_belief(known, count, delay_s=0.0):
+    """What a car believes of a garage with some cars in it, before it has driven."""
+    garage = replace(GARAGE, zone="", capacity=5, known=known, delay_s=delay_s, gate_s=0.0)
+    scenario = make_scenario(town(facilities=(garage,), slot_facility=(), zone_rules={}))
+    times = (*(1e-3 * i for i in range(count)), 100.0)
+    fleet = Fleet(scenario, Demand(ListedArrivals(times), ConstantTime(36000.0)), background="none")
+    fleet.reset()
+    while (car := fleet.next_decision()) != count:
+        slot = scenario.lot.n_slots - 1
+        vertex = int(fleet.observation(car)["vertex"])
+        fleet.act(PARK if vertex == slot else way_to(scenario.lot, vertex, slot))
+    return float(fleet.observation(car)["p_occupied"][-1]), float(
+        fleet.observation(car)["belief"].reshape(4, -1)[0, -1]
+    )
+
+
+def way_to(lot, vertex, target):
+    """The move along a shortest way."""
+    from scipy.sparse.csgraph import dijkstra
+
+    metres = dijkstra(lot.drive_matrix().T.tocsr(), indices=target)
+    moves = [a for a in range(4) if lot.neighbors[vertex, a] >= 0]
+    return min(moves, key=lambda a: lot.edge_length[vertex, a] + metres[lot.neighbors[vertex, a]])
+
+
+def test_a_live_count_is_known_everywhere():
+    for known in ("nothing", "sign"):
+        p, forecast = first_belief(known, 5)
+        assert p == forecast
+    nearly, forecast = first_belief("live", 3)
+    full, _ = first_belief("live", 5)
+    assert nearly < forecast < full
+    assert full < 1.0
+    # It is published every hour: what has happened since is not known.
+    assert first_belief("live", 5, delay_s=3600.0)[0] < 0.1
