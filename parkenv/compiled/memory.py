@@ -62,6 +62,15 @@ def in_one_block(arrays: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
     return [copies[key] for key in keys]
 
 
+def zeros_on_lines(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
+    """Return zeros that begin with a cache line, so that records of whole lines do not reach into others."""
+    n_bytes = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = np.zeros(n_bytes + _LINE, np.uint8)
+    begin = -memory.ctypes.data % _LINE
+    zeros: NDArray[Any] = memory[begin : begin + n_bytes].view(dtype).reshape(shape)
+    return zeros
+
+
 def sparse_zeros(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Return zeros of which little will be written: memory is taken page by page, and by small pages."""
     n_bytes = math.prod(shape) * np.dtype(dtype).itemsize

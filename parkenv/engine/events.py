@@ -33,6 +33,7 @@ from parkenv.compiled.memory import (
     int32s,
     int64_array,
     int64s,
+    prefetch,
 )
 from parkenv.engine.kernel import (
     SCENARIO_BYTES,
@@ -54,6 +55,9 @@ from parkenv.engine.knowledge import clear_live_map, inform, report_slot, report
 from parkenv.engine.policy import LEAVE, TAKE_SLOT
 from parkenv.engine.records import (
     BALKED,
+    BLOCK,
+    BLOCK_BITS,
+    CAR,
     GAVE_UP,
     LEFT,
     N_ACTIONS,
@@ -62,7 +66,10 @@ from parkenv.engine.records import (
     NO_SLOT,
     PARKED,
     RESERVE_KNOWLEDGE,
+    SEARCH,
     SEARCHING,
+    SHARED_SLOT,
+    SLOT,
     TRUNCATED,
     car_at,
     counted_at,
@@ -74,6 +81,7 @@ from parkenv.engine.records import (
 )
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
+from parkenv.world.scenario import EDGE
 
 (
     FINISHED, PAUSED, NEEDS_SEARCH, NEEDS_FORECAST, WRONG_ACTION, NEEDS_REPORTS, NEEDS_RESERVATIONS, NEEDS_STEPS,
@@ -82,6 +90,11 @@ from parkenv.world.occupancy.kernel import EXTERNAL_KIND, inlined, kernel
 needed; Python must compute the forecast of the car `pending`; a compiled policy chose an unknown action; more room for
 reports is needed; Python must reserve slots; more room for the steps that are kept is needed."""
 
+_MANY_STEPS = 64  # cars on their way, from which on their data does not stay in the cache
+_SEARCH_AT = int(CAR.fields["search"][1])  # type: ignore[index]
+_LINE = 64  # bytes of a cache line
+CAR_BYTES, SEARCH_BYTES, SLOT_BYTES = CAR.itemsize, SEARCH.itemsize, SLOT.itemsize
+BLOCK_BYTES, SHARED_BYTES, EDGE_BYTES = BLOCK.itemsize, SHARED_SLOT.itemsize, EDGE.itemsize
 _ON_TICK = 1e-9  # fraction of a tick
 
 
@@ -220,8 +233,33 @@ def _next_event(fleet: Any) -> int:
         number = np.int64(int32s(fleet.step_cars)[0])
         times, cars, ranks = _heap(fleet, fleet.step_times, fleet.step_cars)
         fleet.n_steps_to_end = pop(times, cars, fleet.n_steps_to_end, ranks)
+        if fleet.n_steps_to_end >= _MANY_STEPS:
+            _prefetch_next(fleet)
         _reach(fleet, number)
     return 0
+
+
+@inlined
+def _prefetch_next(fleet: Any) -> None:
+    """Load what the next steps need: in a town, much of the time would be waiting for memory."""
+    cars = int32s(fleet.step_cars)
+    for i in range(3, 7):
+        prefetch(fleet.cars + CAR_BYTES * np.int64(cars[i]) + _SEARCH_AT)
+    for i in range(1, 3):
+        address = car_at(fleet.cars, np.int64(cars[i])).search
+        for line in range(0, SEARCH_BYTES, _LINE):
+            prefetch(address + line)
+    search = search_at(car_at(fleet.cars, np.int64(cars[0])).search, 0)
+    scenario, vertex, block = scenario_at(search.scenario, 0), search.vertex, search.n_columns >> BLOCK_BITS
+    prefetch(scenario.edges + EDGE_BYTES * N_ACTIONS * vertex)
+    prefetch(search.slots + SLOT_BYTES * search.n_columns)
+    for line in range(0, BLOCK_BYTES, _LINE):
+        prefetch(search.blocks + BLOCK_BYTES * block + line)
+    first = int64s(scenario.view_starts)[vertex]
+    if first < int64s(scenario.view_starts)[vertex + 1]:
+        slot = int64s(scenario.viewed)[first]
+        prefetch(search.columns + 4 * slot)
+        prefetch(fleet.slots + SHARED_BYTES * slot)
 
 
 @inlined

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import IntArray
-from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at, sparse_zeros
+from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at, sparse_zeros, zeros_on_lines
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
@@ -666,9 +666,9 @@ class Searches:
         self.needs_python = external or bool((scenarios.records["world"] == 0).any())
         self._worlds: dict[int, World] = {}  # made in Python, by search
         self.scenarios = scenarios
-        self.records = np.zeros(n, SEARCH)
+        self.records = zeros_on_lines((n,), SEARCH)
         # Zeros stand for the sentinel. A search observes a small part of a large lot.
-        zeros = np.zeros if m < SPARSE_SLOTS else sparse_zeros
+        zeros = zeros_on_lines if m < SPARSE_SLOTS else sparse_zeros
         self.slots = zeros((n, m + 1), SLOT)
         self._blocks = zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
         self._columns = zeros((n, m), np.int32)

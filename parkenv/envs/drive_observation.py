@@ -72,9 +72,10 @@ def fill_observation(
     own[2], own[3] = math.cos(yaw - slot[2]), math.sin(yaw - slot[2])
     own[4], own[5], own[6] = vehicle[3], vehicle[4], vehicle[5]
     own[7], own[8] = slot[3], slot[4]
-    own[9:12] = kind
-    achieved[:5] = own[:5]
-    achieved[5:] = own[7:9]
+    for i in range(3):
+        own[9 + i] = kind[i]
+    for i in range(7):
+        achieved[i] = own[i if i < 5 else i + 2]
     return float(max(abs(dx), abs(dy)))
 
 

@@ -328,7 +328,8 @@ def _insert_target(
     kept, trial = targets, np.empty(len(targets) + 1, np.int64)
     for place in range(len(trial)):
         before = vertex if place == 0 else targets[place - 1]
-        trial[:place], trial[place + 1 :] = targets[:place], targets[place:]
+        for k in range(len(targets)):
+            trial[k + (k >= place)] = targets[k]
         for u in nearest_first:
             drive_s = graph.drive_s[vertex, u]
             if work > most_work or not drive_s < min(best.onward_s, at_hand_s):

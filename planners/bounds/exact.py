@@ -321,7 +321,8 @@ def _successors(keys: IntArray, lot: _SmallLot) -> IntArray:
 @compiled
 def _weigh_days(before: FloatArray, seen: int, free: int, lot: _SmallLot, after: FloatArray) -> None:
     """Multiply the weights of the days by the probability of observing `free` of the slots `seen` on each."""
-    after[:] = before
+    for day in range(len(before)):
+        after[day] = before[day]
     for s in range(len(lot.cost_s)):
         if (seen >> s) & 1:
             for d in range(len(before)):
@@ -346,7 +347,8 @@ def _back_up(
     for i in range(levels[level], levels[level + 1]):
         seen, vertex, free = _state(keys[i], n)
         # With a single day, what was observed says nothing, and dominated free slots are missing from `free`.
-        day[:] = lot.day_chance
+        for d in range(len(day)):
+            day[d] = lot.day_chance[d]
         if len(day) > 1:
             _weigh_days(lot.day_chance, seen, free, lot, day)
             day /= day.sum()

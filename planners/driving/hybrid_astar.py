@@ -189,7 +189,8 @@ def _search(
                 if shot_node < 0:
                     last = min(last, opened + int(patience * opened) + 32)
                 best, shot_node, shot_count = cost[node] + more, node, words.n_pieces[word]
-                shot_piece[:], shot_turn[:] = words.piece[word], words.turn[word]
+                for i in range(len(shot_piece)):
+                    shot_piece[i], shot_turn[i] = words.piece[word, i], words.turn[word, i]
         for direction in (1.0, -1.0):
             for share in _STEERINGS:
                 curvature, length = share / radius, direction * move

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN
+from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.memory import (
     ADDRESS,
@@ -80,10 +81,10 @@ STREETS = np.dtype(
         ("place_zone", ADDRESS),
         ("place_walk_s", ADDRESS),
         ("place_cost_s", ADDRESS),
-        # By goal: (n_slots,) float64 arrival costs, s; float64, the least of the two bounds, s.
+        # By goal: (n_slots,) float64 arrival costs, s; (n_junctions,) float64, the least drive and bound from there, s.
         ("arrival_cost_s", ADDRESS),
-        ("least_walk_s", ADDRESS),
-        ("least_cost_s", ADDRESS),
+        ("onward_walk_s", ADDRESS),
+        ("onward_cost_s", ADDRESS),
         # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken), and its forecast.
         ("states", ADDRESS),
         ("p_occupied", ADDRESS),
@@ -140,7 +141,13 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
         **streets,
         "place_zone": lot.zone_of_slot[streets["slots"][first]],
         **dict(zip(("place_walk_s", "place_cost_s"), bounds, strict=True)),
-        **dict(zip(("least_walk_s", "least_cost_s"), (bound.min(axis=1) for bound in bounds), strict=True)),
+        **dict(
+            zip(
+                ("onward_walk_s", "onward_cost_s"),
+                (_onward(streets, lot.n_slots, of) for of in bounds),
+                strict=True,
+            )
+        ),
         "forecast": np.zeros(lot.n_slots),
         "seconds": np.full(n_junctions, np.inf),
         "via": np.zeros(n_junctions, np.int32),
@@ -152,7 +159,7 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
     return PolicyData(STREETS, numbers, arrays, kept=plain)
 
 
-def _streets(lot: ParkingLot, move_s: NDArray[np.float64]) -> dict[str, NDArray[Any]]:
+def _streets(lot: ParkingLot, move_s: FloatArray) -> dict[str, NDArray[Any]]:
     """Return the streets of a lot as arrays of `STREETS`."""
     n, neighbors = lot.n_slots, lot.neighbors
     # On from each slot: to a junction, else to the slot that lies in the same direction; not across the street.
@@ -201,6 +208,21 @@ def _streets(lot: ParkingLot, move_s: NDArray[np.float64]) -> dict[str, NDArray[
         "place_first": np.array(place_first, np.int32),
         "position": position,
     }
+
+
+def _onward(streets: dict[str, NDArray[Any]], n_slots: int, bounds: FloatArray) -> FloatArray:
+    """Return the least drive from each junction to a place and its bound, (n_goals, n_junctions) s."""
+    n, start, end = len(streets["street_of"]), streets["start"] - n_slots, streets["end"] - n_slots
+    via = streets["along_s"][streets["place_first"][:-1]] + bounds
+    of = start[np.repeat(np.arange(len(start)), np.diff(streets["first_place"]))]
+    onward = np.full((len(bounds), n), np.inf)
+    for row, at in zip(onward, via, strict=True):
+        np.minimum.at(row, of, at)
+        before = np.empty(0)
+        while not np.array_equal(row, before):
+            before = row.copy()
+            np.minimum.at(row, start, streets["length_s"] + before[end])
+    return onward
 
 
 @rule
@@ -253,13 +275,12 @@ def _forecast(streets: Any, search: int, slot: int) -> float:
 
 
 @inlined_rule
-def _least_cost_s(streets: Any, goal: int, search: int) -> float:
-    """Return a lower bound on the driver's arrival cost of any slot, s."""
+def _onward_s(streets: Any, goal: int, search: int) -> tuple[int, float]:
+    """Return where lower bounds on the drive and the arrival cost from each junction begin, and what to add, s."""
+    first = 8 * streets.n_junctions * goal
     if search and has_own_price(search_of(search)):
-        return float(
-            float64s(streets.least_walk_s)[goal] + least_zone_cost_s(search_of(search), streets.n_zones)
-        )
-    return float(float64s(streets.least_cost_s)[goal])
+        return streets.onward_walk_s + first, least_zone_cost_s(search_of(search), streets.n_zones)
+    return streets.onward_cost_s + first, 0.0
 
 
 @inlined_rule
@@ -273,12 +294,13 @@ def _bound_s(streets: Any, goal: int, search: int, k: int) -> float:
 
 @rule
 def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
-    """Find the place of the lowest index from a vertex (Dijkstra's algorithm over the junctions)."""
+    """Find the place of the lowest index from a vertex (A* over the junctions)."""
     n, seconds, reached = streets.n_slots, float64s(streets.seconds), int32s(streets.reached)
     street_of, end, length_s = int32s(streets.street_of), int32s(streets.end), float64s(streets.length_s)
     room = streets.n_streets + 2 * _N_MOVES
     keys, vertices = float64_array(streets.keys, (room,)), int32_array(streets.vertices, (room,))
-    least_s = _least_cost_s(streets, goal, search)
+    onward_at, more_s = _onward_s(streets, goal, search)
+    onward_s = float64s(onward_at)
     for i in range(1, reached[0] + 1):
         seconds[reached[i]] = np.inf
     reached[0] = 0
@@ -286,30 +308,38 @@ def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
     size = 0
     if vertex >= n:
         seconds[vertex - n], reached[0], reached[1] = 0.0, 1, vertex - n
-        size = push(keys, vertices, size, 0.0, vertex - n)
+        size = push(keys, vertices, size, onward_s[vertex - n], vertex - n)
     else:
         # On along the street, or across it.
         here = np.int64(int32s(streets.position)[vertex])
-        size = _enter(streets, goal, search, here, 0.0, keys, vertices, size)
+        size = _enter(streets, goal, search, here, 0.0, onward_at, keys, vertices, size)
         for move in range(_N_MOVES):
             v = np.int64(int32s(streets.neighbors)[vertex * _N_MOVES + move])
             if 0 <= v < n and not _follows(streets, here, v):
                 there = np.int64(int32s(streets.position)[v])
                 drive_s = float64s(streets.move_s)[vertex * _N_MOVES + move]
-                size = _enter(streets, goal, search, there, drive_s, keys, vertices, size)
+                size = _enter(streets, goal, search, there, drive_s, onward_at, keys, vertices, size)
     while size > 0:
-        far, junction = keys[0], np.int64(vertices[0])
-        if far + least_s >= streets.best_s:
+        least_s, junction = keys[0], np.int64(vertices[0])
+        if least_s + more_s >= streets.best_s:
             break
-        size = pop(keys, vertices, size)
-        if far > seconds[junction]:
+        size, far = pop(keys, vertices, size), seconds[junction]
+        if least_s > far + onward_s[junction]:
             continue
         for move in range(_N_MOVES):
             street = np.int64(street_of[junction * _N_MOVES + move])
             if street != _NONE:
                 _look_along(streets, goal, search, street, _NONE, far)
                 size = _reach(
-                    streets, end[street] - n, street, _NONE, far + length_s[street], keys, vertices, size
+                    streets,
+                    end[street] - n,
+                    street,
+                    _NONE,
+                    far + length_s[street],
+                    onward_at,
+                    keys,
+                    vertices,
+                    size,
                 )
 
 
@@ -327,7 +357,8 @@ def _enter(
     search: int,
     position: int,
     drive_s: float,
-    keys: NDArray[np.float64],
+    onward_at: int,
+    keys: FloatArray,
     vertices: NDArray[np.int32],
     size: int,
 ) -> int:
@@ -336,7 +367,7 @@ def _enter(
     _look_along(streets, goal, search, street, position, drive_s - before_s)
     end_s = drive_s - before_s + float64s(streets.length_s)[street]
     junction = np.int64(int32s(streets.end)[street] - streets.n_slots)
-    return int(_reach(streets, junction, street, position, end_s, keys, vertices, size))
+    return int(_reach(streets, junction, street, position, end_s, onward_at, keys, vertices, size))
 
 
 @inlined_rule
@@ -346,7 +377,8 @@ def _reach(
     street: int,
     position: int,
     far: float,
-    keys: NDArray[np.float64],
+    onward_at: int,
+    keys: FloatArray,
     vertices: NDArray[np.int32],
     size: int,
 ) -> int:
@@ -359,7 +391,7 @@ def _reach(
         reached[reached[0]] = junction
     seconds[junction] = far
     int32s(streets.via)[junction], int32s(streets.via_from)[junction] = street, position
-    return int(push(keys, vertices, size, far, junction))
+    return int(push(keys, vertices, size, far + float64s(onward_at)[junction], junction))
 
 
 @rule
