@@ -14,7 +14,7 @@ from parkenv.engine.records import STATES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.show.report.page import SCHEMA
 from parkenv.show.report.town_map import town_data
-from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE, Blocks
+from parkenv.studies.fleet.blocks import ALL, BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.studies.fleet.measures import Roads
 from parkenv.studies.fleet.tables import unreached
 from parkenv.world.facility import Facility
@@ -22,11 +22,16 @@ from parkenv.world.facility import Facility
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """Two days in a small lot with a kerb and two zones, one with a price, in which some cars find no slot."""
+    """Two days in a small lot with a kerb, a garage and two zones, in which some cars find no slot."""
     folder, plain = tmp_path_factory.mktemp("blocks"), packaged_lot("mini")
     zone = np.where(plain.walk_m() <= np.median(plain.walk_m()), "centre", "")
     supply = {
-        "facilities": (Facility("Mill Street", "kerb"),),
+        "facilities": (
+            Facility("Mill Street", "kerb"),
+            Facility(
+                "P1", "garage", "centre", capacity=2, xy=(10.0, 14.0), gate_s=5.0, inside_s=(10.0, 30.0)
+            ),
+        ),
         "slot_facility": np.where(
             np.cumsum(zone == "centre") <= 3, np.where(zone == "", "", "Mill Street"), ""
         ),
@@ -36,10 +41,13 @@ def run(tmp_path_factory):
         "lot": str(folder / "zoned.geojson"),
         "costs": {"prices": {"centre": 3.0}},
         "arrivals": {"hours": "08:30-10:30"},
+        "demand": {
+            "shoppers": {"arrivals_per_hour": 40, "stay_s": 1800, "patience_s": 200, "walks_back": True},
+            "commuters": {"arrivals_per_hour": 20, "patience_s": 200},
+        },
     }
     found = fleet(
-        scenarios=[spec], agents=("random",), arrivals_per_hour=(60.0,), knows=("own",), days=2, patience_s=200.0,
-        jobs=1, folder=folder / "run",
+        scenarios=[spec], agents=("random",), knows=("own",), days=2, jobs=1, folder=folder / "run"
     )  # fmt: skip
     its, cars = found.study, []
     for day in range(2):
@@ -52,16 +60,21 @@ def run(tmp_path_factory):
 
 BLOCKS_OF_RUN = {
     ("Mill Street", "kerb", "centre", 3),
+    ("P1", "garage", "centre", 2),
     ("centre", "zone", "centre", 2),
     ("other", "zone", "other", 5),
     (NOWHERE, NOWHERE, NOWHERE, 0),
 }
 
 
-def columns(run, table):
-    """The rows of a table, as arrays by column, one for each day."""
-    rows = run[0].results.rows(table).values()
-    return [{name: np.array(row[name]) for name in (*table.line_keys, *table.columns)} for row in rows]
+def columns(run, table, purpose=ALL):
+    """The lines of a table about cars of a purpose, as arrays by column, for each day."""
+    names, days = (*table.line_keys, *table.columns), []
+    for row in run[0].results.rows(table).values():
+        lines = {name: np.array(row[name]) for name in names}
+        chosen = lines["purpose"] == purpose if "purpose" in names else slice(None)
+        days.append({name: values[chosen] for name, values in lines.items()})
+    return days
 
 
 def test_every_car_is_somewhere_at_the_end_of_each_hour(run):
@@ -91,6 +104,25 @@ def test_blocks_hold_all_cars_attempts_seconds_metres_and_coins(run):
         } == BLOCKS_OF_RUN
 
 
+def test_purposes_add_up_to_all_cars(run):
+    for table, counts in ((BLOCKS, ("arrivals", "refused", "departures", "paid")), (HOURS, STATES)):
+        parts = [columns(run, table, purpose) for purpose in ("shoppers", "commuters")]
+        for day, every in enumerate(columns(run, table)):
+            for name in counts:
+                of_purposes = sum(part[day][name].sum() for part in parts)
+                assert of_purposes == pytest.approx(every[name].sum())
+    names = [one.name for one in run[0].study.built["zoned"].demand.purposes]
+    for row in run[0].summary["purposes"]:
+        its = [cars[cars["purpose"] == names.index(row["purpose"])] for cars in run[1]]
+        assert row["parked_a_day"] == np.mean([(cars["slot"] >= 0).sum() for cars in its])
+        assert row["balked_fraction"] == pytest.approx(np.mean([(cars["slot"] < 0).mean() for cars in its]))
+        assert row["search_s"] == pytest.approx(
+            np.mean([(cars["ended_at"] - cars["arrival"]).mean() for cars in its]), abs=0.01
+        )
+        # Occupancy by purpose is that of its cars; residents have none.
+        assert 0.0 < row["occupancy"] < 1.0
+
+
 def test_detours_of_lanes_are_those_of_cars(run):
     days = run[0].results.of(run[0].study, run[0].study.cells()[0])
     for lanes, blocks, day, cars in zip(columns(run, LANES), columns(run, BLOCKS), days, run[1], strict=True):
@@ -115,7 +147,7 @@ def test_tables_are_read_as_they_were_written_and_the_last_of_two_equal_lines_co
 def test_zones_are_groups_of_blocks(run):
     zones = {row["zone"]: row for row in run[0].summary["zones"]}
     days = columns(run, BLOCKS)
-    assert {name: row["slots"] for name, row in zones.items()} == {"centre": 5, "other": 5}
+    assert {name: row["slots"] for name, row in zones.items()} == {"centre": 7, "other": 5}
     for name, row in zones.items():
         its = [day["zone"] == name for day in days]
         assert row["parked_a_day"] == np.mean(
@@ -127,7 +159,7 @@ def test_zones_are_groups_of_blocks(run):
             for day, i in zip(days, its, strict=True)
         ]
         if name == "centre":
-            assert row["occupancy"] == pytest.approx(np.mean(np.divide(taken, hours)) / 5)
+            assert row["occupancy"] == pytest.approx(np.mean(np.divide(taken, hours)) / 7)
 
 
 def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
@@ -135,7 +167,7 @@ def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
     data = json.loads(re.search(r'id="report-data">(.*?)</script>', text, flags=re.DOTALL)[1])
     jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
     (shown,), (town,) = data["maps"], data["towns"]
-    assert [block["name"] for block in town["blocks"]] == ["Mill Street", "centre", "other"]
+    assert [block["name"] for block in town["blocks"]] == ["Mill Street", "P1", "centre", "other"]
     assert town["blocks"][0]["rules"] == "3 an hour"
     days = columns(run, BLOCKS)
     for number, block in enumerate(town["blocks"]):

@@ -22,6 +22,7 @@ from parkenv.files.csv_tables import (
     WHOLE,
     YES_OR_NO,
     Kind,
+    csv_columns,
     csv_text,
     typed_records,
     wholes,
@@ -207,12 +208,11 @@ class LongTable(Table):
     def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
         """See `Table`."""
         in_line = (*self.line_keys, *self.columns)
-        lines = (
-            {c: row[c] for c in self.keys} | dict(zip(in_line, values, strict=True))
-            for row in rows
-            for values in zip(*(row[c] for c in in_line), strict=True)
-        )
-        yield self.file, csv_text((*self.keys, *in_line), lines, header=header)
+        texts = [csv_text((*self.keys, *in_line), [], header=header)]
+        for row in rows:
+            n = len(row[in_line[0]])
+            texts.append(csv_columns([*([row[c]] * n for c in self.keys), *(row[c] for c in in_line)]))
+        yield self.file, "".join(texts)
 
 
 @dataclass(frozen=True, eq=False)

@@ -239,7 +239,7 @@ def _block_row(
 ) -> Row:
     cars, first, n_blocks = fleet.cars, hours[0], len(blocks.names)
     names, purpose = purposes_of(fleet)
-    parked, arrives = cars["slot"] >= 0, of_cars(fleet, "parked_at", -1) < 0
+    parked, arrives = cars["slot"] >= 0, cars["parked_at"] < 0
     block = np.where(parked, blocks.of_slot[cars["slot"]], n_blocks)
     leaves = np.where(parked, cars["ended_at"] + cars["stay_s"], np.inf)
     shape = n_blocks + 1, len(names), len(hours)
@@ -286,15 +286,8 @@ def _block_row(
 
 def purposes_of(fleet: Fleet) -> tuple[tuple[str, ...], IntArray]:
     """Return the purposes of a fleet's drivers, `ALL` if there is one, and the number of that of each car."""
-    names, purpose = tuple(one.name for one in fleet.demand.purposes), of_cars(fleet, "purpose", -1)
-    several = len(names) > 1 and (purpose >= 0).all()
-    return names if several else (ALL,), np.maximum(purpose, 0)
-
-
-def of_cars(fleet: Fleet, name: str, default: float) -> NDArray[Any]:
-    """Return a field of the cars of a fleet, or where they have none, a default value."""
-    known = name in (fleet.cars.dtype.names or ())
-    return np.array(fleet.cars[name]) if known else np.full(len(fleet.cars), default, type(default))
+    names = tuple(one.name for one in fleet.demand.purposes)
+    return (ALL,) if len(names) == 1 else names, np.array(fleet.cars["purpose"])
 
 
 def _with_all(sums: NDArray[Any]) -> NDArray[Any]:

@@ -14,7 +14,6 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet
 from parkenv.engine.records import LEFT, NO_CAR, PARKED
 from parkenv.show.scene import LotScene
-from parkenv.studies.fleet.blocks import of_cars
 from parkenv.studies.fleet.setting import Setting, rate_text
 from parkenv.studies.report import AGREES_S, MOST_SLOTS, Again, Recording
 from parkenv.studies.report_options import ReportOptions
@@ -87,7 +86,7 @@ def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[K
     residents = fleet.slots["leaves_at"].copy()
     fleet.run(agents)
     cars, begin = fleet.cars, fleet.begin
-    mean_s = float(cars["total_s"][of_cars(fleet, "parked_at", -1) < 0].mean())
+    mean_s = float(cars["total_s"][cars["parked_at"] < 0].mean())
     before = counted.get(study.keys(setting, day)[0])
     agrees = None if before is None else abs(before - mean_s) <= AGREES_S
     differences = []

@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.engine.fleet import Fleet
-from parkenv.studies.fleet.blocks import has_zones, of_cars, paid
+from parkenv.studies.fleet.blocks import has_zones, paid
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.setting import BY_HOUR
 from parkenv.world.cost_terms import COST_FIELDS
@@ -70,9 +70,8 @@ class Roads:
         """
         cars, lot = fleet.cars, self._problem.lot
         rows, free_s = np.searchsorted(self._entries, cars["entry"]), np.zeros((len(cars), len(lot.zones)))
-        factor = of_cars(fleet, "walks", 1.0)
-        for place, walks in sorted({*zip(cars["place"].tolist(), factor.tolist(), strict=True)}):
-            its = (cars["place"] == place) & (factor == walks)
+        for place, walks in sorted({*zip(cars["place"].tolist(), cars["walks"].tolist(), strict=True)}):
+            its = (cars["place"] == place) & (cars["walks"] == walks)
             cost_s = fleet.scenarios[place].walk_s * walks + lot.slot_parking_cost_s
             by_zone = [
                 (self._drive_s[:, lot.zone_of_slot == zone] + cost_s[lot.zone_of_slot == zone]).min(axis=1)
@@ -108,9 +107,7 @@ class Roads:
         """
         lot = self._problem.lot
         holds = (
-            len(fleet.scenarios) == 1
-            and (lot.capacity == 1).all()
-            and (of_cars(fleet, "parked_at", -1) < 0).all()
+            len(fleet.scenarios) == 1 and (lot.capacity == 1).all() and (fleet.cars["parked_at"] < 0).all()
         )
         if len(fleet.cars) * lot.n_slots > MOST_PAIRS or not holds:
             return float("nan")
@@ -160,7 +157,7 @@ def day_measures(
         filled: of `filling`, while cars arrived.
         clairvoyant_s: lower bound on the total time of all cars together, s.
     """
-    arrives = of_cars(fleet, "parked_at", -1) < 0
+    arrives = fleet.cars["parked_at"] < 0
     cars, amounts, members = fleet.cars[arrives], paid(fleet)[arrives], members[arrives]
     times, parked = cars["total_s"], cars["slot"] >= 0
     cruised_m = roads.cruised_m(cars)
@@ -191,7 +188,7 @@ def day_measures(
 
 def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     """Return `CAR_LISTS` of a day whose searches are all over, as texts."""
-    arrives, lot = of_cars(fleet, "parked_at", -1) < 0, fleet.scenario.lot
+    arrives, lot = fleet.cars["parked_at"] < 0, fleet.scenario.lot
     cars, members = fleet.cars[arrives], members[arrives]
     lists = {"total_cs": 100.0 * cars["total_s"], "member": members}
     if has_zones(fleet.scenario):

@@ -329,7 +329,7 @@ class FleetStudy(Study):
         try:
             for time in times:
                 fleet.run(agents, until=float(time))
-                taken.append(getattr(fleet, "counts", fleet.taken)())
+                taken.append(fleet.counts())
                 tally.update()
             fleet.run(agents)
             tally.update()
