@@ -157,6 +157,8 @@ class Run:
             # Stages share the cores; torch's threads would wait for each other by spinning.
             "OMP_NUM_THREADS": "1",
         }
+        # Hundreds of processes would each translate all modules anew.
+        environment.pop("PYTHONDONTWRITEBYTECODE", None)
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
                 ["bash", "-euo", "pipefail", "-c", self.stage.command],

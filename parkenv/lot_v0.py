@@ -27,8 +27,9 @@ from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
 from parkenv.errors import InputError, require_whole
+from parkenv.files.known_names import MAX_CARS
 from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
-from parkenv.world.demand import MAX_CARS, Demand, Headways, TownDemand
+from parkenv.world.demand import Demand, Headways, TownDemand
 from parkenv.world.lot import ACTIONS
 
 if TYPE_CHECKING:

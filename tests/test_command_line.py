@@ -1,7 +1,6 @@
 """Help pages, hints, completion and the start of the command line; what commands do is tested elsewhere."""
 
-import ast
-import os
+import json
 import re
 import shlex
 import subprocess
@@ -128,56 +127,63 @@ def test_a_mistake_is_answered_by_what_was_meant(words, said, tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def fresh(*words, **environment):
-    """Run a command in a process of its own; return its lines, and which large modules it has loaded."""
-    heavy = "pydantic", "numba", "scipy", "rich", "torch", "matplotlib", "cv2", "shapely"
-    program = (
-        "import atexit, sys; sys.argv[0] = 'parkenv'\n"
-        f"atexit.register(lambda: print([m for m in {heavy} if m in sys.modules], file=sys.stderr))\n"
-        "import runpy; runpy.run_module('parkenv', run_name='__main__')"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", program, *words],
-        env={**os.environ, **environment},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.returncode == 0, done.stderr
-    return done.stdout.split("\n")[:-1], done.stderr.strip()
+COMPLETIONS = {
+    "parkenv compare --scenario ca": ["campus"],
+    "parkenv compare --agents mdp,be": ["mdp,belief", "mdp,belief-rivals"],
+    "parkenv compare --figu": ["--figures"],
+    "parkenv compare --rig st": ["stereo"],
+    "parkenv benchmark run v1 --agents be": ["belief", "belief-rivals"],
+    "parkenv plan --sensor-model las": ["laser"],
+    "parkenv survey --weather r": ["rain"],
+    "parkenv run examples/courtyard/s": ["examples/courtyard/sweep.toml"],
+    "parkenv lot sh": ["show"],
+    "parkenv report here --rep": ["--replay"],
+}
+HELPED = ("compare", "train", "lot import", "evaluate-detector", "report", "park")
+FRESH = """
+import contextlib, io, json, os, sys
+heavy = "pydantic", "numba", "scipy", "rich", "torch", "matplotlib", "cv2", "shapely"
+answers = []
+from parkenv.__main__ import main
+for words, variables in json.loads(sys.argv[1]):
+    sys.argv = ["parkenv", *words]
+    os.environ.update(variables)
+    with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
+        main()
+    answers.append((said.getvalue().split("\\n")[:-1], [name for name in heavy if name in sys.modules]))
+print(json.dumps(answers))
+"""
 
 
-@pytest.mark.parametrize(
-    ("line", "wanted"),
-    [
-        ("parkenv compare --scenario ca", ["campus"]),
-        ("parkenv compare --agents mdp,be", ["mdp,belief", "mdp,belief-rivals"]),
-        ("parkenv compare --figu", ["--figures"]),
-        ("parkenv compare --rig st", ["stereo"]),
-        ("parkenv benchmark run v1 --agents be", ["belief", "belief-rivals"]),
-        ("parkenv plan --sensor-model las", ["laser"]),
-        ("parkenv survey --weather r", ["rain"]),
-        ("parkenv run examples/courtyard/s", ["examples/courtyard/sweep.toml"]),
-        ("parkenv lot sh", ["show"]),
-        ("parkenv report here --rep", ["--replay"]),
-    ],
-)
-def test_values_are_completed_without_loading_anything_large(line, wanted):
-    variables = {"_PARKENV_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}
-    found, loaded = fresh(**variables)
+@pytest.fixture(scope="module")
+def answers():
+    """Lines that calls print, and the large modules that are loaded after each, in one process of their own."""
+    calls = [((option,), {}) for option in ("--version", "--help")]
+    calls += [((*name.split(), "--help"), {}) for name in HELPED]
+    of_shell = {"_PARKENV_COMPLETE": "complete_bash"}
+    calls += [
+        ((), of_shell | {"COMP_WORDS": line, "COMP_CWORD": str(line.count(" "))}) for line in COMPLETIONS
+    ]
+    program = [sys.executable, "-c", FRESH, json.dumps(calls)]
+    done = subprocess.run(program, capture_output=True, text=True, timeout=120, check=True)
+    return dict(zip(("--version", "--help", *HELPED, *COMPLETIONS), json.loads(done.stdout), strict=True))
+
+
+@pytest.mark.parametrize("line", COMPLETIONS)
+def test_values_are_completed_without_loading_anything_large(line, answers):
     # Options are fields, which pydantic reads.
-    assert (found, set(ast.literal_eval(loaded)) <= {"pydantic"}) == (wanted, True), loaded
+    assert answers[line] == [COMPLETIONS[line], ["pydantic"]]
 
 
-@pytest.mark.parametrize("name", ["compare", "train", "lot import", "evaluate-detector", "report", "park"])
-def test_help_loads_the_options_of_its_command_alone(name):
-    assert fresh(*name.split(), "--help")[1] == "['pydantic']"
+@pytest.mark.parametrize("name", HELPED)
+def test_help_loads_the_options_of_its_command_alone(name, answers):
+    assert answers[name][1] == ["pydantic"]
 
 
-def test_version_and_help_load_nothing_large():
-    assert fresh("--version") == (["parkenv 0.1.0"], "[]")
-    page, loaded = fresh("--help")
-    assert loaded == "[]"
+def test_version_and_help_load_nothing_large(answers):
+    assert answers["--version"] == [["parkenv 0.1.0"], []]
+    page, loaded = answers["--help"]
+    assert loaded == []
     assert {line.split()[0] for line in page if line.startswith("  ")} >= {"demo", "compare", "lot", "bench"}
 
 

@@ -26,6 +26,8 @@ MapName = Literal["empty", "right", "wrong"]
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
 """What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
+MAX_CARS = 1_000_000
+"""Maximum number of cars of a world."""
 BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)

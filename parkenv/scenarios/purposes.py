@@ -4,28 +4,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from parkenv.errors import InputError, naming
+from parkenv.files.known_names import MAX_CARS
 from parkenv.files.spec_file import Several, Spec
-from parkenv.world.demand import (
-    MAX_CARS,
-    Arrivals,
-    ConstantTime,
-    Demand,
-    Duration,
-    ExponentialTime,
-    LogNormalTime,
-    NoArrivals,
-    PoissonArrivals,
-    TownDemand,
-)
-from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.week import DAY_HOURS
+
+if TYPE_CHECKING:  # help and completion read fields alone
+    from parkenv.world.demand import Arrivals, Duration, TownDemand
+    from parkenv.world.lot import ParkingLot
 
 MAX_RATE = 1e6
 """Maximum number of cars an hour."""
@@ -97,12 +89,16 @@ class PurposeSpec(Spec):
     @property
     def stay(self) -> Duration:
         """Law of the stays."""
+        from parkenv.world.demand import ConstantTime, ExponentialTime, LogNormalTime
+
         if self.stay_law == "log-normal":
             return LogNormalTime(self.stay_s, self.stay_cv)
         return (ConstantTime if self.stay_law == "constant" else ExponentialTime)(self.stay_s)
 
     def arrivals(self, window: ArrivalWindow) -> Arrivals:
         """Return the arrivals in a window."""
+        from parkenv.world.demand import NoArrivals, PoissonArrivals
+
         start, end = int(window.start_s // 3600), math.ceil(window.end_s / 3600)
         if not any(self.arrivals_per_hour[start:end]):
             return NoArrivals(window.start_s)
@@ -121,6 +117,8 @@ def demand_of(
         InputError: the hours end when they begin, a weight does not fit the lot, or nobody arrives; the message names
             the table.
     """
+    from parkenv.world.demand import ConstantTime, Demand, TownDemand
+
     if not purposes:
         return None
     if window.end_s <= window.start_s:

@@ -31,13 +31,12 @@ from parkenv.compiled.keyed_random import (
     named_key,
 )
 from parkenv.errors import InputError, require_number, require_whole
+from parkenv.files.known_names import MAX_CARS
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import Arrival, ArrivalDay, OccupancyModel
 from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S, PERIOD_S
 
-MAX_CARS = 1_000_000
-"""Maximum number of cars of a world."""
 MAX_CLASSES = 60
 """Maximum number of classes of drivers."""
 CHARGING = "charging"
