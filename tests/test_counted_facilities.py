@@ -18,6 +18,8 @@ from parkenv.studies.fleet.drivers import policy_of
 from parkenv.studies.simulate import simulate
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, ListedArrivals, PoissonArrivals
 from parkenv.world.lot import PARK, ParkingLot
+from parkenv.world.occupancy.process import Arrival
+from parkenv.world.occupancy.typical_week import typical_occupancy
 from parkenv.world.tariff import Price, Zone
 from planners import make_agent
 from planners.heuristics.policies import POLICIES
@@ -190,6 +192,44 @@ def test_forbidden_slots_are_as_good_as_taken():
     assert info["failed_parks"] == 0
     allowed = gym.make("parkenv/Search-v2", scenario=scenario.replace(classes=("permit-a",)))
     assert (allowed.reset(seed=0)[0]["p_occupied"] < 1.0).all()
+
+
+def test_a_single_search_takes_as_long_inside_as_agents_expect():
+    scenario = garage_alone(gate_s=20.0, inside_s=(30.0, 80.0))
+    # A week in which nobody else comes.
+    scenario = scenario.replace(walk_back=True, occupancy=typical_occupancy(scenario.lot, demand=-40.0))
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    env.reset(seed=1)
+    while (vertex := env.unwrapped.state.vertex) != 0:
+        env.step(way_to(scenario.lot, vertex, 0))
+    _, reward, terminated, _, info = env.step(PARK)
+    assert terminated
+    assert info["parked"]
+    assert -reward == pytest.approx(scenario.arrival_cost_s[0])
+    assert info["reward_terms"]["drive"] == -75.0
+
+
+def test_a_typical_week_fills_a_facility_as_often_as_all_of_its_spaces():
+    """In the fullest hour, and with the rates of the first car that leaves."""
+    lot = town(zone_rules={})
+    week, spaces = make_scenario(lot).occupancy, typical_occupancy(lot)
+    hour = Arrival((24.0 + 11.5) * 3600.0)
+    p, each = week.forecast(hour), spaces.forecast(hour)
+    np.testing.assert_array_equal(p.p_occupied[:10], each.p_occupied[:10])
+    assert p.p_occupied[10] == pytest.approx(each.p_occupied[10] ** 40, rel=0.25)
+    assert week.departure_factor[10] == 40.0 * spaces.departure_factor[10]
+
+
+def test_the_walk_back_counts_for_those_who_mind_it():
+    scenario = make_scenario(town(zone_rules={}))
+    fleets = [
+        run(scenario, Demand(ListedArrivals((0.0, 60.0)), ConstantTime(600.0), walks_back=back))
+        for back in (False, True)
+    ]
+    there, back = (fleet.cars for fleet in fleets)
+    assert there["slot"].tolist() == back["slot"].tolist()
+    np.testing.assert_allclose(back["walk_s"], 2.0 * there["walk_s"])
+    np.testing.assert_allclose(back["walked_m"], 2.0 * there["walked_m"])
 
 
 # ---- what drivers know

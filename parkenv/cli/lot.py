@@ -404,8 +404,10 @@ def _provenance(path: Path) -> Provenance | None:
 def _summary(lot: ParkingLot) -> str:
     low_x, low_y, high_x, high_y = lot.bounds()
     oneway = sum(lane.oneway for lane in lot.lanes)
+    n_counted, spaces = int(lot.is_counted.sum()), lot.capacity[lot.is_counted].sum()
     parts = [
-        f"{lot.name}: {plural(lot.n_slots, 'slot')}",
+        f"{lot.name}: {plural(lot.n_slots - n_counted, 'slot')}",
+        *([f"{plural(n_counted, 'car park')} with {spaces} spaces"] if n_counted else []),
         f"{plural(len(lot.lanes), 'lane')} ({oneway} one-way)",
         plural(len(lot.entries), "entry", "entries"),
         plural(len(lot.goals), "goal"),
@@ -413,8 +415,10 @@ def _summary(lot: ParkingLot) -> str:
         f"{high_x - low_x:.0f} × {high_y - low_y:.0f} m",
     ]
     if lot.zones != (NO_ZONE,):
-        counts = Counter(lot.zone_of_slot.tolist())
-        parts.append(f"zones {', '.join(f'{zone} ({counts[i]} slots)' for i, zone in enumerate(lot.zones))}")
+        word, counts = "spaces" if n_counted else "slots", Counter[int]()
+        for zone, capacity in zip(lot.zone_of_slot.tolist(), lot.capacity.tolist(), strict=True):
+            counts[zone] += capacity
+        parts.append(f"zones {', '.join(f'{zone} ({counts[i]} {word})' for i, zone in enumerate(lot.zones))}")
     cost = lot.slot_parking_cost_s
     if cost.any():
         parts.append(

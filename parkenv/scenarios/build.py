@@ -30,7 +30,12 @@ from parkenv.world.occupancy.constant_map import FlatMap
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import OccupancyModel, OccupancyProcess, PriorModel
 from parkenv.world.occupancy.real_week import real_week_occupancy
-from parkenv.world.occupancy.typical_week import attraction, typical_occupancy, with_event
+from parkenv.world.occupancy.typical_week import (
+    attraction,
+    typical_occupancy,
+    with_event,
+    with_full_facilities,
+)
 from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.tariff import Tariff
@@ -130,7 +135,7 @@ def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec
 
 def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
     goal = changes.get("goal", 0)
-    occupancy = changes.get("occupancy") or typical_occupancy(lot, goal=goal)
+    occupancy = changes.get("occupancy") or with_full_facilities(typical_occupancy(lot, goal=goal), lot)
     scenario = Scenario(name=lot.name, lot=lot, goal=goal, occupancy=occupancy)
     return scenario.replace(**changes | {"occupancy": occupancy})
 
@@ -234,7 +239,8 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
     if spec.process is not None:
         process = _process(spec.process, lot, goal)
     elif spec.real_week is not None:
-        process = real_week_occupancy(lot, goal=goal, **spec.real_week.model_dump())
+        week = real_week_occupancy(lot, goal=goal, **spec.real_week.model_dump())
+        process = with_full_facilities(week, lot)
     else:
         process = _typical(spec.typical or TypicalWeek(), lot, goal)
     if spec.event is None:
@@ -310,7 +316,8 @@ def _prior(spec: ForecastSpec, occupancy: OccupancyModel, lot: ParkingLot, goal:
 
 def _typical(spec: TypicalWeek, lot: ParkingLot, goal: int) -> OccupancyProcess:
     parameters = spec.model_dump(exclude={"goal"})
-    return typical_occupancy(lot, goal=goal if spec.goal is None else spec.goal, **parameters)
+    week = typical_occupancy(lot, goal=goal if spec.goal is None else spec.goal, **parameters)
+    return with_full_facilities(week, lot)
 
 
 def _process(path: Path, lot: ParkingLot, goal: int) -> OccupancyProcess:

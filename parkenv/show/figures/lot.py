@@ -37,6 +37,8 @@ BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb]
 """Colours of beliefs, from free to taken."""
 ZONE_COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
 """Colours of zones, distinguishable with any colour vision."""
+PARKING_SIGN = "#1565c0"
+"""Ground of a parking sign, which marks counted facilities with their capacity."""
 INK_PALE = "#b4b8bd"
 COST_MAP = "viridis"
 """Colour map of parking costs."""
@@ -78,6 +80,19 @@ def draw_lot(
         Marks(posed(scene.lot.goals), STAR, "goal", px=21.0, edge="paint", edge_px=0.9),
     ]
     paint(ax, marks, 5.0)
+    for slot in np.flatnonzero(lot.is_counted).tolist():
+        x, y = lot.slot_xy[slot].tolist()
+        ax.text(
+            x,
+            y,
+            f"P {lot.capacity[slot]}",
+            fontsize=7,
+            color="white",
+            ha="center",
+            va="center",
+            zorder=5.5,
+            bbox={"boxstyle": "round,pad=0.3", "fc": PARKING_SIGN, "ec": "white", "lw": 0.6},
+        )
     draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0, INK)
 
 

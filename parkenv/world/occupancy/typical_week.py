@@ -56,6 +56,24 @@ def attraction(lot: ParkingLot, goal: int, pull: float, unevenness: float) -> Fl
     return np.asarray(pull * nearness + noise)
 
 
+def with_full_facilities(process: OccupancyProcess, lot: ParkingLot) -> OccupancyProcess:
+    """Return the process in which the slot of a counted facility is taken while all of the facility is.
+
+    In the fullest hour of the week that is as often as all of its spaces are taken, each as the process says; it ends
+    when the first of the cars leaves.
+    """
+    if not lot.is_counted.any():
+        return process
+    arrival, departure = process.arrival_factor, process.departure_factor
+    profile = process.arrival_profile / np.maximum(process.departure_profile, np.finfo(float).tiny)
+    odds = np.maximum(arrival / departure * profile.max(), np.finfo(float).tiny)
+    p_full = (odds / (1.0 + odds)) ** lot.capacity
+    less = np.where(lot.is_counted, p_full / (1.0 - p_full) / odds, 1.0)
+    return dataclasses.replace(
+        process, arrival_factor=arrival * less * lot.capacity, departure_factor=departure * lot.capacity
+    )
+
+
 def with_event(
     usual: OccupancyProcess, lot: ParkingLot, *, goal: int = 0, share: float, factor: float
 ) -> OccupancyProcess:
