@@ -216,7 +216,10 @@ def save_zones_figure(
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=(5.8, 6.2), layout="constrained")
         axes = figure.subplot_mosaic([["map", "map"], ["occupancy", "paid"]], height_ratios=(1.3, 1.0))
-        draw_zones(lot, axes["map"])
+        zones = draw_zones(lot, axes["map"])
+        axes["map"].legend(
+            handles=zones, loc="upper center", bbox_to_anchor=(0.5, 0.0), ncols=4, frameon=False
+        )
         for number, color in enumerate(zone_colors(lot)):
             for name, scale in (("occupancy", 100.0), ("paid", 1.0)):
                 axes[name].plot(at, scale * courses[name][number], color=color, marker="o", markersize=4)

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import wrap
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -35,13 +36,18 @@ ENTRY_ARROW = np.array(
 """An arrow from the entry into the lot."""
 BELIEF_MAP = LinearSegmentedColormap.from_list("belief", [[c / 255 for c in rgb] for rgb in BELIEF_ANCHORS])
 """Colours of beliefs, from free to taken."""
-ZONE_COLORS = ("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442")
-"""Colours of zones, distinguishable with any colour vision."""
+ZONE_COLORS = (
+    *("#0072b2", "#e69f00", "#009e73", "#cc79a7", "#56b4e9", "#d55e00", "#f0e442"),
+    *("#882255", "#117733", "#332288", "#aa4499", "#999933", "#44aa99", "#661100"),
+)
+"""Colours of zones; the first seven are distinguishable with any colour vision."""
 PARKING_SIGN = "#1565c0"
 """Ground of a parking sign, which marks counted facilities with their capacity."""
+MOST_SIGNS = 40  # counted facilities with signs; more are discs
 INK_PALE = "#b4b8bd"
 COST_MAP = "viridis"
 """Colour map of parking costs."""
+MANY_MARKS = 25  # entries and goals from which on their marks are smaller
 SMALLEST_DISC = 6.0
 """Smallest diameter of a disc, points."""
 
@@ -75,25 +81,30 @@ def draw_lot(
     paint(ax, [Lines(list(scene.slot_lines), "paint", 0.12, (0.2, 1.2))], 1.1)
     if show_graph:
         paint(ax, drive_graph(lot), 1.5)
+    if lot.is_counted.any():
+        _draw_counted(lot, ax, INK_PALE if slot_color is None else slot_color)
+    size = float(np.clip(math.sqrt(MANY_MARKS / (len(lot.goals) + len(lot.entries))), 0.4, 1.0))
     marks = [
-        Marks(scene.entries, ENTRY_ARROW, "entry", px=32.0, edge="paint", edge_px=0.7),
-        Marks(posed(scene.lot.goals), STAR, "goal", px=21.0, edge="paint", edge_px=0.9),
+        Marks(scene.entries, ENTRY_ARROW, "entry", px=32.0 * size, edge="paint", edge_px=0.7),
+        Marks(posed(scene.lot.goals), STAR, "goal", px=21.0 * size, edge="paint", edge_px=0.9),
     ]
     paint(ax, marks, 5.0)
-    for slot in np.flatnonzero(lot.is_counted).tolist():
-        x, y = lot.slot_xy[slot].tolist()
-        ax.text(
-            x,
-            y,
-            f"P {lot.capacity[slot]}",
-            fontsize=7,
-            color="white",
-            ha="center",
-            va="center",
-            zorder=5.5,
-            bbox={"boxstyle": "round,pad=0.3", "fc": PARKING_SIGN, "ec": "white", "lw": 0.6},
-        )
     draw_scale_bar(ax, x0, y0 - 0.5 * margin - bar_room, x1 - x0, INK)
+
+
+def _draw_counted(lot: ParkingLot, ax: Axes, color: ColorType | FloatArray) -> None:
+    """Mark car parks and garages that are counted: signs with their capacity or, of many, discs of that size."""
+    which = np.flatnonzero(lot.is_counted)
+    x, y = lot.slot_xy[which].T
+    if len(which) <= MOST_SIGNS:
+        sign = {"boxstyle": "round,pad=0.3", "fc": PARKING_SIGN, "ec": "white", "lw": 0.6}
+        how: dict[str, Any] = {"fontsize": 7, "color": "white", "ha": "center", "va": "center", "zorder": 5.5}
+        for k, slot in enumerate(which.tolist()):
+            ax.text(float(x[k]), float(y[k]), f"P {lot.capacity[slot]}", bbox=sign, **how)
+        return
+    colors = np.broadcast_to(to_rgba_array(color), (lot.n_slots, 4))
+    sizes = np.clip(lot.capacity[which] * 0.5, 14.0, 400.0)
+    ax.scatter(x, y, s=sizes, c=colors[which], edgecolors="white", linewidths=0.6, zorder=4.0)
 
 
 def drive_graph(lot: ParkingLot) -> list[Layer]:
@@ -160,7 +171,8 @@ def save_lot_picture(
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     cost = lot.slot_parking_cost_s
     if lot.zones != (NO_ZONE,):
-        draw_zones(lot, ax, show_graph=show_graph)
+        zones = draw_zones(lot, ax, show_graph=show_graph)
+        ax.legend(handles=zones, title="zone", loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
     elif cost.any():
         scale = ScalarMappable(Normalize(0.0, float(cost.max())), COST_MAP)
         colors = scale.to_rgba(cost)
@@ -181,12 +193,11 @@ def save_lot_picture(
         )
 
 
-def draw_zones(lot: ParkingLot, ax: Axes, *, show_graph: bool = False) -> None:
-    """Draw a lot with its slots in the colours of their zones, and a legend."""
+def draw_zones(lot: ParkingLot, ax: Axes, *, show_graph: bool = False) -> list[Patch]:
+    """Draw a lot with its slots in the colours of their zones; return the entries of a legend."""
     colors = zone_colors(lot)
     draw_lot(lot, ax, slot_color=to_rgba_array(colors)[lot.zone_of_slot], show_graph=show_graph)
-    handles = [Patch(color=color, label=zone) for zone, color in zip(lot.zones, colors, strict=True)]
-    ax.legend(handles=handles, title="zone", loc="upper left", frameon=True, framealpha=0.9).set_zorder(6.0)
+    return [Patch(color=color, label=zone) for zone, color in zip(lot.zones, colors, strict=True)]
 
 
 def zone_colors(lot: ParkingLot) -> list[str]:
