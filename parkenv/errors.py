@@ -93,11 +93,13 @@ def reset_options(options: object, known: Collection[str]) -> dict[str, Any]:
     Raises:
         InputError: it is no dictionary, or an option is unknown.
     """
-    if not isinstance(options, Mapping | None):
+    if options is None:
+        return {}
+    if not isinstance(options, Mapping):
         raise InputError(f"options is {options!r:.60}, want a dictionary or None")
-    for name in options or ():
+    for name in options:
         require_one_of("option of reset", name, known)
-    return dict(options or {})
+    return dict(options)
 
 
 def require_keywords(function: str, given: Iterable[str], known: Collection[str]) -> None:

@@ -261,7 +261,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if place == self._place:
             return
         self._place, self.scenario = place, self.scenarios[place]
-        self._name = self.scenario.name
+        self._name, self._is_exact = self.scenario.name, self.scenario.observes_exactly
         self._copy_mask = self._copy_masks[place]
         self._close_window()
 
@@ -346,7 +346,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     def _stepper(self) -> Callable[[int, int], tuple[Any, ...]]:
         """Return what acts and observes: (address of the search, action) -> numbers named by `STEP_RESULT`."""
-        return _compiled_step(self.scenario.observes_exactly)
+        return _compiled_step(self._is_exact)
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""
