@@ -177,7 +177,7 @@ def _show_places(console: Console, what: str, rows: Sequence[Row], names: dict[s
         title = f"The {MOST_SHOWN} blocks with the most cars, of {len({row[what] for row in rows})}"
         cars = sorted(rows, key=lambda row: -row["parked_a_day"])
         shown = list(dict.fromkeys(row[what] for row in cars))[:MOST_SHOWN]
-        rows = [row for row in rows if row[what] in shown]
+        rows = [row for row in cars if row[what] in shown]
     is_place = what != "purpose"
     headings = [
         *names.values(), what, *(["slots", "price/h"] if is_place else []), "slots taken", "cars a day", "of all",

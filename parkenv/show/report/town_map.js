@@ -90,9 +90,9 @@ class TownView extends LotView {
     context.strokeStyle = palette.cruise;
     this.lanes.forEach((path, number) => {
       const share = Math.min(Math.sqrt(cruised(number) / most), 1);
-      if (share < 0.05) return;
-      context.globalAlpha = 0.25 + 0.65 * share;
-      context.lineWidth = Math.max(this.px(1 + 3.5 * share), 3.2 * share);
+      if (share < 0.12) return;
+      context.globalAlpha = 0.2 + 0.6 * share;
+      context.lineWidth = Math.max(this.px(0.5 + 2.5 * share), 3.2 * share);
       context.stroke(path);
     });
     context.globalAlpha = 1;
