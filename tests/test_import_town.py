@@ -156,9 +156,9 @@ def test_kerbs_drawn_as_areas_are_slots_of_their_street(tmp_path):
 
 def test_places_are_as_tagged_else_by_area_and_levels(tmp_path):
     place = grid(**{"parking:both": "no"})
-    place.box(
-        20, 20, 60, 60, {"amenity": "parking", "name": "P1", "capacity": "77", "capacity:disabled": "4"}
-    )
+    # Its outline is open, as where the edge of a map cuts it.
+    p1 = {"amenity": "parking", "name": "P1", "capacity": "77", "capacity:disabled": "4"}
+    place.way([(20, 20), (60, 20), (60, 60), (20, 60)], p1)
     place.box(80, 20, 120, 60, {"amenity": "parking", "name": "P2", "access": "private"})
     garage = {
         "amenity": "parking",
@@ -202,6 +202,21 @@ def test_drawn_spaces_are_slots_and_what_is_not_drawn_is_counted(tmp_path):
     zones = [lot.zone_rules[name] for name in lot.slot_zone[:8]]
     assert [zone.users for zone in zones] == [("disabled",), *[("public",)] * 7]
     assert zones[1].max_stay_s == 7200.0
+
+
+def test_entrances_without_an_outline_are_a_garage(tmp_path):
+    place = grid(**{"parking:both": "no"}).box(
+        20, 20, 60, 60, {"amenity": "parking", "parking": "underground"}
+    )
+    place.node(70, 40, amenity="parking_entrance").node(230, 230, amenity="parking_entrance", name="Dom")
+    place.node(240, 230, amenity="parking_entrance").node(230, 30, amenity="parking_entrance", capacity="80")
+    town = draft(place, tmp_path)
+    assert {row["capacity"] for row in town.facilities} == {
+        expected_capacity("underground", 1600.0, None),
+        RULES["multi-storey"].typical,
+        80,
+    }
+    assert row_of(town, "Dom")["kind"] == "garage"
 
 
 def test_parking_that_no_street_reaches_is_left_out(tmp_path):

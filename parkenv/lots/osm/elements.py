@@ -64,7 +64,12 @@ class OsmElement:
     @property
     def is_closed(self) -> bool:
         """Whether all of its lines are closed, i.e. enclose an area."""
-        return all(len(line) >= 4 and np.array_equal(line[0], line[-1]) for line in self.lines)
+        return all(map(_is_ring, self.lines))
+
+    def closed(self) -> OsmElement:
+        """Return the element with its outline closed by a straight line, as where the edge of a map cuts it."""
+        rings = tuple(_closed(self.lines))
+        return self if self.is_closed or not rings else replace(self, lines=rings, cut=True)
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,8 @@
   says, else by `capacity`'s rules of area and levels. Where more are tagged than drawn, the others are counted, too.
 - A garage (`parking=multi-storey`, `underground`, `rooftop`) has a barrier that takes 10 s a car, 30 s to a space when
   it is empty and 120 s when it is full, and a full sign. It is entered at its `amenity=parking_entrance`, else at the
-  nearest street, as car parks are.
+  nearest street, as car parks are. Entrances alone, without an outline, are a garage of the usual size: a multi-storey
+  one if there are several within 60 m, else a small underground one.
 - Rules (`fee`, `charge`, `maxstay`, `access`, `capacity:disabled`, `capacity:charging`) become zones, named after the
   kind of facility and the rule (`zones`).
 - Buildings are no walls: a town is searched without sensors.
@@ -50,6 +51,7 @@ GATE_S = 10.0  # s that the barrier of a garage takes for a car
 INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
 """Seconds from the entry of a counted facility to a space, when it is empty and when it is full."""
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
+SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 RESERVED_PLACES = ("disabled", "charging")
 """Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
@@ -114,8 +116,9 @@ class _Town:
     """The state of an import."""
 
     def __init__(self, name: str, place: OsmMap) -> None:
-        self.name, self.place = name, place
-        elements = place.elements
+        # What an extract's edge cuts may have lost its nodes, too.
+        elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
+        self.name, self.place = name, replace(place, elements=elements)
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
         if not streets:
             raise InputError("no street in it, want ways with the tag highway")
@@ -128,6 +131,9 @@ class _Town:
         self.tree = shapely.STRtree(self.lines)
         self.buildings = self._areas(elements, is_building)
         self.parking = [a for a in self._areas(elements, is_parking_area) if self._is_open(a.element)]
+        for e in elements:
+            if is_parking_area(e) and not e.is_node and not e.is_closed:
+                self.left_out["parking without an outline"].append(e.id)
         self.rows: list[_Row] = []
         self.names: set[str] = set()
         self.used: set[int] = set()  # parking areas whose places are slots
@@ -270,22 +276,23 @@ class _Town:
         self.left_out["kerbs with fewer places, because of streets and other places"] += [
             rows[k].element for k in np.flatnonzero(lost).tolist()
         ]
-        for k, row in enumerate(rows):
-            row.slots = slots[np.flatnonzero((of == k) & kept)]
+        slots, of = slots[np.flatnonzero(kept)], of[kept]
+        for row, start, end in zip(
+            rows, *np.searchsorted(of, [range(len(rows)), range(1, len(rows) + 1)]), strict=True
+        ):
+            row.slots = slots[start:end]
             row.slot_rules = [row.rules] * len(row.slots)
         self.rows += [row for row in rows if len(row.slots)]
 
     def read_counted(self) -> None:
         """Read the car parks and garages whose places are counted."""
-        entrances = [
-            self.frame.to_xy(e.lines[0])[0]
-            for e in self.place.elements
-            if e.is_node and e.tags.get("amenity") == "parking_entrance"
-        ]
+        nodes = [e for e in self.place.elements if e.is_node]
+        ways_in = [e for e in nodes if e.tags.get("amenity") == "parking_entrance"]
+        entrances = [self.frame.to_xy(e.lines[0])[0] for e in ways_in]
         points = [
             (e, shapely.Point(self.frame.to_xy(e.lines[0])[0]), None)
-            for e in self.place.elements
-            if e.is_node and is_parking_area(e) and self._is_open(e)
+            for e in (*nodes, *self._unseen_garages(ways_in, entrances))
+            if is_parking_area(e) and self._is_open(e)
         ]
         outlines = [
             (a.element, a.polygon, float(shapely.area(a.polygon)))
@@ -325,6 +332,29 @@ class _Town:
                     rest -= n
             row.counted.insert(0, (row.name, rest, rules))
             self.rows.append(row)
+
+    def _unseen_garages(
+        self, ways_in: Sequence[OsmElement], at: Sequence[FloatArray]
+    ) -> Iterator[OsmElement]:
+        """Yield a garage for each group of entrances without an outline near: a large one if it has several."""
+        if not ways_in:
+            return
+        points = np.asarray(shapely.points(np.array(at)))
+        alone = np.ones(len(points), bool)
+        garages = [a.polygon for a in self.parking if rule_of(a.element.tags) in GARAGES]
+        for outlines, reach in (([a.polygon for a in self.parking], ENTRANCE_WITHIN), (garages, SAME_GARAGE)):
+            known = shapely.STRtree(outlines).query(points, predicate="dwithin", distance=reach)[0]
+            alone[known] = False
+        index = np.flatnonzero(alone)
+        label = component_labels(
+            shapely.STRtree(points[index]).query(points[index], predicate="dwithin", distance=SAME_GARAGE).T,
+            len(index),
+        )
+        for k in range(int(label.max(initial=-1)) + 1):
+            group = [ways_in[i] for i in index[label == k].tolist()]
+            tags = {key: value for e in reversed(group) for key, value in e.tags.items()}
+            usual = "multi-storey" if len(group) > 1 else "underground"
+            yield replace(group[0], tags={"parking": usual, **tags, "amenity": "parking"})
 
     def _entrance(
         self, shape: shapely.Geometry, entrances: Sequence[FloatArray]
