@@ -8,6 +8,9 @@ from parkenv import Lane, ParkingLot, SensorModel
 from parkenv.lots import grid_lot
 from parkenv.world.scenario import SearchProblem
 
+CAR_PARKS = ("campus", "jam", "street", "mini")
+"""Packaged scenarios of one car park each: the town takes too long for every test."""
+
 SHAPES = ((1, 12), (2, 6), (4, 3), (2, 5), (3, 4), (1, 9))
 PITCHES = (2.5, 6.0, 15.0)
 VIEWS = (0.0, 6.0)

@@ -5,10 +5,9 @@ import sys
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_lots import cut_in_two
+from small_lots import CAR_PARKS, cut_in_two
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
-from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
 from parkenv.studies.compare.cases import Case, settings_of
 from parkenv.studies.episodes import EpisodeRunner
@@ -249,7 +248,7 @@ def test_the_static_planner_keeps_trying_its_taken_slot():
 
 
 def test_the_planner_never_tries_a_slot_that_it_sees_taken():
-    for name in SCENARIO_NAMES:
+    for name in CAR_PARKS:
         rows = episodes(make_scenario(name), "mdp")
         assert mean(rows, "failed_parks") == 0.0
         assert mean(rows, "replans") > 0.0
@@ -258,7 +257,7 @@ def test_the_planner_never_tries_a_slot_that_it_sees_taken():
 # --- the oracle ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
+@pytest.mark.parametrize("name", CAR_PARKS)
 def test_nobody_beats_the_bound_and_the_oracle_reaches_it(name):
     scenario = make_scenario(
         name, sensor_model=SensorModel(view_range=6.0, hit_rate=0.95, false_alarm_rate=0.05)

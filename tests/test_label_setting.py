@@ -6,10 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
+from small_lots import CAR_PARKS
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import city_lot, grid_lot
 from parkenv.world.lot import PARK
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
@@ -161,7 +161,7 @@ def test_where_circling_beats_every_stop_policy_iteration_takes_over():
 def test_directed_lots_with_little_free_are_settled_in_one_pass():
     """The real thing: lots with one-way lanes need no other solver, as long as something may be free."""
     rng = np.random.default_rng(1)
-    for lot in [city_lot(600), *(make_scenario(name).lot for name in SCENARIO_NAMES)]:
+    for lot in [city_lot(600), *(make_scenario(name).lot for name in CAR_PARKS)]:
         scenario = make_scenario(lot)
         for chance in (0.0, 0.02, 0.3):
             p_free = np.where(rng.random(lot.n_slots) < chance, rng.random(lot.n_slots), 0.0)
@@ -253,7 +253,7 @@ def test_changes_everywhere_are_planned_afresh(city):
 # On a full day of mini, failing for ever costs nothing.
 @pytest.mark.filterwarnings("ignore:a failed attempt costs nothing:planners.CirclingWarning")
 @pytest.mark.parametrize("failure_s", [0.0, 10.0, 90.0])
-@pytest.mark.parametrize("name", SCENARIO_NAMES)
+@pytest.mark.parametrize("name", CAR_PARKS)
 def test_both_solvers_lead_to_the_same_actions(name, failure_s):
     scenario = make_scenario(name, failure_s=failure_s)
     env = gym.make("parkenv/Search-v2", scenario=scenario)

@@ -7,12 +7,12 @@ import networkx as nx
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from small_lots import CAR_PARKS
 
 import parkenv  # noqa: F401 - registers the ids
 from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
 from parkenv.engine.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
 from parkenv.world.lot import MOVES, PARK
 from parkenv.world.sensor_model import SensorModel
@@ -24,7 +24,7 @@ def squashed(seconds):
     return np.where(np.isfinite(seconds), seconds / (seconds + 60.0), 1.0)
 
 
-@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+@pytest.mark.parametrize("scenario", CAR_PARKS)
 def test_checkers_accept_it_without_a_warning(scenario):
     from stable_baselines3.common.env_checker import check_env as check_sb3
 
@@ -193,7 +193,7 @@ def test_it_is_computed_from_observations_alone(sensor):
 def test_it_has_the_same_size_on_every_lot():
     sizes = {
         LocalObservation(gym.make("parkenv/Search-v2", scenario=name), 7).observation_space["local"].shape
-        for name in SCENARIO_NAMES
+        for name in CAR_PARKS
     }
     assert sizes == {(FIRST_NEAR + PER_NEAR * 7,)}
 

@@ -5,13 +5,18 @@ import math
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.engine.fleet import Fleet
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fleet.recorded_days import record_days
+from parkenv.world.counted_demand import follow_counts
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -23,8 +28,9 @@ from parkenv.world.demand import (
     TownDemand,
     rest_of_stay,
 )
-from parkenv.world.occupancy.process import ArrivalDay
+from parkenv.world.occupancy.process import Arrival, ArrivalDay
 from parkenv.world.tariff import Price, Zone
+from planners.heuristics.policies import POLICIES
 
 DAY = ArrivalDay(0)
 WINDOW = 7 * 3600.0, 20 * 3600.0
@@ -80,6 +86,37 @@ def test_the_rest_of_a_stay_has_the_mean_of_renewal_theory(law):
     assert rest.min() >= 0.0
     assert rest.max() <= stays.max()
     assert np.isinf(rest_of_stay(ConstantTime(math.inf), np.array([0.5]))).all()
+
+
+@settings(max_examples=15)
+@given(st.lists(st.floats(0.1, 300.0), min_size=13, max_size=13), st.sampled_from([1.0, 3.0]))
+def test_counts_that_a_demand_made_are_followed(rates, hours):
+    cars = expected((*[0.0] * 7, *rates, *[0.0] * 4), LogNormalTime(hours * 3600.0, 1.0))
+    found = follow_counts(0.0, cars, *WINDOW, (hours,))
+    assert_allclose(found.expected, cars, atol=1e-6 * (1.0 + cars.max()))
+    assert (found.per_hour >= 0.0).all()
+
+
+def expected(per_hour, stay):
+    """Cars at full hours from 8:00, if they stay by that law; by summing over minutes."""
+    stays = stay.quantile((np.arange(400) + 0.5) / 400)
+    minutes = np.arange(WINDOW[0], WINDOW[1], 60.0) + 30.0
+    rate = np.array(per_hour)[(minutes // 3600.0).astype(int)] / 60.0
+    ends = WINDOW[0] + 3600.0 * np.arange(1, 14)
+    there = (stays > (ends[:, None] - minutes)[..., None]).mean(axis=2) * (minutes < ends[:, None])
+    return (there * rate).sum(axis=1)
+
+
+def test_the_longest_stay_that_follows_is_taken():
+    falls = np.array([100.0] * 6 + [100.0 * 0.5**k for k in range(7)])  # halves in an hour
+    steady = np.full(13, 100.0)
+    assert (
+        follow_counts(100.0, falls, *WINDOW).stay.mean_s
+        < follow_counts(100.0, steady, *WINDOW).stay.mean_s
+        == 24 * 3600.0
+    )
+    with_gap = np.where(np.arange(13) == 4, np.nan, steady)
+    assert_allclose(follow_counts(100.0, with_gap, *WINDOW).expected, 100.0, rtol=0.05)
 
 
 TABLES = {
@@ -156,3 +193,48 @@ def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
     assert_array_equal(costs[~rich], [[900.0, 0.0]] * 5)
     with pytest.raises(InputError, match="permit-b"):
         Fleet(its, Demand(Headways(2), classes={"permit-b": 1.0})).reset()
+
+
+def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
+    town = make_scenario("town")
+    fleet = Fleet(town, town.demand, drivers=[DriverKind(policy=POLICIES["usual"])])
+    fleet.reset(1)
+    cars = fleet.cars[fleet.cars["parked_at"] >= 0]
+    assert len(cars) == sum(one.parked for one in town.demand.purposes)
+    assert_array_equal(np.bincount(cars["parked_at"], minlength=town.lot.n_slots), fleet.counts())
+    assert (fleet.counts() <= town.lot.capacity).all()
+    of_car = fleet.zone_cost_s()[fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]]
+    assert np.isfinite(of_car).all()
+
+
+def test_recorded_days_are_the_world_of_single_searches(tmp_path):
+    spec = ScenarioSpec.parse(TABLES, "town.toml")
+    log = tmp_path / "days.csv.gz"
+    record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=2, seed=0)
+    content = log.read_bytes()
+    record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=2, seed=0)
+    assert log.read_bytes() == content
+    searched = make_scenario(spec.changed(occupancy={"log": str(log), "mapping": "same"}))
+    earlier = make_scenario(spec.changed(occupancy="typical"))
+    assert searched.occupancy.recorded
+    fleet = Fleet(
+        earlier, earlier.demand, drivers=[DriverKind(policy=POLICIES["usual"])], leave_full_lot=False
+    )
+    record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=1, seed=0)
+    searched = make_scenario(spec.changed(occupancy={"log": str(log), "mapping": "same"}))
+    fleet.reset(0, 0)
+    day = searched.occupancy.arrival_days(searched.arrival)[0]
+    for time in (1800.0, 5400.0):
+        fleet.run(until=fleet.begin + time)
+        arrival = Arrival(day.weekday * 86400.0 + 8 * 3600.0 + time, day.date)
+        taken = searched.occupancy.world(world_key(0, 0), arrival).occupied(np.arange(10), arrival.time)
+        assert np.count_nonzero(taken != fleet.taken()) <= 1  # times are whole seconds
+    with pytest.raises(InputError, match="has no demand"):
+        record_days(
+            ScenarioSpec.parse({"lot": "mini"}, "x"),
+            log,
+            agent=AgentSpec(name="usual"),
+            days=2,
+            rounds=1,
+            seed=0,
+        )

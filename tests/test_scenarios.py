@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from small_lots import CAR_PARKS
 
 from parkenv import InputError, make_scenario
 from parkenv.cli.options import made as changed_by
@@ -66,7 +67,7 @@ def test_days_differ_from_their_forecast_by_what_the_file_says(tmp_path, text, w
 
 
 def test_days_of_scenarios_can_be_changed():
-    for name in SCENARIO_NAMES:
+    for name in CAR_PARKS:
         made = make_scenario(name)
         assert made.occupancy.day_error == made.forecast(TUESDAY_NOON).day_error == DayError(0.8)
         as_forecast = make_scenario(name, day_error=0.0)
@@ -182,7 +183,7 @@ def test_logs_and_maps(tmp_path):
         ("goal = 0", "lot is missing"),
         ('lot = "nowhere.geojson"', "lot.file is 'nowhere.geojson', want a file; there is none at /"),
         ("lot = 5", "lot is 5, want a table"),
-        ('lot = "campsu"', "lot is 'campsu', want a packaged lot (campus, jam, street, mini) or a lot file (.geojson"),
+        ('lot = "campsu"', "lot is 'campsu', want a packaged lot (campus, jam, street, mini, town) or a lot file"),
         ('lot = { name = "mini", grid = { rows = 1, columns = 2 } }', "want exactly one of name, file, grid, city"),
         ('lot = "mini"\nspeeds = { v_walk_kmh = -4 }', "speeds.v_walk_kmh is -4, want a number of at least 0.1"),
         ('lot = "mini"\nspeeds = { v_drive_kmh = "fast" }', "speeds.v_drive_kmh is 'fast', want a number"),

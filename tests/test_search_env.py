@@ -13,13 +13,13 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from small_lots import CAR_PARKS
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.engine.kernel import STEP_RESULT, step_exact_at
 from parkenv.envs.wrappers import ThesisReward
-from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
@@ -58,7 +58,7 @@ def digest(env, seed):
     ("scenario", "env_id"),
     [
         (scenario, env_id)
-        for scenario in SCENARIO_NAMES
+        for scenario in CAR_PARKS
         for env_id in ENV_IDS
         if scenario == "mini"
         or ("SearchSensors" not in env_id and (scenario == "street" or "SearchPerception" not in env_id))
@@ -88,7 +88,7 @@ def test_importing_twice_does_no_harm_and_specs_have_a_limit(env_id):
     assert gym.spec(env_id).max_episode_steps == 2000
 
 
-@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+@pytest.mark.parametrize("scenario", CAR_PARKS)
 def test_equal_seeds_give_equal_episodes(scenario):
     one, two = (gym.make("parkenv/Search-v2", scenario=scenario) for _ in range(2))
     for seed in (0, 1, 2**40):
@@ -149,7 +149,7 @@ def test_a_step_returns_the_numbers_in_the_order_of_their_names():
         assert result["total_s"] == pytest.approx(sum(record[name] for name in terms))
 
 
-@pytest.mark.parametrize("scenario", SCENARIO_NAMES)
+@pytest.mark.parametrize("scenario", CAR_PARKS)
 def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
     env = gym.make("parkenv/Search-v2", scenario=scenario)
     for seed in range(5):

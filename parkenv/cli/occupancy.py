@@ -11,8 +11,10 @@ from parkenv.cli.options import Command
 from parkenv.cli.tables import make_console, make_table, save_summary, stages
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
-from parkenv.scenarios.spec import Date
-from parkenv.studies.fields import Seed
+from parkenv.scenarios.spec import Date, scenario_spec
+from parkenv.show.plurals import plural
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import OneAgent, OneScenario, Seed
 from parkenv.studies.results import Row
 
 if TYPE_CHECKING:
@@ -152,6 +154,125 @@ class Evaluate(Command):
             _print_notes(console, summary)
         save_summary(self.out, self.seed, **summary)
         console.print(f"Pictures and summary are in {self.out}")
+
+
+class Demand(Command):
+    """Counts of car parks, and a town that has them: cars come and stay such that they become as full as counted.
+
+    Each car park gets a purpose of its own: arrivals by hour by least squares, and cars that are there at first. Their
+    drivers go where they like, so the town is driven, and what car parks lack is corrected, --rounds times. Counts do
+    not say how often cars change; of several mean stays the longest is taken that can follow them.
+
+    The result, scenario.json, is the scenario with this demand: use it as --scenario of `parkenv fleet`. Errors are
+    mean absolute differences from the counts, hour by hour, on the weeks followed and on later ones.
+    """
+
+    examples = """
+        parkenv occupancy demand counts.csv.gz --scenario town.toml --hours 07:00-20:00 --from 2021-09-06 --weeks 8
+        parkenv fleet --scenario results/demand/scenario.json
+        """
+
+    counts: Annotated[Path, Option("COUNTS", takes="FILE", argument=True)] = Field(
+        description="Counts, car_park,capacity,hour,free (or hour_utc), as .csv or .csv.gz."
+    )
+    scenario: OneScenario = scenario_spec("town")
+    from_day: Date = option(..., "First day that is followed.", name="--from", takes="DATE")
+    weeks: int = option(8, "Weeks that are followed.", ge=1, le=520)
+    held_out: int = option(4, "Weeks after these, on which errors are measured.", ge=1, le=520)
+    agent: OneAgent = AgentSpec(name="usual")
+    rounds: int = option(3, "How often the town is driven.", ge=1, le=100)
+    days: int = option(3, "Days of the fleet in each round.", name="--episodes", short="-n", ge=1, le=1_000)
+    timezone: TimeZone = Field("Europe/Berlin", description="Local time of hour_utc.")
+    seed: Seed = Field(0, description="Seed of these days.")
+    out: Path = option(
+        Path("results/demand"), "Folder for scenario.json, summary.json and demand.png.", short="-o"
+    )
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import make_folder
+        from parkenv.forecast.counts import Counts
+        from parkenv.studies.fleet.counted_demand import Weeks, fit_demand
+
+        make_folder(self.out)
+        console = make_console()
+        with stages(console) as progress:
+            title, summary = fit_demand(
+                self.scenario, Counts.read(self.counts, self.timezone), self.out,
+                weeks=Weeks(self.from_day, self.weeks, self.held_out), agent=self.agent, rounds=self.rounds,
+                days=self.days, seed=self.seed, progress=progress,
+            )  # fmt: skip
+        headings = (
+            "car park",
+            "places",
+            "cars a day",
+            "at first",
+            "stay, h",
+            "days",
+            "off, followed",
+            "off, later",
+        )
+        errors = ("fit_error", "held_out_error")
+        cells = [
+            [
+                row["car_park"], str(row["capacity"]), f"{row['arrivals_a_day']:,.0f}", str(row["parked_at_first"]),
+                f"{row['stay_h']:g}", str(row["days_held_out"]), *(_points(row[name]) for name in errors),
+            ]
+            for row in summary["rows"]
+        ]  # fmt: skip
+        console.print(make_table(title, headings, cells))
+        console.print(
+            f"In the mean {_points(summary['fit_error'])} points of 100 % on the weeks followed, "
+            f"{_points(summary['held_out_error'])} on later ones, and {_points(summary['held_out_profile_error'])} "
+            "from their mean day",
+            soft_wrap=True,
+        )
+        if summary["not_in_lot"]:
+            console.print(f"Not in the lot: {', '.join(summary['not_in_lot'])}", soft_wrap=True)
+        save_summary(self.out, self.seed, **summary)
+        console.print(f"The scenario with this demand, picture and summary are in {self.out}")
+
+
+class Record(Command):
+    """Which slots are taken on days of a town whose scenario says who comes, as a log: the others in a single search.
+
+    Name the log in the scenario, `occupancy = { log = "days.csv.gz", mapping = "same" }`; then `parkenv compare` and
+    environments replay its days. A garage is taken while it is full.
+    """
+
+    examples = """
+        parkenv occupancy record --scenario town.toml --out days.csv.gz
+        """
+
+    scenario: OneScenario = scenario_spec("town")
+    agent: OneAgent = AgentSpec(name="usual")
+    days: int = option(6, "Days.", name="--episodes", short="-n", ge=2, le=1_000)
+    rounds: int = option(
+        4,
+        "How often the days are driven: from the second time on, drivers expect what the days before were like.",
+        ge=1,
+        le=100,
+    )
+    seed: Seed = Field(0, description="Seed of the days.")
+    out: Path = option(..., "The log, .csv or .csv.gz.", short="-o", takes="FILE")
+
+    def run(self) -> None:
+        """See `Command`."""
+        from parkenv.files.atomic_write import check_writable
+        from parkenv.studies.fleet.recorded_days import record_days
+
+        check_writable(self.out)
+        console = make_console()
+        with stages(console) as progress:
+            lines = record_days(
+                self.scenario, self.out, agent=self.agent, days=self.days, rounds=self.rounds, seed=self.seed,
+                progress=progress,
+            )  # fmt: skip
+        console.print(f"{self.out}: {lines:,} observations of {plural(self.days, 'day')}", soft_wrap=True)
+
+
+def _points(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:.1f}"
 
 
 def _cells(row: Row, of_counts: bool) -> list[str]:

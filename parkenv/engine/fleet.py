@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.jit import entry_point
-from parkenv.compiled.keyed_random import world_key
+from parkenv.compiled.keyed_random import SLOT_STREAM, car_uniforms, world_key
 from parkenv.compiled.memory import address_of, sparse_zeros
 from parkenv.engine.events import (
     FINISHED,
@@ -39,6 +39,7 @@ from parkenv.engine.kernel import (
     step_result_at,
 )
 from parkenv.engine.local_observation import FIRST_NEAR, PER_NEAR, Surroundings, observe_surroundings_at
+from parkenv.engine.parked import park_at_first
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.engine.records import (
     BACKGROUNDS,
@@ -357,8 +358,6 @@ class Fleet:
 
     def _write_cars(self, key: np.uint64, midnight: float, arrival_s: float) -> None:
         plans = self.demand.draw(key, arrival_s, len(self._entries), self.day)
-        if plans.parked.any():
-            raise InputError("Demand.parked is not for fleets yet")
         n = len(plans.arrival_s)
         cars = np.zeros(n, CAR)
         cars["arrival"] = midnight + plans.arrival_s
@@ -386,19 +385,9 @@ class Fleet:
         self._states, self._vertices, self._addresses = cars["state"], cars["vertex"], cars["search"]
         capacity = max(n, sum(len(one.records) for one in self._pool))
         self._record["n_cars"], self._record["n_free"] = n, 0
-        self._record["zone_cost_s"] = 0
-        if self.scenario.has_rules or (cars["walks"] != 1.0).any():
-            drivers = self.drivers_of(slice(None))
-            if not np.isfinite(self.scenario.zone_price(drivers)).all():
-                raise InputError(
-                    "Demand.stays: a stay is infinite, want finite ones where parking has a price"
-                )
-            zone_cost_s, lot = self.scenario.zone_cost_s(drivers), self.scenario.lot
-            self._keep({"zone_cost_s": zone_cost_s})
-            self._record["n_zones"] = len(lot.zones)
-            slots_in = np.bincount(lot.zone_of_slot, minlength=len(lot.zones))
-            cars["n_forbidden"] = np.isinf(zone_cost_s) @ slots_in
-        self._require_room(cars["parked_at"][cars["parked_at"] >= 0])
+        zone_cost_s = self._write_zone_costs()
+        if plans.parked.any():
+            cars["parked_at"][plans.parked] = self._slots_of_parked(plans.parked, zone_cost_s, key)
         self._keep(
             {
                 "cars": cars,
@@ -413,6 +402,42 @@ class Fleet:
         )
         for searches in self._pool:
             self._add_free(searches)
+
+    def _write_zone_costs(self) -> NDArray[np.float64]:
+        """Write what parking in each zone costs each car, where that matters; return it, (n_cars, n_zones) s."""
+        cars, lot = self._cars, self.scenario.lot
+        self._record["zone_cost_s"] = 0
+        if not self.scenario.has_rules and (cars["walks"] == 1.0).all():
+            return np.zeros((len(cars), len(lot.zones)))
+        drivers = self.drivers_of(slice(None))
+        if not np.isfinite(self.scenario.zone_price(drivers)).all():
+            raise InputError("Demand.stays: a stay is infinite, want finite ones where parking has a price")
+        zone_cost_s = self.scenario.zone_cost_s(drivers)
+        self._keep({"zone_cost_s": zone_cost_s})
+        self._record["n_zones"] = len(lot.zones)
+        slots_in = np.bincount(lot.zone_of_slot, minlength=len(lot.zones))
+        cars["n_forbidden"] = np.isinf(zone_cost_s) @ slots_in
+        return zone_cost_s
+
+    def _slots_of_parked(
+        self, parked: NDArray[np.bool_], zone_cost_s: NDArray[np.float64], key: np.uint64
+    ) -> NDArray[np.int64]:
+        """Return in which slots cars stand when the world begins; see `parkenv.engine.parked`."""
+        cars, lot = self._cars[parked], self.scenario.lot
+        slots, u = np.empty(len(cars), np.int64), np.empty(len(cars))
+        car_uniforms(key, SLOT_STREAM, 0, u)
+        walk_s = np.array([one.walk_s for one in self.scenarios])
+        by_walk = np.argsort(walk_s, axis=1, kind="stable").astype(np.int64)
+        place, walks = cars["place"].astype(np.int64), cars["walks"].astype(np.float64)
+        cost = zone_cost_s[parked], walk_s, by_walk, lot.zone_of_slot
+        park_at_first(place, walks, u, *cost, lot.capacity.copy(), slots)
+        if lost := np.count_nonzero(slots < 0):
+            purpose = self.demand.purposes[cars["purpose"][np.argmin(slots)]]
+            raise InputError(
+                f"demand.{purpose.name}.parked is {purpose.parked}, want no more cars than find room where they may "
+                f"park when the hours begin: {lost} do not"
+            )
+        return slots
 
     def _drivers_in(self, plans: CarPlans) -> Drivers:
         """Return what decides where the cars may park and what it costs them."""
@@ -614,16 +639,6 @@ class Fleet:
         return np.asarray(
             problem.walk_s * walks + problem.parking_cost_of(self.drivers_of(car)) + problem.enter_s
         )
-
-    def _require_room(self, parked_at: NDArray[np.int64]) -> None:
-        """Require room for the cars that stand in slots when the world begins."""
-        lot = self.scenario.lot
-        over = np.flatnonzero(np.bincount(parked_at, minlength=lot.n_slots) > lot.capacity)
-        if len(over):
-            raise InputError(
-                f"parked: {np.count_nonzero(parked_at == over[0])} cars begin in slot {lot.slot_ids[over[0]]!r:.40}, "
-                f"want at most {lot.capacity[over[0]]}"
-            )
 
     def zone_cost_s(self) -> NDArray[np.float64]:
         """Return what parking in each zone costs each car, (n_cars, n_zones) s; see `SearchProblem.zone_cost_s`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal, get_args
 
-PackagedLot = Literal["campus", "jam", "street", "mini"]
+PackagedLot = Literal["campus", "jam", "street", "mini", "town"]
 PACKAGED_LOTS: tuple[PackagedLot, ...] = get_args(PackagedLot)
 SCENARIO_NAMES = PACKAGED_LOTS
 """Packaged scenarios; each has a lot of the same name."""

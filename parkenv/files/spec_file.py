@@ -49,7 +49,7 @@ _WANTED = {
 T = TypeVar("T")
 
 
-def _resolved(value: object, info: ValidationInfo) -> object:
+def resolved_path(value: object, info: ValidationInfo) -> object:
     """Resolve a path relative to the folder of the file that it was read from."""
     if not isinstance(value, str | Path):
         return value
@@ -60,7 +60,7 @@ def _resolved(value: object, info: ValidationInfo) -> object:
     return path
 
 
-FilePath = Annotated[Path, BeforeValidator(_resolved)]
+FilePath = Annotated[Path, BeforeValidator(resolved_path)]
 """An existing file; paths are relative to the folder of the file that names them."""
 
 
@@ -69,7 +69,7 @@ def _detector(value: object, info: ValidationInfo) -> object:
     if not isinstance(value, str | Path):
         return value
     is_file = str(value).lower().endswith(DETECTOR_SUFFIXES)
-    return str(_resolved(value, info)) if is_file else str(value)
+    return str(resolved_path(value, info)) if is_file else str(value)
 
 
 def _packaged(value: str) -> str:

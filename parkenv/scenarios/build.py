@@ -16,6 +16,7 @@ from parkenv.errors import InputError, require_keywords
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.purposes import demand_of
 from parkenv.scenarios.spec import (
+    SAME_SLOTS,
     CountsSpec,
     ForecastSpec,
     LotSpec,
@@ -222,14 +223,18 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
     if spec.log is not None:
         from parkenv.forecast.counts import is_counts
         from parkenv.world.occupancy.log import OccupancyLog
-        from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping
+        from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping, same_slots
 
         if is_counts(spec.log[0]):
             raise InputError(
                 f"{spec.log[0]}: has counts of car parks, want --car-park with it, or a table `counts`"
             )
         log = OccupancyLog.read_all(spec.log)
-        mapped = None if spec.mapping is None else read_mapping(spec.mapping, lot.slot_ids, log)
+        mapped = None
+        if spec.mapping == SAME_SLOTS:
+            mapped = same_slots(lot.slot_ids, log)
+        elif spec.mapping is not None:
+            mapped = read_mapping(spec.mapping, lot.slot_ids, log)
         return RecordedOccupancy(
             log, lot.walk_m(goal), mapped, spec.replay_from, spec.forecast_from or "others"
         )

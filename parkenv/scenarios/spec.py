@@ -15,6 +15,7 @@ from pydantic import (
     BeforeValidator,
     Field,
     GetJsonSchemaHandler,
+    ValidationInfo,
     model_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
@@ -41,6 +42,7 @@ from parkenv.files.spec_file import (
     Several,
     Spec,
     read_tables,
+    resolved_path,
 )
 from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -56,6 +58,8 @@ Probability = Annotated[float, Field(ge=0.0, le=1.0)]
 Count = Annotated[int, Field(ge=0, le=1_000)]
 Size = Annotated[float, Field(ge=1.0, le=100.0)]  # m
 MAX_SLOTS = 1_000_000
+SAME_SLOTS = "same"
+"""Mapping of a log whose slots have the names of the lot's."""
 
 
 def _require_one(spec: Spec, names: tuple[str, ...], least: int = 1) -> None:
@@ -177,6 +181,10 @@ def _several(value: object) -> object:
     return value.split(",") if isinstance(value, str) else value
 
 
+def _mapping(value: object, info: ValidationInfo) -> object:
+    return value if value == SAME_SLOTS else resolved_path(value, info)
+
+
 def _date(value: object) -> object:
     if isinstance(value, str):
         with contextlib.suppress(ValueError):
@@ -269,9 +277,10 @@ class OccupancySpec(Spec):
         panel="World",
         default="the scenario's; others, with counts rolling",
     )
-    mapping: FilePath | None = option(
+    mapping: Annotated[Path | str, BeforeValidator(_mapping)] | None = option(
         None,
-        "CSV slot_id,log_slot_id that assigns the log's slots to the lot's.",
+        "CSV slot_id,log_slot_id that assigns the log's slots to the lot's; same: those of the same names.",
+        takes="FILE|same",
         panel="World",
         default="the log's fullest slots are nearest to the goal",
     )

@@ -16,6 +16,7 @@ import shapely
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.lots.builders.town import town
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
 from parkenv.world.lot import Lane, ParkingLot
@@ -204,7 +205,9 @@ def mini() -> ParkingLot:
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)
 
 
-LOTS: dict[str, Callable[[], ParkingLot]] = {make.__name__: make for make in (campus, jam, street, mini)}
+LOTS: dict[str, Callable[[], ParkingLot]] = {
+    make.__name__: make for make in (campus, jam, street, mini, town)
+}
 
 
 def build(folder: Path) -> None:
@@ -214,4 +217,4 @@ def build(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    build(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent / "packaged")
+    build(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "packaged")

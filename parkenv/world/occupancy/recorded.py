@@ -80,6 +80,20 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
     return mapping
 
 
+def same_slots(lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
+    """Return the log slot of each slot of a lot, (n,) int64: that of the same name.
+
+    Raises:
+        InputError: the log lacks a slot of the lot.
+    """
+    log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
+    if missing := [slot_id for slot_id in lot_slot_ids if slot_id not in log_index]:
+        raise InputError(
+            f"{log.source}: has no slot {missing[0]!r} of the lot (and {len(missing) - 1} more), want the same names"
+        )
+    return np.array([log_index[slot_id] for slot_id in lot_slot_ids], np.int64)
+
+
 @kernel
 def _occupied(days: int, slots: IntArray, second: float, occupied: BoolArray) -> None:
     """Write whether each slot is taken at a second of the day."""
