@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.jit import compiled
 
-_LINE = 64  # bytes of a cache line
+LINE = 64  # bytes of a cache line
 _SMALL = 4096  # bytes
 ADDRESS = np.int64  # type of the fields of a record that hold addresses
 
@@ -51,9 +51,9 @@ def in_one_block(arrays: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
         for i, array in enumerate(arrays)
     ]
     different = dict(zip(keys, arrays, strict=True))
-    begins = np.cumsum([0, *(-(-array.nbytes // _LINE) * _LINE for array in different.values())])
-    block = np.zeros(int(begins[-1]) + _LINE, np.uint8)
-    block = block[-block.ctypes.data % _LINE :]
+    begins = np.cumsum([0, *(-(-array.nbytes // LINE) * LINE for array in different.values())])
+    block = np.zeros(int(begins[-1]) + LINE, np.uint8)
+    block = block[-block.ctypes.data % LINE :]
     copies = {}
     for (key, array), begin in zip(different.items(), begins, strict=False):
         copies[key] = copy = block[begin : begin + array.nbytes].view(array.dtype).reshape(array.shape)
@@ -65,8 +65,8 @@ def in_one_block(arrays: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
 def zeros_on_lines(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:
     """Return zeros that begin with a cache line, so that records of whole lines do not reach into others."""
     n_bytes = math.prod(shape) * np.dtype(dtype).itemsize
-    memory = np.zeros(n_bytes + _LINE, np.uint8)
-    begin = -memory.ctypes.data % _LINE
+    memory = np.zeros(n_bytes + LINE, np.uint8)
+    begin = -memory.ctypes.data % LINE
     zeros: NDArray[Any] = memory[begin : begin + n_bytes].view(dtype).reshape(shape)
     return zeros
 

@@ -15,7 +15,7 @@ from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.memory import int32s, int64s, prefetch, uint8s
+from parkenv.compiled.memory import LINE, int32s, int64s, prefetch, uint8s
 from parkenv.engine.belief_memory import BeliefMemory
 from parkenv.engine.kernel import (
     arrive,
@@ -43,7 +43,6 @@ from parkenv.engine.spaces import space_of
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined, kernel, prefetch_forecast
 from parkenv.world.scenario import EDGE
 
-_LINE = 64  # bytes of a cache line
 _APART = 2  # searches between two stages of loading
 _SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
 
@@ -343,10 +342,10 @@ def _prefetch_lists(search: Any, around: Surroundings, action: int) -> None:
     scenario = scenario_at(search.scenario, 0)
     target = _target(search, action)
     first = int64s(scenario.view_starts)[target]
-    _prefetch(scenario.viewed + 8 * first, _LINE)
-    _prefetch(around.view_s.ctypes.data + 4 * (around.first_view[search.place] + first), _LINE)
+    _prefetch(scenario.viewed + 8 * first, LINE)
+    _prefetch(around.view_s.ctypes.data + 4 * (around.first_view[search.place] + first), LINE)
     start = around.starts[around.first[search.place] + target]
-    _prefetch(around.slots.ctypes.data + 4 * start, _LINE)
+    _prefetch(around.slots.ctypes.data + 4 * start, LINE)
 
 
 @inlined
@@ -369,6 +368,6 @@ def _prefetch_slots(search: Any, around: Surroundings, action: int) -> None:
 @inlined
 def _prefetch(begin: int, size: int) -> None:
     """Load the bytes from an address on."""
-    for offset in range(0, size, _LINE):
+    for offset in range(0, size, LINE):
         prefetch(begin + offset)
     prefetch(begin + size - 1)

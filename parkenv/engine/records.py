@@ -10,7 +10,15 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import IntArray
-from parkenv.compiled.memory import ADDRESS, address_of, in_one_block, record_at, sparse_zeros, zeros_on_lines
+from parkenv.compiled.memory import (
+    ADDRESS,
+    LINE,
+    address_of,
+    in_one_block,
+    record_at,
+    sparse_zeros,
+    zeros_on_lines,
+)
 from parkenv.errors import InputError
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
@@ -156,7 +164,10 @@ PROGRESS_FIELDS = tuple(str(entry[0]) for entry in _PROGRESS + _EPISODES)
 
 
 def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:
-    """Return the record type of some fields, in which arrays of `N_TERMS` costs overlie the fields that begin there."""
+    """Return the record type of some fields, in which arrays of `N_TERMS` costs overlie the fields that begin there.
+
+    A record is a whole number of cache lines.
+    """
     plain = np.dtype(list(fields), align=True)
     assert plain.names is not None
     assert plain.fields is not None
@@ -164,7 +175,12 @@ def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:
     for name, first in arrays.items():
         members[name] = np.dtype((np.float64, (N_TERMS,))), plain.fields[first][1]
     formats, offsets = zip(*members.values(), strict=True)
-    layout = {"names": list(members), "formats": formats, "offsets": offsets, "itemsize": plain.itemsize}
+    layout = {
+        "names": list(members),
+        "formats": formats,
+        "offsets": offsets,
+        "itemsize": -(-plain.itemsize // LINE) * LINE,
+    }
     return np.dtype(layout, align=True)  # type: ignore[call-overload, no-any-return]
 
 
