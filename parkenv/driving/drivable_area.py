@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.world.drive_graph import SLOT_REACH, linestrings
@@ -18,7 +19,8 @@ JOINT = 0.6  # gaps between slots of up to twice this width, m, are paved
 STRAIGHTENED = 0.03  # tolerance, m, for simplifying kerbs
 
 
-_JOINED_WHOLE = 2000  # slots up to which the whole paved area is computed once
+JOINED_WHOLE = 2000
+"""Slots up to which the whole paved area is computed at once; the union of a town takes ten seconds."""
 
 
 class DrivableArea:
@@ -52,16 +54,24 @@ class DrivableArea:
 
     def around(self, center: FloatArray, reach: float) -> shapely.Geometry:
         """The paved area near a point, (2,) m; exact only within `reach` m along both axes."""
-        if self._lot.n_slots > _JOINED_WHOLE:
+        if self._lot.n_slots > JOINED_WHOLE:
             return self._joined(shapely.box(*(center - reach - 10.0), *(center + reach + 10.0)))
         if self._whole is None:
             west, south, east, north = self._lot.bounds()
             self._whole = self._joined(shapely.box(west - 100.0, south - 100.0, east + 100.0, north + 100.0))
         return self._whole
 
+    def parts(self) -> NDArray[np.object_]:
+        """The paved area as roads, and bays with their approaches, (n,) polygons that overlap."""
+        return np.concatenate([self._roads(self._lanes), self._bays])
+
+    def _roads(self, lanes: NDArray[np.object_]) -> NDArray[np.object_]:
+        return np.asarray(
+            shapely.buffer(lanes, self._half_width, cap_style="square", join_style="mitre"), object
+        )
+
     def _joined(self, window: shapely.Geometry) -> shapely.Geometry:
-        lanes = shapely.intersection(self._lanes, window)
-        roads = shapely.buffer(lanes, self._half_width, cap_style="square", join_style="mitre")
+        roads = self._roads(shapely.intersection(self._lanes, window))
         near = np.sort(self._tree.query(window))
         area = shapely.union_all(np.concatenate([roads, self._bays[near]]))
         joined = shapely.buffer(shapely.buffer(area, JOINT, join_style="mitre"), -JOINT, join_style="mitre")

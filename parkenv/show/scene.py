@@ -180,7 +180,12 @@ class LotScene:
         )
 
     def paved(
-        self, center: FloatArray | None = None, reach: float = math.inf, *, apron: float = APRON
+        self,
+        center: FloatArray | None = None,
+        reach: float = math.inf,
+        *,
+        apron: float = APRON,
+        joined: bool = True,
     ) -> list[Rings]:
         """Return the polygons of the asphalt, which ends at the kerbs of `DrivableArea`.
 
@@ -188,11 +193,12 @@ class LotScene:
             center: (2,); None: the whole lot.
             reach: m, around the centre along both axes, within which the polygons are exact.
             apron: m, width of the asphalt beyond the kerbs, on which the outer painted lines are visible.
+            joined: whether polygons must not overlap; if they may, those of a whole town are found at once.
         """
         if center is None:
             low, high = np.array(self.lot.bounds()).reshape(2, 2)
             center, reach = (low + high) / 2, float((high - low).max()) / 2
-        area = self.area.around(center, reach)
+        area = self.area.around(center, reach) if joined else self.area.parts()
         polygons = shapely.get_parts(shapely.buffer(area, apron, quad_segs=2) if apron else area)
         return [
             tuple(shapely.get_coordinates(ring) for ring in (polygon.exterior, *polygon.interiors))
@@ -200,12 +206,17 @@ class LotScene:
         ]
 
     def ground(
-        self, center: FloatArray | None = None, reach: float = math.inf, *, apron: float = APRON
+        self,
+        center: FloatArray | None = None,
+        reach: float = math.inf,
+        *,
+        apron: float = APRON,
+        joined: bool = True,
     ) -> list[Layer]:
         """Return the layers below the slots: buildings, asphalt, walls and the marks of the lanes; see `paved`."""
         return [
             *building_layers(self.buildings, ()),
-            Areas(self.paved(center, reach, apron=apron), "asphalt"),
+            Areas(self.paved(center, reach, apron=apron, joined=joined), "asphalt"),
             *building_layers((), (*self.buildings, *self.walls)),
             Lines(self.centre_lines, "paint", 0.12, (0.5, 1.2), dash=(6.0, 8.0), opacity=0.45),
             Marks(self.arrows, LANE_ARROW, "paint", (3.2, 1.5), opacity=0.8),

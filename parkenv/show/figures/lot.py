@@ -19,6 +19,7 @@ from matplotlib.typing import ColorType
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.driving.drivable_area import JOINED_WHOLE
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.show.colors import BELIEF_ANCHORS, hex_color
@@ -73,7 +74,7 @@ def draw_lot(
     ax.set_facecolor(GROUND)
     ax.spines[:].set_visible(False)
     scene = LotScene.of(lot)
-    paint(ax, scene.ground(), 0.5)
+    paint(ax, scene.ground(joined=lot.n_slots <= JOINED_WHOLE), 0.5)
     if slot_color is not None:
         ax.add_collection(
             PolyCollection(list(scene.slots), facecolors=slot_color, edgecolors="none", zorder=1.0)
