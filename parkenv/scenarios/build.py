@@ -47,6 +47,8 @@ if TYPE_CHECKING:
     from parkenv.forecast.day_forecast import DayForecast
     from parkenv.world.occupancy.counted import CountedOccupancy
 
+LOT_KMH, TOWN_KMH = 10.0, 20.0
+"""Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean."""
 MIN_PAST_DAYS = 7
 """Days of counts that a forecast needs at least."""
 ScenarioSource = str | Path | ScenarioSpec | ParkingLot | Scenario
@@ -162,7 +164,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             lot=lot,
             goal=goal,
             entry=spec.entry,
-            v_drive=spec.speeds.v_drive_kmh * KMH,
+            v_drive=(spec.speeds.v_drive_kmh or (TOWN_KMH if lot.facilities else LOT_KMH)) * KMH,
             v_walk=spec.speeds.v_walk_kmh * KMH,
             failure_s=spec.costs.failure_s,
             wait_s=spec.costs.wait_s,

@@ -392,7 +392,9 @@ class Arrivals(Spec):
 class Speeds(Spec):
     """Speeds on the lanes and on foot."""
 
-    v_drive_kmh: Speed = 10.0
+    v_drive_kmh: Speed | None = Field(
+        None, description="10 in a car park, 20 in a town (a lot with facilities) if absent."
+    )
     v_walk_kmh: Speed = 4.0
 
 

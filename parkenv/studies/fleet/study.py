@@ -64,8 +64,8 @@ SAMPLE_S = 300.0
 """Time between two samples of the occupancy, s."""
 MOST_LISTED = 8_000_000
 """Cars that are expected in all settings up to which `cars.csv` has a list of them for each day."""
-USUAL, MINDS_PRICES = "greedy-drive", "greedy-total"
-"""Default agents."""
+NEAREST, MINDS_PRICES, IN_TOWNS = "greedy-drive", "greedy-total", "usual"
+"""Default agents: in a lot, where parking has a price, and where there are facilities."""
 OPTIONS = ("stay_s", "patience_s", "delay_s", "leaving_soon_s", "sees_cars")
 """Fields of the specification that all settings have in common."""
 PICTURE = "fleet.png"
@@ -103,7 +103,7 @@ class FleetStudy(Study):
         "other agent decides in Python.",
         takes="NAME[,...]",
         parse=split_agents,
-        default=f"{USUAL}; where parking has a price, {MINDS_PRICES}",
+        default=f"{NEAREST}; where parking has a price, {MINDS_PRICES}; in towns, {IN_TOWNS}",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
     knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = option(
@@ -190,7 +190,7 @@ class FleetStudy(Study):
                 "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
             )
         axes = "scenarios x agents x knows x shares x arrivals_per_hour"
-        lengths = map(len, (self.scenarios, self.agents or (USUAL,), self.knows, self.shares, self.demands))
+        lengths = map(len, (self.scenarios, self.agents or (NEAREST,), self.knows, self.shares, self.demands))
         settings = math.prod(lengths)
         require_at_most(settings, axes, "settings", MAX_SETTINGS)
         require_at_most(settings * self.days, f"{axes} x days", "days")
@@ -214,9 +214,13 @@ class FleetStudy(Study):
 
     @property
     def drivers(self) -> tuple[AgentSpec, ...]:
-        """The agents; by default one that minds prices, where there are any."""
+        """The agents; by default one that minds prices, where there are any, or that knows a town."""
+        if self.agents:
+            return self.agents
+        if any(scenario.lot.facilities for scenario in self.built.values()):
+            return (AgentSpec(name=IN_TOWNS),)
         is_priced = any(scenario.is_priced for scenario in self.built.values())
-        return self.agents or (AgentSpec(name=MINDS_PRICES if is_priced else USUAL),)
+        return (AgentSpec(name=MINDS_PRICES if is_priced else NEAREST),)
 
     @cached_property
     def calibration(self) -> Calibration | None:
