@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from parkenv import InputError, make_scenario
 from parkenv.lots import check_lot, grid_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import LotDraft
+from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import FACILITY_KINDS, KNOWN, Facility
 from parkenv.world.scenario import Drivers
@@ -157,6 +158,8 @@ def test_who_may_park_where_and_when():
     assert scenario.lot.zones == ("inner", "other", "permit")
     assert scenario.has_rules
     assert not make_scenario("mini").has_rules
+    spec = ScenarioSpec.parse({"lot": "mini", "arrivals": {"hours": "12:00-14:00", "days": "sat"}}, "test")
+    assert make_scenario(spec).priced_at_s == 5 * DAY_S + 13 * 3600.0
     monday, permit = 9 * 3600.0, scenario.class_bits(["permit-a"])
     row = scenario.zone_cost_s(Drivers([1800.0, 1800.0, 7200.0], [monday, 0.0, monday], 12.0, [1, permit, 1]))
     np.testing.assert_allclose(row, [[900.0, 0.0, np.inf], [np.inf, 0.0, 0.0], [np.inf, 0.0, np.inf]])

@@ -41,6 +41,7 @@ from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.tariff import Tariff
 from parkenv.world.traffic import Traffic
+from parkenv.world.week import DAY_S
 
 if TYPE_CHECKING:
     from parkenv.forecast.counts import Counts
@@ -172,6 +173,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             tariff=Tariff(spec.costs.prices),
             stay_s=spec.costs.stay_s,
             value_of_time=spec.costs.value_of_time,
+            priced_at_s=window.weekdays[0] * DAY_S + (window.start_s + window.end_s) / 2,
             sensor_model=sensor_model(spec.sensor_model),
             occupancy=occupancy,
             prior=_prior(spec.forecast, occupancy, lot, goal),
