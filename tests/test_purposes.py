@@ -238,3 +238,16 @@ def test_recorded_days_are_the_world_of_single_searches(tmp_path):
             rounds=1,
             seed=0,
         )
+
+
+def test_cars_of_a_town_choose_entries_and_goals_by_its_weights():
+    from parkenv.scenarios.build import make_scenario
+    from parkenv.studies.fleet.drivers import demand_in
+
+    scenario = make_scenario("town")
+    demand = demand_in(scenario.replace(demand=None), 100.0, 3600.0, 600.0)
+    for mine, of_lot in (
+        (demand.goal_weights, scenario.lot.goal_weights),
+        (demand.entry_weights, scenario.lot.entry_weights),
+    ):
+        assert np.allclose(mine, sum(of_lot.values()))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
@@ -108,6 +109,8 @@ def demand_in(
         stay_s: mean of the exponentially distributed stays, s, unless the scenario has a demand.
         patience_s: search time after which a car goes elsewhere, s, unless the scenario has a demand.
 
+    In a lot with weights, cars choose entries and goals by these; else they go to the scenario's goal.
+
     Raises:
         InputError: the hours end when they begin, a number is out of range, or no demand is given.
     """
@@ -129,7 +132,14 @@ def demand_in(
         arrivals = FollowingArrivals(scenario.occupancy, window, stay, times_demanded(per_hour))
     else:
         arrivals = PoissonArrivals(per_hour, window.start_s, window.end_s)
-    return Demand(arrivals, stay, ConstantTime(patience_s))
+    entries = _all_purposes(scenario.lot.entry_weights) if scenario.entry is None else ()
+    goals = _all_purposes(scenario.lot.goal_weights)
+    return Demand(arrivals, stay, ConstantTime(patience_s), entry_weights=entries, goal_weights=goals)
+
+
+def _all_purposes(weights: Mapping[str, FloatArray]) -> tuple[float, ...]:
+    """Return the weights of entries or goals over all purposes; none if a lot has none."""
+    return tuple(np.sum([*weights.values()], axis=0).tolist()) if weights else ()
 
 
 @dataclass(frozen=True)
