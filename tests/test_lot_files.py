@@ -221,7 +221,8 @@ def test_kerbside_cars_stand_as_traffic_runs(tmp_path, y, oneway, mouth, yaw):
     assert np.cos(lot.slot_yaw[0] - yaw) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("name", PACKAGED_LOTS)
+# At corners of a town, an outline alone does not say which of two streets a place at the kerb belongs to.
+@pytest.mark.parametrize("name", [name for name in PACKAGED_LOTS if name != "town"])
 def test_outlines_alone_tell_the_same_lots(tmp_path, name):
     doc = json.loads(
         (Path(__file__).parents[1] / "parkenv" / "lots" / "packaged" / f"{name}.geojson").read_text()

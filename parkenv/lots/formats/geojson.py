@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -138,8 +139,10 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
                 {"weights": {name: float(weight[i]) for name, weight in weights.items()}} if weights else {}
             )
             yield feature("Point", xy, kind=kind, **given)
-    for place in lot.facilities:
-        xy = place.xy or lot.slot_xy[lot.slot_facility == place.name].mean(axis=0).tolist()
+    order = np.argsort(lot.facility_of_slot, kind="stable")
+    ends = np.searchsorted(lot.facility_of_slot[order], range(len(lot.facilities) + 1)).tolist()
+    for place, (start, end) in zip(lot.facilities, pairwise(ends), strict=True):
+        xy = place.xy or lot.slot_xy[order[start:end]].mean(axis=0).tolist()
         yield feature("Point", list(xy), kind="facility", **facility_properties(place))
     for wall in lot.walls:
         if is_building(wall):

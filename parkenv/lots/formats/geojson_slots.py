@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -41,7 +41,7 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
     costs: list[float] = []
     zones: list[str] = []
     facilities: list[str] = []
-    drawn = [facility.name for facility in contents.facilities if not facility.is_counted]
+    drawn = dict.fromkeys(place.name for place in contents.facilities if not place.is_counted)
     first_with |= {
         facility.name: contents.numbers["facility"][i]
         for i, facility in enumerate(contents.facilities)
@@ -128,10 +128,10 @@ def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
     return float(cost)
 
 
-def _facility(properties: dict[str, Any], slot_id: str, drawn: list[str]) -> str:
+def _facility(properties: dict[str, Any], slot_id: str, drawn: Collection[str]) -> str:
     """Return the facility that a slot belongs to, one of those whose slots are drawn; empty text if not given."""
     facility = properties.get("facility", "")
-    if facility not in drawn and "facility" in properties:
+    if not (isinstance(facility, str) and facility in drawn) and "facility" in properties:
         hint = nearest(str(facility), drawn)
         raise InputError(
             f"slot {slot_id!r:.40}: facility is {facility!r:.40}, want that of a feature without a capacity; {hint}"

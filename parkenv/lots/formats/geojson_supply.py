@@ -99,6 +99,7 @@ def read_zone(properties: dict[str, Any], what: str, rules: Collection[str]) -> 
 
 def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray) -> None:
     """Validate the facilities of a file and add the valid ones."""
+    seen: set[str] = set()
     for feature in raw:
         given = dict(feature.properties)
         name = given.get("name", feature.given_id)
@@ -113,7 +114,7 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
                 absent = [member for member in _COUNTED if member in given and not given.get("capacity")]
                 if absent:
                     raise InputError(f"{absent[0]} is of counted facilities, want a capacity, too")
-                if name in [facility.name for facility in contents.facilities]:
+                if str(name) in seen:
                     raise InputError("its name appears already")
                 contents.facilities.append(
                     Facility(
@@ -126,6 +127,7 @@ def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray
                     )
                 )
                 contents.numbers["facility"].append(feature.number)
+                seen.add(str(name))
             read_zone(given, f"facility {name!r:.40}", contents.zone_rules)
         except InputError as error:
             contents.error(feature.number, str(error))
