@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from parkenv.studies.verify import balance, game, queues
+from parkenv.studies.verify import balance, game, queues, town
 from parkenv.studies.verify.queues import MEEK, ORDERED_ENTRY, Queue, Run, erlang_b, lane
 from parkenv.studies.verify.rows import disagreeing
 from planners.heuristics import POLICIES
@@ -115,3 +115,16 @@ def test_a_full_lot_is_left_by_ordered_entry():
     parked = cars["slot"] >= 0
     assert 0 < parked.sum() < len(cars)
     assert (cars["gave_up_s"][~parked] > 0.0).all()
+
+
+def test_a_garage_refuses_as_erlang_says_and_its_barrier_is_a_queue():
+    made = town.garage_rows(3, capacity=10, load=8.0, runs=30, hours=100.0)
+    assert all(row.agrees for row in made)
+    low, high = made[0].interval
+    assert not low <= queues.erlang_b(9, 8.0) <= high
+
+
+def test_a_walk_on_streets_takes_as_long_as_the_formula_says():
+    rows = town.network_rows(5, cars=800)
+    assert all(row.agrees for row in rows)
+    assert [row.expected for row in rows] == sorted(row.expected for row in rows)

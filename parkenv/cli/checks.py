@@ -89,6 +89,7 @@ PARTS = {
     "env": "env_rows",
     "drive": "drive_rows",
     "fleet": "fleet_rows",
+    "town": "town_rows",
 }
 """Modules of `parkenv.studies.bench`, and the function of each that measures."""
 
@@ -101,11 +102,17 @@ class Bench(Command):
         parkenv bench --seconds 2 --out results/bench
         """
 
-    parts: Several[Literal["sensors", "perception", "planning", "env", "drive", "fleet"]] = option(
+    parts: Several[Literal["sensors", "perception", "planning", "env", "drive", "fleet", "town"]] = option(
         (), f"Some of {', '.join(PARTS)}.", takes="PART", argument=True, default="all"
     )
     seconds: float = option(0.6, "How long each figure is measured.", ge=0.01, le=3600)
     seed: Seed = Field(0, description="Of the lots and the noise.")
+    lots: Several[str] = option(
+        (),
+        "Lots whose day the part town compares with SUMO's, besides a made one.",
+        name="--lot",
+        takes="FILE[,...]",
+    )
     out: Path | None = option(
         None, "Folder for summary.json, and a table of each part for a page.", short="-o", default="none"
     )
@@ -123,7 +130,8 @@ class Bench(Command):
         for part in chosen:
             with console.status(f"Measuring {part}"):
                 measure = getattr(import_module(f"parkenv.studies.bench.{part}"), PARTS[part])
-                measured = measure(self.seed, self.seconds)
+                further = {"lots": self.lots} if part == "town" else {}
+                measured = measure(self.seed, self.seconds, **further)
             rows += measured
             if self.out is not None:
                 (self.out / f"{part}.md").write_text(_markdown(measured), encoding="utf-8")

@@ -57,11 +57,12 @@ class Street(NamedTuple):
     end: int
     length: float
     slots: tuple[tuple[int, float], ...]
+    number: int = 0  # of the streets between the same junctions
 
     @property
     def name(self) -> str:
         """Name of the edge."""
-        return f"{self.start}-{self.end}"
+        return f"{self.start}-{self.end}" + (f"-{self.number}" if self.number else "")
 
 
 @dataclass(frozen=True)
@@ -70,10 +71,15 @@ class SumoDay:
 
     Attributes:
         search_s: (n_cars,) s from the arrival until the car stood in its parking area; NaN if it never did.
+        slot: (n_cars,) int64, the slot of that area; -1 if it never did.
+        began_s, left_s: (n_cars,) s since the beginning, when the car came to stand there and left.
         cpu_s: CPU time of the simulation, s.
     """
 
     search_s: NDArray[np.float64]
+    slot: NDArray[np.int64]
+    began_s: NDArray[np.float64]
+    left_s: NDArray[np.float64]
     cpu_s: float
 
 
@@ -154,7 +160,8 @@ def streets_of(lot: ParkingLot) -> list[Street]:
         for a, v in enumerate(row)
         if v >= 0
     }
-    streets = []
+    streets: list[Street] = []
+    count: dict[tuple[int, int], int] = {}
     for start in range(lot.n_slots, lot.n_vertices):
         for first in neighbors[start]:
             before, at, along, slots = start, first, length[start, first], []
@@ -162,7 +169,8 @@ def streets_of(lot: ParkingLot) -> list[Street]:
                 slots.append((at, along))
                 before, at = at, neighbors[at][0]
                 along += length[before, at]
-            streets.append(Street(start, at, along, tuple(slots)))
+            number = count[start, at] = count.get((start, at), -1) + 1
+            streets.append(Street(start, at, along, tuple(slots), number))
     return streets
 
 
@@ -184,7 +192,7 @@ def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> SumoDay
     with tempfile.TemporaryDirectory() as name:
         at = Path(name)
         _write_network(fleet, streets, at, folder)
-        _write_parking(streets, at / "parking.add.xml")
+        _write_parking(streets, fleet.scenario.lot.capacity, at / "parking.add.xml")
         _write_trips(fleet, streets, at / "trips.rou.xml", step_s)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         _run(
@@ -197,11 +205,16 @@ def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> SumoDay
         )  # fmt: skip
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         stops = ElementTree.parse(at / "stops.xml").getroot()
-        started = {stop.get("id"): float(stop.get("started", "nan")) for stop in stops}
+        found = {int(stop.get("id", -1)): stop for stop in stops}
     arrival_s = fleet.cars["arrival"] - fleet.begin
-    search_s = np.array([started.get(str(car), np.nan) for car in range(len(arrival_s))]) - arrival_s
+    slot, began_s, left_s = np.full(len(arrival_s), -1), *np.full((2, len(arrival_s)), np.nan)
+    for car, stop in found.items():
+        slot[car] = int(stop.get("parkingArea", "slot-1").removeprefix("slot"))
+        began_s[car] = float(stop.get("started", "nan"))
+        ended = float(stop.get("ended", "-1"))
+        left_s[car] = ended if ended >= 0.0 else np.inf
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return SumoDay(search_s, cpu_s)
+    return SumoDay(began_s - arrival_s, slot, began_s, left_s, cpu_s)
 
 
 def _write_network(fleet: Fleet, streets: Iterable[Street], at: Path, folder: Path) -> None:
@@ -224,13 +237,13 @@ def _write_network(fleet: Fleet, streets: Iterable[Street], at: Path, folder: Pa
     _run([folder / "netconvert", *files, "--no-internal-links", "true"])
 
 
-def _write_parking(streets: Iterable[Street], path: Path) -> None:
+def _write_parking(streets: Iterable[Street], capacity: NDArray[np.int64], path: Path) -> None:
     root = ElementTree.Element("additional")
     streets = list(streets)
     for street in streets:
         for slot, along in street.slots:
             place = {"lane": f"{street.name}_0", "startPos": max(along - _SHORT_M, 0.0), "endPos": along}
-            _add(root, "parkingArea", {"id": f"slot{slot}", "roadsideCapacity": 1, **place})
+            _add(root, "parkingArea", {"id": f"slot{slot}", "roadsideCapacity": int(capacity[slot]), **place})
     rerouter = _add(root, "rerouter", {"id": "search", "edges": " ".join(street.name for street in streets)})
     interval = _add(rerouter, "interval", {"begin": 0, "end": 1_000_000})
     for street in streets:
@@ -253,13 +266,24 @@ def _write_trips(fleet: Fleet, streets: Iterable[Street], path: Path, step_s: fl
     cars = fleet.cars
     entries = [int(entry) for entry in np.unique(cars["entry"])]
     first = {entry: int(np.argmin(drive_times(fleet.scenario, entry))) for entry in entries}
-    start = {entry: next(street.name for street in streets if street.start == entry) for entry in entries}
+    start = {entry: _first_street(fleet, streets, entry, first[entry]).name for entry in entries}
     for number, car in enumerate(cars):
         entry = int(car["entry"])
         route = {"from": start[entry], "to": of_slot[first[entry]], "departSpeed": "max", "type": "car"}
         trip = _add(root, "trip", {"id": number, "depart": car["arrival"] - fleet.begin, **route})
         _add(trip, "stop", {"parkingArea": f"slot{first[entry]}", "duration": car["stay_s"]})
     ElementTree.ElementTree(root).write(path)
+
+
+def _first_street(fleet: Fleet, streets: Iterable[Street], entry: int, slot: int) -> Street:
+    """Return the street by which a car leaves an entry on its way to a slot."""
+
+    def metres(street: Street) -> float:
+        along = dict(street.slots).get(slot)
+        onward = drive_times(fleet.scenario, street.end)[slot] * fleet.scenario.v_drive
+        return street.length + float(onward) if along is None else along
+
+    return min((street for street in streets if street.start == entry), key=metres)
 
 
 def _write(path: Path, tag: str, children: Iterable[tuple[str, Mapping[str, object]]]) -> None:

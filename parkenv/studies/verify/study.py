@@ -71,9 +71,9 @@ class Verification(Study):
         for case in self.cases:
             if case not in VERIFY_CASES:
                 raise InputError(f"cases: there is no case {case!r}; {nearest(case, VERIFY_CASES)}")
-        from parkenv.studies.verify import balance, game, line, queues
+        from parkenv.studies.verify import balance, game, line, queues, town
 
-        made = line.CASES | queues.CASES | balance.CASES | game.CASES
+        made = line.CASES | queues.CASES | balance.CASES | game.CASES | town.CASES
         return {case: made[case](self.seed) for case in self.cases}
 
     def check(self) -> None:
