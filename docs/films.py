@@ -168,7 +168,7 @@ def play(targets=("C10", "A19", "A19")):
 
 
 ONLY_MAP = """
-const others = ".bar, .head, .controls, h2, main > section:not(#town), .legend, .hint, .small";
+const others = ".bar, .head, .controls, h2, main > section:not(#town), .legend, .keys, .zooms, .small";
 for (const element of document.querySelectorAll(others)) element.remove();
 document.querySelector("main").style.padding = "0.7rem";
 document.documentElement.style.overflow = "hidden";
@@ -187,7 +187,7 @@ def town():
     with tempfile.TemporaryDirectory() as folder:
         command = ["fleet", "--scenario", "town", "--agents", "usual", "--knows", "own", "-n", "1"]
         subprocess.run(["parkenv", *command, "--out", f"{folder}/town"], check=True)
-        with browser_at(1040, 760, folder) as browser:
+        with browser_at(1040, 730, folder) as browser:
             browser.get(Path(folder, "town/fleet.html").as_uri())
             browser.execute_script(ONLY_MAP)
             end = browser.execute_script(GO_TO, 0)
