@@ -26,6 +26,7 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.keyed_random import car_key
 from parkenv.compiled.memory import (
+    LINE,
     call_at,
     float64_array,
     float64s,
@@ -92,7 +93,6 @@ reports is needed; Python must reserve slots; more room for the steps that are k
 
 _MANY_STEPS = 64  # cars on their way, from which on their data does not stay in the cache
 _SEARCH_AT = int(CAR.fields["search"][1])  # type: ignore[index]
-_LINE = 64  # bytes of a cache line
 CAR_BYTES, SEARCH_BYTES, SLOT_BYTES = CAR.itemsize, SEARCH.itemsize, SLOT.itemsize
 BLOCK_BYTES, SHARED_BYTES, EDGE_BYTES = BLOCK.itemsize, SHARED_SLOT.itemsize, EDGE.itemsize
 _ON_TICK = 1e-9  # fraction of a tick
@@ -247,13 +247,13 @@ def _prefetch_next(fleet: Any) -> None:
         prefetch(fleet.cars + CAR_BYTES * np.int64(cars[i]) + _SEARCH_AT)
     for i in range(1, 3):
         address = car_at(fleet.cars, np.int64(cars[i])).search
-        for line in range(0, SEARCH_BYTES, _LINE):
+        for line in range(0, SEARCH_BYTES, LINE):
             prefetch(address + line)
     search = search_at(car_at(fleet.cars, np.int64(cars[0])).search, 0)
     scenario, vertex, block = scenario_at(search.scenario, 0), search.vertex, search.n_columns >> BLOCK_BITS
     prefetch(scenario.edges + EDGE_BYTES * N_ACTIONS * vertex)
     prefetch(search.slots + SLOT_BYTES * search.n_columns)
-    for line in range(0, BLOCK_BYTES, _LINE):
+    for line in range(0, BLOCK_BYTES, LINE):
         prefetch(search.blocks + BLOCK_BYTES * block + line)
     first = int64s(scenario.view_starts)[vertex]
     if first < int64s(scenario.view_starts)[vertex + 1]:

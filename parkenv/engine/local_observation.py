@@ -45,7 +45,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
-from parkenv.compiled.memory import float64s, in_one_block, int32s, int64s
+from parkenv.compiled.memory import LINE, float64s, in_one_block, int32s, int64s
 from parkenv.engine.kernel import add_column, column_of, decay_belief, enter, forecast_of, set_belief_of
 from parkenv.engine.records import (
     BLOCK_BITS,
@@ -84,7 +84,6 @@ _NOWHERE = -1
 # nearest slots; walk from them; drive plus walk via the k slots ahead of each move. Times but the last are encoded.
 _FIRST_MOVE, _MOVE_NUMBERS = 2, 5
 _FIRST_SLOT = _FIRST_MOVE + N_MOVES * _MOVE_NUMBERS
-_LINE = 64  # bytes of a cache line
 
 
 class Surroundings(NamedTuple):
@@ -443,7 +442,7 @@ def _around(problem: SearchProblem, k: int) -> tuple[NDArray[Any], ...]:
 def _in_lines(parts: Sequence[NDArray[Any]], dtype: type[np.generic]) -> NDArray[Any]:
     """Put the rows of several arrays beside each other; each row fills whole cache lines."""
     rows = np.concatenate([part.reshape(len(part), -1) for part in parts], axis=1).astype(dtype)
-    return np.pad(rows, ((0, 0), (0, -rows.shape[1] % (_LINE // rows.itemsize))))
+    return np.pad(rows, ((0, 0), (0, -rows.shape[1] % (LINE // rows.itemsize))))
 
 
 @compiled

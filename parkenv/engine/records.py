@@ -175,12 +175,8 @@ def _with_costs(fields: Sequence[Any], **arrays: str) -> np.dtype[Any]:
     for name, first in arrays.items():
         members[name] = np.dtype((np.float64, (N_TERMS,))), plain.fields[first][1]
     formats, offsets = zip(*members.values(), strict=True)
-    layout = {
-        "names": list(members),
-        "formats": formats,
-        "offsets": offsets,
-        "itemsize": -(-plain.itemsize // LINE) * LINE,
-    }
+    size = -(-plain.itemsize // LINE) * LINE
+    layout = {"names": list(members), "formats": formats, "offsets": offsets, "itemsize": size}
     return np.dtype(layout, align=True)  # type: ignore[call-overload, no-any-return]
 
 
