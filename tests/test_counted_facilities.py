@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import binom, poisson
 from test_supply import GARAGE, town
 
-from parkenv import InputError, make_scenario
+from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.kernel import p_full
 from parkenv.engine.records import GAVE_UP, PARKED, SEARCHING
@@ -113,34 +113,19 @@ def test_every_car_is_somewhere(gate_s):
     assert (np.sort(fleet.cars["state"]) > SEARCHING).all()
 
 
-class Began(Demand):
-    """Three cars that stand in slots when the world begins, and one that comes."""
-
-    slots = (10, 10, 0)
-
-
-def test_cars_may_stand_there_when_the_world_begins(monkeypatch):
+def test_cars_may_stand_there_when_the_world_begins():
     scenario = make_scenario(town(zone_rules={}))
-    draw = Fleet._require_room
-
-    def stand(fleet, _):
-        cars = fleet._cars
-        cars["parked_at"][:3] = Began.slots
-        draw(fleet, cars["parked_at"][:3])
-
-    monkeypatch.setattr(Fleet, "_require_room", stand)
-    fleet = run(scenario, Demand(ListedArrivals((0.0, 0.0, 0.0, 60.0)), ConstantTime(600.0)))
-    assert fleet.cars["slot"][:3].tolist() == [10, 10, 0]
-    assert (fleet.cars["total_s"][:3] == 0.0).all()
-    assert fleet.counts()[[0, 10]].tolist() == [1, 2]
-    fleet.run(until=fleet.begin + 599.0)
-    assert fleet.totals["parked"] == 4.0
+    fleet = run(scenario, Demand(ListedArrivals((60.0,)), ConstantTime(600.0), parked=30))
+    cars = fleet.cars
+    assert np.count_nonzero(cars["parked_at"] >= 0) == 30
+    np.testing.assert_array_equal(cars["slot"][:30], cars["parked_at"][:30])
+    assert (cars["total_s"][:30] == 0.0).all()
+    counts = fleet.counts()
+    assert counts[10] > 0
+    assert counts.sum() == fleet.totals["parked"]
     fleet.run(until=fleet.begin + 601.0)
-    assert fleet.totals["gone"] == 3.0
-    assert fleet.counts()[10] == 0
-    Began.slots = (0, 0, 1)
-    with pytest.raises(InputError, match="2 cars begin in slot 'A1', want at most 1"):
-        fleet.reset()
+    np.testing.assert_allclose(cars["left_at"][:30], fleet.begin + cars["stay_s"][:30])
+    assert fleet.counts().sum() == 1
 
 
 # ---- who may not park
@@ -249,6 +234,20 @@ def test_a_count_tells_how_full_it_will_be(capacity, age):
         assert p_full(long_run, capacity - 1, capacity, 0.0) == 0.0
         assert p_full(long_run, capacity, capacity, 0.0) == 1.0
         assert p_full(long_run, 0, capacity, 50.0) == pytest.approx(long_run, abs=1e-6)
+
+
+def test_a_batch_knows_what_a_single_search_knows():
+    garage = replace(GARAGE, known="live", capacity=3)
+    scenario = make_scenario(town(facilities=(garage, town().facilities[1]), zone_rules=FORBIDDEN))
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    batch = gym.make_vec("parkenv/Search-v2", num_envs=2, scenario=scenario)
+    one, _ = env.reset(seed=3)
+    seen, _ = batch.reset(seed=[3, 4])
+    for action in np.random.default_rng(0).integers(0, 4, 8):
+        for name, value in one.items():
+            np.testing.assert_array_equal(np.ravel(seen[name][0]), np.ravel(value), err_msg=name)
+        one, *_ = env.step(action)
+        seen, *_ = batch.step(np.full(2, action))
 
 
 def first_belief(known, count, delay_s=0.0):

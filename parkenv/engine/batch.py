@@ -211,7 +211,8 @@ def arrive_all(address: int, which: BoolArray) -> None:
             search.episode += 1
             arrive(search)
             scenario = scenario_at(search.scenario, 0)
-            if scenario.n_live > 0 and scenario.prior_kind != EXTERNAL_KIND:
+            # With a full belief, `init_prior` does that.
+            if scenario.n_live > 0 and scenario.prior_kind != EXTERNAL_KIND and search.belief == 0:
                 observe_live(search)
 
 
