@@ -281,6 +281,20 @@ FLEET_SUMMARY = {
             "occupancy": 0.5, "counted_occupancy": 0.75, "excess": -0.25, "excess_ci95": [-0.3, -0.2],
         }
     ],
+    "blocks": [
+        {
+            "scenario": "mini", "agents": "random", "knows": "own", "share": 0.0, "arrivals_per_hour": 20.0,
+            "block": "Mill Street", "type": "kerb", "zone": "centre", "slots": 10, "price": 2.0, "occupancy": 0.5,
+            "parked_a_day": 20.0, "share_parked": 1.0, "refused_a_day": 1.0, "search_s": 30.0, "walk_s": 20.0,
+            "cruised_m": None, "paid_a_day": 40.0, "paid_a_car": 2.0,
+        }
+    ],
+    "reach": [
+        {
+            "scenario": "mini", "patience_s": 600.0, "v_drive_kmh": 20.0, "share_reached": 0.9,
+            "most_reached_s": 700.0, "entries": 3, "entries_cut_off": 1,
+        }
+    ],
     "changes": [
         {
             "change": "knows", "before": "own observations", "after": "a live map for 50 %", "zone": None,

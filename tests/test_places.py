@@ -128,7 +128,7 @@ def test_files_in_a_folder_are_named_by_their_faults(folder, tmp_path_factory):
     empty = tmp_path_factory.mktemp("empty")
     with pytest.raises(InputError, match=r"holds no scenario \(\.toml\) and no lot \(\.geojson\)"):
         make_scenarios(empty)
-    with pytest.raises(InputError, match="holds 4 scenarios, want one"):
+    with pytest.raises(InputError, match="holds 5 scenarios, want one"):
         scenario_spec("parkenv/lots/packaged")
     with pytest.raises(InputError, match="scenario has 6 scenarios, want one"):
         gym.make("parkenv/SearchSensors-v2", scenario=PLACES)

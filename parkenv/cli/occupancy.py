@@ -168,7 +168,7 @@ class Demand(Command):
     """
 
     examples = """
-        parkenv occupancy demand counts.csv.gz --scenario town.toml --hours 07:00-20:00 --from 2021-09-06 --weeks 8
+        parkenv occupancy demand counts.csv.gz --scenario town.toml --from 2021-09-06
         parkenv fleet --scenario results/demand/scenario.json
         """
 
@@ -236,7 +236,7 @@ class Demand(Command):
 class Record(Command):
     """Which slots are taken on days of a town whose scenario says who comes, as a log: the others in a single search.
 
-    Name the log in the scenario, `occupancy = { log = "days.csv.gz", mapping = "same" }`; then `parkenv compare` and
+    Name the log in the scenario's table `occupancy`, as `log`, with `mapping = "same"`; then `parkenv compare` and
     environments replay its days. A garage is taken while it is full.
     """
 
