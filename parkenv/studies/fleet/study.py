@@ -106,11 +106,12 @@ class FleetStudy(Study):
         default=f"{NEAREST}; where parking has a price, {MINDS_PRICES}; in towns, {IN_TOWNS}",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
-    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] = option(
-        KNOWLEDGE,
+    knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] | None = option(
+        None,
         "What members know. own: what they observe; shared: also a live map of what members observe; "
         "reserve: the slot that a guidance system has reserved; full: the state of every slot.",
         panel="Knowledge",
+        default=f"{', '.join(KNOWLEDGE)}; in towns, {OWN}",
     )
     shares: Values[Probability] = option(
         (1.0,),
@@ -190,7 +191,10 @@ class FleetStudy(Study):
                 "decision_limit_s requires the backend loky or ray; threads of Dask get no timer signal",
             )
         axes = "scenarios x agents x knows x shares x arrivals_per_hour"
-        lengths = map(len, (self.scenarios, self.agents or (NEAREST,), self.knows, self.shares, self.demands))
+        lengths = map(
+            len,
+            (self.scenarios, self.agents or (NEAREST,), self.knows or KNOWLEDGE, self.shares, self.demands),
+        )
         settings = math.prod(lengths)
         require_at_most(settings, axes, "settings", MAX_SETTINGS)
         require_at_most(settings * self.days, f"{axes} x days", "days")
@@ -217,10 +221,19 @@ class FleetStudy(Study):
         """The agents; by default one that minds prices, where there are any, or that knows a town."""
         if self.agents:
             return self.agents
-        if any(scenario.lot.facilities for scenario in self.built.values()):
+        if self._in_towns:
             return (AgentSpec(name=IN_TOWNS),)
         is_priced = any(scenario.is_priced for scenario in self.built.values())
         return (AgentSpec(name=MINDS_PRICES if is_priced else NEAREST),)
+
+    @property
+    def knowledge(self) -> tuple[str, ...]:
+        """What members know, in turn; by default everything that there is to know, but in towns."""
+        return self.knows or ((OWN,) if self._in_towns else KNOWLEDGE)
+
+    @property
+    def _in_towns(self) -> bool:
+        return any(scenario.lot.facilities for scenario in self.built.values())
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -255,7 +268,7 @@ class FleetStudy(Study):
         made = dict.fromkeys(
             (per_hour, number, OWN if share == 0.0 else knows, 0.0 if knows == OWN else share)
             for per_hour, number, knows, share in itertools.product(
-                self.demands, range(len(self.drivers)), self.knows, self.shares
+                self.demands, range(len(self.drivers)), self.knowledge, self.shares
             )
         )
         return [
