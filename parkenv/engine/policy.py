@@ -150,6 +150,21 @@ def draw_uniform(search: Any) -> float:
 
 
 @inlined
+def draw_action(search: Any, n_actions: int) -> int:
+    """Return one of the first actions that the graph has where the car is, all with equal probability; -1 if none."""
+    count = 0
+    for action in range(n_actions):
+        count += is_allowed(search, action)
+    left = int(draw_uniform(search) * count)
+    for action in range(n_actions):
+        if is_allowed(search, action):
+            if left == 0:
+                return action
+            left -= 1
+    return -1
+
+
+@inlined
 def has_own_price(search: Any) -> bool:
     """Return whether arriving costs the car something else than the scenario's driver: zones have rules."""
     return bool(search.zone_cost_s != 0)

@@ -6,7 +6,6 @@ import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
 from parkenv.errors import InputError, naming
@@ -117,7 +116,7 @@ def demand_of(
         InputError: the hours end when they begin, a weight does not fit the lot, or nobody arrives; the message names
             the table.
     """
-    from parkenv.world.demand import ConstantTime, Demand, TownDemand
+    from parkenv.world.demand import ConstantTime, Demand, TownDemand, weights_of_all
 
     if not purposes:
         return None
@@ -127,13 +126,7 @@ def demand_of(
     others: dict[str, tuple[float, ...]] = {}
     for field, (points, of_lot) in places.items():
         some = any(getattr(one, field) for one in purposes.values())
-        others[field] = (
-            tuple(np.sum([*of_lot.values()], axis=0).tolist())
-            if of_lot
-            else (1.0,) * len(points)
-            if some
-            else ()
-        )
+        others[field] = weights_of_all(of_lot) or ((1.0,) * len(points) if some else ())
     made = []
     for name, one in purposes.items():
         chosen: dict[str, tuple[float, ...]] = {}

@@ -701,6 +701,11 @@ def _cars_of(log: OccupancyLog, kind: str) -> _RecordedCars:
     return _RecordedCars(np.array(stays), np.array(ended, dtype=np.bool_), arrived, seen)
 
 
+def weights_of_all(weights: Mapping[str, FloatArray]) -> tuple[float, ...]:
+    """Return the weights of a lot's entries or goals over all purposes; none if it has none."""
+    return tuple(np.sum([*weights.values()], axis=0).tolist()) if weights else ()
+
+
 def hours_between(start_s: float, end_s: float) -> FloatArray:
     """Return the full hours between two times, and these, s."""
     hours = np.arange(start_s // HOUR_S + 1, math.ceil(end_s / HOUR_S)) * HOUR_S

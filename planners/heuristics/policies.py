@@ -14,8 +14,7 @@ from parkenv.engine.policy import (
     CompiledPolicy,
     PolicyData,
     car_of,
-    draw_uniform,
-    is_allowed,
+    draw_action,
     policy_data,
     recent_state,
     search_of,
@@ -118,17 +117,7 @@ class UsualPolicy(CompiledPolicy):
 @kernel
 def decide_random(address: int, number: int) -> int:
     """Choose one of the actions that the graph has, all with equal probability."""
-    search = search_of(car_of(address, number).search)
-    count = 0
-    for action in range(_N_ACTIONS):
-        count += is_allowed(search, action)
-    left = int(draw_uniform(search) * count)
-    for action in range(_N_ACTIONS):
-        if is_allowed(search, action):
-            if left == 0:
-                return action
-            left -= 1
-    return 0
+    return int(max(draw_action(search_of(car_of(address, number).search), _N_ACTIONS), 0))
 
 
 POLICIES = {

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
@@ -25,6 +24,7 @@ from parkenv.world.demand import (
     FollowingArrivals,
     PoissonArrivals,
     TownDemand,
+    weights_of_all,
 )
 from parkenv.world.scenario import Drivers, Scenario
 from parkenv.world.week import HOUR_S
@@ -132,14 +132,9 @@ def demand_in(
         arrivals = FollowingArrivals(scenario.occupancy, window, stay, times_demanded(per_hour))
     else:
         arrivals = PoissonArrivals(per_hour, window.start_s, window.end_s)
-    entries = _all_purposes(scenario.lot.entry_weights) if scenario.entry is None else ()
-    goals = _all_purposes(scenario.lot.goal_weights)
+    entries = weights_of_all(scenario.lot.entry_weights) if scenario.entry is None else ()
+    goals = weights_of_all(scenario.lot.goal_weights)
     return Demand(arrivals, stay, ConstantTime(patience_s), entry_weights=entries, goal_weights=goals)
-
-
-def _all_purposes(weights: Mapping[str, FloatArray]) -> tuple[float, ...]:
-    """Return the weights of entries or goals over all purposes; none if a lot has none."""
-    return tuple(np.sum([*weights.values()], axis=0).tolist()) if weights else ()
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from parkenv.engine.policy import (
     CompiledPolicy,
     PolicyData,
     car_of,
+    draw_action,
     draw_uniform,
     is_allowed,
     policy_data,
@@ -266,16 +267,8 @@ def decide_walk(address: int, number: int) -> int:
     search = search_of(car_of(address, number).search)
     if is_allowed(search, PARK) and recent_state(search, search.vertex) == OBSERVED_FREE:
         return PARK
-    count = 0
-    for move in range(PARK):
-        count += is_allowed(search, move)
-    left = int(draw_uniform(search) * count)
-    for move in range(PARK):
-        if is_allowed(search, move):
-            if left == 0:
-                return move
-            left -= 1
-    return LEAVE
+    move = draw_action(search, PARK)
+    return LEAVE if move < 0 else int(move)
 
 
 WALK = CompiledPolicy("walk", decide_walk)
