@@ -173,7 +173,7 @@ class Demand(Command):
         """
 
     counts: Annotated[Path, Option("COUNTS", takes="FILE", argument=True)] = Field(
-        description="Counts, car_park,capacity,hour,free (or hour_utc), as .csv or .csv.gz."
+        description="Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), as .csv or .csv.gz."
     )
     scenario: OneScenario = scenario_spec("town")
     from_day: Date = option(..., "First day that is followed.", name="--from", takes="DATE")
@@ -182,7 +182,7 @@ class Demand(Command):
     agent: OneAgent = AgentSpec(name="usual")
     rounds: int = option(3, "How often the town is driven.", ge=1, le=100)
     days: int = option(3, "Days of the fleet in each round.", name="--episodes", short="-n", ge=1, le=1_000)
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time of hour_utc.")
+    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
     seed: Seed = Field(0, description="Seed of these days.")
     out: Path = option(
         Path("results/demand"), "Folder for scenario.json, summary.json and demand.png.", short="-o"

@@ -409,10 +409,9 @@ class Fleet:
         self._record["zone_cost_s"] = 0
         if not self.scenario.has_rules and (cars["walks"] == 1.0).all():
             return np.zeros((len(cars), len(lot.zones)))
-        drivers = self.drivers_of(slice(None))
-        if not np.isfinite(self.scenario.zone_price(drivers)).all():
+        if not np.isfinite(self.scenario.zone_price(self.drivers_of(slice(None)))).all():
             raise InputError("Demand.stays: a stay is infinite, want finite ones where parking has a price")
-        zone_cost_s = self.scenario.zone_cost_s(drivers)
+        zone_cost_s = self.zone_cost_s()
         self._keep({"zone_cost_s": zone_cost_s})
         self._record["n_zones"] = len(lot.zones)
         slots_in = np.bincount(lot.zone_of_slot, minlength=len(lot.zones))

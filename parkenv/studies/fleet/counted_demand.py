@@ -19,7 +19,7 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.counted_demand import CarParkDays, save_counted_demand
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.drivers import policy_of
+from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.occupancy import Found
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress
@@ -78,17 +78,14 @@ def fit_demand(
     car_parks = _CarParks(scenario, counts)
     at_first, counted = car_parks.mean_of(weeks.first, weeks.followed)
     target = counted
-    policy, one = policy_of(agent, scenario)
-    if one is not None:
-        raise InputError(f"--agents is {agent.label!r}, want a compiled one, such as usual")
+    policy = compiled_policy_of(agent, scenario)
     stays_h: dict[str, tuple[float, ...]] = {}
     for number in range(rounds):
         fitted = car_parks.purposes(at_first, target, stays_h)
         stays_h = {name: (its.stay_s / HOUR_S,) for name, its in fitted.items()}
         made = spec.changed(demand={**spec.demand, **fitted})
-        fleet = Fleet(
-            build(made), build(made).demand, drivers=[DriverKind(policy=policy)], leave_full_lot=False
-        )
+        town = build(made)
+        fleet = Fleet(town, town.demand, drivers=[DriverKind(policy=policy)], leave_full_lot=False)
         simulated = car_parks.driven(fleet, seed, days)
         target = np.maximum(target + _STEP * (counted - simulated), 0.0)
         progress("Rounds", number + 1, rounds)

@@ -73,6 +73,18 @@ def policy_of(
     return None, AgentsByStay(spec, scenario, known)
 
 
+def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
+    """Return the compiled policy of an agent.
+
+    Raises:
+        InputError: it decides in Python.
+    """
+    policy, _ = policy_of(spec, scenario)
+    if policy is None:
+        raise InputError(f"--agents is {spec.label!r}, want a compiled one, such as usual")
+    return policy
+
+
 class AgentsByStay:
     """An agent in Python for each car of a fleet, which plans with what the car's own stay costs.
 

@@ -16,11 +16,9 @@ from parkenv.files.atomic_write import atomic_write
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import SAME_SLOTS, ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.drivers import policy_of
+from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.study import Progress
 
-USUAL = "usual"
-"""What towns are filled with."""
 FIRST_MONDAY = date(2024, 1, 1)
 """Days of a fleet have no date; in a log the first is in this week, the next one a week later."""
 _BEFORE_S = 1  # between the last observation of a state and the next state
@@ -59,9 +57,7 @@ def record_days(
         scenario = build(spec.changed(occupancy=occupancy))
         if scenario.demand is None:
             raise InputError(f"{spec.source}: has no demand, want tables such as [demand.shoppers]")
-        policy, one = policy_of(agent, scenario)
-        if one is not None:
-            raise InputError(f"--agents is {agent.label!r}, want a compiled one, such as {USUAL}")
+        policy = compiled_policy_of(agent, scenario)
         fleet = Fleet(scenario, scenario.demand, drivers=[DriverKind(policy=policy)], leave_full_lot=False)
         lines = []
         for day in range(days):
