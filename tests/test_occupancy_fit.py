@@ -53,6 +53,26 @@ def test_constant_rates_are_recovered_however_coarse_the_looks(every_s):
     assert fitted == pytest.approx((arrival, departure), rel=0.06)
 
 
+def test_constant_rates_are_recovered_from_a_log_of_each_change():
+    truth, n, days, day_s = (1 / 1500, 1 / 3000), 60, 14, 12 * HOUR_S
+    world = constant_process(n, *truth).world(world_key(0, 0), Arrival(0.0))
+    found = []
+    for slot in range(n):
+        for day in range(days):
+            begin, time = day * DAY_S, day * DAY_S
+            found.append((slot, day, 0, world.occupied([slot], begin)[0]))
+            while (time := world.next_change([slot], time, begin + day_s)[0]) < np.inf:
+                second, taken = int(time - begin) + 1, world.occupied([slot], time)[0]
+                if taken != found[-1][-1] and second > found[-1][2]:
+                    found += [(slot, day, second - 1, not taken), (slot, day, second, taken)]
+            found.append((slot, day, day_s, found[-1][-1]))
+    slot, day, second, taken = map(np.array, zip(*found, strict=True))
+    names, dates = (tuple(map(str, values)) for values in (range(n), FIRST_MONDAY + np.arange(days)))
+    looks = OccupancyLog(names, dates, slot, day, second, taken).intervals()
+    fitted = fit_constant_rates(looks.end - looks.start, looks.before, looks.after)
+    assert fitted == pytest.approx(truth, rel=0.06)
+
+
 def test_counting_flips_of_coarse_looks_misses_half_of_them():
     truth = np.array([1 / 1500, 1 / 3000])
     looks = simulated_log(constant_process(60, *truth), 2, 1800.0).intervals()

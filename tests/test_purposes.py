@@ -205,6 +205,10 @@ def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
     assert (fleet.counts() <= town.lot.capacity).all()
     of_car = fleet.zone_cost_s()[fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]]
     assert np.isfinite(of_car).all()
+    # Two thirds of the spaces stay free, and whoever drives as usual finds one.
+    fleet.run()
+    arrived = fleet.cars[fleet.cars["parked_at"] < 0]
+    assert np.mean(arrived["slot"] >= 0) > 0.98
 
 
 def test_recorded_days_are_the_world_of_single_searches(tmp_path):

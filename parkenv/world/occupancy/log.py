@@ -26,6 +26,8 @@ from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, PERIOD_S
 DayClass = Literal["weekday", "weekend"]
 
 MAX_GAP_S = 7200.0
+SAMPLE_S = 900.0
+"""Time between the pairs of observations of a log that has each change, s."""
 MAX_LOG_BYTES = 512_000_000
 """Maximum size of a log, unpacked: some 12 million observations."""
 MAX_RECORDS = 5_000_000
@@ -238,7 +240,13 @@ class OccupancyLog:
         return np.array([day_class(day) == "weekend" for day in self.days], bool)
 
     def intervals(self, max_gap_s: float = MAX_GAP_S) -> Intervals:
-        """Return the pairs of consecutive observations of one slot on one day, at most `max_gap_s` apart."""
+        """Return the pairs of consecutive observations of one slot on one day, at most `max_gap_s` apart.
+
+        Where observations follow from changes, as in days of a fleet, they would say that states change within a
+        second. The pairs of such a log are `SAMPLE_S` apart, at times that do not depend on the states.
+        """
+        if self._has_each_change:
+            return self._samples(min(SAMPLE_S, max_gap_s))
         same_record = (np.diff(self.slot) == 0) & (np.diff(self.day) == 0)
         earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
         later = earlier + 1
@@ -250,6 +258,31 @@ class OccupancyLog:
             self.occupied[earlier],
             self.occupied[later],
         )
+
+    @cached_property
+    def _has_each_change(self) -> bool:
+        """Whether all changes, of which there are some, lie between observations a second apart."""
+        changes = (np.diff(self._record) == 0) & (np.diff(self.occupied.astype(np.int8)) != 0)
+        return bool(changes.any() and np.diff(self.second)[changes].max() <= 1.0)
+
+    @property
+    def _record(self) -> IntArray:
+        """(k,) int64, the record of each observation."""
+        return self.day * len(self.slot_ids) + self.slot
+
+    def _samples(self, each_s: float) -> Intervals:
+        """Return the states of all slots each so many seconds, from the first to the last observation of a day."""
+        grid = np.arange(0.0, DAY_S, each_s)
+        observed = np.flatnonzero(np.diff(self.first))
+        begin, end = self.second[self.first[observed]], self.second[self.first[observed + 1] - 1]
+        which, at = np.nonzero((grid >= begin[:, None]) & (grid + each_s <= end[:, None]))
+        day, slot = np.divmod(observed[which], len(self.slot_ids))
+        start, key = grid[at], self._record * DAY_S + self.second
+        before, after = (
+            self.occupied[np.searchsorted(key, observed[which] * DAY_S + second, side="right") - 1]
+            for second in (start, start + each_s)
+        )
+        return Intervals(slot, day, start, start + each_s, before, after)
 
     def mean_occupancy(
         self, kind: DayClass, hours: tuple[int, int] = (0, DAY_HOURS), days: BoolArray | None = None
