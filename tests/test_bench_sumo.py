@@ -52,7 +52,7 @@ def test_sumo_gets_the_cars_of_the_fleet_and_its_stops_are_read(monkeypatch):
     def run(command):
         """Stand for SUMO: every car but the last stops a minute after its departure."""
         options = {str(a): Path(b) for a, b in itertools.pairwise(command)}
-        for option in ("-n", "-e", "-a", "-r"):
+        for option in ("-n", "-e", "-x", "-a", "-r"):
             if option in options and options[option].exists():
                 seen[options[option].name] = ElementTree.parse(options[option]).getroot()
         if "--stop-output" in options:
@@ -70,11 +70,17 @@ def test_sumo_gets_the_cars_of_the_fleet_and_its_stops_are_read(monkeypatch):
     edges = {edge.get("id") for edge in seen["lot.edg.xml"]}
     nodes = {node.get("id") for node in seen["lot.nod.xml"]}
     assert {edge.get(end) for edge in seen["lot.edg.xml"] for end in ("from", "to")} <= nodes
+    turns = {(turn.get("from"), turn.get("to")) for turn in seen["lot.con.xml"]}
+    assert turns == {(a, b) for a in edges for b in edges if a.split("-")[1] == b.split("-")[0]}
     areas = {area.get("id"): area for area in seen["parking.add.xml"].findall("parkingArea")}
     assert len(areas) == STREET.lot.n_slots
     assert {area.get("lane").removesuffix("_0") for area in areas.values()} <= edges
-    reroutes = seen["parking.add.xml"].findall("rerouter/interval/parkingAreaReroute")
-    assert {reroute.get("id") for reroute in reroutes} == set(areas)
+    for street in sumo.streets_of(STREET.lot):
+        (places,) = seen["parking.add.xml"].findall(f"rerouter[@edges='{street.name}']/interval")
+        assert len(places) == min(sumo.ALTERNATIVES, len(areas))
+        # The nearest come first: those of the street itself, in their order.
+        names = [place.get("id") for place in places]
+        assert names[: len(street.slots)] == [f"slot{slot}" for slot, _ in street.slots]
     trips = seen["trips.rou.xml"].findall("trip")
     assert len(trips) == len(fleet.cars)
     for trip, car, arrival in zip(trips, fleet.cars, arrival_s, strict=True):
@@ -86,8 +92,8 @@ def test_sumo_gets_the_cars_of_the_fleet_and_its_stops_are_read(monkeypatch):
 
 def test_without_sumo_a_row_says_so(monkeypatch):
     monkeypatch.setattr(sumo, "sumo_folder", lambda: None)
-    (row,) = sumo.sumo_rows()
-    assert (row["case"], row["value"]) == ("SUMO: not installed", None)
+    ((row,), days) = sumo.sumo_rows(None, "a day", 0, 3600.0, (1.0,))
+    assert (row["case"], row["value"], days) == ("SUMO: not installed", None, {})
 
 
 def test_an_error_of_sumo_is_told_in_a_line():

@@ -22,6 +22,6 @@ def test_occupancy_is_the_share_of_the_spaces_and_the_time():
     blocks = town.blocks_of(town.with_garage(city_lot(200, 1), 30))
     slot = np.array([blocks.n_slots - 1, blocks.n_slots - 1, -1])
     began, left = np.array([0.0, 50.0, np.nan]), np.array([100.0, np.inf, np.nan])
-    share = town.parked_share(blocks, slot, began, left, 100.0)
+    share = sumo.ParkedDay(began, slot, began, left, 0.0).parked_share(blocks.capacity, 100.0)
     assert share[-1] == 1.5 / 30
     assert not share[:-1].any()

@@ -22,6 +22,8 @@ WORLDS, CARS = 64, 50
 SLOTS = (10, 20)
 LARGE, DAY_CARS = 10_000, 1_000
 FULL = 0.8  # share of taken slots
+STEPS_S = (1.0, 0.1)
+"""Time steps of SUMO, s."""
 GROWTH = (10, 100, 1_000, 10_000)
 
 
@@ -79,7 +81,18 @@ def fleet_rows(
         )
         rows += duration("growth", case, 1e3 * took, "ms a day")
         rows += duration("growth", case, 1e9 * took / day.totals["decisions"], "ns a decision")
-    return rows + sumo_rows(seed)
+    return rows + _street_rows(seed)
+
+
+def _street_rows(seed: int) -> list[BenchRow]:
+    """Return rows of the lot `street`, where all lanes are one-way, beside SUMO."""
+    begin, end, cars = 8 * HOUR_S, 13 * HOUR_S, 60.0
+    demand = Demand(PoissonArrivals(cars, begin, end), ExponentialTime(HOUR_S))
+    kind = DriverKind(policy=POLICIES["greedy-drive"])
+    fleet = Fleet("street", demand, background="none", drivers=[kind], leave_full_lot=False)
+    return sumo_rows(fleet, f"street, {cars:g} cars an hour for 5 hours", seed, end - begin, STEPS_S, days=3)[
+        0
+    ]
 
 
 def _day(cars: int) -> Demand:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -19,7 +18,7 @@ from scipy.sparse import csr_matrix, vstack
 
 from parkenv.lots import city_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, duration, seconds_each
+from parkenv.studies.bench.rows import BenchRow, duration, peak_memory_gib, seconds_each
 from parkenv.studies.simulate import simulate
 from parkenv.studies.workers import worker_start
 from parkenv.world.lot import PARK, ParkingLot
@@ -157,17 +156,6 @@ def city_rows(n_slots: int, seed: int) -> list[BenchRow]:
     if memory_gib := peak_memory_gib():
         rows += duration("search", f"city, {n_slots:,} slots: peak memory", memory_gib, "GiB")
     return rows
-
-
-def peak_memory_gib() -> float | None:
-    """Return this process's peak memory; None where the system does not report it."""
-    if find_spec("resource") is None:
-        return None
-    import resource
-
-    # Kilobytes, except on macOS.
-    unit = 1 if sys.platform == "darwin" else 1024
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
 
 
 def drive(

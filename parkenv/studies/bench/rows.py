@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Mapping
+from importlib.util import find_spec
 from typing import TypedDict
 
 import numpy as np
@@ -46,19 +48,35 @@ def duration(part: str, case: str, value: float, unit: str, **peers: float) -> l
     return _rows(part, case, value, unit, {name: (other, other / value) for name, other in peers.items()})
 
 
+def equal(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
+    """Return rows like `rate` for a value that is to be equal, not high or low."""
+    return _rows(part, case, value, unit, {name: (other, None) for name, other in peers.items()})
+
+
 def absent(part: str, case: str, unit: str) -> list[BenchRow]:
     """Return the row of a value that could not be measured."""
     return _rows(part, case, None, unit, {})
 
 
 def _rows(
-    part: str, case: str, value: float | None, unit: str, peers: Mapping[str, tuple[float, float]]
+    part: str, case: str, value: float | None, unit: str, peers: Mapping[str, tuple[float, float | None]]
 ) -> list[BenchRow]:
     alone: dict[str | None, tuple[float | None, float | None]] = {None: (None, None)}
     return [
         BenchRow(part=part, case=case, value=value, unit=unit, peer=peer, peer_value=other, ratio=ratio)
         for peer, (other, ratio) in (peers or alone).items()
     ]
+
+
+def peak_memory_gib() -> float | None:
+    """Return this process's peak of resident memory; None where the system does not report it."""
+    if find_spec("resource") is None:
+        return None
+    import resource
+
+    # Kilobytes, except on macOS.
+    unit = 1 if sys.platform == "darwin" else 1024
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
 
 
 Measure = Callable[[int], float]

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,13 +21,12 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.compiled.arrays import FloatArray
+from parkenv.engine.fleet import Fleet, drive_times
 from parkenv.errors import InputError
-from parkenv.studies.bench.rows import BenchRow, absent, duration
-from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
+from parkenv.studies.bench.rows import BenchRow, absent, duration, equal
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import HOUR_S
-from planners.heuristics import POLICIES
 
 PARKING_WEIGHTS = {
     "parking.distanceto.weight": 1,  # the nearest of the areas not known to be full
@@ -36,9 +35,8 @@ PARKING_WEIGHTS = {
     "parking.frustration": 1_000_000,
 }
 """Parameters with which SUMO's drivers do as `greedy-drive`: drive on to the nearest slot not known to be taken."""
-STEPS_S = (1.0, 0.1)
-"""Time steps of SUMO, s."""
-_WINDOW = 8 * HOUR_S, 13 * HOUR_S
+ALTERNATIVES = 100
+"""Parking areas that a car may go on to from a full one, the nearest: SUMO computes a route to each."""
 _SHORT_M = 2.0  # length of a parking area on its lane, m
 # A step is 0.1 to 1 s, so these reach any speed, or stop, within one.
 _AT_ONCE = 100.0  # m/s²
@@ -66,21 +64,27 @@ class Street(NamedTuple):
 
 
 @dataclass(frozen=True)
-class SumoDay:
-    """What SUMO made of a day.
+class ParkedDay:
+    """What a model made of a day.
 
     Attributes:
-        search_s: (n_cars,) s from the arrival until the car stood in its parking area; NaN if it never did.
-        slot: (n_cars,) int64, the slot of that area; -1 if it never did.
+        search_s: (n_cars,) s from the arrival until the car stood in its slot; NaN if it never did.
+        slot: (n_cars,) int64; -1 if it never did.
         began_s, left_s: (n_cars,) s since the beginning, when the car came to stand there and left.
         cpu_s: CPU time of the simulation, s.
     """
 
-    search_s: NDArray[np.float64]
+    search_s: FloatArray
     slot: NDArray[np.int64]
-    began_s: NDArray[np.float64]
-    left_s: NDArray[np.float64]
+    began_s: FloatArray
+    left_s: FloatArray
     cpu_s: float
+
+    def parked_share(self, capacity: NDArray[np.int64], end_s: float) -> FloatArray:
+        """Return the mean share of the spaces of each slot in which cars stood until a time, (n_slots,)."""
+        stood = np.clip(self.left_s, 0.0, end_s) - np.clip(self.began_s, 0.0, end_s)
+        parked = (self.slot >= 0) & np.isfinite(self.began_s)
+        return np.bincount(self.slot[parked], stood[parked], len(capacity)) / (end_s * capacity)
 
 
 def sumo_folder() -> Path | None:
@@ -98,45 +102,61 @@ def sumo_version(folder: Path) -> str:
     return f"SUMO {said[said.index('sumo') + 1] if 'sumo' in said else said[3]}"
 
 
-def sumo_rows(seed: int = 0, days: int = 3, per_hour: float = 60.0) -> list[BenchRow]:
-    """Return rows with CPU times and mean search times of the same days in a fleet and in SUMO, if it is installed.
+def sumo_rows(
+    fleet: Fleet, case: str, seed: int, end_s: float, steps_s: Sequence[float], days: int = 1
+) -> tuple[list[BenchRow], dict[str, list[ParkedDay]]]:
+    """Return rows with CPU times and mean search times of days in a fleet and in SUMO, and these days.
 
     Args:
+        fleet: a fleet in an empty lot, whose drivers are `greedy-drive`.
+        case: what the days are.
         seed: seed of the days.
+        end_s: s from the beginning of the day until no more cars come.
+        steps_s: time steps of SUMO, s, each a peer.
         days: number of days.
-        per_hour: cars an hour, from 8 to 13 o'clock.
+
+    Returns:
+        The rows; the days of the fleet under the name `ours`, and of each peer. Without SUMO, a row that says so.
     """
     folder = sumo_folder()
     if folder is None:
-        return absent("day", "SUMO: not installed", "s")
-    demand = Demand(PoissonArrivals(per_hour, *_WINDOW), ExponentialTime(HOUR_S))
-    kind = DriverKind(policy=POLICIES["greedy-drive"])
-    fleet = Fleet("street", demand, background="none", drivers=[kind], leave_full_lot=False)
-    end_s = _WINDOW[1] - _WINDOW[0] + HOUR_S
-    peers = {f"{sumo_version(folder)}, steps of {step:g} s": step for step in STEPS_S}
-    cpu_s: dict[str, list[float]] = {name: [] for name in ("ours", *peers)}
-    search_s: dict[str, list[float]] = {name: [] for name in ("ours", *peers)}
+        return absent("day", "SUMO: not installed", "s"), {}
+    peers = {f"{sumo_version(folder)}, steps of {step:g} s": step for step in steps_s}
+    driven: dict[str, list[ParkedDay]] = {name: [] for name in ("ours", *peers)}
     fleet.reset(seed)
     fleet.run()  # compiles
     for day in range(days):
-        start = time.process_time()
-        fleet.reset(seed, day)
-        fleet.run()
-        cpu_s["ours"].append(time.process_time() - start)
-        search_s["ours"].append(float((fleet.cars["ended_at"] - fleet.cars["arrival"]).mean()))
+        driven["ours"].append(run_fleet(fleet, seed, day))
         for name, step in peers.items():
-            theirs = run_sumo(fleet, folder, step, end_s)
-            cpu_s[name].append(theirs.cpu_s)
-            search_s[name].append(float(np.nanmean(theirs.search_s)))
-    case = f"street, {per_hour:g} cars an hour for 5 hours, greedy-drive"
-    ours, *others = (float(np.mean(cpu_s[name])) for name in cpu_s)
-    rows = duration("day", case, 1e3 * ours, "ms", **{n: 1e3 * t for n, t in zip(peers, others, strict=True)})
-    ours, *others = (float(np.mean(search_s[name])) for name in search_s)
-    for name, other in zip(peers, others, strict=True):
-        (row,) = duration("day", f"{case}: mean search time", ours, "s of search", **{name: other})
-        row["ratio"] = None  # to be equal, not to be small
-        rows.append(row)
-    return rows
+            driven[name].append(run_sumo(fleet, folder, step, end_s + HOUR_S))
+    milliseconds = {
+        name: 1e3 * float(np.mean([one.cpu_s for one in those])) for name, those in driven.items()
+    }
+    seconds = {
+        name: float(np.mean([np.nanmean(one.search_s) for one in those])) for name, those in driven.items()
+    }
+    case = f"{case}, greedy-drive"
+    rows = duration("day", case, milliseconds.pop("ours"), "ms", **milliseconds)
+    return rows + equal(
+        "day", f"{case}: mean search time", seconds.pop("ours"), "s of search", **seconds
+    ), driven
+
+
+def run_fleet(fleet: Fleet, seed: int, day: int = 0) -> ParkedDay:
+    """Run a day of a fleet to its end."""
+    start = time.process_time()
+    fleet.reset(seed, day)
+    fleet.run()
+    took, cars = time.process_time() - start, fleet.cars
+    parked = cars["slot"] >= 0
+    began_s = np.where(parked, cars["ended_at"], np.nan)
+    return ParkedDay(
+        began_s - cars["arrival"],
+        cars["slot"].astype(np.int64),
+        began_s - fleet.begin,
+        cars["left_at"] - fleet.begin,
+        took,
+    )
 
 
 def streets_of(lot: ParkingLot) -> list[Street]:
@@ -174,7 +194,7 @@ def streets_of(lot: ParkingLot) -> list[Street]:
     return streets
 
 
-def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> SumoDay:
+def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> ParkedDay:
     """Run a fleet's day in SUMO: the cars of `fleet.cars`, arrivals, entries and stays alike, in an empty lot.
 
     Cars accelerate at once and keep their minimum gap; they know a slot to be taken only when they are there.
@@ -189,11 +209,12 @@ def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> SumoDay
         InputError: the lot has two-way lanes, or SUMO reports an error.
     """
     streets = streets_of(fleet.scenario.lot)
+    ahead_m = {street.name: _metres_ahead(fleet, street) for street in streets}
     with tempfile.TemporaryDirectory() as name:
         at = Path(name)
         _write_network(fleet, streets, at, folder)
-        _write_parking(streets, fleet.scenario.lot.capacity, at / "parking.add.xml")
-        _write_trips(fleet, streets, at / "trips.rou.xml", step_s)
+        _write_parking(fleet, streets, ahead_m, at / "parking.add.xml")
+        _write_trips(fleet, streets, ahead_m, at / "trips.rou.xml", step_s)
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         _run(
             [
@@ -205,97 +226,116 @@ def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> SumoDay
         )  # fmt: skip
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         stops = ElementTree.parse(at / "stops.xml").getroot()
-        found = {int(stop.get("id", -1)): stop for stop in stops}
     arrival_s = fleet.cars["arrival"] - fleet.begin
     slot, began_s, left_s = np.full(len(arrival_s), -1), *np.full((2, len(arrival_s)), np.nan)
-    for car, stop in found.items():
+    for stop in stops:
+        car, ended = int(stop.attrib["id"]), float(stop.get("ended", "-1"))
         slot[car] = int(stop.get("parkingArea", "slot-1").removeprefix("slot"))
         began_s[car] = float(stop.get("started", "nan"))
-        ended = float(stop.get("ended", "-1"))
         left_s[car] = ended if ended >= 0.0 else np.inf
     cpu_s = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return SumoDay(began_s - arrival_s, slot, began_s, left_s, cpu_s)
+    return ParkedDay(began_s - arrival_s, slot, began_s, left_s, cpu_s)
 
 
-def _write_network(fleet: Fleet, streets: Iterable[Street], at: Path, folder: Path) -> None:
+def _metres_ahead(fleet: Fleet, street: Street) -> FloatArray:
+    """Return the drive from the beginning of a street, through it, to each slot, (n_slots,) m."""
+    scenario = fleet.scenario
+    beyond: FloatArray = drive_times(scenario, street.end)[: scenario.lot.n_slots] * scenario.v_drive
+    metres = street.length + beyond
+    for slot, along in street.slots:
+        metres[slot] = along
+    return metres
+
+
+def _write_network(fleet: Fleet, streets: Sequence[Street], at: Path, folder: Path) -> None:
     xy, speed = fleet.scenario.lot.vertex_xy, fleet.scenario.v_drive
-    streets = list(streets)
     junctions = sorted({v for street in streets for v in (street.start, street.end)})
-    _write(
-        at / "lot.nod.xml", "nodes", [("node", {"id": v, "x": xy[v, 0], "y": xy[v, 1]}) for v in junctions]
+    edges = (
+        {"id": s.name, "from": s.start, "to": s.end, "speed": speed, "length": s.length} for s in streets
     )
-    edges = [
-        (
-            "edge",
-            {"id": s.name, "from": s.start, "to": s.end, "numLanes": 1, "speed": speed, "length": s.length},
-        )
-        for s in streets
-    ]
-    _write(at / "lot.edg.xml", "edges", edges)
-    files: list[str | Path] = ["-n", at / "lot.nod.xml", "-e", at / "lot.edg.xml", "-o", at / "lot.net.xml"]
+    # All turns of the drive graph, also back at a corner, which netconvert would leave out.
+    turns = (
+        {"from": a.name, "to": b.name, "fromLane": 0, "toLane": 0}
+        for a in streets
+        for b in streets
+        if a.end == b.start
+    )
+    nodes = ({"id": v, "x": xy[v, 0], "y": xy[v, 1]} for v in junctions)
+    _write(at / "lot.nod.xml", _element("nodes", {}, *(_element("node", node) for node in nodes)))
+    _write(at / "lot.edg.xml", _element("edges", {}, *(_element("edge", edge) for edge in edges)))
+    _write(at / "lot.con.xml", _element("connections", {}, *(_element("connection", turn) for turn in turns)))
+    files = (
+        "-n",
+        at / "lot.nod.xml",
+        "-e",
+        at / "lot.edg.xml",
+        "-x",
+        at / "lot.con.xml",
+        "-o",
+        at / "lot.net.xml",
+    )
     # Without lanes within junctions, routes have the lengths of the lot's drive graph.
     _run([folder / "netconvert", *files, "--no-internal-links", "true"])
 
 
-def _write_parking(streets: Iterable[Street], capacity: NDArray[np.int64], path: Path) -> None:
-    root = ElementTree.Element("additional")
-    streets = list(streets)
+def _write_parking(
+    fleet: Fleet, streets: Sequence[Street], ahead_m: Mapping[str, FloatArray], path: Path
+) -> None:
+    capacity = fleet.scenario.lot.capacity
+    areas = (
+        {
+            "id": f"slot{slot}", "roadsideCapacity": int(capacity[slot]), "lane": f"{street.name}_0",
+            "startPos": max(along - _SHORT_M, 0.0), "endPos": along,
+        }
+        for street in streets
+        for slot, along in street.slots
+    )  # fmt: skip
+    rerouters = []
     for street in streets:
-        for slot, along in street.slots:
-            place = {"lane": f"{street.name}_0", "startPos": max(along - _SHORT_M, 0.0), "endPos": along}
-            _add(root, "parkingArea", {"id": f"slot{slot}", "roadsideCapacity": int(capacity[slot]), **place})
-    rerouter = _add(root, "rerouter", {"id": "search", "edges": " ".join(street.name for street in streets)})
-    interval = _add(rerouter, "interval", {"begin": 0, "end": 1_000_000})
-    for street in streets:
-        for slot, _ in street.slots:
-            _add(interval, "parkingAreaReroute", {"id": f"slot{slot}", "visible": "false"})
-    ElementTree.ElementTree(root).write(path)
+        nearest = np.argsort(ahead_m[street.name])[:ALTERNATIVES].tolist()
+        places = (_element("parkingAreaReroute", {"id": f"slot{k}", "visible": "false"}) for k in nearest)
+        always = _element("interval", {"begin": 0, "end": 1_000_000}, *places)
+        rerouters.append(_element("rerouter", {"id": f"at{street.name}", "edges": street.name}, always))
+    _write(path, _element("additional", {}, *(_element("parkingArea", area) for area in areas), *rerouters))
 
 
-def _write_trips(fleet: Fleet, streets: Iterable[Street], path: Path, step_s: float) -> None:
-    streets = list(streets)
-    of_slot = {slot: street.name for street in streets for slot, _ in street.slots}
-    root = ElementTree.Element("routes")
+def _write_trips(
+    fleet: Fleet, streets: Sequence[Street], ahead_m: Mapping[str, FloatArray], path: Path, step_s: float
+) -> None:
     driver = {
         "id": "car", "sigma": 0, "speedDev": 0, "speedFactor": 1, "length": 4, "minGap": 0.5, "tau": step_s,
         "accel": _AT_ONCE, "decel": _AT_ONCE, "emergencyDecel": _AT_ONCE,
     }  # fmt: skip
-    kind = _add(root, "vType", driver)
-    for name, value in PARKING_WEIGHTS.items():
-        _add(kind, "param", {"key": name, "value": value})
-    cars = fleet.cars
-    entries = [int(entry) for entry in np.unique(cars["entry"])]
-    first = {entry: int(np.argmin(drive_times(fleet.scenario, entry))) for entry in entries}
-    start = {entry: _first_street(fleet, streets, entry, first[entry]).name for entry in entries}
-    for number, car in enumerate(cars):
-        entry = int(car["entry"])
-        route = {"from": start[entry], "to": of_slot[first[entry]], "departSpeed": "max", "type": "car"}
-        trip = _add(root, "trip", {"id": number, "depart": car["arrival"] - fleet.begin, **route})
-        _add(trip, "stop", {"parkingArea": f"slot{first[entry]}", "duration": car["stay_s"]})
-    ElementTree.ElementTree(root).write(path)
+    weights = (_element("param", {"key": name, "value": value}) for name, value in PARKING_WEIGHTS.items())
+    of_slot = {slot: (street.name, along) for street in streets for slot, along in street.slots}
+    first: dict[int, dict[str, object]] = {}
+    for entry in np.unique(fleet.cars["entry"]).tolist():
+        begins = [street for street in streets if street.start == entry]
+        start = min(begins, key=lambda street: float(ahead_m[street.name].min()))
+        slot = int(ahead_m[start.name].argmin())
+        street, along = of_slot[slot]
+        # A route that ends in the parking area ends in each next one, too: nobody drives on from there.
+        first[entry] = {"from": start.name, "to": street, "arrivalPos": along - _SHORT_M / 4, "slot": slot}
+    trips = []
+    for number, car in enumerate(fleet.cars):
+        way = dict(first[int(car["entry"])])
+        stop = _element("stop", {"parkingArea": f"slot{way.pop('slot')}", "duration": car["stay_s"]})
+        how = {"id": number, "type": "car", "depart": car["arrival"] - fleet.begin, "departSpeed": "max"}
+        trips.append(_element("trip", how | way, stop))
+    _write(path, _element("routes", {}, _element("vType", driver, *weights), *trips))
 
 
-def _first_street(fleet: Fleet, streets: Iterable[Street], entry: int, slot: int) -> Street:
-    """Return the street by which a car leaves an entry on its way to a slot."""
-
-    def metres(street: Street) -> float:
-        along = dict(street.slots).get(slot)
-        onward = drive_times(fleet.scenario, street.end)[slot] * fleet.scenario.v_drive
-        return street.length + float(onward) if along is None else along
-
-    return min((street for street in streets if street.start == entry), key=metres)
-
-
-def _write(path: Path, tag: str, children: Iterable[tuple[str, Mapping[str, object]]]) -> None:
-    root = ElementTree.Element(tag)
-    for name, attributes in children:
-        _add(root, name, attributes)
-    ElementTree.ElementTree(root).write(path)
-
-
-def _add(parent: ElementTree.Element, tag: str, attributes: Mapping[str, object]) -> ElementTree.Element:
+def _element(
+    tag: str, attributes: Mapping[str, object], *children: ElementTree.Element
+) -> ElementTree.Element:
     text = {name: f"{v:.3f}" if isinstance(v, float) else str(v) for name, v in attributes.items()}
-    return ElementTree.SubElement(parent, tag, text)
+    element = ElementTree.Element(tag, text)
+    element.extend(children)
+    return element
+
+
+def _write(path: Path, root: ElementTree.Element) -> None:
+    ElementTree.ElementTree(root).write(path)
 
 
 def _run(command: Sequence[str | Path]) -> str:

@@ -1,4 +1,4 @@
-"""Benchmark of towns: 20,000 spaces and 80,000 cars, and the day of a district beside SUMO."""
+"""Benchmark of towns: 20,000 spaces and 80,000 cars, and the day of districts beside SUMO."""
 
 from __future__ import annotations
 
@@ -6,17 +6,16 @@ import dataclasses
 import itertools
 import time
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.lots import city_lot
+from parkenv.lots.generators import Slots
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, absent, duration, rate
-from parkenv.studies.bench.sumo import run_sumo, streets_of, sumo_folder, sumo_version
+from parkenv.studies.bench.rows import BenchRow, duration, equal, peak_memory_gib
+from parkenv.studies.bench.sumo import streets_of, sumo_rows
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNormalTime, PoissonArrivals
 from parkenv.world.drive_graph import node_labels
 from parkenv.world.facility import Facility
@@ -34,9 +33,8 @@ SPEED = 20.0 / 3.6  # m/s
 BLOCKS, GARAGE = 1_000, 150
 """Spaces at the kerbs of the made district that is compared with SUMO, and in its garage."""
 DAY = 8 * HOUR_S, 12 * HOUR_S
-CARS_PER_SPACE = (
-    0.22  # that arrive in an hour: those at entries have to search, and SUMO's streets do not jam
-)
+CARS_PER_SPACE = 0.22  # that arrive in an hour: kerbs near the entries are full, so that cars search
+STEP_S = 0.5  # time step of SUMO, s
 SHIFT = 1.5  # m, from the middle of a two-way street to the lanes of its directions
 
 
@@ -58,12 +56,8 @@ def town_rows(
     rows: list[BenchRow] = []
     scenario = made_town(SPACES, seed)
     for n in cars:
-        fleet = Fleet(
-            scenario,
-            town_demand(scenario, n),
-            background="none",
-            drivers=[DriverKind(policy=POLICIES["usual"])],
-        )
+        driver = DriverKind(policy=POLICIES["usual"])
+        fleet = Fleet(scenario, town_demand(scenario, n), background="none", drivers=[driver])
         fleet.reset(seed)
         fleet.run(until=fleet.begin + 60.0)  # compiles
         start = time.process_time()
@@ -73,10 +67,12 @@ def town_rows(
         case = f"{SPACES:,} spaces, {n:,} cars from 7 to 20, usual"
         rows += duration("town", case, took, "s of CPU")
         rows += duration("town", case, 1e9 * took / fleet.totals["decisions"], "ns a decision")
-        rows += rate("town", f"{case}: cars, slots and searches", fleet.n_bytes / 2**20, "MiB, at most")
-    for lot in (with_garage(made_town(BLOCKS, seed).lot), *(make_scenario(name).lot for name in lots)):
-        rows += sumo_town_rows(lot, seed)
-    return rows
+        if memory_gib := peak_memory_gib():
+            rows += duration("town", f"{case}: peak memory of the process", memory_gib, "GiB")
+    made = with_garage(made_town(BLOCKS, seed).lot)
+    return rows + [
+        row for lot in (made, *(make_scenario(name).lot for name in lots)) for row in beside_sumo(lot, seed)
+    ]
 
 
 def made_town(spaces: int, seed: int) -> Scenario:
@@ -85,7 +81,7 @@ def made_town(spaces: int, seed: int) -> Scenario:
     west, south, east, north = city.bounds()
     ends = np.concatenate([lane.points[[0, -1]] for lane in city.lanes[:-1]])
     goals = np.stack([rng.uniform(west, east, GOALS), rng.uniform(south, north, GOALS)], axis=1)
-    lot = _changed(city, goals=goals, entries=ends[rng.permutation(len(ends))[:ENTRIES]])
+    lot = dataclasses.replace(city, goals=goals, entries=ends[rng.permutation(len(ends))[:ENTRIES]])
     scenario = make_scenario(lot, v_drive=SPEED)
     return scenario.replace(occupancy=scenario.occupancy.at_mean_occupancy(0.1, 0.0))
 
@@ -105,118 +101,78 @@ def town_demand(scenario: Scenario, cars: int) -> Demand:
 # ---- beside SUMO
 
 
-def sumo_town_rows(lot: ParkingLot, seed: int) -> list[BenchRow]:
+def beside_sumo(lot: ParkingLot, seed: int) -> list[BenchRow]:
     """Return rows with CPU times, search times and occupancy of the same day of a district in a fleet and in SUMO.
 
     The district is that of `blocks_of`. Drivers are `greedy-drive`: they head for the nearest facility not known to be
     full, and learn that one is full when they come to its street.
     """
-    folder = sumo_folder()
     blocks = blocks_of(lot)
-    case = f"{lot.name}, {int(blocks.capacity.sum()):,} spaces in {blocks.n_slots} kerbs and garages"
-    if folder is None:
-        return absent("day", f"{case}; SUMO: not installed", "s")
-    per_hour = CARS_PER_SPACE * float(blocks.capacity.sum())
-    demand = Demand(
-        PoissonArrivals(per_hour, *DAY), ExponentialTime(HOUR_S), entry_weights=(1.0,) * len(lot.entries)
-    )
+    capacity, end_s = blocks.capacity, DAY[1] - DAY[0]
+    arrivals = PoissonArrivals(CARS_PER_SPACE * float(capacity.sum()), *DAY)
+    demand = Demand(arrivals, ExponentialTime(HOUR_S), entry_weights=(1.0,) * len(lot.entries))
     scenario = make_scenario(blocks, v_drive=SPEED)
     # As in SUMO, a car sees on its own side of the street only.
-    sensor = dataclasses.replace(scenario.sensor_model, view_range=SHIFT)
-    fleet = Fleet(
-        scenario.replace(sensor_model=sensor),
-        demand,
-        background="none",
-        drivers=[DriverKind(policy=POLICIES["greedy-drive"])],
-        leave_full_lot=False,
+    scenario = scenario.replace(sensor_model=dataclasses.replace(scenario.sensor_model, view_range=SHIFT))
+    driver = DriverKind(policy=POLICIES["greedy-drive"])
+    fleet = Fleet(scenario, demand, background="none", drivers=[driver], leave_full_lot=False)
+    case = (
+        f"{lot.name}, {capacity.sum():,} spaces in {blocks.n_slots} kerbs and garages, "
+        f"{arrivals.per_hour:.0f} cars an hour for {end_s / HOUR_S:g} hours"
     )
-    fleet.reset(seed)
-    fleet.run()  # compiles
-    start = time.process_time()
-    fleet.reset(seed)
-    fleet.run(until=fleet.begin + (DAY[1] - DAY[0]))
-    took = time.process_time() - start
-    fleet.run()
-    ours, end_s = fleet.cars, DAY[1] - DAY[0]
-    theirs = run_sumo(fleet, folder, 1.0, end_s + HOUR_S)
-    peer = f"{sumo_version(folder)}, steps of 1 s"
-    case = f"{case}, {len(ours):,} cars in {end_s / HOUR_S:g} h, greedy-drive"
-    search_s = ours["ended_at"] - ours["arrival"]
-    both = np.isfinite(theirs.search_s)
-    rows = duration("day", case, 1e3 * took, "ms", **{peer: 1e3 * theirs.cpu_s})
-    rows += _equal(
-        f"{case}: mean search time",
-        float(search_s[both].mean()),
-        "s of search",
-        peer,
-        float(theirs.search_s[both].mean()),
-    )
-    shares = [
-        parked_share(
-            blocks, ours["slot"], ours["ended_at"] - fleet.begin, ours["left_at"] - fleet.begin, end_s
-        ),
-        parked_share(blocks, theirs.slot, theirs.began_s, theirs.left_s, end_s),
-    ]
-    rows += _equal(
-        f"{case}: mean occupancy", 100 * _mean(blocks, shares[0]), "%", peer, 100 * _mean(blocks, shares[1])
-    )
-    apart = 100 * _mean(blocks, np.abs(shares[0] - shares[1]))
-    return [*rows, *rate("day", f"{case}: occupancy by facility, mean difference to SUMO", apart, "points")]
-
-
-def parked_share(
-    lot: ParkingLot, slot: NDArray[np.int64], began_s: FloatArray, left_s: FloatArray, end_s: float
-) -> FloatArray:
-    """Return the mean share of the spaces of each slot in which cars stood until a time, (n_slots,)."""
-    stood = np.clip(left_s, 0.0, end_s) - np.clip(began_s, 0.0, end_s)
-    parked = (slot >= 0) & np.isfinite(began_s)
-    return np.bincount(slot[parked], stood[parked], lot.n_slots) / (end_s * lot.capacity)
-
-
-def _mean(lot: ParkingLot, values: FloatArray) -> float:
-    """Return the mean of a value of each slot over its spaces."""
-    return float(np.average(values, weights=lot.capacity))
+    rows, days = sumo_rows(fleet, case, seed, end_s, (STEP_S,))
+    for peer in list(days)[1:]:
+        ours, theirs = (days[name][0].parked_share(capacity, end_s) for name in ("ours", peer))
+        whole, other, apart = (
+            100.0 * float(np.average(share, weights=capacity))
+            for share in (ours, theirs, np.abs(ours - theirs))
+        )
+        rows += equal("day", f"{case}: mean occupancy", whole, "%", **{peer: other})
+        rows += duration("day", f"{case}: occupancy by facility, mean difference to {peer}", apart, "points")
+    return rows
 
 
 def with_garage(lot: ParkingLot, capacity: int = GARAGE) -> ParkingLot:
     """Return a lot with a garage next to its first goal."""
-    nearest = lot.vertex_xy[np.hypot(*(lot.vertex_xy - lot.goals[0]).T).argmin()]
-    return _changed(
-        lot,
-        facilities=(
-            Facility("garage", "garage", capacity=capacity, xy=tuple(nearest.tolist()), known="sign"),
-        ),
-    )
+    x, y = lot.vertex_xy[np.hypot(*(lot.vertex_xy - lot.goals[0]).T).argmin()].tolist()
+    garage = Facility("garage", "garage", capacity=capacity, xy=(x, y), known="sign")
+    return dataclasses.replace(lot, facilities=(garage,))
 
 
 def blocks_of(lot: ParkingLot) -> ParkingLot:
     """Return a lot as SUMO can have it: one-way lanes, and a counted facility for the kerb of each street's side.
 
-    The two directions of a street share its ends only, so nobody turns round amid a street. Garages are kept.
+    The two directions of a street share its ends only, so nobody turns round amid a street. Garages are kept, rules
+    and prices are not.
     """
-    drawn = ~lot.is_counted
-    columns = {f.name: getattr(lot, f.name)[drawn] for f in dataclasses.fields(lot) if f.name in _COLUMNS}
-    ids = tuple(name for name, is_drawn in zip(lot.slot_ids, drawn, strict=True) if is_drawn)
-    garages = tuple(each for each in lot.facilities if each.is_counted and each.kind == "garage")
-    plain = _changed(lot, slot_ids=ids, **columns, lanes=_one_way(lot.lanes), facilities=(), slot_facility=())
-    reached = np.isfinite(
-        np.min([drive_times(make_scenario(plain), int(v)) for v in plain.entry_vertices], axis=0)
-    )
+
+    def plain(slots: Slots, lanes: tuple[Lane, ...], facilities: tuple[Facility, ...]) -> ParkingLot:
+        slots = dataclasses.replace(slots, zone=slots.zone[:0], facility=slots.facility[:0])
+        ids = tuple(map(str, range(len(slots))))
+        return ParkingLot(
+            lot.name,
+            ids,
+            **slots.columns(),
+            lanes=lanes,
+            entries=lot.entries,
+            goals=lot.goals,
+            facilities=facilities,
+        )
+
+    drawn = Slots.of_lot(lot)[~lot.is_counted]
+    each = plain(drawn, _one_way(lot.lanes), ())
+    drives = [drive_times(make_scenario(each), int(v)) for v in each.entry_vertices]
+    reached = np.isfinite(np.min(drives, axis=0))
     kerbs = []
-    for street in streets_of(plain):
+    for street in streets_of(each):
         slots = [slot for slot, _ in street.slots if reached[slot]]
         if slots:
-            x, y = plain.vertex_xy[slots[len(slots) // 2]].tolist()
-            kerbs.append(
-                Facility(f"kerb {street.name}", "kerb", capacity=len(slots), xy=(x, y), known="sign")
-            )
-    none = {name: column[:0] for name, column in columns.items()}
-    return _changed(plain, slot_ids=(), **none, slot_facility=(), facilities=(*kerbs, *garages))
-
-
-_COLUMNS = (
-    "slot_xy", "slot_yaw", "slot_length", "slot_width", "slot_mouth", "slot_parking_cost_s", "slot_zone",
-)  # fmt: skip
+            x, y = each.vertex_xy[slots[len(slots) // 2]].tolist()
+            kerb = Facility(f"kerb {street.name}", "kerb", capacity=len(slots), xy=(x, y), known="sign")
+            kerbs.append(kerb)
+    garages = [one for one in lot.facilities if one.is_counted and one.kind == "garage"]
+    garages = [dataclasses.replace(garage, zone="", known="sign") for garage in garages]
+    return plain(drawn[:0], each.lanes, (*kerbs, *garages))
 
 
 def _one_way(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
@@ -246,14 +202,3 @@ def _shifted(points: FloatArray) -> Lane:
         -1, 2
     )
     return Lane(np.concatenate([points[:1], beside, points[-1:]]), oneway=True)
-
-
-def _changed(lot: ParkingLot, **changes: Any) -> ParkingLot:
-    fields = {f.name: getattr(lot, f.name) for f in dataclasses.fields(lot) if f.init}
-    return ParkingLot(**fields | changes)
-
-
-def _equal(case: str, ours: float, unit: str, peer: str, theirs: float) -> list[BenchRow]:
-    """Return a row of values that are to be equal, not small."""
-    rows = duration("day", case, ours, unit, **{peer: theirs})
-    return [row | {"ratio": None} for row in rows]
