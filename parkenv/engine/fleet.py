@@ -54,6 +54,7 @@ from parkenv.engine.records import (
     SEARCH,
     SEARCHING,
     SHARED_SLOT,
+    SPARSE_SLOTS,
     STATES,
     STEP,
     UNGUIDED,
@@ -463,7 +464,8 @@ class Fleet:
         """Make more SEARCH records, so that more cars can search at a time."""
         size = sum(len(one.records) for one in self._pool)
         n = min(max(_FIRST_CHUNK, size), max(len(self._cars) - size, 1))
-        searches = Searches(self._tables, n, self.full_belief, self._most_observed)
+        sparse = self.scenario.lot.n_slots >= SPARSE_SLOTS
+        searches = Searches(self._tables, n, self.full_belief, self._most_observed, sparse)
         # A route may pass the street where it begins once more.
         moves = sparse_zeros((n, 2 * self.scenario.lot.n_vertices), np.uint8)
         searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]

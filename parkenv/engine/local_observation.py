@@ -156,7 +156,7 @@ def observe_surroundings_at(address: int, around: Surroundings, local: NDArray[n
     observe_surroundings(search_at(address, 0), around, local)
 
 
-@kernel
+@inlined
 def observe_surroundings(search: Any, around: Surroundings, local: NDArray[np.float32]) -> None:
     """Write the local observation of a search; must be called after each reset and each step."""
     decay_belief(search)
@@ -364,7 +364,7 @@ def _forecast_regions(search: Any, around: Surroundings, lot: int) -> None:
         search.free_by_region[region] = free / SAMPLES
 
 
-@kernel
+@inlined
 def _remember(search: Any, around: Surroundings, lot: int) -> None:
     """Remember the best slot observed free, and drop it when it is observed taken; or the one that is reserved."""
     if search.reserved != UNGUIDED:

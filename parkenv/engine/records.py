@@ -245,7 +245,7 @@ SLOT = np.dtype(
 """A slot with a column: true state as in CURSOR; whether it was observed, was last observed taken, was passed."""
 
 SPARSE_SLOTS = 4096
-"""Slots from which the tables of searches take memory only where they are written."""
+"""Slots from which the tables of a fleet's searches take memory only where they are written."""
 BLOCK_BITS = 3
 BLOCK_SIZE = 1 << BLOCK_BITS
 BLOCK = np.dtype(
@@ -654,6 +654,7 @@ class Searches:
         full_belief: whether to keep `p_occupied`, `belief` and `step_observed` up to date.
         most_observed: maximum number of slots that a step observes; None: those in view, and one more; with 0,
             `step_observed` is not kept.
+        sparse: whether tables take memory only where they are written, by small pages, which are slower.
 
     Attributes:
         records: (n,) of the dtype SEARCH.
@@ -671,7 +672,12 @@ class Searches:
     """
 
     def __init__(
-        self, scenarios: ScenarioRecords, n: int, full_belief: bool, most_observed: int | None = None
+        self,
+        scenarios: ScenarioRecords,
+        n: int,
+        full_belief: bool,
+        most_observed: int | None = None,
+        sparse: bool = False,
     ) -> None:
         m = int(scenarios.records["n_slots"].max())
         external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
@@ -680,7 +686,7 @@ class Searches:
         self.scenarios = scenarios
         self.records = zeros_on_lines((n,), SEARCH)
         # Zeros stand for the sentinel. A search observes a small part of a large lot.
-        zeros = zeros_on_lines if m < SPARSE_SLOTS else sparse_zeros
+        zeros = sparse_zeros if sparse else zeros_on_lines
         self.slots = zeros((n, m + 1), SLOT)
         self._blocks = zeros((n, (m + BLOCK_SIZE) >> BLOCK_BITS), BLOCK)
         self._columns = zeros((n, m), np.int32)
