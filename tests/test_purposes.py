@@ -255,3 +255,21 @@ def test_cars_of_a_town_choose_entries_and_goals_by_its_weights():
         (demand.entry_weights, scenario.lot.entry_weights),
     ):
         assert np.allclose(mine, sum(of_lot.values()))
+
+
+def test_a_parked_car_passes_no_garage_that_has_room():
+    """Each drawn slot was taken with a chance of 0.8 when a car came, a garage only when it was full."""
+    from parkenv.world.facility import Facility
+
+    mini = make_scenario("mini")
+    at = mini.lot.goals[0]
+    lot = dataclasses.replace(mini.lot, facilities=(Facility("P", "garage", capacity=40, xy=tuple(at)),))
+    its = make_scenario(lot)
+    goals = (1.0,) * len(lot.goals)
+    fleet = Fleet(its, Demand(Headways(1), ConstantTime(3600.0), parked=30, goal_weights=goals))
+    fleet.reset(0)
+    garage = int(np.flatnonzero(lot.is_counted)[0])
+    walk_s = its.at_goal(0).walk_s
+    parked_at = fleet.cars["parked_at"][fleet.cars["parked_at"] >= 0]
+    assert (walk_s[parked_at] <= walk_s[garage]).all()
+    assert np.count_nonzero(parked_at == garage) >= 20

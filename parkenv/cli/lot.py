@@ -199,6 +199,13 @@ class Import(Command):
         False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
     )
     town: bool = option(False, "Import a whole town as one lot; entries and goals are those of the map.")
+    car_parks: Path | None = option(
+        None,
+        "Car parks that the city counts: name,capacity,lat,lon. With --town, the map's take these names and "
+        "capacities; those that it lacks are added.",
+        takes="FILE.csv",
+    )
+    listed_only: bool = option(False, "Leave out kerbs, and car parks that are not in --car-parks.")
     least: int = option(10, "Number of spaces of the smallest car park, with --split.", ge=2)
     out: Path = option(
         ..., "Lot file to write, or folder with --split.", short="-o", takes="FILE.geojson|DIR"
@@ -214,6 +221,8 @@ class Import(Command):
                 "whole",
                 "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture",
             )
+        if (self.car_parks is not None and not self.town) or (self.listed_only and self.car_parks is None):
+            raise PydanticCustomError("whole", "--car-parks wants --town, --listed-only wants --car-parks")
         if self.town and (self.entry or self.goal or self.bounds or self.disabled):
             raise PydanticCustomError(
                 "whole", "--town reads the whole map, want no --entry, --goal, --bounds, --disabled"
@@ -256,7 +265,7 @@ class Import(Command):
                 raise InputError(f"--picture {self.picture}: want a name that ends in .png")
             check_writable(self.picture)
         console = make_console(soft_wrap=True)
-        town = import_town(self.place) if self.town else None
+        town = import_town(self.place, self.car_parks, listed_only=self.listed_only) if self.town else None
         draft = town.draft if town is not None else import_lot(self.place, self._options)
         for line in draft.found:
             console.print(line)

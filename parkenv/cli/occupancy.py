@@ -163,8 +163,8 @@ class Demand(Command):
     drivers go where they like, so the town is driven, and what car parks lack is corrected, --rounds times. Counts do
     not say how often cars change; of several mean stays the longest is taken that can follow them.
 
-    The result, scenario.json, is the scenario with this demand: use it as --scenario of `parkenv fleet`. Errors are
-    mean absolute differences from the counts, hour by hour, on the weeks followed and on later ones.
+    The result, scenario.json, is the scenario with this demand, of weekdays; Saturdays and Sundays have files of their
+    own. Each day held out is driven with the demand of that day, which follows the forecast from the counts before it.
     """
 
     examples = """
@@ -178,59 +178,62 @@ class Demand(Command):
     scenario: OneScenario = scenario_spec("town")
     from_day: Date = option(..., "First day that is followed.", name="--from", takes="DATE")
     weeks: int = option(8, "Weeks that are followed.", ge=1, le=520)
-    held_out: int = option(4, "Weeks after these, on which errors are measured.", ge=1, le=520)
+    held_out: int = option(4, "Weeks after these, which are predicted.", ge=1, le=520)
+    roll_outs: int = option(1, "How often, each time that many weeks later.", ge=1, le=520)
     agent: OneAgent = AgentSpec(name="usual")
-    rounds: int = option(3, "How often the town is driven.", ge=1, le=100)
-    days: int = option(3, "Days of the fleet in each round.", name="--episodes", short="-n", ge=1, le=1_000)
+    rounds: int = option(3, "How often the town is driven for a fit.", ge=1, le=100)
+    days: int = option(
+        3,
+        "Days of the fleet in each round, and for each day predicted.",
+        name="--episodes",
+        short="-n",
+        ge=1,
+        le=1_000,
+    )
+    jobs: int | None = option(1, "Processes; roll-outs are shared among them.", short="-j", ge=1, le=1_024)
     timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
     seed: Seed = Field(0, description="Seed of these days.")
     out: Path = option(
-        Path("results/demand"), "Folder for scenario.json, summary.json and demand.png.", short="-o"
+        Path("results/demand"),
+        "Folder for scenario.json, saturday.json, sunday.json, summary.json, predicted.csv and demand.png.",
+        short="-o",
     )
 
     def run(self) -> None:
         """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.forecast.counts import Counts
-        from parkenv.studies.fleet.counted_demand import Weeks, fit_demand
+        from parkenv.studies.fleet.counted_demand import PREDICTIONS, Weeks, fit_demand
 
         make_folder(self.out)
         console = make_console()
         with stages(console) as progress:
             title, summary = fit_demand(
                 self.scenario, Counts.read(self.counts, self.timezone), self.out,
-                weeks=Weeks(self.from_day, self.weeks, self.held_out), agent=self.agent, rounds=self.rounds,
-                days=self.days, seed=self.seed, progress=progress,
+                weeks=Weeks(self.from_day, self.weeks, self.held_out, self.roll_outs), agent=self.agent,
+                rounds=self.rounds, days=self.days, seed=self.seed, jobs=self.jobs, progress=progress,
             )  # fmt: skip
-        headings = (
-            "car park",
-            "places",
-            "cars a day",
-            "at first",
-            "stay, h",
-            "days",
-            "off, followed",
-            "off, later",
-        )
-        errors = ("fit_error", "held_out_error")
+        headings = ("car park", "places", "cars a day", "stay, h", "days", "fit", *PREDICTIONS[4:])
         cells = [
             [
-                row["car_park"], str(row["capacity"]), f"{row['arrivals_a_day']:,.0f}", str(row["parked_at_first"]),
-                f"{row['stay_h']:g}", str(row["days_held_out"]), *(_points(row[name]) for name in errors),
+                row["car_park"], str(row["capacity"]), f"{row['arrivals_a_day']:,.0f}", f"{row['stay_h']:.1f}",
+                str(row["days_held_out"]), f"{100 * row['fit_error']:.1f}", *_points_of(row),
             ]
             for row in summary["rows"]
         ]  # fmt: skip
-        console.print(make_table(title, headings, cells))
+        mean = ["all", "", "", "", "", f"{100 * summary['fit_error']:.1f}", *_points_of(summary)]
+        names = [name.replace("_", " ") for name in headings]
+        console.print(make_table(title, names, [*cells, mean]))
         console.print(
-            f"In the mean {_points(summary['fit_error'])} points of 100 % on the weeks followed, "
-            f"{_points(summary['held_out_error'])} on later ones, and {_points(summary['held_out_profile_error'])} "
-            "from their mean day",
+            "Mean absolute differences from the counts by car park and hour, points of 100 %: of the fit on the weeks "
+            "followed, and on each day held out of the town driven with the day's demand, of the forecast that it "
+            "follows, of the same hour a week before, and of the mean of the weeks followed",
             soft_wrap=True,
         )
         if summary["not_in_lot"]:
             console.print(f"Not in the lot: {', '.join(summary['not_in_lot'])}", soft_wrap=True)
         save_summary(self.out, self.seed, **summary)
-        console.print(f"The scenario with this demand, picture and summary are in {self.out}")
+        console.print(f"The scenarios with this demand, predictions, picture and summary are in {self.out}")
 
 
 class Record(Command):
@@ -271,8 +274,14 @@ class Record(Command):
         console.print(f"{self.out}: {lines:,} observations of {plural(self.days, 'day')}", soft_wrap=True)
 
 
-def _points(share: float | None) -> str:
-    return "-" if share is None else f"{100.0 * share:.1f}"
+def _points_of(row: Row) -> list[str]:
+    from parkenv.studies.fleet.counted_demand import PREDICTIONS
+
+    errors = [(row[f"{name}_error"], *row[f"{name}_error_ci95"]) for name in PREDICTIONS[4:]]
+    return [
+        f"{100 * mean:.1f}" + (f" [{100 * low:.1f}, {100 * high:.1f}]" if low == low else "")
+        for mean, low, high in errors
+    ]
 
 
 def _cells(row: Row, of_counts: bool) -> list[str]:

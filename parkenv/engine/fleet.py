@@ -430,7 +430,8 @@ class Fleet:
         by_walk = np.argsort(walk_s, axis=1, kind="stable").astype(np.int64)
         place, walks = cars["place"].astype(np.int64), cars["walks"].astype(np.float64)
         cost = zone_cost_s[parked], walk_s, by_walk, lot.zone_of_slot
-        park_at_first(place, walks, u, *cost, lot.capacity.copy(), slots)
+        first_counted = int(self._record["first_counted"])
+        park_at_first(place, walks, u, *cost, lot.capacity.copy(), first_counted, slots)
         if lost := np.count_nonzero(slots < 0):
             purpose = self.demand.purposes[cars["purpose"][np.argmin(slots)]]
             raise InputError(

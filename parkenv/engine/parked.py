@@ -10,7 +10,8 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 
 _TAKEN_BEFORE = 0.8
-"""Chance that a free slot was taken when such a car came: it stands in the first one that was not."""
+"""Chance that a free slot was taken when such a car came: it stands in the first one that was not. A counted facility
+that has room had room."""
 _MOST_PASSED = 30
 
 
@@ -24,6 +25,7 @@ def park_at_first(
     by_walk: IntArray,
     zone_of_slot: IntArray,
     left: IntArray,
+    first_counted: int,
     slots: IntArray,
 ) -> None:
     """Choose slots for cars, one after another: the cheapest one by walk and price that is free and was so before.
@@ -37,6 +39,7 @@ def park_at_first(
         by_walk: (n_places, n_slots) slots by `walk_s`.
         zone_of_slot: (n_slots,)
         left: (n_slots,) cars that still fit; counted down.
+        first_counted: index of the first counted facility; those are the last slots.
         slots: (n,) the result; -1 if no slot is left where the car may park.
     """
     cost_s, found = np.empty(_MOST_PASSED), np.empty(_MOST_PASSED, np.int64)
@@ -56,6 +59,8 @@ def park_at_first(
                 cost_s[at], found[at] = cost_s[at - 1], found[at - 1]
                 at -= 1
             cost_s[at], found[at] = cost, slot
+            if slot >= first_counted:
+                n = wanted = at + 1
         slots[car] = found[n - 1] if n else -1
         if n:
             left[found[n - 1]] -= 1

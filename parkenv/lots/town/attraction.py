@@ -23,6 +23,7 @@ PURPOSES = ("residents", "commuters", "shoppers", "visitors", "deliveries")
 MOST_GOALS = 100
 APART = 40.0  # m, least distance of goals in a small map, on average
 STREET_WITHIN = 300.0  # m, from the streets of a town, of what attracts anybody
+WALK_WITHIN = 500.0  # m, from car parks whose drivers alone are wanted
 LEAST_AREA = 30.0  # m², of buildings that anybody lives in
 DWELLING = {"residents": 1.0, "visitors": 0.05, "deliveries": 0.05}
 WORK = {"commuters": 1.0, "visitors": 0.1, "deliveries": 0.1}
@@ -71,14 +72,22 @@ QUIET = {
 
 
 def find_goals(
-    elements: Sequence[OsmElement], buildings: Sequence[Area], frame: LocalFrame, streets: shapely.STRtree
+    elements: Sequence[OsmElement],
+    buildings: Sequence[Area],
+    frame: LocalFrame,
+    streets: shapely.STRtree,
+    beside: FloatArray | None = None,
 ) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return at most `MOST_GOALS` goals, (n, 2) m, and their weights by purpose, (n,) each; none without buildings.
 
-    What is farther than `STREET_WITHIN` from all streets does not count.
+    What is farther than `STREET_WITHIN` from all streets does not count, nor what is farther than `WALK_WITHIN` from
+    all points `beside`, (k, 2) m, if there are any.
     """
     xy, weight = _sources(elements, buildings, frame)
     near = np.unique(streets.query(shapely.points(xy), predicate="dwithin", distance=STREET_WITHIN)[0])
+    if beside is not None:
+        walk = shapely.distance(shapely.multipoints(beside), shapely.points(xy[near]))
+        near = near[walk <= WALK_WITHIN]
     xy, weight = xy[near], weight[near]
     if not len(xy):
         return np.empty((0, 2)), {}

@@ -41,11 +41,13 @@ from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
 from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of, tagged_capacity
 from parkenv.lots.town.kerbs import STRIPS, KerbSide, kerb_sides, strip_side
+from parkenv.lots.town.listed import ListedCarPark, matched, read_listed
 from parkenv.lots.town.streets import read_streets
-from parkenv.lots.town.zones import Rules, rules_of, zones_of
+from parkenv.lots.town.zones import PRICE, Rules, rules_of, zones_of
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH, Facility
 from parkenv.world.lot import Lane
+from parkenv.world.tariff import PUBLIC
 
 GATE_S = 10.0  # s that the barrier of a garage takes for a car
 INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
@@ -55,13 +57,16 @@ SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its 
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
 RESERVED_PLACES = ("disabled", "charging")
 """Classes of users whose places a car park may count apart: `capacity:disabled`, `capacity:charging`."""
+PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
+"""Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it."""
 CLOSED = ("no", "military", "forestry", "agricultural")
 """Values of `access` of parking that no car in town may use."""
 
 
 TABLE = ("name", "kind", "capacity", "capacity_from", "rule", "zone", "slots", "tagged", "element")
-"""Columns of the table of facilities: `capacity_from` is tag, drawn or rule, `rule` which one; `slots` of the capacity
-are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb with its side."""
+"""Columns of the table of facilities: `capacity_from` is tag, drawn, list or rule, `rule` which one; `slots` of the
+capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb with its
+side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,19 +82,32 @@ class TownDraft:
     facilities: list[dict[str, Any]]
 
 
-def import_town(path: str | Path) -> TownDraft:
+def import_town(
+    path: str | Path, car_parks: str | Path | None = None, *, listed_only: bool = False
+) -> TownDraft:
     """Draft a town from an OpenStreetMap file; see the module for the rules.
+
+    Args:
+        path: the file.
+        car_parks: list of car parks, such as those that the city counts; their names and capacities win (`listed`).
+        listed_only: whether kerbs and other car parks are left out.
 
     Raises:
         InputError: the file is damaged or has another format, has no street or no parking, or is too large for a plane.
     """
     path = Path(path)
+    listed = [] if car_parks is None else read_listed(Path(car_parks))
     place = read_map(path)
     with naming(path):
         town = _Town(place_name(path), place)
         town.read_drawn()
         town.read_kerbs()
         town.read_counted()
+        if listed:
+            town.use_list(listed)
+        if listed_only:
+            town.rows = [row for row in town.rows if row.capacity_from == "list"]
+            town.beside = np.array([row.xy for row in town.rows]).reshape(-1, 2)
         return town.draft()
 
 
@@ -137,6 +155,8 @@ class _Town:
         self.rows: list[_Row] = []
         self.names: set[str] = set()
         self.used: set[int] = set()  # parking areas whose places are slots
+        self.beside: FloatArray | None = None  # what is near these attracts, if not everything does
+        self.listed: list[str] = []  # which facilities car parks of a list are
 
     def _areas(self, elements: Sequence[OsmElement], wanted: Any) -> list[Area]:
         found = areas_of(elements, self.frame, wanted, mended=True)
@@ -333,6 +353,35 @@ class _Town:
             row.counted.insert(0, (row.name, rest, rules))
             self.rows.append(row)
 
+    def use_list(self, listed: list[ListedCarPark]) -> None:
+        """Give the car parks of a list their names and capacities; those that the map lacks are garages of it."""
+        of_map = [row for row in self.rows if row.kind != "kerb" and row.xy is not None]
+        places = np.array([len(row.slots) + sum(n for _, n, _ in row.counted) for row in of_map], np.float64)
+        at = self.frame.to_xy([(one.lon, one.lat) for one in listed])
+        xy = np.array([row.xy for row in of_map]).reshape(-1, 2)
+        same = matched(listed, at, [row.name for row in of_map], places, xy)
+        for one, point, k in zip(listed, at, same.tolist(), strict=True):
+            if k < 0:
+                xy_of = self._entrance(shapely.Point(point), [])
+                if xy_of is None or not one.capacity:
+                    self.left_out[
+                        "car parks of the list that the map lacks, without a street or a capacity"
+                    ].append(one.name)
+                    continue
+                row = _Row(one.name, "garage", Rules(), "list", "", "", xy=xy_of)
+                self.rows.append(row)
+            else:
+                row = of_map[k]
+                self.listed.append(f"{one.name}: {row.name}, {places[k]:.0f} places in the map")
+            # It is counted as a whole, and open to everybody.
+            capacity = one.capacity or int(places[k])
+            self.names.discard(row.name)
+            row.name = self._named({"name": one.name}, row.element)
+            row.slots, row.slot_rules = NO_SLOTS, []
+            row.rules = replace(row.rules, users=PUBLIC, **({} if row.rules.per_hour else PAID))
+            row.counted = [(row.name, capacity, row.rules)]
+            row.capacity_from, row.rule = "list", ""
+
     def _unseen_garages(
         self, ways_in: Sequence[OsmElement], at: Sequence[FloatArray]
     ) -> Iterator[OsmElement]:
@@ -404,7 +453,7 @@ class _Town:
             for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
         ]
         entries, traffic = self.streets.entries()
-        goals, weights = find_goals(self.place.elements, self.buildings, self.frame, self.tree)
+        goals, weights = find_goals(self.place.elements, self.buildings, self.frame, self.tree, self.beside)
         draft = LotDraft(
             name=self.name,
             slot_ids=tuple(ids),
@@ -451,7 +500,7 @@ class _Town:
             mine = [row for row in rows if row["kind"] == kind]
             places = {
                 source: sum(r["capacity"] for r in mine if r["capacity_from"] == source)
-                for source in ("tag", "drawn", "rule")
+                for source in ("tag", "drawn", "list", "rule")
             }
             listed = ", ".join(f"{source}: {n:,}" for source, n in places.items() if n)
             yield f"{kind}s: {len(mine):,}, places: {sum(places.values()):,}" + (
@@ -460,6 +509,7 @@ class _Town:
         yield f"entries: {len(draft.entries)}, where streets cross the edge of the map"
         yield f"goals: {len(draft.goals)}, of buildings and points of interest"
         yield f"zones: {', '.join(draft.zone_rules)}"
+        yield from (f"of the list: {line}" for line in self.listed)
         yield f"frame: {self.frame}"
 
 

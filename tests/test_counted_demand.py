@@ -1,0 +1,131 @@
+"""A town from a map and a list of car parks, whose demand follows counts, and predictions of days held out."""
+
+import csv
+import json
+from datetime import date
+
+import numpy as np
+import pytest
+from car_park_counts import write_counts
+from command_line import parkenv
+from made_maps import FREIBURG
+from test_import_town import grid
+
+from parkenv.errors import InputError
+from parkenv.lots import import_town, write_lot
+from parkenv.world.tariff import PUBLIC
+
+LIST = {"P1": (100, 100.0, 205.0), "Parkhaus P0": (100, 260.0, 330.0), "empty": (100, 300.0, 205.0)}
+"""Capacity and position of the car parks, m: one as in the map, one far from its namesake, one that the map lacks."""
+
+
+def listed(folder, changes=()):
+    lonlat = FREIBURG.to_lonlat([at for _, *at in LIST.values()]).tolist()
+    rows = [[name, n, lat, lon] for (name, (n, *_)), (lon, lat) in zip(LIST.items(), lonlat, strict=True)]
+    for row, column, value in changes:
+        rows[row][column] = value
+    path = folder / "list.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("name", "capacity", "lat", "lon"), *rows])
+    return path
+
+
+def a_map(folder):
+    place = grid().box(95, 210, 115, 230, {"amenity": "parking"}, capacity="80", fee="no", access="customers")
+    place.box(
+        370, 305, 390, 325, {"amenity": "parking", "parking": "multi-storey", "name": "P0"}, capacity="30"
+    )
+    (folder / "town.osm").write_text(place.xml(), encoding="utf-8")
+    return folder / "town.osm"
+
+
+def test_car_parks_of_a_list_have_its_names_and_capacities(tmp_path):
+    town = import_town(a_map(tmp_path), listed(tmp_path))
+    rows = {row["name"]: row for row in town.facilities if row["capacity_from"] == "list"}
+    assert {name: row["capacity"] for name, row in rows.items()} == {
+        "P1": 100,
+        "Parkhaus P0": 100,
+        "empty": 100,
+    }
+    assert rows["P1"]["tagged"] == 80  # of the place
+    assert rows["Parkhaus P0"]["kind"] == "garage"
+    assert rows["Parkhaus P0"]["tagged"] == 30  # of the name, as it is too far away for another one
+    assert rows["empty"]["element"] == ""
+    lot = town.draft.lot()
+    zones = {lot.zone_rules[facility.zone] for facility in lot.facilities if facility.name in rows}
+    assert {zone.users for zone in zones} == {(PUBLIC,)}
+    assert len({zone.price for zone in zones}) == 1  # nothing is known, so that none draws drivers
+    alone = import_town(a_map(tmp_path), listed(tmp_path), listed_only=True).draft.lot()
+    assert set(alone.slot_ids) == set(rows)
+    assert len(alone.lanes) > 0
+
+
+@pytest.mark.parametrize(
+    ("row", "column", "value", "named"),
+    [
+        (1, 1, "-3", "line 3: capacity is '-3'"),
+        (1, 1, "2.5", "line 3: capacity is '2.5'"),
+        (0, 1, "nan", "line 2: capacity"),
+        (2, 2, "91", "line 4: lat is '91'"),
+        (2, 3, "east", "line 4: lon is 'east'"),
+        (2, 0, "P1", "line 4: name is 'P1'"),
+        (0, 0, "", "line 2: name is ''"),
+    ],
+)
+def test_a_bad_list_is_one_line(tmp_path, row, column, value, named):
+    with pytest.raises(InputError) as error:
+        import_town(a_map(tmp_path), listed(tmp_path, [(row, column, value)]))
+    assert named in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def town(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("town")
+    draft = import_town(a_map(folder), listed(folder), listed_only=True).draft
+    write_lot(draft.lot(), folder / "town.geojson")
+    text = 'lot = "town.geojson"\n[arrivals]\nhours = "00:00-24:00"\ndays = "all"\n'
+    (folder / "town.toml").write_text(text)
+    return folder
+
+
+def predicted(town, counts, *more):
+    out = counts.with_suffix("")
+    result = parkenv(
+        "occupancy", "demand", counts, "--scenario", town / "town.toml", "--from", "2024-01-01", "--weeks", "2",
+        "--held-out", "1", "--roll-outs", "2", "--rounds", "2", "-n", "2", "--out", out, *more,
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    with (out / "predicted.csv").open() as file:
+        rows = {(row["car_park"], row["date"], row["hour"]): row for row in csv.DictReader(file)}
+    return rows, json.loads((out / "summary.json").read_text()), out
+
+
+def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path):
+    """What is counted from a day on changes no prediction of that day, but all of the next one."""
+    names = {"P0": "Parkhaus P0", "P1": "P1", "empty": "empty"}
+
+    def counts(name, change):
+        path = write_counts(tmp_path / name, first=date(2024, 1, 1), days=30, change=change)
+        lines = path.read_text().splitlines()
+        path.write_text(
+            "\n".join(names.get(row.split(",")[0], "car_park") + row[row.index(",") :] for row in lines)
+        )
+        return path
+
+    rows, summary, folder = predicted(town, counts("a.csv", lambda park, day, taken: taken))
+    other, *_ = predicted(town, counts("b.csv", lambda park, day, taken: 0.5 * taken if day >= 24 else taken))
+    assert len({day for _, day, _ in rows}) == 14  # two weeks held out, of all kinds of days
+    for park, day, hour in rows:
+        same = rows[park, day, hour]["simulated"] == other[park, day, hour]["simulated"]
+        assert same or day > "2024-01-25"
+        assert (rows[park, day, hour]["counted"] == other[park, day, hour]["counted"]) or day >= "2024-01-25"
+    assert any(rows[key]["simulated"] != other[key]["simulated"] for key in rows if key[1] == "2024-01-26")
+    for row in summary["rows"]:
+        its = [one for (park, *_), one in rows.items() if park == row["car_park"]]
+        error = np.mean([abs(float(one["simulated"]) - float(one["counted"])) for one in its])
+        assert row["simulated_error"] == pytest.approx(error, abs=1e-3)
+    # Days differ by half a logit from their forecasts, and the town by little more.
+    assert summary["simulated_error"] < 1.5 * summary["forecast_error"] + 0.02
+    for name in ("scenario", "saturday", "sunday"):
+        assert set(json.loads((folder / f"{name}.json").read_text())["demand"]) >= {"P1", "Parkhaus P0"}
