@@ -7,15 +7,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import parkenv
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from made_maps import AISLE, SERVICE, SPACE, STREET, Map
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.lots import import_town, read_lot, write_lot
+from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.osm.elements import read_map
-from parkenv.lots.town.capacity import RULES, expected_capacity, tagged_capacity
+from parkenv.lots.osm.roads import whole_number
+from parkenv.lots.town.capacity import RULES, expected_capacity
 from parkenv.lots.town.kerbs import PLACES_PER_METRE
 from parkenv.lots.town.streets import ENTRY_WEIGHT
 from parkenv.lots.town.zones import PRICE, Rules, kerb_rules, rules_of
+from parkenv.world.drive_graph import build_drive_graph
+from parkenv.world.lot import Lane
 from parkenv.world.tariff import Hours
 
 TOWNS = Path(__file__).parents[2] / "shared" / "data" / "towns"
@@ -90,11 +96,28 @@ def test_dual_carriageways_are_joined_beyond_the_edge(tmp_path):
     assert town.draft.lot().entries[:, 0].max() > town.draft.goals[:, 0].max() + 300
 
 
-def test_junctions_of_many_streets_can_be_driven(tmp_path):
-    """Seven streets meet in one place; the graph has four moves a vertex."""
-    place = grid()
-    for x, y in ((60, 300), (100, 280), (140, 300)):
-        place.way([(200, 200), (x, y)], {"highway": "living_street"})
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from([0, 1, -1]), min_size=5, max_size=9), st.randoms(use_true_random=False))
+def test_junctions_of_many_streets_are_split_and_lead_where_they_led(directions, random):
+    """Of streets that meet in one place, some one-way into it or out of it."""
+    angles = np.sort([random.uniform(0.0, 2 * np.pi) for _ in directions]) + 0.05 * np.arange(len(directions))
+    ends = 80.0 * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    lanes = [
+        Lane(np.array([[0.0, 0.0], end] if way >= 0 else [end, [0.0, 0.0]]), oneway=way != 0)
+        for way, end in zip(directions, ends, strict=True)
+    ]
+    split = limit_junctions(lanes)
+    graph = build_drive_graph([(lane.points, lane.oneway) for lane in split], np.empty((0, 2)), ends)
+    matrix = np.zeros((len(graph.vertex_xy),) * 2)
+    source, column = np.nonzero(graph.neighbors >= 0)
+    matrix[source, graph.neighbors[source, column]] = 1.0
+    reached = np.isfinite(dijkstra(matrix, indices=graph.entry_vertices))[:, graph.entry_vertices]
+    comes, goes = np.array(directions) <= 0, np.array(directions) >= 0
+    assert reached[np.ix_(comes, goes)].all()
+
+
+def test_a_town_may_be_one_street(tmp_path):
+    place = Map().way([(0, 0), (200, 0)], STREET).box(20, 8, 40, 18, {"building": "house"})
     assert draft(place, tmp_path).draft.lot().n_slots > 0
 
 
@@ -231,10 +254,14 @@ def test_parking_that_no_street_reaches_is_left_out(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "capacity"), [("12", 12), ("> 110", 110), ("ca. 60", 60), ("many", None), ("", None)]
+    ("text", "capacity"),
+    [
+        *(("12", 12), ("> 110", 110), ("ca. 60", 60), ("50+", 50), ("20-30", 25), ("1,500", 1500)),
+        *(("many", None), ("", None), ("-3", None), ("2.5", None), ("123456", None)),
+    ],
 )
 def test_capacities_are_read_with_what_stands_around_them(text, capacity):
-    assert tagged_capacity({"capacity": text}) == capacity
+    assert whole_number(text) == capacity
 
 
 # ---- rules ----
@@ -249,6 +276,11 @@ def test_capacities_are_read_with_what_stands_around_them(text, capacity):
         ({"fee": "Mo-Fr 09:00-18:00"}, Rules(per_hour=PRICE, charged="Mo-Fr 09:00-18:00", assumed=True)),
         ({"fee": "yes", "charge": "1.50 EUR/hour"}, Rules(per_hour=1.5)),
         ({"charge": "0,50 €/30 minutes"}, Rules(per_hour=1.0)),
+        ({"charge": "$1.25 per hour"}, Rules(per_hour=1.25)),
+        ({"charge": "6 EUR/day"}, Rules(per_hour=0.25, by_day=True)),
+        ({"opening_hours": "Mo-Sa 07:00-22:00; PH off"}, Rules(hours="Mo-Sa 07:00-22:00; Su off")),
+        ({"opening_hours": "24/7"}, Rules()),
+        ({"opening_hours": "sunrise-sunset"}, Rules()),
         ({"access": "customers", "maxstay": "30 days"}, Rules("customers")),
         ({"access": "private"}, Rules("private")),
     ],
@@ -257,6 +289,8 @@ def test_fees_stays_and_access_become_rules(tags, rules):
     assert rules_of(tags) == rules
     zone = rules.zone("lot")
     assert (zone.users, zone.max_stay_s) == ((rules.users,), rules.max_stay_s)
+    assert zone.hours == (Hours.parse(rules.hours) if rules.hours else None)
+    assert float(zone.price.amount(36_000.0, 3600.0)) == rules.per_hour * (24 if rules.by_day else 1)
     assert zone.price.charged == (Hours.parse(rules.charged) if rules.charged else None)
 
 
@@ -362,7 +396,7 @@ def test_real_extracts_become_towns(path):
     assert len(listed) >= 0.95 * len(elements)
     assert set(elements) - listed <= lost
     for row in town.facilities:
-        said = tagged_capacity(elements.get(row["element"], {}))
+        said = whole_number(elements.get(row["element"], {}).get("capacity"))
         if said and row["kind"] != "kerb":
             assert row["capacity"] >= said, row
             assert row["capacity"] == said or row["capacity_from"] == "drawn"

@@ -27,9 +27,9 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.buildings import areas_of
 from parkenv.lots.osm.elements import read_map
 from parkenv.lots.osm.kerbs import Junctions, free_intervals
-from parkenv.lots.osm.roads import Road, road_of
+from parkenv.lots.osm.roads import Road, road_of, whole_number
 from parkenv.lots.osm.spaces import is_parking_area
-from parkenv.lots.town.capacity import KINDS, RULES, levels_of, rule_of, tagged_capacity
+from parkenv.lots.town.capacity import KINDS, RULES, levels_of, rule_of
 from parkenv.lots.town.kerbs import PLACES_PER_METRE
 from parkenv.world.drive_graph import linestrings
 
@@ -130,7 +130,7 @@ def car_parks(folder: Path, extracts: Iterable[Path]) -> dict[str, FloatArray]:
         frame = LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
         for area in areas_of(parking, frame, is_parking_area, mended=True):
             tags, size = area.element.tags, float(shapely.area(area.polygon))
-            capacity = tagged_capacity(tags)
+            capacity = whole_number(tags.get("capacity"))
             if capacity and size and tags.get("parking", "surface") in ("surface", *KINDS):
                 rows[rule_of(tags)].append((size, levels_of(tags) or 0.0, capacity))
     return {name: np.array(found).reshape(-1, 3) for name, found in rows.items()}

@@ -203,7 +203,7 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
         for users in _crowded_nodes(lines, oneway):
             # The points of a moved lane are numbered anew: its other junctions wait for the next round.
             if moved.isdisjoint(k for k, _ in users):
-                moved.update(_move_lane_end(lines, users))
+                moved.update(_move_lane_end(lines, oneway, users))
         if not moved:
             break
     return [Lane(points, one) for points, one in zip(lines, oneway, strict=True)]
@@ -227,16 +227,21 @@ def _crowded_nodes(lines: Sequence[FloatArray], oneway: Sequence[bool]) -> list[
     ]
 
 
-def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> tuple[int, ...]:
-    """Move the end of the lane closest to another arm onto that arm; return the two lanes, if there are any."""
-    arms = []  # lane, point, neighbouring point, whether the lane ends here
+def _move_lane_end(
+    lines: list[FloatArray], oneway: Sequence[bool], users: set[tuple[int, int]]
+) -> tuple[int, ...]:
+    """Move the end of the lane closest to another arm onto that arm; return the two lanes, if there are any.
+
+    Both lead away from the junction, and a two-way lane does not join a one-way arm: cars would not come back by it.
+    """
+    arms = []  # lane, point, neighbouring point
     for k, i in sorted(users):
-        ends = i in (0, len(lines[k]) - 1)
-        arms += [(k, i, j, ends) for j in (i - 1, i + 1) if 0 <= j < len(lines[k])]
+        arms += [(k, i, j) for j in (i - 1, i + 1) if 0 <= j < len(lines[k]) and (j > i or not oneway[k])]
     best: tuple[float, int, int] | None = None
-    for a, (k, i, j, ends) in enumerate(arms):
-        for b, (other, i_b, j_b, _) in enumerate(arms):
-            if not ends or other == k:
+    for a, (k, i, j) in enumerate(arms):
+        for b, (other, i_b, j_b) in enumerate(arms):
+            ends = i in (0, len(lines[k]) - 1)
+            if not ends or other == k or (oneway[other] and not oneway[k]):
                 continue
             one, two = lines[k][j] - lines[k][i], lines[other][j_b] - lines[other][i_b]
             turn = float(one @ two / (np.hypot(*one) * np.hypot(*two)))
@@ -244,8 +249,8 @@ def _move_lane_end(lines: list[FloatArray], users: set[tuple[int, int]]) -> tupl
                 best = (turn, a, b)
     if best is None:
         return ()
-    k, i, _, _ = arms[best[1]]
-    other, i_b, j_b, _ = arms[best[2]]
+    k, i, _ = arms[best[1]]
+    other, i_b, j_b = arms[best[2]]
     arm = lines[other][j_b] - lines[other][i_b]
     length = float(np.hypot(*arm))
     joint = lines[other][i_b] + min(JOIN_DISTANCE, length / 2) / length * arm

@@ -147,5 +147,10 @@ def metres(text: str | None) -> float | None:
 
 
 def whole_number(text: str | None) -> int | None:
-    """Parse a count; None for anything else."""
-    return int(text) if text is not None and re.fullmatch(r"\d{1,6}", text.strip()) else None
+    """Parse a count, also of texts such as `> 110`, `50+`, `ca. 60` and `1,500`; the middle of `20-30`.
+
+    Returns None for anything else.
+    """
+    plain = re.sub(r"(?<=\d)[,. ](?=\d{3}(?!\d))", "", (text or "").strip())
+    match = re.fullmatch(r"[^\d-]{0,5}(\d{1,5})(?:\s*[-–]\s*(\d{1,5}))?\D{0,10}", plain)
+    return (int(match[1]) + int(match[2] or match[1])) // 2 if match else None

@@ -56,12 +56,6 @@ def levels_of(tags: Mapping[str, str]) -> float | None:
     return None
 
 
-def tagged_capacity(tags: Mapping[str, str], key: str = "capacity") -> int | None:
-    """Return a tagged number of places, also of texts such as `> 110` and `ca. 60`; None without one."""
-    match = re.fullmatch(r"\D{0,5}(\d{1,6})\D{0,10}", tags.get(key, "").strip())
-    return int(match[1]) if match else None
-
-
 def expected_capacity(rule: str, area: float | None, levels: float | None) -> int:
     """Return the number of places by the rule, at least 1.
 

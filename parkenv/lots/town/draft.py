@@ -34,12 +34,12 @@ from parkenv.lots.osm.buildings import Area, areas_of, is_building
 from parkenv.lots.osm.draft import MAPPED_OVERLAP, NO_AISLE, RULE_OVERLAP, cut_elements, refuse_far_away
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.outlines import CORRIDOR
-from parkenv.lots.osm.roads import Rank, off_the_ground
+from parkenv.lots.osm.roads import Rank, off_the_ground, whole_number
 from parkenv.lots.osm.rows import without_overlaps
 from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots_by_rank, split_space
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
-from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of, tagged_capacity
+from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of
 from parkenv.lots.town.kerbs import STRIPS, KerbSide, kerb_sides, strip_side
 from parkenv.lots.town.listed import ListedCarPark, matched, read_listed
 from parkenv.lots.town.streets import read_streets
@@ -231,7 +231,7 @@ class _Town:
             row.slots = Slots.joined(drawn)
             # A space without rules of its own has those of its car park.
             row.slot_rules = [own if own != Rules() else whole for own in rules]
-            row.tagged = tagged_capacity(inside.tags) if k in self.used else None
+            row.tagged = whole_number(inside.tags.get("capacity")) if k in self.used else None
             more = (row.tagged or 0) - len(row.slots)
             if more > 0:
                 row.xy = self._entrance(self.parking[k].polygon, [])
@@ -332,7 +332,7 @@ class _Town:
                     element.id
                 )
                 continue
-            said = tagged_capacity(tags)
+            said = whole_number(tags.get("capacity"))
             capacity = said or expected_capacity(rule, area, levels_of(tags))
             row = _Row(
                 self._named(tags, element.id),
@@ -346,7 +346,7 @@ class _Town:
             row.xy = xy
             rest = capacity
             for users in RESERVED_PLACES:
-                n = tagged_capacity(tags, f"capacity:{users}") or 0
+                n = whole_number(tags.get(f"capacity:{users}")) or 0
                 if 0 < n < rest:
                     row.counted.append((f"{row.name}, {users}", n, replace(rules, users=users)))
                     rest -= n

@@ -173,12 +173,16 @@ class Streets:
         for piece in real.tolist():
             road = self.roads[self.road[piece]]
             kind = road.tags["highway"].removesuffix("_link")
+            weight = ENTRY_WEIGHT.get(kind, 0.25) if road.rank is Rank.STREET else 0.0
+            is_end = self.span[piece, 0] == 0, self.span[piece, 1] == len(road.points) - 1
             for end, node in enumerate(self.nodes[piece].tolist()):
-                near = away[node] <= AT_EDGE * (4 if road.oneway else 1)
-                if users[node] == 1 and (near or kind in THROUGH or road.id in self.cut):
-                    traffic[node] = ENTRY_WEIGHT.get(kind, 0.25) if road.rank is Rank.STREET else 0.0
-                    enters[node] = end == 0 or not road.oneway
-                    leaves[node] = end == 1 or not road.oneway
+                near, cut = away[node] <= AT_EDGE * (4 if road.oneway else 1), road.id in self.cut
+                # Where the edge cuts a way at a junction, other streets end there, too.
+                leads_on = users[node] == 1 and (near or kind in THROUGH or cut)
+                if leads_on or (is_end[end] and cut and away[node] <= AT_EDGE):
+                    traffic[node] = max(traffic[node], weight)
+                    enters[node] |= end == 0 or not road.oneway
+                    leaves[node] |= end == 1 or not road.oneway
         return traffic, enters, leaves
 
     def ways_beyond(self) -> list[Road]:
@@ -261,7 +265,7 @@ class Streets:
         runs: list[tuple[int, list[FloatArray]]] = []
         before = -1
         for piece in np.flatnonzero(kept).tolist():
-            follows = before == piece - 1 and self.road[piece] == self.road[before]
+            follows = runs and before == piece - 1 and self.road[piece] == self.road[before]
             if follows and int(self.nodes[piece, 0]) not in cuts:
                 runs[-1][1].append(self.points(piece)[1:])
             else:

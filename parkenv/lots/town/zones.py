@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from parkenv.errors import InputError
 from parkenv.lots.osm.rows import Side
-from parkenv.world.tariff import HOUR_S, PUBLIC, Hours, Price, Zone
+from parkenv.world.tariff import DAY_S, HOUR_S, PUBLIC, Hours, Price, Zone
 
 PRICE = 2.0  # assumed price of an hour where a fee is charged, in the currency of the town
 RESERVED = {
@@ -30,9 +30,12 @@ RESERVED = {
 """Class of users for each value of `access`, `parking:condition` and `restriction` that not everyone may park by."""
 LONGEST_LIMIT = 24 * HOUR_S  # s; a longer `maxstay` is no limit for a day's parking
 _CHARGE = re.compile(
-    r"(\d+(?:[.,]\d+)?)\s*(?:€|EUR|euros?|\$|USD|CHF|£|GBP)?\s*(?:/|per)\s*(\d+)?\s*(h|hour|hours|min|minutes)\b",
+    r"(\d+(?:[.,]\d+)?)[^\d/]{0,8}?(?:/|per)\s*(\d+(?:\.\d+)?)?\s*(h|hr|hours?|min|minutes?|days?|Stunde|Tag)\b",
     re.I,
 )
+_HOURS_OF = {"h": 1.0, "s": 1.0, "m": 1.0 / 60.0, "d": 24.0, "t": 24.0}
+"""Hours of a unit, by its first letter."""
+MOST_PER_HOUR = 1000.0  # a higher price is a mistake
 _STAY = re.compile(r"(\d+(?:[.,]\d+)?)\s*(h|hr|hour|hours|m|min|minute|minutes)\b", re.I)
 _HOURS = re.compile(r"[A-Z][a-z](?:[-,][A-Z][a-z])*\s+\d?\d:\d\d-\d?\d:\d\d")
 
@@ -46,6 +49,8 @@ class Rules:
     charged: str = ""  # hours, as OpenStreetMap writes them; empty: always
     max_stay_s: float | None = None
     assumed: bool = False  # whether the price is
+    by_day: bool = False  # whether a day costs 24 `per_hour`, however short the stay
+    hours: str = ""  # when it is open, as OpenStreetMap writes it; empty: always
 
     def zone(self, kind: str) -> Zone:
         """Return the zone of a kind of facility with these rules, named after them."""
@@ -53,23 +58,28 @@ class Rules:
         if self.users != PUBLIC:
             words.append(self.users)
         if self.per_hour:
-            words.append("paid" if self.assumed else f"{self.per_hour:g}/h")
+            each = f"{24 * self.per_hour:g}/day" if self.by_day else f"{self.per_hour:g}/h"
+            words.append("paid" if self.assumed else each)
             words += [self.charged] if self.charged else []
         elif self.users == PUBLIC:
             words.append("free")
         if self.max_stay_s is not None:
             words.append(f"{self.max_stay_s / 60:g} min")
+        words += [f"open {self.hours}"] if self.hours else []
         charged = Hours.parse(self.charged) if self.charged and self.per_hour else None
-        price = Price(self.per_hour, charged=charged)
-        return Zone(" ".join(words), price, max_stay_s=self.max_stay_s, users=(self.users,))
+        day = ((DAY_S, 24 * self.per_hour),) if self.by_day else ()
+        price = Price(self.per_hour, day, charged=charged)
+        hours = Hours.parse(self.hours) if self.hours else None
+        return Zone(" ".join(words), price, hours, self.max_stay_s, (self.users,))
 
 
 def rules_of(tags: Mapping[str, str]) -> Rules:
     """Return the rules of a car park, a garage or a drawn space."""
     users = RESERVED.get(tags.get("parking_space", ""), RESERVED.get(tags.get("access", ""), PUBLIC))
-    return _rules(
+    rules = _rules(
         users, tags.get("fee"), tags.get("charge"), tags.get("fee:conditional"), tags.get("maxstay")
     )
+    return replace(rules, hours=_open_hours(tags.get("opening_hours", "")))
 
 
 def kerb_rules(tags: Mapping[str, str], side: Side) -> Rules:
@@ -111,10 +121,12 @@ def kerb_rules(tags: Mapping[str, str], side: Side) -> Rules:
 def _rules(
     users: str, fee: str | None, charge: str | None, conditional: str | None, maxstay: str | None
 ) -> Rules:
-    per_hour, assumed, charged = 0.0, False, ""
+    per_hour, assumed, charged, by_day = 0.0, False, "", False
     if charge is not None and (match := _CHARGE.search(charge)):
-        spans = float(match[2] or 1.0) / (1.0 if match[3].lower().startswith("h") else 60.0)
+        unit = match[3][0].lower()
+        spans, by_day = float(match[2] or 1.0) * _HOURS_OF[unit], unit in "dt"
         per_hour = float(match[1].replace(",", ".")) / spans if spans else 0.0
+        per_hour = per_hour if per_hour <= MOST_PER_HOUR else 0.0
     elif (fee or "no").lower() not in ("no", "free", "unknown") or (conditional or "").startswith("yes"):
         per_hour, assumed = PRICE, True
     if per_hour:
@@ -123,7 +135,18 @@ def _rules(
     if maxstay is not None and (match := _STAY.search(maxstay)):
         seconds = float(match[1].replace(",", ".")) * (HOUR_S if match[2].lower().startswith("h") else 60.0)
         stay = seconds if 0.0 < seconds < LONGEST_LIMIT else None
-    return Rules(users, round(per_hour, 2), charged, stay, assumed)
+    return Rules(
+        users, round(per_hour, 4 if by_day else 2), charged, stay, assumed, by_day and per_hour > 0.0
+    )
+
+
+def _open_hours(text: str) -> str:
+    """Return opening hours in their shortest form, but for holidays; empty if always, or if they cannot be read."""
+    try:
+        hours = Hours.parse(re.sub(r"[;,]?\s*(PH|SH)\b[^;]*", "", text).strip("; "))
+    except InputError:
+        return ""
+    return "" if hours == Hours.parse("24/7") or not any(hours.days) else str(hours)
 
 
 def _known_hours(text: str | None) -> str:
