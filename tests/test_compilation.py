@@ -62,15 +62,19 @@ def write(path, text):
     os.utime(path, (1e9, 1e9))
 
 
-def start(own, cache, **environment):
-    """A new process that prints g(1.0), and how many functions it has compiled."""
+def start(own, cache, program=PROGRAM, **environment):
+    """A new process; by default it prints g(1.0), and how many functions it has compiled."""
     variables = {
         **os.environ, "PYTHONPATH": os.pathsep.join([str(own), str(ROOT)]), "PYTHONDONTWRITEBYTECODE": "1",
         "NUMBA_CACHE_DIR": str(cache), **environment,
     }  # fmt: skip
-    program = [sys.executable, "-c", PROGRAM]
     return subprocess.Popen(
-        program, env=variables, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=own.parent
+        [sys.executable, "-c", program],
+        env=variables,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=own.parent,
     )
 
 
@@ -83,12 +87,25 @@ def ended(process):
 
 def result(process):
     """The value that it printed, and its lines on standard error."""
-    value, _, told = ended(process)
+    value, *_, told = ended(process)
     return value, told
 
 
 def kept(folder):
     return {path: path.stat().st_mtime_ns for path in Path(folder).rglob("*.nbc")}
+
+
+def test_code_that_two_processes_have_compiled_works_together(own, tmp_path):
+    """Numba's `sort` and `argsort` have functions of the same name, and each is the same one of its process."""
+    for name, body in (("lowest", "x.sort(); return x[0]"), ("first", "return x.argsort()[0]")):
+        write(
+            own / f"{name}.py",
+            f"from parkenv.compiled.jit import compiled\n@compiled\ndef {name}(x):\n    {body}\n",
+        )
+        prints = f"import numpy as np\nfrom {name} import {name}\nprint({name}(np.array([3.0, 1.0, 2.0])))\n"
+        assert result(start(own, tmp_path / "cache", prints))[0] == 1.0
+    both = "import numpy as np\nfrom lowest import lowest\nfrom first import first\nx = np.array([3.0, 4.0, 2.0])\n"
+    assert ended(start(own, tmp_path / "cache", f"{both}print(first(x), lowest(x))"))[:2] == (2.0, 2.0)
 
 
 def test_a_caller_is_compiled_again_when_what_it_calls_or_reads_changes(own, tmp_path):

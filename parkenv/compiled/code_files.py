@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import itertools
 import logging
 import os
 import pickle
+import secrets
 import shutil
 import sys
 import time
@@ -21,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from filelock import FileLock
+from numba.core.bytecode import FunctionIdentity
 from numba.core.compiler import CompileResult
 from numba.core.errors import NumbaWarning
 from numba.core.registry import cpu_target
@@ -33,6 +36,9 @@ _KEPT_DAYS = 30  # age at which compiled code of other versions of a module is d
 _WAIT_S = 120.0  # for another process that compiles the same; a stopped one is not waited for longer
 _DIGEST_BYTES = 32
 _LOGGER = logging.getLogger("parkenv")
+# Numba tells functions of one name apart by how many its process has compiled before. Two processes would give one name
+# to different functions, such as those of `sort` and `argsort`, and where both are loaded, the first would be called.
+FunctionIdentity._unique_ids = itertools.count(secrets.randbits(48))
 
 
 def cache_folder() -> Path:
