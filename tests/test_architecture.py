@@ -1,6 +1,7 @@
 """The architecture: which module may import which, and what importing costs."""
 
 import ast
+import functools
 import importlib
 import subprocess
 import sys
@@ -45,16 +46,31 @@ PLANNERS_MAY_SEE = (
 
 def import_statements(path):
     """Every import of a file, at any depth of its code, but those for type checking alone."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    for node in ast.walk(tree):
-        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
-            node.body = []
-    for node in ast.walk(tree):
+    return parsed(path, path.stat().st_mtime_ns)[0]
+
+
+def calls(path):
+    """What a file calls, as it is written there: `json.loads`."""
+    return parsed(path, path.stat().st_mtime_ns)[1]
+
+
+@functools.cache
+def parsed(path, _):
+    imported, called = [], set()
+    waiting = [ast.parse(path.read_text(encoding="utf-8"))]
+    while waiting:
+        node = waiting.pop()
         if isinstance(node, ast.Import):
-            yield from ((alias.name, None) for alias in node.names)
+            imported += [(alias.name, None) for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
-            yield from ((node.module, alias.name) for alias in node.names)
+            imported += [(node.module, alias.name) for alias in node.names]
+        elif isinstance(node, ast.Call):
+            called.add(ast.unparse(node.func))
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            node.body = []
+        waiting += ast.iter_child_nodes(node)
+    return imported, called
 
 
 def imports(path):
@@ -184,10 +200,7 @@ def test_packages_import_those_below_them_only():
 def test_files_are_read_within_limits():
     for path in (path for package in PACKAGES for path in sources(package)):
         name = path.relative_to(ROOT).as_posix()
-        calls = {
-            ast.unparse(n.func) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)
-        }
-        unlimited = {call for call in calls & READS.keys() if name not in READS[call]}
+        unlimited = {call for call in calls(path) & READS.keys() if name not in READS[call]}
         assert not unlimited, f"{name}: read by parkenv.files instead"
 
 

@@ -27,8 +27,8 @@ def gap(seed, **options):
     return 100.0 * (expected_time(agent, problem, p, entry) / best - 1.0)
 
 
-LOTS = range(0, 324, 7)
-"""Seven divides none of the rounds of slot chances, pitch, view and shape: they are mixed as in all 324."""
+LOTS = range(0, 324, 13)
+"""Thirteen divides none of the rounds of slot chances, pitch, view and shape: they are mixed as in all 324."""
 
 
 def has_large_trees(seed):
@@ -39,7 +39,7 @@ def has_large_trees(seed):
 @pytest.mark.slow
 def test_it_stays_near_the_optimum_on_small_lots():
     gaps = np.array([gap(seed, day=False) for seed in LOTS if not has_large_trees(seed)])
-    assert len(gaps) > 25
+    assert len(gaps) > 12
     assert gaps.min() > -1e-3
     assert gaps.mean() < 0.02
     assert np.quantile(gaps, 0.95) < 0.1
@@ -48,7 +48,7 @@ def test_it_stays_near_the_optimum_on_small_lots():
 @pytest.mark.slow
 def test_it_stays_near_the_optimum_where_there_is_much_to_choose_and_doubting_a_right_map_costs_little():
     gaps = np.array([gap(seed, day=False) for seed in LOTS if has_large_trees(seed)])
-    assert len(gaps) > 10
+    assert len(gaps) > 5
     assert gaps.min() > -1e-3
     assert gaps.mean() < 0.5
     assert np.quantile(gaps, 0.95) < 2.0

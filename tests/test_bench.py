@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from command_line import parkenv
 from typer.testing import CliRunner
 
 from parkenv.cli import app
@@ -12,11 +13,13 @@ from parkenv.studies.bench import sensors as bench_sensors
 from parkenv.studies.bench.rows import duration, rate, seconds_each
 from parkenv.studies.bench.sensors import (
     GRID_CELL,
+    camera_rows,
     embree_scanner,
     laser_rows,
     marching_scanner,
     parked_cars,
     pymunk_scanner,
+    search_rows,
     walled_lot,
 )
 from sim_sensors.laser.scanner import LaserScanner
@@ -66,18 +69,29 @@ def test_the_measured_scene_is_full():
 
 
 @pytest.mark.slow
-def test_bench_writes_its_rows(tmp_path):
-    result = CliRunner().invoke(app, ["bench", "sensors", "--seconds", "0.01", "--out", str(tmp_path / "b")])
-    assert result.exit_code == 0, result.output
-    summary = json.loads((tmp_path / "b" / "summary.json").read_text())
+def test_sensors_are_measured():
+    rows = laser_rows(seconds=0.0) + camera_rows(seconds=0.0)
+    rows += search_rows(seconds=0.0, scenario="mini", searches=4)
     keys = {"part", "case", "value", "unit", "peer", "peer_value", "ratio"}
-    assert summary["rows"]
-    assert all(set(row) == keys and row["value"] > 0 for row in summary["rows"])
-    assert {row["part"] for row in summary["rows"]} == {"laser", "camera", "environment"}
-    assert "pymunk" in result.output
-    assert result.output.splitlines()[0].startswith("After an installation each part first compiles")
+    assert all(set(row) == keys and row["value"] > 0 for row in rows)
+    assert {row["part"] for row in rows} == {"laser", "camera", "environment"}
+    assert any(row["peer"] and "pymunk" in row["peer"] for row in rows)
     stages = {"transform and raster", "of that, transform", "shading", "exposure and noise"}
-    assert {row["case"].removeprefix("stages: ") for row in summary["rows"]} > stages
+    assert {row["case"].removeprefix("stages: ") for row in rows} > stages
+
+
+def test_the_command_shows_and_keeps_its_rows(monkeypatch, tmp_path):
+    def measured(seed, seconds):
+        return rate("laser", "a", 300.0 * seconds, "scans/s", pymunk=100.0 + seed)
+
+    monkeypatch.setattr(bench_sensors, "sensor_rows", measured)
+    done = parkenv("bench", "sensors", "--seconds", 2, "--seed", 20, "--out", tmp_path / "b")
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "b" / "summary.json").read_text())["rows"] == measured(20, 2.0)
+    for text in (done.stdout, (tmp_path / "b" / "sensors.md").read_text()):
+        assert "pymunk" in text
+        assert text.index("600") < text.index("120")
+    assert done.stdout.startswith("After an installation each part first compiles")
 
 
 def test_an_unknown_part_is_named():

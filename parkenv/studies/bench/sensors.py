@@ -40,7 +40,6 @@ Scans = Callable[[FloatArray], NDArray[Any]]  # maps poses, (n, 3), to ranges, (
 
 SLOT_WIDTH, SLOT_LENGTH, MODULE, MARGIN = 2.5, 5.0, 16.0, 6.0
 GRID_CELL = 0.05  # cell size of the grid for ray marching, m
-_SEARCHES = 256
 _WARM_STEPS = 5
 LIT_AHEAD = 12.0  # distance of the light maps' centre in front of the camera, m, when shading is timed alone
 
@@ -161,8 +160,10 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     return rows + duration("camera", "true boxes of a frame", 1e3 * boxes, "ms")
 
 
-def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Measure the steps per second of random drives on `campus` through sensors, resets included."""
+def search_rows(
+    seed: int = 0, seconds: float = 0.6, scenario: str = "campus", searches: int = 256
+) -> list[BenchRow]:
+    """Measure the steps per second of random drives through sensors, resets included."""
     few = 10.0 * seconds  # an episode begins with a new world, weather and sky
     rows: list[BenchRow] = []
     drives: list[tuple[str, dict[str, Any], str]] = [
@@ -175,21 +176,21 @@ def search_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
             ("SearchPerception", wide, f"{size}, seen by the pipeline, up to 2 a step"),
         ]
     for name, options, case in drives:
-        env: gym.Env[Any, Any] = gym.make(f"parkenv/{name}-v2", scenario="campus", **options)
+        env: gym.Env[Any, Any] = gym.make(f"parkenv/{name}-v2", scenario=scenario, **options)
         rows += rate(
-            "environment", f"{name}-v2 on campus, {case}", _steps_per_second(env, seed, few), "steps/s"
+            "environment", f"{name}-v2 on {scenario}, {case}", _steps_per_second(env, seed, few), "steps/s"
         )
-    envs = ScanSearchVectorEnv(_SEARCHES, "campus", copy=False)
+    envs = ScanSearchVectorEnv(searches, scenario, copy=False)
     observation, _ = envs.reset(seed=seed)
     rng = np.random.default_rng(seed)
 
     def step(_: int) -> None:
         nonlocal observation
-        chosen = (rng.random((_SEARCHES, PARK)) * observation["action_mask"][:, :PARK]).argmax(axis=1)
+        chosen = (rng.random((searches, PARK)) * observation["action_mask"][:, :PARK]).argmax(axis=1)
         observation = envs.step(chosen)[0]
 
-    batch = _SEARCHES / seconds_each(step, few)
-    case = f"SearchSensors-v2 on campus, scans alone, {_SEARCHES} at once"
+    batch = searches / seconds_each(step, few)
+    case = f"SearchSensors-v2 on {scenario}, scans alone, {searches} at once"
     return rows + rate("environment", case, batch, "steps/s")
 
 
