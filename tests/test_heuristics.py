@@ -134,10 +134,13 @@ def test_usual_heads_for_the_place_of_the_lowest_index():
         decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
         state = np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
         indices = {s: seconds[s] + problem.arrival_cost_s[s] for s in np.flatnonzero(state == OBSERVED_FREE)}
+        seen = state != 0
+        level = (1.0 + np.sum(state == OBSERVED_FREE)) / (1.0 + np.sum(1.0 - belief.forecast[seen]))
         for run in places:
             if unseen := [s for s in run if state[s] == 0]:
                 middle = run[(run.index(unseen[0]) + run.index(unseen[-1])) // 2]
-                q = 1.0 - float(belief.forecast[middle]) ** len(unseen)
+                p = float(belief.forecast[middle])
+                q = 1.0 - (p / (p + (1.0 - p) * level)) ** len(unseen)
                 drive = (seconds[unseen[0]] + seconds[unseen[-1]]) / 2.0
                 indices[unseen[-1]] = problem.arrival_cost_s[middle] + drive / q
         memory = agent.begin({"vertex": vertex}, belief)
@@ -146,6 +149,29 @@ def test_usual_heads_for_the_place_of_the_lowest_index():
         path = (vertex, *agent.plan_preview({"vertex": vertex}, action, memory).path)
         assert path[-1] == memory.target
         assert drive_s(problem, path) == pytest.approx(seconds[memory.target])
+
+
+def test_usual_tries_every_full_street_once_before_it_gives_up():
+    scenario = parkenv.make_scenario("street")
+    n = scenario.lot.n_slots
+    forecast, full = (
+        OccupancyProcess.from_demand(np.full(n, level), np.zeros(168), 1800.0) for level in (0.5, 12.0)
+    )
+    scenario = scenario.replace(occupancy=full, prior=forecast)
+    place = {slot: i for i, run in enumerate(one_way_places(scenario.public())) for slot in run}
+    agent, env = make_agent("usual", scenario), gym.make("parkenv/Search-v2", scenario=scenario)
+    for seed in range(3):
+        observation, _ = env.reset(seed=seed)
+        state, over, tried = None, False, []
+        while not over:
+            action, state = agent.predict(observation, state)
+            if not tried or tried[-1] != state.target:
+                tried.append(state.target)
+            observation, _, over, truncated, _ = env.step(action)
+            assert not truncated
+        seen = [place[slot] for slot in tried]
+        assert len(seen) > 10
+        assert len(set(seen)) == len(seen)
 
 
 @pytest.mark.parametrize("name", COMPILED)

@@ -2,9 +2,19 @@
 
 A *place* is a run of slots on one side of a street, between two junctions and in one zone, or a counted facility. The
 rule is Pandora's (Weitzman 1979), with places as boxes that take a drive to open: a place where n slots were not
-observed yet, each taken with the forecast p, has a free one with q = 1 - p^n, and its index is c + d / q, with the
+observed yet, each taken with probability p, has a free one with q = 1 - p^n, and its index is c + d / q, with the
 arrival cost c and the drive d there. The driver goes to the place of the lowest index, and through it; it takes a free
 slot on its way that costs no more than what is left of that index, and goes on to the next place where one is full.
+
+p is the forecast, corrected by what the driver remembers: the odds that a slot of a zone is free are multiplied by how
+many slots of it were seen free over how many were expected, with `DOUBT` added to both (the posterior mean of a factor
+that has a gamma law with mean 1 beforehand). After some full streets, the next ones of the zone promise less, and
+garages more.
+
+People do the same: on the way they judge by the spaces they pass how many are still to come, and once they have missed
+the goal, they search an area that grows with time (PARKAGENT: Benenson, Martens and Birfir 2008, from surveys). Here
+both follow from one rule: full streets near the goal leave those farther out as the next cheapest ones, one by one,
+and none is tried again while the driver remembers it.
 
 Places are searched over junctions instead of slots, in a fraction of the time.
 """
@@ -17,7 +27,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN
+from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.heap import pop, push
 from parkenv.compiled.memory import (
@@ -30,7 +40,14 @@ from parkenv.compiled.memory import (
     record_at,
     uint8s,
 )
-from parkenv.engine.policy import PolicyData, forecast, has_own_price, least_zone_cost_s, search_of
+from parkenv.engine.policy import (
+    PolicyData,
+    forecast,
+    has_own_price,
+    known_slot,
+    least_zone_cost_s,
+    search_of,
+)
 from parkenv.world.lot import MOVES, ParkingLot
 from parkenv.world.scenario import SearchProblem
 from planners.heuristics.rules import (
@@ -43,7 +60,10 @@ from planners.heuristics.rules import (
     state_of,
 )
 
+DOUBT = 1.0
+"""Free slots, seen and expected, that stand for what a driver believes of a zone before it has seen any of it."""
 _N_MOVES = len(MOVES)
+_UNITS = 1 << 20  # whole numbers add up alike in any order
 _NONE = -1
 
 STREETS = np.dtype(
@@ -81,6 +101,8 @@ STREETS = np.dtype(
         ("place_zone", ADDRESS),
         ("place_walk_s", ADDRESS),
         ("place_cost_s", ADDRESS),
+        # (n_slots,) int64 zone of each slot.
+        ("zone_of_slot", ADDRESS),
         # By goal: (n_slots,) float64 arrival costs, s; (n_junctions,) float64, the least drive and bound from there, s.
         ("arrival_cost_s", ADDRESS),
         ("onward_walk_s", ADDRESS),
@@ -89,6 +111,9 @@ STREETS = np.dtype(
         ("states", ADDRESS),
         ("p_occupied", ADDRESS),
         ("forecast", ADDRESS),
+        # Of the last search: (n_zones,) int64 slots seen free, and expected free, in millionths of a slot.
+        ("seen_free", ADDRESS),
+        ("expected_free", ADDRESS),
         # Of the last search: by junction, float64 drive, s, inf where it did not arrive; int32 the street by which it
         # is reached, and the position on it from which that was entered, -1 for its beginning; (n_junctions + 1,)
         # int32, how many junctions it reached, and then these.
@@ -148,7 +173,10 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
                 strict=True,
             )
         ),
+        "zone_of_slot": np.ascontiguousarray(lot.zone_of_slot, np.int64),
         "forecast": np.zeros(lot.n_slots),
+        "seen_free": np.zeros(len(lot.zones), np.int64),
+        "expected_free": np.zeros(len(lot.zones), np.int64),
         "seconds": np.full(n_junctions, np.inf),
         "via": np.zeros(n_junctions, np.int32),
         "via_from": np.zeros(n_junctions, np.int32),
@@ -274,6 +302,29 @@ def _forecast(streets: Any, search: int, slot: int) -> float:
     return float(forecast(search_of(search), slot) if search else float64s(streets.forecast)[slot])
 
 
+@rule
+def _count_free(streets: Any, search: int) -> None:
+    """Count by zone how many of the slots that the driver remembers were free, and how many the forecast expected."""
+    zone_of_slot = int64s(streets.zone_of_slot)
+    free, expected = int64s(streets.seen_free), int64s(streets.expected_free)
+    for zone in range(streets.n_zones):
+        free[zone] = expected[zone] = 0
+    for i in range(search_of(search).n_columns if search else streets.n_slots):
+        slot = np.int64(known_slot(search_of(search), i) if search else i)
+        state = state_of(streets, search, slot)
+        if state != UNOBSERVED:
+            zone = zone_of_slot[slot]
+            free[zone] += _UNITS if state == OBSERVED_FREE else 0
+            expected[zone] += int((1.0 - _forecast(streets, search, slot)) * _UNITS)
+
+
+@inlined_rule
+def _level(streets: Any, zone: int) -> float:
+    """Return the factor of the odds that a slot of a zone is free: as many as were seen over those expected."""
+    free, expected = int64s(streets.seen_free)[zone], int64s(streets.expected_free)[zone]
+    return float((free + DOUBT * _UNITS) / (expected + DOUBT * _UNITS))
+
+
 @inlined_rule
 def _onward_s(streets: Any, goal: int, search: int) -> tuple[int, float]:
     """Return where lower bounds on the drive and the arrival cost from each junction begin, and what to add, s."""
@@ -305,6 +356,7 @@ def _search_places(streets: Any, goal: int, search: int, vertex: int) -> None:
         seconds[reached[i]] = np.inf
     reached[0] = 0
     streets.best_s, streets.best = np.inf, _NONE
+    _count_free(streets, search)
     size = 0
     if vertex >= n:
         seconds[vertex - n], reached[0], reached[1] = 0.0, 1, vertex - n
@@ -427,7 +479,9 @@ def _look_along(streets: Any, goal: int, search: int, street: int, position: int
         if n_open > 0:
             slot = np.int64(slots[(first_open + last_open) // 2])
             drive_s = before_s + (along_s[first_open] + along_s[last_open]) / 2.0
-            q = 1.0 - _forecast(streets, search, slot) ** n_open
+            p = _forecast(streets, search, slot)
+            p /= p + (1.0 - p) * _level(streets, int64s(streets.place_zone)[k])
+            q = 1.0 - p**n_open
             if q > 0.0:
                 _compare(streets, cost_of(streets, goal, search, slot) + drive_s / q, last_open, position)
 
