@@ -203,7 +203,8 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
 
     ## Episode end
     - Terminated, car by car: parked; gave up, because it has observed that every slot is taken; or *balked*, because
-      its search has lasted as long as its patience. Giving up and balking cost `give_up_s`.
+      its search has lasted as long as its patience (in a town, without the way to its goal). Giving up and balking
+      cost `give_up_s`.
     - Truncated, car by car: after `max_cycles` decisions.
 
     The world ends when all cars' searches are over. A parked car stays in its slot for its stay, then leaves.

@@ -134,8 +134,8 @@ def test_usual_heads_for_the_place_of_the_lowest_index():
         decayed = (belief.p_occupied == belief.forecast) & (belief.p_observed != belief.forecast)
         state = np.where((belief.state == OBSERVED_TAKEN) & decayed, 0, belief.state)
         indices = {s: seconds[s] + problem.arrival_cost_s[s] for s in np.flatnonzero(state == OBSERVED_FREE)}
-        seen = state != 0
-        level = (1.0 + np.sum(state == OBSERVED_FREE)) / (1.0 + np.sum(1.0 - belief.forecast[seen]))
+        seen = belief.state != 0
+        level = (1.0 + np.sum(belief.state == OBSERVED_FREE)) / (1.0 + np.sum(1.0 - belief.forecast[seen]))
         for run in places:
             if unseen := [s for s in run if state[s] == 0]:
                 middle = run[(run.index(unseen[0]) + run.index(unseen[-1])) // 2]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.errors import InputError
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
@@ -205,6 +205,21 @@ def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
     assert (fleet.counts() <= town.lot.capacity).all()
     of_car = fleet.zone_cost_s()[fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]]
     assert np.isfinite(of_car).all()
+
+
+def test_in_a_town_the_way_to_the_goal_takes_no_patience():
+    town = make_scenario("town")
+    goals = tuple(np.ones(len(town.lot.goals)))
+    demand = Demand(Headways(60, 20.0), patience=ConstantTime(1.0), goal_weights=goals)
+    fleet = Fleet(town, demand, background="none", drivers=[DriverKind(policy=POLICIES["greedy-goal"])])
+    fleet.reset(1)
+    fleet.run()
+    for car in fleet.cars:
+        problem = fleet.scenarios[car["place"]]
+        way_s = drive_times(problem, int(car["entry"]))[problem.walk_s.argmin()]
+        assert car["patience_s"] == pytest.approx(1.0 + way_s)
+        assert car["slot"] >= 0 or car["ended_at"] - car["arrival"] >= car["patience_s"]
+    assert np.mean(fleet.cars["slot"] >= 0) > 0.2  # those whose goal has a free space beside it
 
 
 def test_hardly_anybody_who_drives_as_usual_gives_up_before_the_town_is_full():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -146,7 +146,8 @@ class Fleet:
 
     A car's search ends when it parks, when it has observed that every slot is taken (*gave up*), when its patience is
     at an end (*balked*), or at the limit of steps (*truncated*); the last three cost `give_up_s`. A parked car leaves
-    after its stay. The world ends when all searches are over.
+    after its stay. The world ends when all searches are over. Patience begins at the entry of a lot; in a town
+    (`ParkingLot.is_town`), when the shortest way to the slot nearest to the goal would be over.
 
     Knowledge reaches a driver through its observations, so every agent uses it. The live map holds the last report of
     each slot. The guidance system knows the true state of every slot, and reserves slots anew whenever a car with
@@ -367,7 +368,10 @@ class Fleet:
             cars["arrival"] = begin + np.ceil((cars["arrival"] - begin) / tick_s - 1e-9) * tick_s
         cars["entry"] = self._entries[plans.entry]
         cars["place"] = plans.goal
-        cars["stay_s"], cars["patience_s"] = plans.stay_s, plans.patience_s
+        cars["stay_s"], cars["patience_s"] = (
+            plans.stay_s,
+            plans.patience_s + self._way_s[plans.goal, plans.entry],
+        )
         shares = np.cumsum([kind.weight for kind in self.drivers])
         cars["kind"] = np.minimum(
             np.searchsorted(shares / shares[-1], plans.kind, side="right"), len(self.drivers) - 1
@@ -403,6 +407,21 @@ class Fleet:
         )
         for searches in self._pool:
             self._add_free(searches)
+
+    @cached_property
+    def _way_s(self) -> NDArray[np.float64]:
+        """Shortest drive by goal and entry, (n_goals, n_entries) s, in a town to the slot nearest to the goal.
+
+        A lot that is no town is where its cars want to be: they search from the entry on.
+        """
+        lot = self.scenario.lot
+        if not lot.is_town:
+            return np.zeros((len(self.scenarios), len(self._entries)))
+        metres = dijkstra(lot.drive_matrix(), indices=self._entries)[:, : lot.n_slots]
+        walk_s = np.array([one.walk_s for one in self.scenarios])
+        nearest = np.where(np.isfinite(metres), walk_s[:, None], np.inf).argmin(axis=2)
+        way_s = metres[np.arange(len(metres)), nearest] / self.scenario.v_drive
+        return np.where(np.isfinite(way_s), way_s, 0.0)
 
     def _write_zone_costs(self) -> NDArray[np.float64]:
         """Write what parking in each zone costs each car, where that matters; return it, (n_cars, n_zones) s."""

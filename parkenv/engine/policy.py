@@ -205,6 +205,21 @@ def known_slot(search: Any, i: int) -> int:
 
 
 @inlined
+def observed_column(search: Any, i: int) -> tuple[Any, float, Any]:
+    """Return the i-th of these slots, -1 if it was not observed; 1 if it was last observed free; its forecast.
+
+    The forecast is rounded as in the observation. What a reservation says of a slot is no observation.
+    """
+    column = SENTINEL + 1 + i
+    record = slot_at(search.slots, column)
+    block, k = block_at(search.blocks, column >> BLOCK_BITS), column & (BLOCK_SIZE - 1)
+    prior, p_observed = np.float32(block.prior[k]), np.float32(block.p_observed[k])
+    is_free = p_observed < prior or p_observed == 0.0
+    is_seen = record.observed and (is_free or p_observed != prior)
+    return np.int64(record.slot if is_seen else -1), 1.0 if is_free else 0.0, np.float64(prior)
+
+
+@inlined
 def p_occupied(search: Any, slot: int) -> float:
     """Return P(taken) of an observed slot, rounded as in the observation; as `SlotBelief.with_reservation`."""
     if search.reserved != UNGUIDED:

@@ -165,7 +165,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             lot=lot,
             goal=goal,
             entry=spec.entry,
-            v_drive=(spec.speeds.v_drive_kmh or (TOWN_KMH if lot.facilities else LOT_KMH)) * KMH,
+            v_drive=(spec.speeds.v_drive_kmh or (TOWN_KMH if lot.is_town else LOT_KMH)) * KMH,
             v_walk=spec.speeds.v_walk_kmh * KMH,
             failure_s=spec.costs.failure_s,
             wait_s=spec.costs.wait_s,

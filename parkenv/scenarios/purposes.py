@@ -74,7 +74,10 @@ class PurposeSpec(Spec):
     )
     walks_back: bool = Field(False, description="Whether the walk back to the car counts, too.")
     patience_s: float = Field(
-        600.0, gt=0.0, le=1e7, description="Search time after which a car goes elsewhere."
+        600.0,
+        gt=0.0,
+        le=1e7,
+        description="Search time, without the way to their goal, after which cars go elsewhere.",
     )
     kwh: float = Field(0.0, ge=0.0, le=1e3, description="Energy that a car of the class charging takes, kWh.")
     parked: int = Field(0, ge=0, le=MAX_CARS, description="Cars that stand in slots when the hours begin.")

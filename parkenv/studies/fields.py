@@ -182,7 +182,8 @@ Patience = Annotated[
         default="10",
         panel="Demand",
         parse=seconds_of_minutes,
-        description="Minutes after which a searching car goes elsewhere, at the give-up penalty.",
+        description="Minutes after which a searching car goes elsewhere, at the give-up penalty; "
+        "in a town, its way there does not count.",
     ),
 ]
 BUSY = TrafficSpec(cars=3, pedestrians=5)

@@ -428,7 +428,7 @@ class Demand:
         arrivals: when cars arrive.
         stay: law of the time that a car stays in its slot.
         patience: law of the time after which a searching car *balks*: at its next decision it goes elsewhere, at the
-            cost of the scenario's `give_up_s`.
+            cost of the scenario's `give_up_s`. In a town, the shortest way to its goal does not count.
         entry_weights: relative number of cars of each entry of the lot; empty: as in a single search, the scenario's
             entry, or all alike.
         goal_weights: relative number of cars of each goal of the lot; empty: the scenario's goal.

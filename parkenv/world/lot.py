@@ -377,6 +377,11 @@ class ParkingLot:
         return len(self.vertex_xy)
 
     @property
+    def is_town(self) -> bool:
+        """Whether there are kerbs, car parks or garages, so that a car drives some way before it can park."""
+        return bool(self.facilities)
+
+    @property
     def is_counted(self) -> NDArray[np.bool_]:
         """Whether each slot stands for a counted facility, (n_slots,) bool."""
         counted = np.array([*(facility.is_counted for facility in self.facilities), False])

@@ -180,6 +180,7 @@ class UsualAgent(TargetAgent):
         tables.arrays["states"][:] = states
         if target == NO_SLOT or states[target] == OBSERVED_TAKEN:
             tables.arrays["p_occupied"][:], tables.arrays["forecast"][:] = belief.p_occupied, belief.forecast
+            tables.arrays["last_states"][:] = belief.state
             memory.target, memory.n_moves, index_s = choose_place(
                 tables.address, 0, 0, vertex, target, memory.moves, memory.n_moves
             )

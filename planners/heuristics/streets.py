@@ -44,8 +44,8 @@ from parkenv.engine.policy import (
     PolicyData,
     forecast,
     has_own_price,
-    known_slot,
     least_zone_cost_s,
+    observed_column,
     search_of,
 )
 from parkenv.world.lot import MOVES, ParkingLot
@@ -63,7 +63,6 @@ from planners.heuristics.rules import (
 DOUBT = 1.0
 """Free slots, seen and expected, that stand for what a driver believes of a zone before it has seen any of it."""
 _N_MOVES = len(MOVES)
-_UNITS = 1 << 20  # whole numbers add up alike in any order
 _NONE = -1
 
 STREETS = np.dtype(
@@ -107,11 +106,13 @@ STREETS = np.dtype(
         ("arrival_cost_s", ADDRESS),
         ("onward_walk_s", ADDRESS),
         ("onward_cost_s", ADDRESS),
-        # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken), and its forecast.
+        # What the observation of an agent holds, (n_slots,): uint8 recent states, and those last observed; float64
+        # P(taken), and its forecast.
         ("states", ADDRESS),
+        ("last_states", ADDRESS),
         ("p_occupied", ADDRESS),
         ("forecast", ADDRESS),
-        # Of the last search: (n_zones,) int64 slots seen free, and expected free, in millionths of a slot.
+        # Of the last search: (n_zones,) float64 slots seen free, and expected free.
         ("seen_free", ADDRESS),
         ("expected_free", ADDRESS),
         # Of the last search: by junction, float64 drive, s, inf where it did not arrive; int32 the street by which it
@@ -175,8 +176,9 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
         ),
         "zone_of_slot": np.ascontiguousarray(lot.zone_of_slot, np.int64),
         "forecast": np.zeros(lot.n_slots),
-        "seen_free": np.zeros(len(lot.zones), np.int64),
-        "expected_free": np.zeros(len(lot.zones), np.int64),
+        "last_states": np.full(lot.n_slots, UNOBSERVED, np.uint8),
+        "seen_free": np.zeros(len(lot.zones)),
+        "expected_free": np.zeros(len(lot.zones)),
         "seconds": np.full(n_junctions, np.inf),
         "via": np.zeros(n_junctions, np.int32),
         "via_from": np.zeros(n_junctions, np.int32),
@@ -304,25 +306,42 @@ def _forecast(streets: Any, search: int, slot: int) -> float:
 
 @rule
 def _count_free(streets: Any, search: int) -> None:
-    """Count by zone how many of the slots that the driver remembers were free, and how many the forecast expected."""
-    zone_of_slot = int64s(streets.zone_of_slot)
-    free, expected = int64s(streets.seen_free), int64s(streets.expected_free)
-    for zone in range(streets.n_zones):
-        free[zone] = expected[zone] = 0
+    """Count by zone how many of the slots that the driver has seen were free, and how many the forecast expected."""
+    zone_of_slot, n_zones = int64s(streets.zone_of_slot), streets.n_zones
+    free, expected = (
+        float64_array(streets.seen_free, (n_zones,)),
+        float64_array(streets.expected_free, (n_zones,)),
+    )
+    free[:] = expected[:] = 0.0
+    # Sums of numbers that were rounded to float32 are exact, so their order does not matter.
+    zone, n_free, n_expected = np.int64(0), 0.0, 0.0
     for i in range(search_of(search).n_columns if search else streets.n_slots):
-        slot = np.int64(known_slot(search_of(search), i) if search else i)
-        state = state_of(streets, search, slot)
-        if state != UNOBSERVED:
-            zone = zone_of_slot[slot]
-            free[zone] += _UNITS if state == OBSERVED_FREE else 0
-            expected[zone] += int((1.0 - _forecast(streets, search, slot)) * _UNITS)
+        slot, is_free, p = observed_column(search_of(search), i) if search else _observed_slot(streets, i)
+        if slot < 0:
+            continue
+        if zone_of_slot[slot] != zone:
+            free[zone] += n_free
+            expected[zone] += n_expected
+            zone, n_free, n_expected = zone_of_slot[slot], 0.0, 0.0
+        n_free += is_free
+        n_expected += 1.0 - p
+    free[zone] += n_free
+    expected[zone] += n_expected
+
+
+@inlined_rule
+def _observed_slot(streets: Any, slot: int) -> tuple[Any, float, Any]:
+    state = uint8s(streets.last_states)[slot]
+    seen = np.int64(slot if state != UNOBSERVED else _NONE)
+    return seen, 1.0 if state == OBSERVED_FREE else 0.0, float64s(streets.forecast)[slot]
 
 
 @inlined_rule
 def _level(streets: Any, zone: int) -> float:
     """Return the factor of the odds that a slot of a zone is free: as many as were seen over those expected."""
-    free, expected = int64s(streets.seen_free)[zone], int64s(streets.expected_free)[zone]
-    return float((free + DOUBT * _UNITS) / (expected + DOUBT * _UNITS))
+    return float(
+        (float64s(streets.seen_free)[zone] + DOUBT) / (float64s(streets.expected_free)[zone] + DOUBT)
+    )
 
 
 @inlined_rule

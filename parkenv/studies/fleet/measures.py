@@ -81,23 +81,11 @@ class Roads:
         least_s = (free_s + fleet.zone_cost_s()).min(axis=1)
         return np.where(np.isfinite(least_s), least_s, self._problem.give_up_s)
 
-    def reach(self, patience_s: float) -> dict[str, float]:
-        """Return what cars reach from their entries, of all pairs of an entry and a space.
-
-        `share_reached` is the share of the spaces within their patience; `most_reached_s`, s, when 95 % of those that
-        can be reached are; `entries`, and `entries_cut_off`, from which there is no way to half of the spaces.
-        """
-        capacity, drive_s = self._problem.lot.capacity, self._drive_s
-        can = np.isfinite(drive_s)
-        spaces = np.broadcast_to(capacity, drive_s.shape)
-        order = np.argsort(drive_s[can])
-        so_far = np.cumsum(spaces[can][order])
-        return {
-            "share_reached": float(spaces[drive_s <= patience_s].sum() / spaces.sum()),
-            "most_reached_s": float(drive_s[can][order][np.searchsorted(so_far, 0.95 * so_far[-1])]),
-            "entries": len(drive_s),
-            "entries_cut_off": int((can @ capacity < 0.5 * capacity.sum()).sum()),
-        }
+    def reach(self) -> dict[str, int]:
+        """Return how many `entries` there are, and from how many half of the spaces cannot be reached."""
+        capacity, can = self._problem.lot.capacity, np.isfinite(self._drive_s)
+        cut_off = int((can @ capacity < 0.5 * capacity.sum()).sum())
+        return {"entries": len(can), "entries_cut_off": cut_off}
 
     def clairvoyant_s(self, fleet: Fleet) -> float:
         """Return the clairvoyant bound of the day of a fleet that has been reset, s, for all cars together.

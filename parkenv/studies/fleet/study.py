@@ -233,7 +233,7 @@ class FleetStudy(Study):
 
     @property
     def _in_towns(self) -> bool:
-        return any(scenario.lot.facilities for scenario in self.built.values())
+        return any(scenario.lot.is_town for scenario in self.built.values())
 
     @cached_property
     def calibration(self) -> Calibration | None:
@@ -432,7 +432,7 @@ class FleetStudy(Study):
         blocks = results.rows(BLOCKS)
         shown = [blocks[key] for key in keys if key in blocks]
         zoned = [row for row in shown if has_zones(self.built[row["scenario"]])]
-        grouped = [row for row in shown if self.built[row["scenario"]].lot.facilities]
+        grouped = [row for row in shown if self.built[row["scenario"]].lot.is_town]
         mixed = [row for row in shown if set(row["purpose"]) != {ALL}]
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
@@ -449,26 +449,8 @@ class FleetStudy(Study):
             "zones": summarize_blocks(zoned, "zone", prices),
             "blocks": summarize_blocks(grouped, "block", prices),
             "purposes": summarize_blocks(mixed, "purpose"),
-            "reach": self._reach(),
+            "reach": [{"scenario": name, **roads.reach()} for name, roads in self._roads.items()],
         }
-
-    def _reach(self) -> list[Row]:
-        """Return what share of the spaces of each scenario cars reach within their patience."""
-        import numpy as np
-
-        rows: list[Row] = []
-        for name, scenario in self.built.items():
-            patience_s = self.patience_s
-            if scenario.demand is not None:
-                purposes = [one for one in scenario.demand.purposes if one.expected]
-                patience_s = float(
-                    np.average(
-                        [one.patience.mean_s for one in purposes], weights=[one.expected for one in purposes]
-                    )
-                )
-            its = {"patience_s": patience_s, "v_drive_kmh": 3.6 * scenario.v_drive}
-            rows.append({"scenario": name, **its, **self._roads[name].reach(patience_s)})
-        return rows
 
     @property
     def title(self) -> str:
@@ -539,7 +521,7 @@ class FleetStudy(Study):
             findings.append(f"{finding}.")
         findings += [sentence(row) for row in changes if row["change"] == "knows"]
         findings += [ONE_DAY] if all(row["days"] == 1 for row in summary["rows"]) else []
-        findings += unreached(summary["reach"], summary["rows"])
+        findings += unreached(summary["reach"])
         return findings + departures(summary["hours"], summary["rows"])
 
     @classmethod

@@ -15,8 +15,6 @@ ASSIGNED = "reserve"
 COUNTS = "counted_occupancy"
 FAR = 0.03
 """Difference between simulated and counted occupancy that is said."""
-ROOM, NOTICED = 0.9, 0.02
-"""Occupancy below which there is room, and share of the cars that find none from which that is said."""
 WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s")
 """Measures whose summary has a 95 % interval over days."""
 DIFFERENCES = {
@@ -90,34 +88,14 @@ def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
     return rows
 
 
-def unreached(reach: Sequence[Row], rows: Sequence[Row]) -> list[str]:
-    """Say of a town that is too large for the patience of its drivers why they find no slot although many are free.
-
-    Args:
-        reach: `scenario`, `patience_s`, `v_drive_kmh`, and `Roads.reach`.
-        rows: of `summarize_days`.
-    """
-    said = []
-    for its in reach:
-        gone = [row for row in rows if row["scenario"] == its["scenario"] and row["occupancy"] < ROOM]
-        most = max(gone, key=lambda row: row["balked_fraction"], default=None)
-        if most is None or most["balked_fraction"] < NOTICED:
-            continue
-        if its["entries_cut_off"]:
-            said.append(
-                f"On {its['scenario']}, most spaces cannot be reached from {its['entries_cut_off']} of the "
-                f"{its['entries']} entries: look at the streets there (parkenv lot show --graph)."
-            )
-        if its["share_reached"] > 1.0 - NOTICED:
-            continue
-        minutes, most_minutes = its["patience_s"] / 60.0, math.ceil(its["most_reached_s"] / 60.0)
-        said.append(
-            f"On {its['scenario']} {most['balked_fraction']:.0%} of the cars find no slot while "
-            f"{most['occupancy']:.0%} of the spaces are taken: their patience of {minutes:.0f} min counts from where "
-            f"they enter the lot, and at {its['v_drive_kmh']:.0f} km/h {its['share_reached']:.0%} of the spaces are "
-            f"within it. 95% are within {most_minutes} min (--patience-min, or patience_s of a purpose)."
-        )
-    return said
+def unreached(reach: Sequence[Row]) -> list[str]:
+    """Say from how many entries of a lot most spaces cannot be reached: `scenario`, and `Roads.reach`."""
+    return [
+        f"On {its['scenario']}, most spaces cannot be reached from {its['entries_cut_off']} of the {its['entries']} "
+        "entries: look at the streets there (parkenv lot show --graph)."
+        for its in reach
+        if its["entries_cut_off"]
+    ]
 
 
 def departures(hours: Sequence[Row], rows: Sequence[Row]) -> list[str]:
