@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from made_maps import AISLE, SERVICE, SPACE, STREET, Map
 from scipy.sparse.csgraph import dijkstra
 
+from parkenv import make_scenario
 from parkenv.lots import import_town, read_lot, write_lot
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.osm.elements import read_map
@@ -107,7 +108,7 @@ def test_junctions_of_many_streets_are_split_and_lead_where_they_led(directions,
         for way, end in zip(directions, ends, strict=True)
     ]
     split = limit_junctions(lanes)
-    graph = build_drive_graph([(lane.points, lane.oneway) for lane in split], np.empty((0, 2)), ends)
+    graph = build_drive_graph([(lane.points, lane.oneway, 1.0) for lane in split], np.empty((0, 2)), ends)
     matrix = np.zeros((len(graph.vertex_xy),) * 2)
     source, column = np.nonzero(graph.neighbors >= 0)
     matrix[source, graph.neighbors[source, column]] = 1.0
@@ -119,6 +120,33 @@ def test_junctions_of_many_streets_are_split_and_lead_where_they_led(directions,
 def test_a_town_may_be_one_street(tmp_path):
     place = Map().way([(0, 0), (200, 0)], STREET).box(20, 8, 40, 18, {"building": "house"})
     assert draft(place, tmp_path).draft.lot().n_slots > 0
+
+
+def test_cars_drive_as_fast_as_the_street_allows(tmp_path):
+    """Streets have their limit over 30 km/h: as tagged, else by their class; and the file keeps it."""
+    place = grid()
+    for y, tags in (
+        (-40, {}),
+        (-60, {"maxspeed": "30"}),
+        (-80, {"maxspeed": "25 mph"}),
+        (-90, {"maxspeed": "walk"}),
+    ):
+        place.way([(0, -100 if y == -90 else y - 10), (150, y - 10)], {"highway": "primary"}, **tags)
+        place.way([(0, 0), (0, y - 10)], STREET)
+    lot = draft(place, tmp_path).draft.lot()
+    speeds = {round(lane.speed, 2) for lane in lot.lanes}
+    assert speeds == {round(50 / 30, 2), 1.0, round(25 * 1.609 / 30, 2), round(7 / 30, 2)}
+    write_lot(lot, tmp_path / "town.geojson")
+    assert [lane.speed for lane in read_lot(tmp_path / "town.geojson").lanes] == [
+        lane.speed for lane in lot.lanes
+    ]
+    moves, scenario = lot.neighbors >= 0, make_scenario(lot, v_drive=5.0)
+    np.testing.assert_allclose(
+        scenario.move_s[moves] * lot.edge_speed[moves] * 5.0, lot.edge_length[moves], rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        lot.drive_matrix(timed=True).sum() / 5.0, scenario.move_s[moves].sum(), rtol=0.02
+    )
 
 
 # ---- kerbs ----

@@ -26,7 +26,7 @@ TWO_WAY, ONE_WAY = False, True
 
 def graph_of(lanes, mouths=(), entries=((0.0, 0.0),)) -> DriveGraph:
     return build_drive_graph(
-        [(np.array(points, dtype=float), oneway) for points, oneway in lanes],
+        [(np.array(points, dtype=float), oneway, *(speed or (1.0,))) for points, oneway, *speed in lanes],
         np.array(mouths, dtype=float).reshape(-1, 2),
         np.array(entries, dtype=float).reshape(-1, 2),
     )
@@ -50,6 +50,16 @@ def test_two_way_lane_keeps_to_the_right_and_turns_at_its_ends():
     # Along each side and round the ends; and across, between the two slots that face each other.
     assert moves(graph) == {(west, 0), (0, 1), (1, east), (east, 2), (2, west), (1, 2), (2, 1)}
     np.testing.assert_allclose(np.cos(graph.vertex_yaw[:3]), [1, 1, -1])
+
+
+def test_edges_have_the_speed_of_their_lane_also_behind_an_entry():
+    lanes = [([(0, 0), (30, 0)], TWO_WAY, 2.0), ([(30, 0), (60, 0)], TWO_WAY)]
+    graph = graph_of(lanes, [(10, -3), (10, 3), (50, -3)], entries=((20.0, 0.0),))
+    for vertex, row in enumerate(graph.neighbors.tolist()):
+        for column, target in enumerate(row):
+            ends = graph.vertex_xy[[vertex, target], 0]
+            fast = target >= 0 and ends.mean() < 30.0
+            assert graph.edge_speed[vertex, column] == (2.0 if fast else 1.0)
 
 
 def test_one_way_lane_is_one_chain_that_serves_both_sides():

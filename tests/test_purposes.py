@@ -12,6 +12,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from parkenv.compiled.keyed_random import world_key
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.errors import InputError
+from parkenv.lots import write_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
@@ -234,7 +235,10 @@ def test_hardly_anybody_who_drives_as_usual_gives_up_before_the_town_is_full():
 
 
 def test_recorded_days_are_the_world_of_single_searches(tmp_path):
-    spec = ScenarioSpec.parse(TABLES, "town.toml")
+    mini = make_scenario("mini").lot
+    lot = dataclasses.replace(mini, slot_ids=tuple(f"{name}, left" for name in mini.slot_ids))
+    write_lot(lot, tmp_path / "mini.geojson")
+    spec = ScenarioSpec.parse(TABLES | {"lot": str(tmp_path / "mini.geojson")}, "town.toml")
     log = tmp_path / "days.csv.gz"
     record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=2, seed=0)
     content = log.read_bytes()

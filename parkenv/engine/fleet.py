@@ -417,7 +417,7 @@ class Fleet:
         lot = self.scenario.lot
         if not lot.is_town:
             return np.zeros((len(self.scenarios), len(self._entries)))
-        metres = dijkstra(lot.drive_matrix(), indices=self._entries)[:, : lot.n_slots]
+        metres = dijkstra(lot.drive_matrix(timed=True), indices=self._entries)[:, : lot.n_slots]
         walk_s = np.array([one.walk_s for one in self.scenarios])
         nearest = np.where(np.isfinite(metres), walk_s[:, None], np.inf).argmin(axis=2)
         way_s = metres[np.arange(len(metres)), nearest] / self.scenario.v_drive
@@ -859,5 +859,5 @@ def _counted(lot: ParkingLot) -> NDArray[Any]:
 
 def drive_times(problem: SearchProblem, vertex: int) -> NDArray[np.float64]:
     """Return the shortest drive time from a vertex to the stop position of each slot, (n_slots,) s; inf without one."""
-    metres = dijkstra(problem.lot.drive_matrix(), indices=np.array([vertex]))
+    metres = dijkstra(problem.lot.drive_matrix(timed=True), indices=np.array([vertex]))
     return np.asarray(metres[0, : problem.lot.n_slots] / problem.v_drive)

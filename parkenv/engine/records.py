@@ -606,7 +606,7 @@ class ScenarioRecords:
         """Keep how long cars drive from each vertex to facilities with a live count; once for all goals of a lot."""
         key = id(scenario.lot), scenario.v_drive
         if key not in self._drives:
-            metres = dijkstra(scenario.lot.drive_matrix().T.tocsr(), indices=live)
+            metres = dijkstra(scenario.lot.drive_matrix(timed=True).T.tocsr(), indices=live)
             self._drives[key] = self._keep(metres / scenario.v_drive)
         return self._drives[key]
 

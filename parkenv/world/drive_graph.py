@@ -61,6 +61,7 @@ class DriveGraph:
     # (n_vertices, 4) int32, columns up, down, left, right; -1 where there is no edge
     neighbors: NDArray[np.int32]
     edge_length: FloatArray  # (n_vertices, 4) float64, m; 0 where there is no edge
+    edge_speed: FloatArray  # (n_vertices, 4) float64, speed of its lane; 1 where there is no edge
     entry_vertices: IntArray  # (n_entries,) int64, the vertex of each entry
 
 
@@ -79,6 +80,7 @@ class _Centrelines:
     segment_nodes: IntArray  # (n_segments, 2) node at the start and at the end
     segment_stations: FloatArray  # (n_segments, 2)
     segment_oneway: NDArray[np.bool_]  # (n_segments,)
+    segment_speed: FloatArray  # (n_segments,)
     node_xy: FloatArray  # (n_nodes, 2)
 
     def legs_at(self, station: FloatArray) -> IntArray:
@@ -91,14 +93,16 @@ class _Centrelines:
         return self.xy[start] + (station - self.station[start])[:, None] * self.leg_tangent[leg]
 
 
-def build_drive_graph(
-    lanes: Sequence[tuple[FloatArray, bool]], mouth_xy: FloatArray, entry_xy: FloatArray
-) -> DriveGraph:
+LaneParts = tuple[FloatArray, bool, float]
+"""The points of a lane, whether it is one-way, and its speed."""
+
+
+def build_drive_graph(lanes: Sequence[LaneParts], mouth_xy: FloatArray, entry_xy: FloatArray) -> DriveGraph:
     """Build the drive graph: assign slots and entries to lanes, and connect vertices by moves.
 
     Args:
-        lanes: pairs of a centre line, (k, 2) m, and whether it is one-way in the order of its points. Lanes are
-            connected where they share a point.
+        lanes: of each its centre line, (k, 2) m, whether it is one-way in the order of its points, and its speed.
+            Lanes are connected where they share a point.
         mouth_xy: (n_slots, 2) m, middle of the side by which each slot is entered.
         entry_xy: (n_entries, 2) m.
 
@@ -126,9 +130,16 @@ def build_drive_graph(
 
     edges = _chain_edges(lines, station, tangent, chain, order, n_slots)
     edges += _crossing_edges(lines, station, tangent, segment, against)
-    source, target, length, bearing = (np.concatenate(part) for part in zip(*edges, strict=True))
-    neighbors, edge_length = _four_columns(
-        n_slots + len(lines.node_xy), n_slots, lines.node_xy, source, target, length, bearing
+    source, target, length, bearing, of = (np.concatenate(part) for part in zip(*edges, strict=True))
+    neighbors, edge_length, edge_speed = _four_columns(
+        n_slots + len(lines.node_xy),
+        n_slots,
+        lines.node_xy,
+        source,
+        target,
+        length,
+        bearing,
+        lines.segment_speed[of],
     )
     vertex_yaw = np.zeros(n_slots + len(lines.node_xy))
     vertex_yaw[:n_slots] = np.arctan2(tangent[:, 1], tangent[:, 0])
@@ -137,18 +148,19 @@ def build_drive_graph(
         vertex_yaw=vertex_yaw,
         neighbors=neighbors,
         edge_length=edge_length,
+        edge_speed=edge_speed,
         entry_vertices=n_slots + np.asarray(cKDTree(lines.node_xy).query(entry_point)[1], dtype=np.int64),
     )
 
 
 def _with_entry_points(
-    lanes: Sequence[tuple[FloatArray, bool]], entry_xy: FloatArray
-) -> tuple[list[tuple[FloatArray, bool]], FloatArray]:
+    lanes: Sequence[LaneParts], entry_xy: FloatArray
+) -> tuple[list[LaneParts], FloatArray]:
     """Insert a node into the lane nearest to each entry; return the lanes and the nodes, (n_entries, 2) m."""
     parts = [[lane] for lane in lanes]
     points = np.empty((len(entry_xy), 2))
     problems = []
-    tree = shapely.STRtree(linestrings([centre for centre, _ in lanes]))
+    tree = shapely.STRtree(linestrings([centre for centre, _, _ in lanes]))
     of, near = tree.query_nearest(shapely.points(entry_xy))
     for i, xy in enumerate(entry_xy):
         point = shapely.Point(xy)
@@ -164,7 +176,7 @@ def _with_entry_points(
             problems.append(GraphProblem("entry", i, reason, (float(xy[0]), float(xy[1]))))
             continue
         k, j = at[nearest_line]
-        line, (centre, oneway) = lines[nearest_line], parts[k][j]
+        line, (centre, oneway, speed) = lines[nearest_line], parts[k][j]
         along = shapely.line_locate_point(line, point)
         station = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(centre, axis=0).T))])
         nearest = int(np.argmin(np.abs(station - along)))
@@ -175,7 +187,8 @@ def _with_entry_points(
         points[i] = centre[nearest]
         if 0 < nearest < len(centre) - 1:
             # Splitting the lane at the entry makes it a node.
-            parts[k][j : j + 1] = [(centre[: nearest + 1], oneway), (centre[nearest:], oneway)]
+            halves = centre[: nearest + 1], centre[nearest:]
+            parts[k][j : j + 1] = [(half, oneway, speed) for half in halves]
     if problems:
         raise GraphError(problems)
     return [part for lane in parts for part in lane], points
@@ -199,10 +212,10 @@ def component_labels(links: IntArray, n: int) -> IntArray:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
-    xy = np.concatenate([centre for centre, _ in lanes])
-    count = np.array([len(centre) for centre, _ in lanes])
-    oneway = np.array([oneway for _, oneway in lanes])
+def _centrelines(lanes: Sequence[LaneParts]) -> _Centrelines:
+    xy = np.concatenate([centre for centre, _, _ in lanes])
+    count = np.array([len(centre) for centre, _, _ in lanes])
+    oneway, speed = (np.array([lane[k] for lane in lanes]) for k in (1, 2))
     lane = np.repeat(np.arange(len(lanes)), count)
     last = np.cumsum(count) - 1
     is_end = np.zeros(len(xy), dtype=bool)
@@ -241,6 +254,7 @@ def _centrelines(lanes: Sequence[tuple[FloatArray, bool]]) -> _Centrelines:
         segment_nodes=np.stack([node_of_point[first], node_of_point[end]], axis=1),
         segment_stations=np.stack([station[first], station[end]], axis=1),
         segment_oneway=oneway[lane[first]],
+        segment_speed=speed[lane[first]],
         node_xy=node_xy,
     )
 
@@ -302,7 +316,7 @@ def _spread(
     return spread
 
 
-Edges = tuple[IntArray, IntArray, FloatArray, FloatArray]
+Edges = tuple[IntArray, IntArray, FloatArray, FloatArray, IntArray]
 
 
 def _chain_edges(
@@ -313,7 +327,7 @@ def _chain_edges(
     order: IntArray,
     n_slots: int,
 ) -> list[Edges]:
-    """Edges along every chain, from node to slots to node: sources, targets, lengths, m, and bearings, rad."""
+    """Edges along every chain, node to slots to node: sources, targets, lengths, m, bearings, rad, and segments."""
     n_segments = len(lines.segment_oneway)
     drivable = np.ones(2 * n_segments, dtype=bool)
     drivable[1::2] = ~lines.segment_oneway
@@ -345,6 +359,7 @@ def _chain_edges(
             stop_vertex[there],
             np.abs(stop_station[there] - stop_station[here]),
             np.arctan2(direction[:, 1], direction[:, 0]),
+            stop_chain[here] // 2,
         )
     ]
 
@@ -375,7 +390,7 @@ def _crossing_edges(
         here, mate, along = here[linked], mate[linked], along[linked]
         # A crossing leads to the left of the direction of travel.
         bearing = np.arctan2(tangent[here, 0], -tangent[here, 1])
-        edges.append((here, mate, np.hypot(2 * LANE_OFFSET, along), bearing))
+        edges.append((here, mate, np.hypot(2 * LANE_OFFSET, along), bearing, segment[here]))
     return edges
 
 
@@ -391,7 +406,8 @@ def _four_columns(
     target: IntArray,
     length: FloatArray,
     bearing: FloatArray,
-) -> tuple[NDArray[np.int32], FloatArray]:
+    speed: FloatArray,
+) -> tuple[NDArray[np.int32], FloatArray, FloatArray]:
     """Assign the edges of every vertex to the columns up, down, left, right with the least total bearing error.
 
     The assignment problem has at most 4! solutions, so all are tried, for many vertices at once.
@@ -425,7 +441,7 @@ def _four_columns(
             total += misfit[i : i + _CHUNK, edge][:, choices[:, edge]]
         column[i : i + _CHUNK] = choices[np.argmin(total, axis=1)]
     neighbors = np.full((n_vertices, 4), -1, dtype=np.int32)
-    edge_length = np.zeros((n_vertices, 4))
-    neighbors[source, column[source, rank]] = target
-    edge_length[source, column[source, rank]] = length
-    return neighbors, edge_length
+    edge_length, edge_speed = np.zeros((n_vertices, 4)), np.ones((n_vertices, 4))
+    at = source, column[source, rank]
+    neighbors[at], edge_length[at], edge_speed[at] = target, length, speed[order]
+    return neighbors, edge_length, edge_speed

@@ -44,15 +44,19 @@ class Lane:
     Args:
         points: (k, 2) float64, m, lot frame, k ≥ 2. Lanes are connected where they share a point.
         oneway: whether cars may drive only in the order of the points; otherwise they keep to the right.
+        speed: how fast cars drive there, as a multiple of the scenario's driving speed.
 
     Raises:
-        InputError: a wrong shape, a value that is not finite, or two equal consecutive points.
+        InputError: a wrong shape, a value that is not finite, or two equal consecutive points; a speed that is not
+            from 0.05 to 20.
     """
 
     points: FloatArray
     oneway: bool = False
+    speed: float = 1.0
 
     def __post_init__(self) -> None:
+        require_number("lane: speed", self.speed, least=0.05, most=20.0)
         points = _frozen(self.points, "points")
         if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2:
             raise InputError(f"lane points: shape {points.shape}, want (at least 2, 2)")
@@ -66,7 +70,9 @@ class Lane:
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Lane):
             return NotImplemented
-        return self.oneway == other.oneway and np.array_equal(self.points, other.points)
+        return (self.oneway, self.speed) == (other.oneway, other.speed) and np.array_equal(
+            self.points, other.points
+        )
 
     __hash__ = None  # type: ignore[assignment]
 
@@ -109,6 +115,7 @@ class ParkingLot:
         vertex_yaw: (n_vertices,) float64, rad, the direction of travel at a slot's vertex.
         neighbors: (n_vertices, 4) int32, the vertex reached by up, down, left, right; -1 where there is none.
         edge_length: (n_vertices, 4) float64, m; 0 where there is no edge.
+        edge_speed: (n_vertices, 4) float64, `speed` of the edge's lane; 1 where there is no edge.
         entry_vertices: (n_entries,) int64, the vertex of each entry.
         zones: names of the zones, sorted; `NO_ZONE` stands for slots without one.
         zone_of_slot: (n_slots,) int64, index into `zones`.
@@ -154,6 +161,7 @@ class ParkingLot:
     vertex_yaw: FloatArray = field(init=False)
     neighbors: NDArray[np.int32] = field(init=False)
     edge_length: FloatArray = field(init=False)
+    edge_speed: FloatArray = field(init=False)
     entry_vertices: NDArray[np.int64] = field(init=False)
     zones: tuple[str, ...] = field(init=False)
     zone_of_slot: NDArray[np.int64] = field(init=False)
@@ -207,9 +215,9 @@ class ParkingLot:
                 raise InputError(f"lot {self.name!r} has no {kind}")
 
         graph = build_drive_graph(
-            [(lane.points, lane.oneway) for lane in self.lanes], self.mouth_xy(), self.entries
+            [(lane.points, lane.oneway, lane.speed) for lane in self.lanes], self.mouth_xy(), self.entries
         )
-        for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "entry_vertices"):
+        for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "edge_speed", "entry_vertices"):
             values = getattr(graph, name)
             values.flags.writeable = False
             set_field(name, values)
@@ -421,15 +429,19 @@ class ParkingLot:
         low, high = points.min(axis=0), points.max(axis=0)
         return float(low[0]), float(low[1]), float(high[0]), float(high[1])
 
-    def drive_matrix(self) -> csr_array[np.float64]:
-        """The drive graph as a sparse matrix of edge lengths, (n_vertices, n_vertices) float64, m, for scipy."""
+    def drive_matrix(self, timed: bool = False) -> csr_array[np.float64]:
+        """The drive graph as a sparse matrix of edge lengths, (n_vertices, n_vertices) float64, m, for scipy.
+
+        Args:
+            timed: whether lengths are divided by the lanes' `speed`: over the scenario's speed, they are seconds.
+        """
         from scipy.sparse import csr_array
 
         source, column = np.nonzero(self.neighbors >= 0)
         target = self.neighbors[source, column]
         shape = (self.n_vertices, self.n_vertices)
         # The matrix would sum parallel edges: keep the shortest.
-        length = self.edge_length[source, column]
+        length = (self.edge_length / self.edge_speed if timed else self.edge_length)[source, column]
         order = np.lexsort((length, target, source))
         source, target, length = source[order], target[order], length[order]
         first = np.r_[True, (np.diff(source) != 0) | (np.diff(target) != 0)]

@@ -209,7 +209,7 @@ class SearchProblem:
     @cached_property
     def move_s(self) -> FloatArray:
         """Drive time of each edge, (n_vertices, 4) s; 0 where there is none (eq. 3.22)."""
-        return _read_only(self.lot.edge_length / self.v_drive)
+        return _read_only(self.lot.edge_length / self.lot.edge_speed / self.v_drive)
 
     @property
     def move_cost_s(self) -> FloatArray:

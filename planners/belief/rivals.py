@@ -71,7 +71,7 @@ class BeliefRivalsAgent(BeliefAgent):
             raise InputError(f"arrivals_per_hour is {arrivals_per_hour}, want a finite number of at least 0")
         self.arrivals_per_hour = arrivals_per_hour
         lot = self.problem.lot
-        drive_m = dijkstra(lot.drive_matrix(), indices=np.unique(lot.entry_vertices), min_only=True)
+        drive_m = dijkstra(lot.drive_matrix(timed=True), indices=np.unique(lot.entry_vertices), min_only=True)
         rival_s = drive_m[: lot.n_slots] / self.problem.v_drive + self.problem.finite_cost_s
         self._order = np.argsort(rival_s, kind="stable")
 

@@ -106,7 +106,7 @@ class LotContents:
 
 def graph_errors(contents: LotContents) -> list[LotProblem]:
     """Return errors of the drive graph: slots, entries and facilities without a lane, junctions with too many lanes."""
-    lanes = [(lane.points, lane.oneway) for lane in contents.lanes]
+    lanes = [(lane.points, lane.oneway, lane.speed) for lane in contents.lanes]
     if not lanes:
         return []
     mouth_xy = contents.slots.mouths()
@@ -122,7 +122,7 @@ def graph_errors(contents: LotContents) -> list[LotProblem]:
             for problem in error.problems:
                 if kind == "junction":
                     distance = shapely.distance(
-                        linestrings([points for points, _ in lanes]), shapely.Point(problem.xy)
+                        linestrings([points for points, _, _ in lanes]), shapely.Point(problem.xy)
                     )
                     feature = contents.numbers["lane"][int(np.argmin(distance))]
                     message = f"lane: the junction {problem.message}"

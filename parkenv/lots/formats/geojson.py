@@ -10,7 +10,7 @@ to metres east and north of the centre of the features; metres without either ar
 |---|---|---|
 | `slot` | Polygon | `id`; `parking_cost_s`, 0 if absent; `zone` and `facility`, none if absent; all or none of \
 `center`, `yaw`, `length`, `width`, `mouth` (rear, left, right) |
-| `lane` | LineString | `oneway`, false if absent |
+| `lane` | LineString | `oneway`, false if absent; `speed`, multiple of the driving speed, 1 if absent |
 | `entry`, `goal` | Point | `weights`, numbers by purpose, none if absent |
 | `wall` | LineString or Polygon | |
 | `facility` | Point | `name`, `type` (kerb, lot, garage), `zone`; a counted one `capacity`, `gate_s`, `inside_s`, \
@@ -129,7 +129,8 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
         given = {name: value for name, value in given.items() if value}
         yield feature("Polygon", [ring], kind="slot", id=slot_id, **given, **exact)
     for lane in lot.lanes:
-        yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway)
+        given = {} if lane.speed == 1.0 else {"speed": lane.speed}
+        yield feature("LineString", lane.points.tolist(), kind="lane", oneway=lane.oneway, **given)
     for kind, points, weights in (
         ("entry", lot.entries, lot.entry_weights),
         ("goal", lot.goals, lot.goal_weights),
@@ -211,7 +212,12 @@ def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatAr
     """Add a lane, an entry, a goal, or a wall with one part per ring."""
     if feature.kind == "lane":
         try:
-            contents.lanes.append(Lane(parts[0], feature.properties.get("oneway", False)))
+            given = {
+                name: value
+                for name in ("oneway", "speed")
+                if (value := feature.properties.get(name)) is not None
+            }
+            contents.lanes.append(Lane(parts[0], **given))
         except InputError as error:
             contents.error(feature.number, str(error))
             return

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import networkx as nx
 import numpy as np
@@ -206,7 +206,7 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
                 moved.update(_move_lane_end(lines, oneway, users))
         if not moved:
             break
-    return [Lane(points, one) for points, one in zip(lines, oneway, strict=True)]
+    return [replace(lane, points=points) for lane, points in zip(lanes, lines, strict=True)]
 
 
 def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[int, int]]) -> int:

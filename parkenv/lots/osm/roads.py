@@ -25,6 +25,13 @@ STREET_WIDTH = {
     "service": 5.0,
 }
 """Carriageway width, m, without parked cars, of two-way roads without the tags `width` and `lanes`."""
+LIMITS = {
+    **dict.fromkeys(("primary", "secondary", "tertiary", "unclassified", "road"), 50.0),
+    **{"motorway": 100.0, "trunk": 70.0, "residential": 30.0, "living_street": 10.0, "service": 15.0},
+}
+"""Speed limit, km/h, of roads without the tag `maxspeed`, by class."""
+_AISLE_LIMIT = 10.0  # km/h, of a `service=parking_aisle`
+_NAMED_LIMITS = {"walk": 7.0, "none": 100.0, "urban": 50.0, "rural": 70.0, "living_street": 7.0}
 AISLE_WIDTH = 6.0  # the same for a `service=parking_aisle`
 LANE_WIDTH = 3.0  # width of each of the tagged `lanes`, m
 NOT_FOR_PARKING = ("drive-through", "emergency_access", "bus")
@@ -65,6 +72,23 @@ class Road:
         if self.oneway:
             return ONE_WAY_HALF_WIDTH
         return STREET_WIDTH[self.tags["highway"].removesuffix("_link")] / 2
+
+    @property
+    def tagged_limit(self) -> float | None:
+        """The speed limit that the tags say, km/h; None without one that can be read."""
+        text = self.tags.get("maxspeed", "").strip()
+        match = re.fullmatch(r"(\d{1,3})(?: ?(mph|km/h|kmh))?", text)
+        if match is None:
+            return _NAMED_LIMITS.get(text.rpartition(":")[2])
+        return float(match[1]) * (1.609 if match[2] == "mph" else 1.0) or None
+
+    @property
+    def limit(self) -> float:
+        """The speed limit, km/h: as tagged, else that of the class."""
+        usual = (
+            _AISLE_LIMIT if self.rank is Rank.AISLE else LIMITS[self.tags["highway"].removesuffix("_link")]
+        )
+        return self.tagged_limit or usual
 
     @property
     def has_kerb_parking(self) -> bool:

@@ -4,8 +4,8 @@ Streets are cut at their junctions into pieces. Those from which cars can drive 
 fence or a missing junction parts from them is left out. Beyond the edge of the map streets go on: where a one-way
 street leaves it or enters it, and where the edge parts streets from the others, a way to the nearest street that
 crosses the edge within 600 m is assumed. Service roads that lead to no parking are dropped. Turn restrictions are not
-applied: a junction is one vertex of the drive graph, whichever arm a car comes from. Speeds are not read: all drive at
-the scenario's speed.
+applied: a junction is one vertex of the drive graph, whichever arm a car comes from. The speed of a lane is its limit
+over 30 km/h: where 30 is allowed, cars drive at the scenario's speed.
 """
 
 from __future__ import annotations
@@ -42,6 +42,8 @@ ENTRY_WEIGHT = {
 """How much traffic a street brings into town, by its class; others 0.25. Assumed: each class has twice the next."""
 THROUGH = ("motorway", "trunk", "primary", "secondary", "tertiary")
 """Classes of streets that do not end in a town: where they end, the map does."""
+BASE_LIMIT, SPEEDS = 30.0, (0.2, 4.0)
+"""Limit, km/h, where cars drive at the scenario's speed; least and most speeds of lanes, multiples of it."""
 AT_EDGE = 50.0  # distance, m, from the hull of all streets within which streets that end leave the map
 BEYOND = "beyond"  # ids of the ways beyond the edge begin with it
 LONGEST_BEYOND = 600.0  # m, longest way beyond the edge of the map that is assumed
@@ -256,9 +258,17 @@ class Streets:
         back = ~self.oneway[kept]
         ways_out = np.bincount(np.r_[a, b[back]], minlength=len(self.node_xy))
         crowded = set(np.flatnonzero(ways_out > len(MOVES)).tolist())
-        return limit_junctions(
-            [Lane(points, self.roads[k].oneway) for k, points in self._runs(kept, crowded)]
-        )
+        return limit_junctions([self._lane(self.roads[k], points) for k, points in self._runs(kept, crowded)])
+
+    @staticmethod
+    def _lane(road: Road, points: FloatArray) -> Lane:
+        return Lane(points, road.oneway, round(float(np.clip(road.limit / BASE_LIMIT, *SPEEDS)), 3))
+
+    def tagged_limits(self) -> float:
+        """Return the share of the streets whose speed limit is tagged, by length, 0 to 1."""
+        known = np.array([road.tagged_limit is not None for road in self.roads])[self.road]
+        is_street = np.array([road.rank is Rank.STREET for road in self.roads])[self.road] & ~self._is_beyond
+        return float(self.length[known & is_street].sum() / max(self.length[is_street].sum(), 1e-9))
 
     def _runs(self, kept: BoolArray, cuts: set[int]) -> list[tuple[int, FloatArray]]:
         """Join consecutive pieces of one road: its index and its points, cut at some junctions."""

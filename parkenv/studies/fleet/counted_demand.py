@@ -204,7 +204,8 @@ class _Town:
         numbers = np.arange(len(self.names))
         near = (walk_m.argmin(axis=1) == numbers[:, None]) @ weight
         arrival_s = np.array([scenario.at_goal(k).arrival_cost_s[self.slots] for k in range(len(lot.goals))])
-        drive_s = dijkstra(lot.drive_matrix(), indices=lot.entry_vertices)[:, self.slots] / scenario.v_drive
+        timed = dijkstra(lot.drive_matrix(timed=True), indices=lot.entry_vertices)[:, self.slots]
+        drive_s = timed / scenario.v_drive
         best = (drive_s[:, None] + arrival_s).argmin(axis=2)  # of each entry and goal
         traffic = np.array(weights_of_all(lot.entry_weights) or np.ones(len(lot.entries)))
         share = np.array([traffic @ (best == number) for number in numbers]) / traffic.sum()

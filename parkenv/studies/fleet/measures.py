@@ -31,16 +31,18 @@ class Roads:
         problem: lot, goal, speeds and costs.
 
     Attributes:
-        first_slot_m: mean drive from an entry to the slot that is nearest to it, m.
+        first_slot_m: mean drive from an entry to the slot that is nearest to it, m at the scenario's speed.
     """
 
     def __init__(self, problem: SearchProblem) -> None:
         lot = problem.lot
         entries = np.unique(lot.entry_vertices)
-        metres = dijkstra(lot.drive_matrix(), indices=entries)[:, : lot.n_slots]
-        self._entries, self._metres, self._drive_s = entries, metres, metres / problem.v_drive
+        metres, timed = (
+            dijkstra(lot.drive_matrix(timed), indices=entries)[:, : lot.n_slots] for timed in (False, True)
+        )
+        self._entries, self._metres, self._drive_s = entries, metres, timed / problem.v_drive
         self._problem, self._cost_s = problem, problem.walk_s + lot.slot_parking_cost_s
-        self.first_slot_m = float(metres.min(axis=1).mean())
+        self.first_slot_m = float(timed.min(axis=1).mean())
 
     def direct_m(self, cars: NDArray[np.void]) -> FloatArray:
         """Return the shortest drive of cars from their entries to their slots, (n,) m; 0 without a slot."""

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import csv
 import gzip
 from collections.abc import Iterator
 from datetime import date, datetime, time, timedelta
+from io import StringIO
 from pathlib import Path
 
 import numpy as np
@@ -65,7 +67,9 @@ def record_days(
             fleet.run()
             lines += _lines(fleet, FIRST_MONDAY + timedelta(weeks=day, days=fleet.day.weekday))
             progress("Days", number * days + day + 1, rounds * days)
-        content = "\n".join(["datetime,slot_id,occupied", *lines, ""]).encode()
+        text = StringIO()
+        csv.writer(text, lineterminator="\n").writerows([("datetime", "slot_id", "occupied"), *lines])
+        content = text.getvalue().encode()
         with atomic_write(path) as beside:
             # Without the time of writing, so that equal days make equal files.
             beside.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
@@ -73,11 +77,11 @@ def record_days(
     return len(lines)
 
 
-def _lines(fleet: Fleet, day: date) -> list[str]:
-    """Return the observations of a day whose searches are over, as lines of a log."""
+def _lines(fleet: Fleet, day: date) -> list[tuple[str, str, int]]:
+    """Return the observations of a day whose searches are over, as rows of a log."""
     ids, midnight = fleet.scenario.lot.slot_ids, datetime.combine(day, time())
     return [
-        f"{(midnight + timedelta(seconds=second)).isoformat()},{ids[slot]},{int(taken)}"
+        ((midnight + timedelta(seconds=second)).isoformat(), ids[slot], int(taken))
         for slot, second, taken in observations(fleet)
     ]
 
