@@ -10,6 +10,7 @@ from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_maps import AISLE, SERVICE, SPACE, STREET, Map
+from parking_rules import fit_kerbs, kerb_table
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv import make_scenario
@@ -434,8 +435,6 @@ def test_real_extracts_become_towns(path):
 @pytest.mark.slow
 @pytest.mark.skipif(not (TOWNS / "neukoelln_kerb").exists(), reason="the kerbs of Neukölln are not here")
 def test_the_rule_of_kerbs_holds_where_all_are_known():
-    from parkenv.lots.builders.parking_rules import fit_kerbs, kerb_table
-
     roads, free, places = kerb_table(TOWNS / "neukoelln_kerb")
     assert places.sum() == pytest.approx(43_863, rel=0.01)
     kind = [road.tags["highway"] for road in roads]

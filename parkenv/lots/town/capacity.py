@@ -30,7 +30,7 @@ RULES = {
     "multi-storey": AreaRule(0.0377, 1.0, 4.7, 350),
     "rooftop": AreaRule(0.0342, 1.0, 1.0, 45),
 }
-"""Rule of each kind; fitted by `python -m parkenv.lots.builders.parking_rules`, which states the errors."""
+"""Rule of each kind; fitted by `python tests/parking_rules.py`, which states the errors."""
 KINDS = {
     **dict.fromkeys(("garage", "garages", "garage_boxes", "carport", "carports", "sheds"), "boxes"),
     **{"underground": "underground", "multi-storey": "multi-storey", "rooftop": "rooftop"},

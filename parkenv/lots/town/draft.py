@@ -16,7 +16,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -40,7 +40,7 @@ from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
 from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of
-from parkenv.lots.town.kerbs import STRIPS, KerbSide, kerb_sides, strip_side
+from parkenv.lots.town.kerbs import STRIPS, FacilityRow, kerb_sides, strip_side
 from parkenv.lots.town.listed import ListedCarPark, matched, read_listed
 from parkenv.lots.town.streets import read_streets
 from parkenv.lots.town.zones import PRICE, Rules, rules_of, zones_of
@@ -111,25 +111,6 @@ def import_town(
         return town.draft()
 
 
-@dataclass(eq=False)
-class _Row:
-    """A facility: its line in the table, its rules, and what makes it."""
-
-    name: str
-    kind: str
-    rules: Rules
-    capacity_from: str
-    rule: str
-    element: str
-    tagged: int | None = None
-    slots: Slots = NO_SLOTS  # drawn ones
-    slot_rules: list[Rules] = field(default_factory=list)
-    counted: list[tuple[str, int, Rules]] = field(
-        default_factory=list
-    )  # name, places and rules of counted parts
-    xy: tuple[float, float] | None = None
-
-
 class _Town:
     """The state of an import."""
 
@@ -152,7 +133,7 @@ class _Town:
         for e in elements:
             if is_parking_area(e) and not e.is_node and not e.is_closed:
                 self.left_out["parking without an outline"].append(e.id)
-        self.rows: list[_Row] = []
+        self.rows: list[FacilityRow] = []
         self.names: set[str] = set()
         self.used: set[int] = set()  # parking areas whose places are slots
         self.beside: FloatArray | None = None  # what is near these attracts, if not everything does
@@ -221,13 +202,10 @@ class _Town:
             self.left_out[NO_AISLE].append(parts[i][1])
         self.used = {k for k in groups if k < len(self.parking)}
         for k, (drawn, rules) in sorted(groups.items()):
-            inside = (
-                self.parking[k].element
-                if k in self.used
-                else parts[int(np.flatnonzero(owner == k)[0])][0].element
-            )
+            around = self.parking[k] if k in self.used else parts[int(np.flatnonzero(owner == k)[0])][0]
+            inside = around.element
             whole = rules_of(inside.tags) if k in self.used else Rules()
-            row = _Row(self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id)
+            row = FacilityRow(self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id)
             row.slots = Slots.joined(drawn)
             # A space without rules of its own has those of its car park.
             row.slot_rules = [own if own != Rules() else whole for own in rules]
@@ -251,39 +229,27 @@ class _Town:
 
     def read_kerbs(self) -> None:
         """Read the kerbs: those drawn as areas, those tagged on streets, and those by rule."""
-        sides: list[tuple[KerbSide, str]] = []
+        sides: list[FacilityRow] = []
         for k, area in enumerate(self.parking):
             if area.element.tags.get("parking") in STRIPS and k not in self.used:
                 side = strip_side(area, self.roads, self.tree)
                 if side is not None:
                     self.used.add(k)
-                    sides.append((side, area.element.tags.get("name", "")))
-        crossings = [
-            e.lines[0] for e in self.place.elements if e.is_node and e.tags.get("highway") == "crossing"
-        ]
-        at = self.frame.to_xy(np.concatenate([np.empty((0, 2)), *crossings]))
-        sides += [(side, "") for side in kerb_sides(self.roads, at, self.buildings, self.left_out)]
-        corridors = shapely.buffer(
-            self.lines, [CORRIDOR * road.half_width for road in self.roads], cap_style="flat"
-        )
+                    sides.append(side)
+        crossings = [e for e in self.place.elements if e.is_node and e.tags.get("highway") == "crossing"]
+        at = self.frame.to_xy(np.concatenate([np.empty((0, 2)), *(e.lines[0] for e in crossings)]))
+        sides += kerb_sides(self.roads, at, self.buildings, self.left_out)
+        half_widths = [CORRIDOR * road.half_width for road in self.roads]
+        corridors = shapely.buffer(self.lines, half_widths, cap_style="flat")
         # Several runs of one way are one kerb.
-        whole: dict[str, _Row] = {}
-        for side, given in sides:
-            row = whole.get(side.id)
-            if row is None:
-                title = given or (
-                    f"{side.street} ({side.id})" if side.street and is_plain(side.street) else side.id
-                )
-                row = whole[side.id] = _Row(
-                    self._named({"name": title}, side.id),
-                    "kerb",
-                    side.rules,
-                    side.capacity_from,
-                    side.rule,
-                    side.id,
-                    side.tagged,
-                )
-            row.slots = Slots.joined([row.slots, side.slots])
+        whole: dict[str, FacilityRow] = {}
+        for side in sides:
+            row = whole.setdefault(side.element, side)
+            if row is side:
+                named = f"{side.name} ({side.element})" if is_plain(side.name) and side.name else ""
+                row.name = self._named({"name": named}, side.element)
+            else:
+                row.slots = Slots.joined([row.slots, side.slots])
         rows = list(whole.values())
         slots = Slots.joined([row.slots for row in rows] or [NO_SLOTS])
         of = np.repeat(np.arange(len(rows)), [len(row.slots) for row in rows])
@@ -334,16 +300,9 @@ class _Town:
                 continue
             said = whole_number(tags.get("capacity"))
             capacity = said or expected_capacity(rule, area, levels_of(tags))
-            row = _Row(
-                self._named(tags, element.id),
-                kind,
-                rules,
-                "tag" if said else "rule",
-                "" if said else rule,
-                element.id,
-                said,
-            )
-            row.xy = xy
+            source, which = ("tag", "") if said else ("rule", rule)
+            name = self._named(tags, element.id)
+            row = FacilityRow(name, kind, rules, source, which, element.id, said, xy=xy)
             rest = capacity
             for users in RESERVED_PLACES:
                 n = whole_number(tags.get(f"capacity:{users}")) or 0
@@ -368,7 +327,7 @@ class _Town:
                         "car parks of the list that the map lacks, without a street or a capacity"
                     ].append(one.name)
                     continue
-                row = _Row(one.name, "garage", Rules(), "list", "", "", xy=xy_of)
+                row = FacilityRow(one.name, "garage", Rules(), "list", "", "", xy=xy_of)
                 self.rows.append(row)
             else:
                 row = of_map[k]
@@ -514,7 +473,7 @@ class _Town:
         yield f"frame: {self.frame}"
 
 
-def _facilities(row: _Row, filled: set[str]) -> Iterator[Facility]:
+def _facilities(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
     """Yield the facilities of a row of the table: one for drawn slots, one for each counted part."""
     if len(row.slots) and row.name in filled:
         yield Facility(row.name, row.kind, row.rules.zone(row.kind).name)
@@ -531,7 +490,7 @@ def _facilities(row: _Row, filled: set[str]) -> Iterator[Facility]:
         )
 
 
-def _table(rows: Sequence[_Row], draft: LotDraft) -> list[dict[str, Any]]:
+def _table(rows: Sequence[FacilityRow], draft: LotDraft) -> list[dict[str, Any]]:
     """Return the table of facilities, those of the draft."""
     names, count = np.unique(draft.slots.facility, return_counts=True)
     slots = dict(zip(names.tolist(), count.tolist(), strict=True))
@@ -540,20 +499,12 @@ def _table(rows: Sequence[_Row], draft: LotDraft) -> list[dict[str, Any]]:
     for row in rows:
         places = slots.get(row.name, 0) + sum(counted.get(name, 0) for name, _, _ in row.counted)
         if places:
-            zone = row.rules.zone(row.kind).name
-            drawn = slots.get(row.name, 0)
-            values = (
-                row.name,
-                row.kind,
-                places,
-                row.capacity_from,
-                row.rule,
-                zone,
-                drawn,
-                row.tagged,
-                row.element,
-            )
-            table.append(dict(zip(TABLE, values, strict=True)))
+            more = {
+                "capacity": places,
+                "zone": row.rules.zone(row.kind).name,
+                "slots": slots.get(row.name, 0),
+            }
+            table.append({name: more[name] if name in more else getattr(row, name) for name in TABLE})
     return table
 
 

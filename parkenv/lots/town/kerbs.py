@@ -11,13 +11,13 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import Slots
+from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.osm.buildings import Area
 from parkenv.lots.osm.kerbs import SHORTEST_KERB_SLOT, Junctions, Kerb, free_intervals, kerb_of, kerb_slots
 from parkenv.lots.osm.roads import Rank, Road, whole_number
@@ -35,7 +35,7 @@ PLACES_PER_METRE = {
 }
 """Places per metre of kerb, both sides, 5 m off the corners at junctions, by class of street.
 
-Fitted to the 43,863 places of Berlin-Neukölln by `python -m parkenv.lots.builders.parking_rules`, which says how well.
+Fitted to the 43,863 places of Berlin-Neukölln by `python tests/parking_rules.py`, which says how well.
 """
 METRES_PER_PLACE = {"parallel": 5.4, "diagonal": 3.1, "perpendicular": 2.6}
 """Kerb taken by a place, m, by orientation; from the same kerbs."""
@@ -46,17 +46,23 @@ STATION = 20.0  # m, between the points of a street at which buildings are looke
 STRIP_REACH = 20.0  # largest distance, m, of a drawn kerb from its street
 
 
-@dataclass(frozen=True, eq=False)
-class KerbSide:
-    """The places along one side of a way, or along a drawn kerb."""
+@dataclass(eq=False)
+class FacilityRow:
+    """A facility: its line in the table, its rules, and what makes it."""
 
-    id: str  # of the way or the area, with the side
-    street: str  # name of the street; empty if it has none
-    slots: Slots
+    name: str
+    kind: str
     rules: Rules
-    capacity_from: str  # `tag` or `rule`
+    capacity_from: str  # `tag`, `drawn`, `rule` or `list`
     rule: str  # which rule
+    element: str  # of the map; of a kerb with its side
     tagged: int | None = None  # number of places that the tags say
+    slots: Slots = NO_SLOTS  # drawn ones
+    slot_rules: list[Rules] = field(default_factory=list)
+    counted: list[tuple[str, int, Rules]] = field(
+        default_factory=list
+    )  # name, places, rules of counted parts
+    xy: tuple[float, float] | None = None
 
 
 def capacity_by_class(free_m: float, kind: str) -> float:
@@ -71,8 +77,8 @@ def capacity_by_class(free_m: float, kind: str) -> float:
 
 def kerb_sides(
     roads: Sequence[Road], crossings: FloatArray, buildings: Sequence[Area], left_out: Mapping[str, list[str]]
-) -> Iterator[KerbSide]:
-    """Yield the kerbs of roads that have places.
+) -> Iterator[FacilityRow]:
+    """Yield the kerbs of roads that have places, under the names of their streets; of a way there may be several.
 
     Args:
         roads: the roads of a town.
@@ -118,14 +124,12 @@ def kerb_sides(
                 kerb = Kerb("parallel", int(expected), False)
             slots = kerb_slots(road, side, kerb, closed)
             if len(slots):
-                rules = kerb_rules(road.tags, tagged)
-                yield KerbSide(
-                    f"{road.id} {tagged}", road.tags.get("name", ""), slots, rules, source, rule, said
-                )
+                rules, name = kerb_rules(road.tags, tagged), road.tags.get("name", "")
+                yield FacilityRow(name, "kerb", rules, source, rule, f"{road.id} {tagged}", said, slots)
 
 
-def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> KerbSide | None:
-    """Return the places of a kerb that is drawn as an area; None if it is not along a street.
+def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> FacilityRow | None:
+    """Return the kerb that is drawn as an area, under its name; None if it is not along a street.
 
     Args:
         area: the drawn kerb.
@@ -157,7 +161,8 @@ def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> Kerb
     if not len(slots):
         return None
     source, rule = ("tag", "") if said is not None else ("rule", "length of kerb")
-    return KerbSide(area.element.id, road.tags.get("name", ""), slots, rules_of(tags), source, rule, said)
+    name = tags.get("name", road.tags.get("name", ""))
+    return FacilityRow(name, "kerb", rules_of(tags), source, rule, area.element.id, said, slots)
 
 
 def _is_half(road: Road) -> bool:

@@ -11,7 +11,7 @@ import shutil
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -129,17 +129,15 @@ def sumo_rows(
         driven["ours"].append(run_fleet(fleet, seed, day))
         for name, step in peers.items():
             driven[name].append(run_sumo(fleet, folder, step, end_s + HOUR_S))
-    milliseconds = {
-        name: 1e3 * float(np.mean([one.cpu_s for one in those])) for name, those in driven.items()
-    }
-    seconds = {
-        name: float(np.mean([np.nanmean(one.search_s) for one in those])) for name, those in driven.items()
-    }
+
+    def means(value: Callable[[ParkedDay], float]) -> dict[str, float]:
+        return {name: float(np.mean([value(day) for day in those])) for name, those in driven.items()}
+
     case = f"{case}, greedy-drive"
-    rows = duration("day", case, milliseconds.pop("ours"), "ms", **milliseconds)
-    return rows + equal(
-        "day", f"{case}: mean search time", seconds.pop("ours"), "s of search", **seconds
-    ), driven
+    took_ms, search_s = means(lambda day: 1e3 * day.cpu_s), means(lambda day: float(np.nanmean(day.search_s)))
+    rows = duration("day", case, took_ms.pop("ours"), "ms", **took_ms)
+    rows += equal("day", f"{case}: mean search time", search_s.pop("ours"), "s of search", **search_s)
+    return rows, driven
 
 
 def run_fleet(fleet: Fleet, seed: int, day: int = 0) -> ParkedDay:
@@ -150,12 +148,9 @@ def run_fleet(fleet: Fleet, seed: int, day: int = 0) -> ParkedDay:
     took, cars = time.process_time() - start, fleet.cars
     parked = cars["slot"] >= 0
     began_s = np.where(parked, cars["ended_at"], np.nan)
+    slot = cars["slot"].astype(np.int64)
     return ParkedDay(
-        began_s - cars["arrival"],
-        cars["slot"].astype(np.int64),
-        began_s - fleet.begin,
-        cars["left_at"] - fleet.begin,
-        took,
+        began_s - cars["arrival"], slot, began_s - fleet.begin, cars["left_at"] - fleet.begin, took
     )
 
 
@@ -248,22 +243,34 @@ def _metres_ahead(fleet: Fleet, street: Street) -> FloatArray:
 
 
 def _write_network(fleet: Fleet, streets: Sequence[Street], at: Path, folder: Path) -> None:
-    xy, speed = fleet.scenario.lot.vertex_xy, fleet.scenario.v_drive
-    junctions = sorted({v for street in streets for v in (street.start, street.end)})
-    edges = (
-        {"id": s.name, "from": s.start, "to": s.end, "speed": speed, "length": s.length} for s in streets
+    xy, speed = fleet.scenario.lot.vertex_xy.tolist(), fleet.scenario.v_drive
+    _write(
+        at / "lot.nod.xml",
+        "nodes",
+        (
+            f'<node id="{v}" x="{xy[v][0]:.3f}" y="{xy[v][1]:.3f}"/>'
+            for v in sorted({v for street in streets for v in (street.start, street.end)})
+        ),
+    )
+    _write(
+        at / "lot.edg.xml",
+        "edges",
+        (
+            f'<edge id="{s.name}" from="{s.start}" to="{s.end}" speed="{speed:.3f}" length="{s.length:.3f}"/>'
+            for s in streets
+        ),
     )
     # All turns of the drive graph, also back at a corner, which netconvert would leave out.
-    turns = (
-        {"from": a.name, "to": b.name, "fromLane": 0, "toLane": 0}
-        for a in streets
-        for b in streets
-        if a.end == b.start
+    _write(
+        at / "lot.con.xml",
+        "connections",
+        (
+            f'<connection from="{a.name}" to="{b.name}" fromLane="0" toLane="0"/>'
+            for a in streets
+            for b in streets
+            if a.end == b.start
+        ),
     )
-    nodes = ({"id": v, "x": xy[v, 0], "y": xy[v, 1]} for v in junctions)
-    _write(at / "lot.nod.xml", _element("nodes", {}, *(_element("node", node) for node in nodes)))
-    _write(at / "lot.edg.xml", _element("edges", {}, *(_element("edge", edge) for edge in edges)))
-    _write(at / "lot.con.xml", _element("connections", {}, *(_element("connection", turn) for turn in turns)))
     files = (
         "-n",
         at / "lot.nod.xml",
@@ -281,61 +288,50 @@ def _write_network(fleet: Fleet, streets: Sequence[Street], at: Path, folder: Pa
 def _write_parking(
     fleet: Fleet, streets: Sequence[Street], ahead_m: Mapping[str, FloatArray], path: Path
 ) -> None:
-    capacity = fleet.scenario.lot.capacity
-    areas = (
-        {
-            "id": f"slot{slot}", "roadsideCapacity": int(capacity[slot]), "lane": f"{street.name}_0",
-            "startPos": max(along - _SHORT_M, 0.0), "endPos": along,
-        }
+    lines = [
+        f'<parkingArea id="slot{slot}" roadsideCapacity="{fleet.scenario.lot.capacity[slot]}" lane="{street.name}_0" '
+        f'startPos="{max(along - _SHORT_M, 0.0):.3f}" endPos="{along:.3f}"/>'
         for street in streets
         for slot, along in street.slots
-    )  # fmt: skip
-    rerouters = []
+    ]
     for street in streets:
         nearest = np.argsort(ahead_m[street.name])[:ALTERNATIVES].tolist()
-        places = (_element("parkingAreaReroute", {"id": f"slot{k}", "visible": "false"}) for k in nearest)
-        always = _element("interval", {"begin": 0, "end": 1_000_000}, *places)
-        rerouters.append(_element("rerouter", {"id": f"at{street.name}", "edges": street.name}, always))
-    _write(path, _element("additional", {}, *(_element("parkingArea", area) for area in areas), *rerouters))
+        places = "".join(f'<parkingAreaReroute id="slot{slot}" visible="false"/>' for slot in nearest)
+        lines.append(
+            f'<rerouter id="at{street.name}" edges="{street.name}"><interval begin="0" end="1000000">{places}'
+            "</interval></rerouter>"
+        )
+    _write(path, "additional", lines)
 
 
 def _write_trips(
     fleet: Fleet, streets: Sequence[Street], ahead_m: Mapping[str, FloatArray], path: Path, step_s: float
 ) -> None:
-    driver = {
-        "id": "car", "sigma": 0, "speedDev": 0, "speedFactor": 1, "length": 4, "minGap": 0.5, "tau": step_s,
-        "accel": _AT_ONCE, "decel": _AT_ONCE, "emergencyDecel": _AT_ONCE,
-    }  # fmt: skip
-    weights = (_element("param", {"key": name, "value": value}) for name, value in PARKING_WEIGHTS.items())
+    weights = "".join(f'<param key="{name}" value="{value}"/>' for name, value in PARKING_WEIGHTS.items())
+    lines = [
+        f'<vType id="car" sigma="0" speedDev="0" speedFactor="1" length="4" minGap="0.5" tau="{step_s}" '
+        f'accel="{_AT_ONCE}" decel="{_AT_ONCE}" emergencyDecel="{_AT_ONCE}">{weights}</vType>'
+    ]
     of_slot = {slot: (street.name, along) for street in streets for slot, along in street.slots}
-    first: dict[int, dict[str, object]] = {}
+    first: dict[int, tuple[str, int]] = {}
     for entry in np.unique(fleet.cars["entry"]).tolist():
-        begins = [street for street in streets if street.start == entry]
-        start = min(begins, key=lambda street: float(ahead_m[street.name].min()))
-        slot = int(ahead_m[start.name].argmin())
-        street, along = of_slot[slot]
-        # A route that ends in the parking area ends in each next one, too: nobody drives on from there.
-        first[entry] = {"from": start.name, "to": street, "arrivalPos": along - _SHORT_M / 4, "slot": slot}
-    trips = []
+        begins = [street.name for street in streets if street.start == entry]
+        start = min(begins, key=lambda name: float(ahead_m[name].min()))
+        first[entry] = start, int(ahead_m[start].argmin())
     for number, car in enumerate(fleet.cars):
-        way = dict(first[int(car["entry"])])
-        stop = _element("stop", {"parkingArea": f"slot{way.pop('slot')}", "duration": car["stay_s"]})
-        how = {"id": number, "type": "car", "depart": car["arrival"] - fleet.begin, "departSpeed": "max"}
-        trips.append(_element("trip", how | way, stop))
-    _write(path, _element("routes", {}, _element("vType", driver, *weights), *trips))
+        start, slot = first[int(car["entry"])]
+        to, along = of_slot[slot]
+        # A route that ends in the parking area ends in each next one, too: nobody drives on from there.
+        lines.append(
+            f'<trip id="{number}" type="car" depart="{car["arrival"] - fleet.begin:.3f}" departSpeed="max" '
+            f'from="{start}" to="{to}" arrivalPos="{along - _SHORT_M / 4:.3f}">'
+            f'<stop parkingArea="slot{slot}" duration="{car["stay_s"]:.3f}"/></trip>'
+        )
+    _write(path, "routes", lines)
 
 
-def _element(
-    tag: str, attributes: Mapping[str, object], *children: ElementTree.Element
-) -> ElementTree.Element:
-    text = {name: f"{v:.3f}" if isinstance(v, float) else str(v) for name, v in attributes.items()}
-    element = ElementTree.Element(tag, text)
-    element.extend(children)
-    return element
-
-
-def _write(path: Path, root: ElementTree.Element) -> None:
-    ElementTree.ElementTree(root).write(path)
+def _write(path: Path, tag: str, lines: Iterable[str]) -> None:
+    path.write_text("\n".join([f"<{tag}>", *lines, f"</{tag}>", ""]), encoding="utf-8")
 
 
 def _run(command: Sequence[str | Path]) -> str:
