@@ -22,7 +22,7 @@ from parkenv.studies.training.training import MODEL
 COMMANDS = {
     "compare": "compare --scenario mini --agents mdp,greedy-goal,oracle -n 600 --occupancy-levels none --no-figures",
     "survey": "survey --scenario mini --sessions 3 --every 12",
-    "train": "train ppo --scenario mini --steps 16000 --trainings 2 --evaluate-every 4000 --evaluation-episodes 16 "
+    "train": "train ppo --scenario mini --steps 6000 --trainings 2 --evaluate-every 1500 --evaluation-episodes 4 "
     "--agents none",
 }
 """Of all studies, those that keep rows alone, rows and a map, and checkpoints."""

@@ -61,17 +61,17 @@ def tries(mask, rng):
 
 
 @pytest.mark.parametrize(
-    ("name", "options"),
+    ("name", "options", "searches"),
     [
-        ("Search-v2", {}),
-        ("SearchSensors-v2", {"observation": "scan"}),
-        ("SearchPerception-v2", {"captures": 1}),
+        ("Search-v2", {}, 3),
+        ("SearchSensors-v2", {"observation": "scan"}, 3),
+        ("SearchPerception-v2", {"captures": 1, "picture_width": 160}, 1),
     ],
 )
-def test_single_searches(scenario, name, options):
+def test_single_searches(scenario, name, options, searches):
     env = gym.make(f"parkenv/{name}", scenario=scenario, **options)
     rng, seen = np.random.default_rng(0), set()
-    for seed in range(3):
+    for seed in range(searches):
         observation, _ = env.reset(seed=seed)
         returned, over, sums = 0.0, False, dict.fromkeys(REWARD_TERMS, 0.0)
         while not over:

@@ -10,7 +10,9 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.demo.study import AGENTS, QUICK, Demo
 
 
-def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
+def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path, monkeypatch):
+    monkeypatch.setitem(QUICK, "more", 10)
+    monkeypatch.setitem(QUICK, "every", 8.0)
     out = tmp_path / "demo"
     done = parkenv("demo", "--scenario", "mini", "--quick", "--jobs", 1, "--out", out)
     assert done.returncode == 0, done.stderr
@@ -37,7 +39,7 @@ def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     assert (out / "search.gif").stat().st_size < 3e6
 
     # The oracle needs no sensors.
-    spec = Demo(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=4.0)
+    spec = Demo(scenario=scenario_spec("mini"), sessions=2, episodes=2, every=8.0)
     cases = spec.cases_in(out)
     (oracle,) = [case for case, _ in cases if case.agent == "oracle"]
     seed = cases[0][1][0]

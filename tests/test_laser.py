@@ -87,12 +87,12 @@ def test_scans_are_what_the_definition_says(seed, n, n_walls, extent, yaw, scann
 def test_few_beams_are_at_edges_in_a_large_sample():
     rng = np.random.default_rng(1)
     edges = beams = 0
-    for _ in range(20):
+    for _ in range(10):
         plane = random_plane(rng, int(rng.integers(20, 300)), int(rng.integers(0, 20)), 60.0)
         for pose in rng.uniform((-50, -50, -4), (50, 50, 4), (5, 3)):
             edges += compare(LASER, plane, pose)
             beams += LASER.n_beams
-    assert edges < 1e-3 * beams  # of 108,100
+    assert edges < 1e-3 * beams  # of 54,050
 
 
 def test_a_lot_far_from_the_origin_is_seen_as_exactly():

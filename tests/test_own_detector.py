@@ -91,7 +91,7 @@ def test_the_command_line_takes_it(tmp_path):
         "--sessions",
         "1",
         "--every",
-        "5",
+        "15",
         "--jobs",
         "1",
         "--out",

@@ -377,10 +377,11 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
 @pytest.mark.slow
 def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
     monkeypatch.setattr("parkenv.studies.training.search.clone", partial(clone, updates=50))
+    make_small(monkeypatch)
     out = folder / "trained"
     done = parkenv(
-        "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 20_000, "--trainings", 1,
-        "--evaluate-every", 10_000, "--evaluation-episodes", 16, "--agents", "first-free", "--curriculum", "size",
+        "train", "maskable-ppo", "--scenario", folder, "--held-out", 0.5, "--steps", 1_100, "--trainings", 1,
+        "--evaluate-every", 500, "--evaluation-episodes", 16, "--agents", "first-free", "--curriculum", "size",
         "--clone", "first-free", "--demonstrations", 20, "--report", "--out", out,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

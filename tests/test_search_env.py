@@ -52,16 +52,14 @@ def digest(env, seed):
     return hashlib.sha256(repr(random_episode(env, seed)).encode()).hexdigest()
 
 
-# Gymnasium's checker takes many steps, and sensors are slow: one lot more for SearchPerception, which captures the
-# images that SearchSensors shows.
+# Gymnasium's checker takes many steps, and sensors are slow.
 @pytest.mark.parametrize(
     ("scenario", "env_id"),
     [
         (scenario, env_id)
         for scenario in CAR_PARKS
         for env_id in ENV_IDS
-        if scenario == "mini"
-        or ("SearchSensors" not in env_id and (scenario == "street" or "SearchPerception" not in env_id))
+        if scenario == "mini" or ("SearchSensors" not in env_id and "SearchPerception" not in env_id)
     ],
 )
 def test_every_id_passes_the_checker_without_a_warning(env_id, scenario):

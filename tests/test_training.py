@@ -489,14 +489,12 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
 @pytest.mark.parametrize(
     ("algorithm", "options"), [("maskable-ppo", ()), ("dqn", ()), ("maskable-ppo", ("--observation", "scan"))]
 )
-def test_the_command_trains_and_its_models_can_be_compared(tmp_path, algorithm, options):
-    out = tmp_path / "out"
-    steps = (
-        20_000 if algorithm == "maskable-ppo" else 13_000
-    )  # two rollouts; a few thousand steps with updates
+def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch, algorithm, options):
+    make_small(monkeypatch)
+    out, steps = tmp_path / "out", 1_100  # two rollouts or more
     command = [
         "train", algorithm, *options, "--scenario", "mini", "--steps", steps, "--trainings", 1,
-        "--evaluate-every", 6000, "--evaluation-episodes", 16, "--agents", "mdp", "--jobs", 2, "--out",
+        "--evaluate-every", 500, "--evaluation-episodes", 4, "--agents", "mdp", "--jobs", 1, "--out",
     ]  # fmt: skip
     assert parkenv(*command, out).returncode == 0
     refused = parkenv(*command, out)
@@ -514,7 +512,7 @@ def test_the_command_trains_and_its_models_can_be_compared(tmp_path, algorithm, 
     assert [row["steps"] for row in means] == [row["steps"] for row in curve]
     compared = parkenv(
         "compare", "--scenario", "mini", "--agents", f"mdp,{algorithm}:{out / 'seed_1' / 'model.safetensors'}",
-        "-n", 10, "--occupancy-levels", "none", "--jobs", 1, "--out", tmp_path / "compared",
+        "-n", 2, "--occupancy-levels", "none", "--no-figures", "--jobs", 1, "--out", tmp_path / "compared",
     )  # fmt: skip
     assert compared.returncode == 0, compared.stderr
 
