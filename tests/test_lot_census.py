@@ -1,10 +1,8 @@
-"""The census of lots, and the way from a town's export to a comparison on its largest car parks."""
+"""The census of lots; `test_documents` goes on to a comparison on a town's largest car parks."""
 
 import csv
 import json
-from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import parkenv
 from made_outlines import document, double_row, kerb, row, write
@@ -16,7 +14,6 @@ from parkenv.scenarios.build import largest_lots
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.lots.census import COLUMNS, count_lot, longest_drive_m, lot_columns, lot_files
 
-TOWN = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
 AUTO = ImportOptions(guess_entry=True, guess_goal=True)
 
 
@@ -95,21 +92,3 @@ def test_the_largest_lots_are_chosen(lots):
     specs = scenario_specs(lots)
     assert [spec.title for spec in largest_lots(specs, 2)] == ["a", "b"]
     assert len(largest_lots(specs, 9)) == 3
-
-
-@pytest.mark.slow  # about half a minute: the story of docs/own.md on fewer episodes
-def test_three_commands_lead_from_a_town_to_a_comparison(tmp_path):
-    for command in (
-        ("lot", "import", TOWN, "--split", "--out", "lots"),
-        ("lot", "census", "lots", "--no-drive", "--out", "census"),
-        ("compare", "--scenario", "lots", "--largest", 3, "--agents", "mdp,first-free", "-n", 2, "--jobs", 1,
-         "--occupancy-levels", "none", "--no-figures", "--report", "--out", "compared"),
-    ):  # fmt: skip
-        done = parkenv(*command, cwd=tmp_path)
-        assert (done.returncode, done.stderr) == (0, ""), command
-    census = json.loads((tmp_path / "census" / "summary.json").read_text())["rows"]
-    rows = json.loads((tmp_path / "compared" / "summary.json").read_text())["rows"]
-    compared = list(dict.fromkeys(row["scenario"] for row in rows))
-    assert compared == [row["lot"] for row in census[:3]]
-    assert np.isfinite([row["total_s"] for row in rows]).all()
-    assert (tmp_path / "compared" / "report.html").stat().st_size > 100_000

@@ -2,9 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
-from pathlib import Path
 
 import gymnasium as gym
 import numba
@@ -409,12 +406,3 @@ def test_cars_of_a_full_lot_do_not_touch(name):
     for arrival in (0, 7919):
         scene = slot_lot(lot).scene(np.ones(lot.n_slots, bool), arrival)  # an overlap would warn
         assert len(scene.present) == lot.n_slots
-
-
-@pytest.mark.slow
-def test_the_example_that_learns_from_scans_runs():
-    pytest.importorskip("sb3_contrib", reason="the extra rl is not installed")
-    example = Path(__file__).parents[1] / "examples" / "12_scans_alone.py"
-    done = subprocess.run([sys.executable, example], capture_output=True, text=True, timeout=600, check=False)
-    assert done.returncode == 0, done.stderr
-    assert [line.split("  ")[0] for line in done.stdout.splitlines()][1:] == ["mdp", "first-free", "random"]
