@@ -17,6 +17,7 @@ if is_command():
 from gymnasium.envs.registration import register, registry
 
 if TYPE_CHECKING:
+    from parkenv.engine.model import model
     from parkenv.errors import InputError
     from parkenv.lots import import_lot, load_lot
     from parkenv.scenarios.build import make_scenario, make_scenarios
@@ -62,6 +63,7 @@ _EXPORTS = {
     "make_agent": "planners.agent",
     "make_scenario": "parkenv.scenarios.build",
     "make_scenarios": "parkenv.scenarios.build",
+    "model": "parkenv.engine.model",
     "open_run": "parkenv.studies.runner",
     "simulate": "parkenv.studies.simulate",
     "survey": "parkenv.studies.verbs",
@@ -90,6 +92,7 @@ __all__ = [
     "make_agent",
     "make_scenario",
     "make_scenarios",
+    "model",
     "open_run",
     "simulate",
     "survey",

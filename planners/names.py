@@ -16,6 +16,7 @@ AGENTS: dict[str, tuple[str, str]] = {
     "oracle": ("planners.bounds.oracle", "OracleAgent"),
     "belief": ("planners.belief.agent", "BeliefAgent"),
     EXPECTS_RIVALS: ("planners.belief.rivals", "BeliefRivalsAgent"),
+    "rollout": ("planners.rollout", "RolloutAgent"),
     "network": ("planners.network.agent", "NetworkAgent"),
     "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
     "exact": ("planners.bounds.exact", "ExactAgent"),

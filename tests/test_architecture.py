@@ -38,6 +38,7 @@ PLANNERS_MAY_SEE = (
     "parkenv.world",
     "parkenv.belief",
     "parkenv.driving",
+    "parkenv.engine.model",
     "parkenv.engine.policy",
     "parkenv.errors",
     "parkenv.files",

@@ -11,6 +11,7 @@ further on are also more likely to be taken.
 from __future__ import annotations
 
 import math
+from copy import copy
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,6 +62,7 @@ class DayBelief:
         certain: whether the forecast is right on every day, whatever is observed.
         rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
             None: there are no such cars.
+        hypotheses: about the day: prior weights, (k,), and P(taken) under each, (n_slots, k); None: those above.
 
     Examples:
         The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
@@ -83,12 +85,15 @@ class DayBelief:
         nearness: FloatArray,
         certain: bool = False,
         rival_rates: FloatArray | None = None,
+        hypotheses: tuple[FloatArray, FloatArray] | None = None,
     ) -> None:
         forecast = np.clip(belief.forecast.astype(np.float64), _LEAST, _MOST)
         crowded = rival_rates is not None and bool(rival_rates.any())
         # Rivals make slopes and events of their own: with them, days differ by their level only.
-        self._n_events = 0 if certain or crowded else len(EVENTS)
-        if certain:
+        self._n_events = 0 if certain or crowded or hypotheses is not None else len(EVENTS)
+        if hypotheses is not None:
+            weight, p_taken = hypotheses
+        elif certain:
             weight, p_taken = np.ones(1), forecast[:, None]
         elif crowded:
             weight, p_taken = _hypotheses(forecast, nearness, np.array([belief.day_error[0], 0.0]))
@@ -133,6 +138,20 @@ class DayBelief:
             self._log_weight, self._p_taken, self._forecast, self._decay_rate,
             self._p_then, self._p_alone, self._observed_at, *observations,
         )  # fmt: skip
+
+    def copy(self) -> DayBelief:
+        """Return a copy, to which updates of this one do nothing."""
+        other = copy(self)
+        for name in ("_log_weight", "_p_then", "_p_alone", "_observed_at"):
+            setattr(other, name, getattr(self, name).copy())
+        return other
+
+    def on_days(self, slots: IntArray, time: float) -> tuple[FloatArray, FloatArray]:
+        """Return the probabilities of all hypotheses, (k,), and P(taken) under each of observed slots, (n, k)."""
+        elapsed = time - self._observed_at[slots]
+        leaving = self._decay_rate[slots] * (1.0 - self._forecast[slots])
+        p_taken = _decayed(self._p_taken[slots], leaving, self._p_then[slots], elapsed)
+        return _weights(self._log_weight), p_taken
 
     def mixture(self) -> tuple[FloatArray, FloatArray]:
         """Return the weights, (k,), of the hypotheses that matter, and P(free) under each, (n_slots, k)."""
@@ -240,6 +259,16 @@ def _weights(log_weight: FloatArray) -> FloatArray:
     """Return the probabilities of the hypotheses, (k,)."""
     weight: FloatArray = np.exp(log_weight - log_weight.max())
     return np.asarray(weight / weight.sum())
+
+
+@compiled
+def _decayed(p_taken: FloatArray, leaving: FloatArray, p_then: FloatArray, elapsed: FloatArray) -> FloatArray:
+    p_now = np.empty_like(p_taken)
+    for s in range(len(p_taken)):
+        for h in range(p_taken.shape[1]):
+            p = p_taken[s, h]
+            p_now[s, h] = decay_to_prior(p, leaving[s] / (1.0 - p), p_then[s, h], elapsed[s])
+    return p_now
 
 
 @compiled

@@ -485,7 +485,8 @@ class Fleet:
         size = sum(len(one.records) for one in self._pool)
         n = min(max(_FIRST_CHUNK, size), max(len(self._cars) - size, 1))
         sparse = self.scenario.lot.n_slots >= SPARSE_SLOTS
-        searches = Searches(self._tables, n, self.full_belief, self._most_observed, sparse)
+        most_observed = self._most_observed if self.full_belief else 0
+        searches = Searches(self._tables, n, self.full_belief, most_observed, sparse)
         # A route may pass the street where it begins once more.
         moves = sparse_zeros((n, 2 * self.scenario.lot.n_vertices), np.uint8)
         searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]

@@ -651,9 +651,9 @@ class Searches:
     Args:
         scenarios: scenarios of the searches; if there are several, one is drawn for each episode.
         n: number of searches.
-        full_belief: whether to keep `p_occupied`, `belief` and `step_observed` up to date.
-        most_observed: maximum number of slots that a step observes; None: those in view, and one more; with 0,
-            `step_observed` is not kept.
+        full_belief: whether to keep `p_occupied` and `belief` up to date.
+        most_observed: maximum number of slots that a step observes; None: those in view, and one more, or 0 without
+            the full belief; with 0, `step_observed` is not kept.
         sparse: whether tables take memory only where they are written, by small pages, which are slower.
 
     Attributes:
@@ -697,10 +697,12 @@ class Searches:
         self.belief = np.zeros((n, 4, m) if full_belief else (0, 4, 0), np.float32)
         self.belief[:, [FORECAST, P_OBSERVED]] = 1.0
         self.belief[:, OBSERVED_AT] = NEVER_OBSERVED
-        k = most_observed_in(scenarios.scenarios) if most_observed is None else most_observed
-        self.step_observed = np.zeros((n, 4, k) if full_belief and k > 0 else (0, 4, 0), np.float32)
+        if most_observed is None:
+            most_observed = most_observed_in(scenarios.scenarios) if full_belief else 0
+        k = most_observed
+        self.step_observed = np.zeros((n, 4, k) if k > 0 else (0, 4, 0), np.float32)
         self.records["width"], self.records["most_observed"], self.records["n_step_used"] = m, k, k
-        self.records["walks"] = 1.0
+        self.records["walks"], self.records["reserved"] = 1.0, UNGUIDED
         self.records["scenarios"] = address_of(scenarios.records, SCENARIO)
         self.records["n_places"] = len(scenarios.records)
         self._find_scenarios()
@@ -786,9 +788,11 @@ class Searches:
         """Memory of the searches, bytes, without the shared tables of the scenarios."""
         return sum(array.nbytes for array in (self.records, *self._arrays().values()))
 
-    def save(self) -> tuple[NDArray[Any], ...]:
-        """Return copies of everything that a search changes."""
-        return (self.records.copy(), *(array.copy() for array in self._arrays().values()))
+    def save(self, rows: IntArray | None = None) -> tuple[NDArray[Any], ...]:
+        """Return copies of everything that a search changes; of some searches, (k,), which may occur several times."""
+        rows = np.arange(len(self.records)) if rows is None else rows
+        parts = (self.records, *self._arrays().values())
+        return tuple(array[rows] if len(array) else array.copy() for array in parts)
 
     def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
         """Restore a copy returned by `save` of searches in the same scenarios; records may be given as bytes, uint8.

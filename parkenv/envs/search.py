@@ -281,7 +281,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return SavedSearch(self.searches.save(), list(self.state.path))
 
     def set_state(self, state: SavedSearch) -> None:
-        """Continue from a state returned by `get_state` of an environment with the same scenario."""
+        """Continue from a state returned by `get_state` of an environment with the same scenario.
+
+        The world is part of it: what follows is the true future once more. Plan with `parkenv.model`, not with this.
+        """
         self.searches.restore(state.arrays)
         self._state.path = list(state.path)
         self._enter_place()

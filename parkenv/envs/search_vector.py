@@ -279,7 +279,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return self.observer.get_state()
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over."""
+        """Continue from a state that `get_state` returned for the same scenarios; no search in it may be over.
+
+        The worlds are part of it: what follows is the true future once more.
+        """
         self.observer.set_state(state)
         self._begun, self._done = True, self._nobody
         for one in self._states:

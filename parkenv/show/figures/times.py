@@ -36,6 +36,7 @@ AGENT_COLORS = {
     "belief-rivals": "#661100",
     "exact": "#882255",
     "network": "#44aa99",
+    "rollout": "#4b5d16",
     "dqn": "#999933",
     "ppo": "#332288",
     "maskable-ppo": "#aa4499",

@@ -1,0 +1,554 @@
+"""A generative model of a search, for planners: worlds drawn from a belief, stepped and observed by the engine itself.
+
+It is made of what an agent may know: the problem, and the forecast in the first observation. The world of a search is
+out of its reach, where `get_state` and `set_state` of an environment replay it: a planner that looks ahead with them
+sees the future.
+
+Worlds follow the forecast: each slot is a two-state Markov chain with the forecast as its mean and the decay rate as
+its speed, and the day has the level and the slope that `day_error` states. Given observations, the day is drawn from
+its posterior, and the slots given the day.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from parkenv.belief.day_belief import DayBelief
+from parkenv.belief.slot_belief import Observations, SlotBelief
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.memory import address_of, call_at
+from parkenv.engine.batch import first_wrong
+from parkenv.engine.kernel import (
+    column_of,
+    drive_or_park,
+    end_observed,
+    enter,
+    finish_step,
+    give_up,
+    is_taken,
+    set_belief_of,
+    step_cost_s,
+    sum_of_costs,
+    take_step,
+    write_clock,
+)
+from parkenv.engine.policy import CompiledPolicy, car_of
+from parkenv.engine.records import (
+    CAR,
+    FLEET,
+    N_ACTIONS,
+    NO_SLOT,
+    SEARCH,
+    ScenarioRecords,
+    Searches,
+    most_observed_in,
+    scenario_at,
+    search_at,
+    slot_at,
+)
+from parkenv.engine.spaces import action_number
+from parkenv.errors import InputError
+from parkenv.world.lot import PARK
+from parkenv.world.occupancy.centred_logits import centred_logits
+from parkenv.world.occupancy.day_error import DayError, nearness
+from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY, kernel
+from parkenv.world.occupancy.process import MAX_RATE, OccupancyProcess
+from parkenv.world.scenario import Scenario, SearchProblem
+from parkenv.world.week import WEEK_HOURS
+
+MAX_STEPS = 2000
+"""Steps after which `Simulations.run` ends a search, as environments do."""
+_LEVELS, _SLOPES, _REACH = (
+    33,
+    9,
+    3.5,
+)  # cells of the day's level and slope, and standard deviations that they span
+_LEAST_RATE = 1e-9  # 1/s, of slots that never change
+_SAME_TIME_S = 0.01
+_SEARCH_BYTES = SEARCH.itemsize
+
+
+class Observation(NamedTuple):
+    """What a step tells.
+
+    Attributes:
+        vertex: where the car is.
+        time: s since the search began.
+        slots: (k,) int64, the observed slots: first the one that the car attempted to park in, if it did.
+        taken: (k,) bool, what was observed.
+        hit_rate, false_alarm_rate: (k,) float64, P(observed taken | taken) and P(observed taken | free); 1 and 0 of an
+            attempt.
+    """
+
+    vertex: int
+    time: float
+    slots: IntArray
+    taken: BoolArray
+    hit_rate: FloatArray
+    false_alarm_rate: FloatArray
+
+    @classmethod
+    def of(cls, observation: Mapping[str, Any] | Observation) -> Observation:
+        """Return what an observation of `parkenv/Search-v2` tells of the last step."""
+        if isinstance(observation, Observation):
+            return observation
+        slots, _, taken, *rates = SlotBelief.of_observation(observation).observations
+        return cls(int(observation["vertex"]), float(observation["time"][1]), slots, taken, *rates)
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What the driver knows; `Model.update` returns a new one.
+
+    Attributes:
+        vertex: where the car is.
+        slots: P(taken) of each slot, and when it was observed.
+        day: posterior over the level and the slope of the day.
+        last_taken: (n_slots,) bool, whether the slot was last observed taken.
+        arrival: when the search began, s since Monday 00:00.
+        n_steps: number of steps so far.
+    """
+
+    vertex: int
+    slots: SlotBelief
+    day: DayBelief
+    last_taken: BoolArray
+    arrival: float
+    n_steps: int
+    _days: _Days
+    _tables: ScenarioRecords
+
+
+class _Days(NamedTuple):
+    """Hypotheses about the day, cells of its level and slope: prior weights, middles, (k,), and widths of a cell."""
+
+    weight: FloatArray
+    level: FloatArray
+    slope: FloatArray
+    widths: tuple[float, float]
+
+    @classmethod
+    def of(cls, error: DayError) -> _Days:
+        (levels, level_p, level_width), (slopes, slope_p, slope_width) = (
+            _cells(error.level, _LEVELS),
+            _cells(error.slope, _SLOPES),
+        )
+        weight = np.outer(level_p, slope_p).ravel()
+        level, slope = (one.ravel() for one in np.meshgrid(levels, slopes, indexing="ij"))
+        return cls(weight, level, slope, (level_width, slope_width))
+
+
+def _cells(deviation: float, n: int) -> tuple[FloatArray, FloatArray, float]:
+    """Return middles and probabilities, (n,), of equal cells of a normal law, and their width; one if it is certain."""
+    if deviation == 0.0:
+        return np.zeros(1), np.ones(1), 0.0
+    edges = np.linspace(-_REACH, _REACH, n + 1)
+    p = np.diff(norm.cdf(edges))
+    return (edges[:-1] + edges[1:]) / 2 * deviation, p / p.sum(), float(2 * _REACH / n * deviation)
+
+
+class Simulations:
+    """Simulated searches in worlds of their own, stepped by compiled code; `Model.sample` makes them.
+
+    They are as a particle filter or a tree search wants them: `take` copies some, `reseed` gives them another future.
+
+    Attributes:
+        searches: the searches.
+    """
+
+    def __init__(self, tables: ScenarioRecords, n: int) -> None:
+        self.searches = Searches(tables, n, False, most_observed_in(tables.scenarios))
+        self._costs, self._over = np.zeros(n), np.zeros(n, np.bool_)
+
+    def __len__(self) -> int:
+        return len(self.searches.records)
+
+    @property
+    def over(self) -> BoolArray:
+        """Which searches are over, (n,) bool: parked, or gave up in a full lot."""
+        over: BoolArray = self.searches.records["over"].copy()
+        return over
+
+    def observation(self, i: int = 0) -> Observation:
+        """Return what the last step of a search has told."""
+        rows, record = self.searches.step_observed[i], self.searches.records[i]
+        k = int(record["n_step_observed"])
+        slots, taken, *rates = rows[:, :k].astype(np.float64)
+        return Observation(
+            int(record["vertex"]), float(record["clock"][1]), slots.astype(np.int64), taken == 1.0, *rates
+        )
+
+    def step(self, actions: IntArray) -> tuple[FloatArray, BoolArray]:
+        """Take an action in each search in place; those that are over stay as they are, at no cost.
+
+        Args:
+            actions: (n,) int64.
+
+        Returns:
+            Cost of the step, (n,) s, and which searches are over, (n,) bool.
+
+        Raises:
+            InputError: an action that does not exist.
+        """
+        actions = np.ascontiguousarray(np.broadcast_to(actions, len(self)), np.int64)
+        wrong = first_wrong(actions)
+        if wrong >= 0:
+            action_number(actions[wrong])
+        _step_at(self.searches.address, actions, self._costs, self._over)
+        return self._costs.copy(), self._over.copy()
+
+    def take(self, rows: IntArray) -> Simulations:
+        """Return copies of some searches, (m,), with the same future as these; an index may occur several times."""
+        taken = Simulations(self.searches.scenarios, len(rows))
+        taken.searches.restore(self.searches.save(rows))
+        return taken
+
+    def reseed(self, rng: np.random.Generator) -> None:
+        """Draw again what is to come: how long states last, which slots are hidden, errors of the sensor.
+
+        What was drawn of the present stays: the day, and the slots that were asked for.
+        """
+        keys = rng.integers(2**64, size=len(self), dtype=np.uint64)
+        _reseed_at(self.searches.address, keys)
+
+    def run(self, policy: CompiledPolicy, max_steps: int = MAX_STEPS) -> FloatArray:
+        """Let a compiled policy, such as one of `planners.heuristics.policies`, end all searches in place.
+
+        Returns:
+            Cost from now on, (n,) s; what it is so far, where a search takes more than `max_steps`.
+        """
+        cost_s = np.zeros(len(self))
+        self._drive(policy, max_steps, cost_s, np.zeros(0, np.int64))
+        return cost_s
+
+    def choose(self, policy: CompiledPolicy) -> IntArray:
+        """Return what a compiled policy does now in each search, (n,) int64; -1 where it gives up."""
+        actions = np.full(len(self), -1)
+        self._drive(policy, 0, np.zeros(len(self)), actions)
+        return actions
+
+    def _drive(self, policy: CompiledPolicy, max_steps: int, cost_s: FloatArray, actions: IntArray) -> None:
+        n, problem = len(self), self.searches.scenarios.scenarios[0]
+        cars, fleet = np.zeros(n, CAR), np.zeros(1, FLEET)
+        moves = np.zeros((n, 2 * problem.lot.n_vertices), np.uint8)
+        self.searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
+        cars["search"] = self.searches.address + np.arange(n) * _SEARCH_BYTES
+        cars["target"] = NO_SLOT
+        data = policy.data_for([problem])
+        at = np.array([0 if data is None else data.address], np.int64)
+        fleet["cars"], fleet["policy_data"] = address_of(cars, CAR), address_of(at, np.int64)
+        _run_at(address_of(fleet, FLEET), policy.address, max_steps, cost_s, actions)
+
+
+class Model:
+    """The generative model of a search.
+
+    Args:
+        problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept.
+
+    Attributes:
+        problem: the public part.
+
+    Raises:
+        InputError: a lot with live counts of facilities, which the model does not have.
+    """
+
+    def __init__(self, problem: SearchProblem) -> None:
+        self.problem = problem.public()
+        if len(self.problem.live_slots):
+            raise InputError(f"lot {self.problem.lot.name!r} has live counts, want one without them")
+
+    def initial_belief(self, observation: Mapping[str, Any]) -> Belief:
+        """Return the belief in an observation of `parkenv/Search-v2`, such as the first one, that of `reset`.
+
+        Of a search that goes on, the last observation of each slot counts for the day; with `update` after each step,
+        all do.
+
+        Raises:
+            InputError: an observation of another lot.
+        """
+        seen, n = SlotBelief.of_observation(observation), self.problem.lot.n_slots
+        if len(seen.p_occupied) != n:
+            raise InputError(f"observation has {len(seen.p_occupied)} slots, want {n}, those of the lot")
+        slots = seen.take(np.arange(n))
+        forecast = np.clip(slots.forecast, MIN_PROBABILITY, MAX_PROBABILITY)
+        error = DayError(*(float(one) for one in seen.day_error))
+        near, days = nearness(self.problem.walk_s), _Days.of(error)
+        centre = centred_logits(forecast, error.deviations(near))
+        logits = centre[:, None] + days.level + near[:, None] * days.slope
+        day = DayBelief(slots, near, hypotheses=(days.weight, 1.0 / (1.0 + np.exp(-logits))))
+        day.update(_last_observations(slots, forecast))
+        rate, hours = np.clip(slots.decay_rate, _LEAST_RATE, MAX_RATE), np.ones(WEEK_HOURS)
+        world = OccupancyProcess(forecast * rate, hours, (1.0 - forecast) * rate, hours, error, near)
+        fields = {name: getattr(self.problem, name) for name in SearchProblem.__dataclass_fields__}
+        tables = ScenarioRecords([Scenario(name="model", occupancy=world, **fields)])
+        vertex, (now, elapsed) = int(observation["vertex"]), observation["time"]
+        return Belief(vertex, slots, day, slots.observed_taken, float(now - elapsed), 0, days, tables)
+
+    def sample(self, belief: Belief, rng: np.random.Generator, n: int = 1, copies: int = 1) -> Simulations:
+        """Draw n worlds from a belief, with a search that goes on in each.
+
+        With `copies`, simulations i, n + i, 2n + i, ... are in the same world i, to compare what they do there.
+
+        The day comes from its posterior. Given the day, a slot that was observed is taken with the probability to which
+        its observation has decayed, and others with that of the day; from now on all change at their rates.
+        """
+        self._require_own(belief)
+        seen = np.flatnonzero(belief.slots.observed)
+        p_day, p_taken = belief.day.on_days(seen, belief.slots.time)
+        day = rng.choice(len(p_day), n, p=p_day)
+        level, slope = (
+            middle[day] + width * (rng.random(n) - 0.5)
+            for middle, width in zip(
+                (belief._days.level, belief._days.slope), belief._days.widths, strict=True
+            )
+        )
+        taken = rng.random((n, len(seen))) < p_taken.T[day]
+        keys, rows = rng.integers(2**64, size=n, dtype=np.uint64), np.tile(np.arange(n), copies)
+        drawn = Simulations(belief._tables, n * copies)
+        _sample_at(
+            drawn.searches.address, keys[rows], belief.vertex, belief.arrival, belief.slots.time, belief.n_steps,
+            np.exp(level)[rows], slope[rows], seen, taken[rows], belief.last_taken[seen],
+            belief.slots.p_observed[seen], belief.slots.observed_at[seen],
+        )  # fmt: skip
+        return drawn
+
+    def step(
+        self, state: Simulations, action: int, rng: np.random.Generator | None = None
+    ) -> tuple[Simulations, Observation, float, bool]:
+        """Take an action in one simulated search, and leave `state` as it is.
+
+        Args:
+            state: a simulation of `sample`; many are stepped at once by `Simulations.step`.
+            action: 0 to 4, as in `parkenv/Search-v2`.
+            rng: draws what comes anew, see `Simulations.reseed`; None: the future that was drawn with the state.
+
+        Returns:
+            The next state, what is observed, the cost of the step, s, and whether the search is over.
+
+        Raises:
+            InputError: a state of another lot, of several simulations or of a search that is over; an action that does
+                not exist.
+        """
+        self._require_own(state)
+        if len(state) != 1:
+            raise InputError(f"state holds {len(state)} simulations, want one; Simulations.step steps many")
+        if state.over[0]:
+            raise InputError("state is of a search that is over, want one that goes on")
+        after = state.take(np.zeros(1, np.int64))
+        if rng is not None:
+            after.reseed(rng)
+        (cost_s,), (over,) = after.step(np.array([action_number(action)]))
+        return after, after.observation(), float(cost_s), bool(over)
+
+    def update(self, belief: Belief, action: int, observation: Mapping[str, Any] | Observation) -> Belief:
+        """Return the belief after an action and what was observed then (Bayes' rule).
+
+        Args:
+            belief: before the action.
+            action: the action.
+            observation: of the model, or of `parkenv/Search-v2`.
+
+        Raises:
+            InputError: a belief of another lot; an action that does not exist; an observation of another place than the
+                one to which the action leads.
+        """
+        self._require_own(belief)
+        vertex, time, slots, taken, *rates = Observation.of(observation)
+        target = int(self.problem.edges["target"][belief.vertex, action_number(action)])
+        if vertex != target:
+            raise InputError(
+                f"observation is of vertex {vertex}, want {target}, to which action {action} leads"
+            )
+        attempts = self._n_attempts(vertex, action, slots)
+        times = np.full(len(slots), time)
+        times[:attempts] = belief.slots.time
+        after, day, last_taken = belief.slots, belief.day.copy(), belief.last_taken.copy()
+        for part in (slice(attempts), slice(attempts, None)):
+            if part.stop is None:
+                after = after.decay(time - after.time)
+            after = after.update(slots[part], taken[part], *(rate[part] for rate in rates))
+            last_taken[slots[part]] = taken[part]
+        day.update(Observations(slots, times, taken, *rates))
+        return replace(
+            belief, vertex=vertex, slots=after, day=day, last_taken=last_taken, n_steps=belief.n_steps + 1
+        )
+
+    def observation_probability(
+        self, observation: Mapping[str, Any] | Observation, state: Simulations, action: int
+    ) -> FloatArray:
+        """Return how probable an observation is after an action in each simulation, (n,): weights of a particle filter.
+
+        That is the probability of what was observed of these slots. Which slots can be seen has nothing to do with
+        where cars are, and does not count; 0 where the action leads elsewhere or takes another time.
+        """
+        self._require_own(state)
+        vertex, time, slots, *seen = Observation.of(observation)
+        after, p = state.take(np.arange(len(state))), np.ones(len(state))
+        number, attempts = action_number(action), self._n_attempts(vertex, action, slots)
+        _probability_at(after.searches.address, number, vertex, time, attempts, slots, *seen, p)
+        return p
+
+    def _n_attempts(self, vertex: int, action: int, slots: IntArray) -> int:
+        """Return how many of the slots, the first ones, were observed by an attempt to park, before it took time."""
+        return int(action == PARK and self.problem.action_masks[vertex, PARK] == 1 and len(slots) > 0)
+
+    def _require_own(self, of: Belief | Simulations) -> None:
+        """Raise an `InputError` for a belief or a simulation of another model."""
+        name = "belief" if isinstance(of, Belief) else "state"
+        tables = of._tables if isinstance(of, Belief) else of.searches.scenarios
+        lot, other = self.problem.lot, tables.scenarios[0].lot
+        if other is not lot:
+            raise InputError(
+                f"{name} is of lot {other.name!r} with {other.n_slots} slots, want {lot.name!r} with {lot.n_slots}"
+            )
+
+
+def model(scenario: SearchProblem) -> Model:
+    """Return the generative model of a search, on which planners are built; see the page "Write a planner".
+
+    Args:
+        scenario: the scenario, of which the model keeps the public part, or a problem.
+
+    Examples:
+        >>> import gymnasium as gym
+        >>> import numpy as np
+        >>> import parkenv
+        >>> scenario, rng = parkenv.make_scenario("mini"), np.random.default_rng(0)
+        >>> observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=0)
+        >>> model = parkenv.model(scenario)
+        >>> belief = model.initial_belief(observation)
+        >>> state, seen, cost_s, over = model.step(model.sample(belief, rng), 3, rng)
+        >>> model.update(belief, 3, seen).vertex == seen.vertex
+        True
+    """
+    return Model(scenario)
+
+
+def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
+    """Return observations that lead from the forecast to what is known after the last one of each slot."""
+    seen = np.flatnonzero(slots.observed)
+    p, taken = slots.p_observed[seen], slots.observed_taken[seen]
+    with np.errstate(divide="ignore"):
+        odds = p / (1.0 - p) * (1.0 - forecast[seen]) / forecast[seen]
+        hit_rate, false_alarm_rate = np.where(taken, 1.0, 1.0 - odds), np.where(taken, 1.0 / odds, 0.0)
+    rates = np.clip(hit_rate, 0.0, 1.0), np.clip(false_alarm_rate, 0.0, 1.0)
+    return Observations(seen, slots.observed_at[seen].astype(np.float64), taken, *rates)
+
+
+# ---- compiled
+
+
+@kernel
+def _sample_at(
+    address: int,
+    keys: NDArray[np.uint64],
+    vertex: int,
+    arrival: float,
+    time: float,
+    n_steps: int,
+    day_odds: FloatArray,
+    day_slope: FloatArray,
+    slots: IntArray,
+    taken: BoolArray,
+    last_taken: BoolArray,
+    p_observed: FloatArray,
+    observed_at: FloatArray,
+) -> None:
+    """Put a search into the situation of a belief, in a world of which the day and the observed slots are given."""
+    for e in range(len(keys)):
+        search = search_at(address, e)
+        search.scenario, search.place = search.scenarios, 0
+        search.n_forbidden = scenario_at(search.scenario, 0).n_forbidden
+        enter(search, keys[e], 0, arrival, 0.0, vertex)
+        search.day_odds, search.day_slope = day_odds[e], day_slope[e]
+        search.time, search.n_steps = arrival + time, n_steps
+        for i in range(len(slots)):
+            column = column_of(search, slots[i])
+            set_belief_of(search, column, last_taken[i], p_observed[i], arrival + observed_at[i])
+            record = slot_at(search.slots, column)
+            if record.valid_until < np.inf:
+                # What comes does not depend on when the state began.
+                record.occupied, record.sojourn, record.end_known = taken[e, i], 1, False
+                record.since = record.valid_until = search.time
+        write_clock(search)
+
+
+@kernel
+def _step_at(address: int, actions: IntArray, costs: FloatArray, over: BoolArray) -> None:
+    for e in range(len(actions)):
+        search = search_at(address, e)
+        costs[e] = 0.0
+        if not search.over:
+            take_step(search, actions[e])
+            end_observed(search)
+            write_clock(search)
+            costs[e] = step_cost_s(search)
+        over[e] = search.over
+
+
+@kernel
+def _reseed_at(address: int, keys: NDArray[np.uint64]) -> None:
+    for e in range(len(keys)):
+        search = search_at(address, e)
+        for column in range(1, search.n_columns + 1):
+            record = slot_at(search.slots, column)
+            if record.sojourn > 0:
+                is_taken(search, column, search.time)
+                record.since = record.valid_until = search.time
+                record.end_known = False
+        search.key = keys[e]
+
+
+@kernel
+def _run_at(fleet: int, policy: int, max_steps: int, cost_s: FloatArray, actions: IntArray) -> None:
+    """Write the cost of all steps from now on, and the next action where `actions` has room."""
+    for e in range(len(actions)):
+        action = call_at(policy, fleet, e)
+        actions[e] = action if action < N_ACTIONS else -1
+    for e in range(len(cost_s)):
+        search = search_at(car_of(fleet, e).search, 0)
+        before, steps = sum_of_costs(search), 0
+        while not search.over and steps < max_steps:
+            action = call_at(policy, fleet, e)
+            if 0 <= action < N_ACTIONS:
+                take_step(search, action)
+            else:
+                give_up(search)
+            write_clock(search)
+            steps += 1
+        cost_s[e] = sum_of_costs(search) - before
+
+
+@kernel
+def _probability_at(
+    address: int,
+    action: int,
+    vertex: int,
+    time: float,
+    attempts: int,
+    slots: IntArray,
+    taken: BoolArray,
+    hit_rate: FloatArray,
+    false_alarm_rate: FloatArray,
+    p: FloatArray,
+) -> None:
+    for e in range(len(p)):
+        search = search_at(address, e)
+        before = search.time
+        drive_or_park(search, action)
+        finish_step(search)
+        write_clock(search)
+        # Observed times are rounded.
+        if search.vertex != vertex or abs(search.clock[1] - time) > _SAME_TIME_S:
+            p[e] = 0.0
+        for i in range(len(slots)):
+            at = before if i < attempts else search.time
+            rate = hit_rate[i] if is_taken(search, column_of(search, slots[i]), at) else false_alarm_rate[i]
+            p[e] *= rate if taken[i] else 1.0 - rate

@@ -1,0 +1,186 @@
+"""The generative model: its beliefs are those of the environment, its worlds are so in distribution."""
+
+import gc
+import types
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import parkenv
+from parkenv import InputError, SensorBand, SensorModel
+from parkenv.world.lot import PARK
+from planners import make_agent
+from planners.heuristics.policies import POLICIES
+
+NOISY = SensorModel(
+    view_range=9.0,
+    bands=(SensorBand(4.0, True, 0.9, 0.9, 0.1), SensorBand(9.0, False, 0.6, 0.8, 0.3)),
+)
+SENSORS = {"exact": SensorModel(view_range=6.0), "noisy": NOISY}
+START = {"entry": 0, "arrival": "Tue 09:10"}
+
+
+def searching(sensor="exact", name="mini", **changes):
+    scenario = parkenv.make_scenario(name, sensor_model=SENSORS[sensor], **changes)
+    env = gym.make("parkenv/Search-v2", scenario=scenario)
+    return env, parkenv.model(scenario)
+
+
+def random_action(observation, rng, n_actions=PARK + 1):
+    return int(rng.choice(np.flatnonzero(observation["action_mask"][:n_actions])))
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 2**32))
+def test_its_beliefs_are_those_of_the_environment(sensor, seed):
+    env, model = searching(sensor, day_error=0.8)
+    observation, _ = env.reset(seed=seed)
+    belief, rng = model.initial_belief(observation), np.random.default_rng(seed)
+    for _ in range(25):
+        action = random_action(observation, rng)
+        observation, _, over, _, _ = env.step(action)
+        belief = model.update(belief, action, observation)
+        assert belief.vertex == observation["vertex"]
+        np.testing.assert_allclose(belief.slots.p_occupied, observation["p_occupied"], atol=1e-6)
+        np.testing.assert_allclose(belief.slots.parts, observation["belief"], atol=1e-5)
+        if over:
+            return
+
+
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_worlds_of_the_updated_belief_are_those_weighted_by_the_observations(sensor):
+    """Bayes' rule: a particle filter by `observation_probability` expects what `sample` of the updated belief does."""
+    env, model = searching(sensor, day_error=0.8)
+    rng, n = np.random.default_rng(5), 40_000
+    observation, _ = env.reset(seed=2)
+    belief = model.initial_belief(observation)
+    particles, weight = model.sample(belief, rng, n), np.ones(n)
+    for _ in range(5):
+        action = random_action(observation, rng, PARK)
+        observation, *_ = env.step(action)
+        p = model.observation_probability(observation, particles, action)
+        by_particles = weight @ p / weight.sum()
+        by_belief = model.observation_probability(observation, model.sample(belief, rng, n), action)
+        error = np.sqrt(weight**2 @ (p - by_particles) ** 2) / weight.sum() + by_belief.std() / n**0.5
+        assert by_particles > 0.0
+        assert abs(by_particles - by_belief.mean()) < 4 * error + 1e-9
+        weight *= p
+        particles.step(np.full(n, action))
+        belief = model.update(belief, action, observation)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", SENSORS)
+def test_a_heuristic_takes_as_long_as_in_the_environment(sensor):
+    env, model = searching(sensor, "campus")
+    agent, total_s = make_agent("first-free", env.unwrapped.scenario), []
+    for seed in range(1500):
+        observation, _ = env.reset(seed=seed, options=START)
+        memory, over, late = None, False, False
+        while not (over or late):
+            action, memory = agent.predict(observation, memory)
+            observation, _, over, late, info = env.step(action)
+        total_s.append(info["total_s"])
+    observation, _ = env.reset(seed=0, options=START)
+    belief = model.initial_belief(observation)
+    cost_s = model.sample(belief, np.random.default_rng(0), 20_000).run(POLICIES["first-free"])
+    error = np.hypot(np.std(total_s) / len(total_s) ** 0.5, cost_s.std() / len(cost_s) ** 0.5)
+    assert abs(np.mean(total_s) - cost_s.mean()) < 3.5 * error
+
+
+def numbers_in(*roots):
+    """Yield the bytes of all arrays and whole numbers that the objects lead to, not by way of code."""
+    seen, waiting = set(), list(roots)
+    while waiting:
+        one = waiting.pop()
+        code = type(one).__module__.startswith(("numba", "llvmlite", "ctypes"))
+        if code or id(one) in seen or isinstance(one, (type, types.ModuleType, types.FunctionType)):
+            continue
+        seen.add(id(one))
+        if isinstance(one, (np.ndarray, np.generic)):
+            yield np.asarray(one).tobytes()
+            waiting.append(one.base)
+        elif isinstance(one, int) and abs(one) < 2**64:
+            yield one.to_bytes(9, "little", signed=True)
+        waiting += gc.get_referents(one)
+
+
+def test_no_key_of_the_world_can_be_reached():
+    env, model = searching("noisy")
+    observation, _ = env.reset(seed=3)
+    rng, belief = np.random.default_rng(0), model.initial_belief(observation)
+    for _ in range(5):
+        action = random_action(observation, rng, PARK)
+        observation, *_ = env.step(action)
+        belief = model.update(belief, action, observation)
+    state = model.sample(belief, rng)
+    record = env.unwrapped.searches.records[0]
+    hidden = [record[name].tobytes() for name in ("key", "seed_state")]
+    assert any(hidden[0] in found for found in numbers_in(env.unwrapped.searches)), "the walk finds it there"
+    for found in numbers_in(model, belief, state, agent_memory(env)):
+        assert not any(key in found for key in hidden)
+
+
+def agent_memory(env):
+    agent = make_agent("rollout", env.unwrapped.scenario, simulations=4)
+    return agent, agent.predict(env.reset(seed=3)[0])[1]
+
+
+def test_a_step_leaves_its_state_and_only_new_random_numbers_change_what_comes():
+    env, model = searching("noisy", "campus")
+    belief, rng = model.initial_belief(env.reset(seed=0)[0]), np.random.default_rng(0)
+    state = model.sample(belief, rng)
+    many = model.sample(belief, np.random.default_rng(0), 1, copies=3)
+    before = state.searches.records.tobytes()
+    futures = []
+    for reseeded in (False, False, True):
+        now, told = state, []
+        for action in (3, 3, 3, 0, 3, 3):
+            now, observation, cost_s, over = model.step(now, action, rng if reseeded else None)
+            told.append((observation.slots.tolist(), observation.taken.tolist(), cost_s, over))
+        futures.append(told)
+    assert state.searches.records.tobytes() == before
+    assert futures[0] == futures[1] != futures[2]
+    for action, told in zip((3, 3, 3, 0, 3, 3), futures[0], strict=True):
+        cost_s, over = many.step(np.full(3, action))
+        assert (many.observation(2).slots.tolist(), many.observation(1).taken.tolist()) == told[:2]
+        assert cost_s.tolist() == [told[2]] * 3
+        assert over.tolist() == [told[3]] * 3
+
+
+def test_bad_input_is_answered_in_one_line():
+    env, model = searching()
+    observation, _ = env.reset(seed=0)
+    belief, rng = model.initial_belief(observation), np.random.default_rng(0)
+    other_env, other = searching(name="campus")
+    state = model.sample(belief, rng)
+    calls = {
+        "lot 'mini'": lambda: other.sample(belief, rng),
+        "slots, want": lambda: other.initial_belief(observation),
+        "action is 7": lambda: model.step(state, 7),
+        "lot 'campus'": lambda: model.step(
+            other.sample(other.initial_belief(other_env.reset(seed=0)[0]), rng), 0
+        ),
+        "holds 2": lambda: model.step(model.sample(belief, rng, 2), 0),
+        "of vertex": lambda: model.update(belief, 3, {**observation, "vertex": 10_000}),
+    }
+    for message, call in calls.items():
+        with pytest.raises(InputError, match=message) as caught:
+            call()
+        assert "\n" not in str(caught.value)
+
+
+def test_rollouts_are_the_same_under_a_seed_and_no_worse_than_their_heuristic():
+    env, _ = searching(name="mini", day_error=0.8)
+    scenario = env.unwrapped.scenario
+    takes = {}
+    for name, options in (("rollout", {}), ("rollout", {"seed": 0}), ("greedy-total", {})):
+        agent = make_agent(name, scenario, **options)
+        total_s = [parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in range(12)]
+        takes.setdefault(name, []).append(total_s)
+    assert takes["rollout"][0] == takes["rollout"][1]
+    assert np.mean(takes["rollout"][0]) < np.mean(takes["greedy-total"])
