@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from weakref import WeakKeyDictionary
 
 import cv2
@@ -18,6 +18,7 @@ from sim_sensors.mesh import Ground
 _FINEST = 0.025  # m a texel
 _MOST_TEXELS = 20e6
 _MARGIN = 6.0  # m of ground drawn around paved and painted areas
+_STRIP = 64  # rows
 _SUBPIXEL = 4  # bits of fraction in OpenCV's polygon corners
 
 
@@ -71,27 +72,39 @@ def _draw(ground: Ground) -> GroundTexture:
     for x0, y0, x1, y1, width in ground.markings:
         cv2.fillConvexPoly(paint, corners(_strip(x0, y0, x1, y1, width)), 255, cv2.LINE_AA, _SUBPIXEL)
 
-    blotch = _spread(fractal_noise(512, generator, 1.3), paved.shape, texel, 40.0)
-    mottle = _spread(fractal_noise(512, generator, 0.8), paved.shape, texel, 9.0)
-    grain = generator.standard_normal((512, 512)).astype(np.float32)
-    grain = np.tile(grain, (rows // 512 + 1, columns // 512 + 1))[:rows, :columns]
+    blotches = _spread(fractal_noise(512, generator, 1.3), columns, texel, 40.0)
+    mottles = _spread(fractal_noise(512, generator, 0.8), columns, texel, 9.0)
+    grains = _beside(generator.standard_normal((512, 512)).astype(np.float32), columns)
 
-    asphalt = 0.115 * (1.0 + 0.16 * blotch + 0.1 * mottle + 0.13 * grain)
+    def noise(strip: slice) -> list[NDArray[np.float32]]:
+        return [each[np.arange(strip.start, strip.stop) % len(each)] for each in (blotches, mottles, grains)]
+
+    # What is computed in strips stays in the processor's cache.
+    strips = [slice(first, min(first + _STRIP, rows)) for first in range(0, rows, _STRIP)]
+    asphalt = np.empty(paved.shape, dtype=np.float32)
+    for strip in strips:
+        blotch, mottle, grain = noise(strip)
+        asphalt[strip] = 0.115 * (1.0 + 0.16 * blotch + 0.1 * mottle + 0.13 * grain)
     _repair(asphalt, generator, texel)
-    asphalt *= _stains(paved.shape, ground, corners, generator, texel)
-    _crack(asphalt, generator, texel)
-    # Paint wears off under tyres and on protruding stones.
-    wear = np.clip(0.8 - 0.28 * mottle - 0.2 * blotch - 0.14 * grain, 0.1, 0.95)
-    cover = wear * (paint.astype(np.float32) / 255.0)
-    grey = asphalt * (1.0 - cover) + (0.5 + 0.05 * blotch + 0.02 * grain) * cover
+    stains = _stains(paved.shape, ground, corners, generator, texel)
+    cracks = _cracks(paved.shape, generator, texel)
+    texels = np.empty((rows, columns, 3), dtype=np.uint8)
+    for strip in strips:
+        blotch, mottle, grain = noise(strip)
+        dark = asphalt[strip] * (1.0 - 0.75 * (stains[strip].astype(np.float32) / 255.0))
+        dark *= 1.0 - 0.6 * cracks[strip].astype(np.float32) / 255.0
+        # Paint wears off under tyres and on protruding stones.
+        wear = np.clip(0.8 - 0.28 * mottle - 0.2 * blotch - 0.14 * grain, 0.1, 0.95)
+        cover = wear * (paint[strip].astype(np.float32) / 255.0)
+        grey = dark * (1.0 - cover) + (0.5 + 0.05 * blotch + 0.02 * grain) * cover
 
-    on_pavement = paved.astype(np.float32) / 255.0
-    grass = 0.075 * (1.0 + 0.2 * blotch + 0.25 * mottle + 0.35 * grain)
-    texels = np.empty((rows, columns, 3), dtype=np.float32)
-    texels[..., 0] = np.sqrt(np.clip(grey * on_pavement + grass * (1.0 - on_pavement), 0.004, 1.0))
-    texels[..., 1] = 1.0 - on_pavement
-    texels[..., 2] = np.clip(0.4 - 0.3 * blotch - 0.1 * mottle, 0.0, 1.0) * on_pavement
-    return _pyramid((texels * 255.0).astype(np.uint8), low, texel)
+        on_pavement = paved[strip].astype(np.float32) / 255.0
+        grass = 0.075 * (1.0 + 0.2 * blotch + 0.25 * mottle + 0.35 * grain)
+        light = np.sqrt(np.clip(grey * on_pavement + grass * (1.0 - on_pavement), 0.004, 1.0))
+        water = np.clip(0.4 - 0.3 * blotch - 0.1 * mottle, 0.0, 1.0) * on_pavement
+        for channel, values in enumerate((light, 1.0 - on_pavement, water)):
+            texels[strip, :, channel] = (values * 255.0).astype(np.uint8)
+    return _pyramid(texels, low, texel)
 
 
 def _extent(ground: Ground) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -110,14 +123,15 @@ def _strip(x0: float, y0: float, x1: float, y1: float, width: float) -> NDArray[
     return np.stack([start - across, end - across, end + across, start + across])
 
 
-def _spread(
-    noise: NDArray[np.float64], shape: tuple[int, int], texel: float, period: float
-) -> NDArray[np.float32]:
-    """Stretch tileable noise so that it repeats every `period` metres."""
+def _spread(noise: NDArray[np.float64], columns: int, texel: float, period: float) -> NDArray[np.float32]:
+    """Stretch tileable noise so that it repeats every `period` metres; rows repeat after the last."""
     size = max(8, round(period / texel))
-    big = cv2.resize(noise.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC)
-    repeats = (shape[0] // size + 1, shape[1] // size + 1)
-    return np.ascontiguousarray(np.tile(big, repeats)[: shape[0], : shape[1]])
+    return _beside(cv2.resize(noise.astype(np.float32), (size, size), interpolation=cv2.INTER_CUBIC), columns)
+
+
+def _beside(tile: NDArray[Any], columns: int) -> NDArray[np.float32]:
+    """Repeat a tile along its rows, up to a number of columns."""
+    return np.tile(tile, columns // tile.shape[1] + 1)[:, :columns]
 
 
 def _repair(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
@@ -135,8 +149,8 @@ def _stains(
     corners: Callable[[NDArray[np.float64]], NDArray[np.int32]],
     generator: np.random.Generator,
     texel: float,
-) -> NDArray[np.float32]:
-    """Return a factor on the albedo: oil and rust stains, denser near markings."""
+) -> NDArray[np.uint8]:
+    """Return how dark oil and rust stains are, 255 = 1; they are denser near markings."""
     stain = np.zeros(shape[:2], dtype=np.uint8)
     n_lines = len(ground.markings)
     area = shape[0] * shape[1] * texel**2
@@ -149,13 +163,12 @@ def _stains(
         radius = max(1, round(float(generator.exponential(0.09)) / texel))
         position = (int(center[0]), int(center[1]))
         cv2.circle(stain, position, radius, int(generator.integers(40, 160)), -1)
-    soft = cv2.GaussianBlur(stain, (0, 0), 1.6).astype(np.float32) / 255.0
-    return np.asarray(1.0 - 0.75 * soft, dtype=np.float32)
+    return np.asarray(cv2.GaussianBlur(stain, (0, 0), 1.6), dtype=np.uint8)
 
 
-def _crack(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: float) -> None:
-    """Draw cracks: dark random walks."""
-    rows, columns = asphalt.shape
+def _cracks(shape: tuple[int, ...], generator: np.random.Generator, texel: float) -> NDArray[np.uint8]:
+    """Return how dark cracks are, 255 = 1: random walks."""
+    rows, columns = shape
     mask = np.zeros((rows, columns), dtype=np.uint8)
     for _ in range(int(rows * columns * texel**2 / 90.0)):
         steps = int(generator.integers(6, 40))
@@ -163,7 +176,7 @@ def _crack(asphalt: NDArray[np.float32], generator: np.random.Generator, texel: 
         path = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0) * 0.12 / texel
         path += generator.uniform(0.0, 1.0, 2) * (columns, rows)
         cv2.polylines(mask, [path.astype(np.int32)], False, int(generator.integers(70, 200)), 1, cv2.LINE_AA)
-    asphalt *= 1.0 - 0.6 * mask.astype(np.float32) / 255.0
+    return mask
 
 
 def _pyramid(image: NDArray[np.uint8], low: NDArray[np.float64], texel: float) -> GroundTexture:
