@@ -22,12 +22,11 @@ from parkenv.studies.fleet.recorded_days import record_days
 from planners.heuristics import POLICIES
 
 DISTRICTS = {
-    "a block of flats (Neukölln)": "neukoelln_patch_20240328.osm.gz",
-    "the centre of a small town (Hoyerswerda)": "hoyerswerda_20240812.osm.pbf",
-    "the centre of a city (Helsinki)": "helsinki_centre_20190421.osm.pbf",
+    "residential, inner (Neukölln)": ("neukoelln_patch_20240328.osm.gz", (1.0, 2.0)),
+    "centre of a small town (Hoyerswerda)": ("hoyerswerda_20240812.osm.pbf", (1.0, 2.0)),
+    "centre of a city (Helsinki)": ("helsinki_centre_20190421.osm.pbf", (1.0,)),
 }
-LOADS = (1.0, 2.0)
-"""How many times as many cars a space come as in the packaged town."""
+"""Extract of each district, and how many times as many cars a space come as in the packaged town."""
 CLASSES = {
     "residents": {"permit": 0.85, "private": 0.5},
     "commuters": {"private": 0.5},
@@ -36,7 +35,7 @@ CLASSES = {
     "deliveries": {"delivery": 1.0, "customers": 0.5},
 }
 """Who may park by the rules that an import finds, by purpose; as far as the district has such rules."""
-DAYS, ROUNDS, SHORTEST_MIN = 2, 3, 0.05
+DAYS, ROUNDS, SHORTEST_MIN = 2, 2, 0.05
 
 
 def scenario_file(path, lot, load):
@@ -116,9 +115,9 @@ def main(towns):
     for kind in (None, *sorted({kind for kind, _ in trips})):
         minutes = np.array([value for place, value in trips if kind in (None, place)])
         say(row(f"measured{f', {kind}' if kind else ''}", "", "", minutes))
-    for name, extract in DISTRICTS.items():
+    for name, (extract, loads) in DISTRICTS.items():
         lot = import_town(towns / "osm" / extract).draft.lot()
-        for load in LOADS:
+        for load in loads:
             with tempfile.TemporaryDirectory() as folder:
                 minutes, taken = searches(Path(folder), lot, load)
             title = name if load == 1.0 else f"the same, {load:g} times as many cars"
