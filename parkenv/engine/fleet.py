@@ -168,8 +168,7 @@ class Fleet:
     | `reserved` | `Box(-1, 1, (n_slots,), int8)` | 1: reserved for this car; -1: it knows of none | `reserve` |
     | `leaving` | `Box(0, 1, (n_slots,), int8)` | slots in view whose cars leave soon | `leaving_soon_s` |
     | `cars` | `Box(0, 127, (2, n_vertices), int8)` | other cars in view at each vertex; standing | `sees_cars` |
-    | `stay_s` | `Box(0, inf, (1,), float32)` | the car's own stay, s, which it pays for | rules of zones |
-    | `driver` | `Box(0, inf, (6,), float64)` | its `Drivers`, and the factor of its walk | rules of zones |
+    | `driver` | `Box(0, inf, (6,), float64)` | its `Drivers`, stay first, and the factor of its walk | rules of zones |
 
     With one car, `Demand(Headways(1))` and the background `process`, the fleet is `parkenv/Search-v2` to the last bit.
 
@@ -682,7 +681,6 @@ class Fleet:
         if self.leaving_soon_s > 0.0:
             further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
         if self.scenario.has_rules:
-            further["stay_s"] = spaces.Box(0.0, np.inf, (1,), np.float32)
             further["driver"] = spaces.Box(0.0, np.inf, (6,), np.float64)
         if self.sees_cars:
             further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
@@ -709,7 +707,6 @@ class Fleet:
         if self.leaving_soon_s > 0.0:
             observation["leaving"] = self._leaving_in_view(int(vertex))
         if self.scenario.has_rules:
-            observation["stay_s"] = np.float32(self._cars["stay_s"][[car]])
             observation["driver"] = np.array([*self.drivers_of(car), self._cars["walks"][car]], np.float64)
         if self.sees_cars:
             observation["cars"] = self._cars_in_view(car, int(vertex))
