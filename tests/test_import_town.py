@@ -293,6 +293,47 @@ def test_capacities_are_read_with_what_stands_around_them(text, capacity):
     assert whole_number(text) == capacity
 
 
+def test_values_that_nobody_can_read_are_as_none(tmp_path):
+    """Odd values of tags, as maps of the world have them, make a lot with the places that are tagged plainly."""
+    odd = {
+        "capacity": ("12;14", "-3", "many", "99999999", "12 x 3", "\u0661\u0662"),
+        "charge": ("free", "0 EUR/0 min", "1e9 EUR/hour", "999999 EUR/hour", "\u20ac2; \u20ac3", "2 EUR/"),
+        "maxstay": ("P1D", "unlimited", "0 min", "2 hours @ (Mo-Fr 08:00-18:00)", "1e99 h", "-1 h"),
+        "opening_hours": ("sunrise-sunset", "Mo-Su 22:00-06:00", "Mo-Fr 25:00-99:00", "PH off", "open", ";;"),
+        "access": ("destination", "?", "permissive", "customers", "yes;no", ""),
+        "building:levels": ("-1", "0", "3.5", "1e9", "x", "12;3"),
+    }
+    road = {
+        "maxspeed": ("none", "signals", "-1", "20;30", "DE:urban", "0"),
+        "width": ("0.1", "99", "-3", "12'", "narrow", "3 m"),
+        "lanes": ("0", "1.5", "99", "x", "-2", "2;3"),
+        "parking:both": ("lane", "??", "yes", "separate", "half_on_kerb", "street_side"),
+        "parking:both:orientation": ("diagonal", "x", "parallel", "perpendicular", "", "marked"),
+        "parking:both:capacity": ("20-30", "50+", "-1", "0", "x", "1,500"),
+    }
+    place = grid()
+    for k in range(6):
+        own = {name: values[k] for name, values in odd.items()}
+        place.box(
+            20 + 30 * k, 20, 40 + 30 * k, 60, {"amenity": "parking", "fee": "yes", "name": f"P{k}"}, **own
+        )
+        plain = own | {"capacity": str(70 + k), "name": f"Q{k}", "access": "yes"}
+        place.box(
+            20 + 30 * k, 120, 40 + 30 * k, 160, {"amenity": "parking", "parking": "multi-storey"}, **plain
+        )
+        way = {name: values[k] for name, values in road.items()}
+        place.way(
+            [(200 + 40 * k, 200), (220 + 40 * k, 290), (200 + 40 * k, 400)],
+            {"highway": "unclassified"},
+            **way,
+        )
+    town = draft(place, tmp_path)
+    assert [row_of(town, f"Q{k}")["capacity"] for k in range(6)] == [70 + k for k in range(6)]
+    lot = town.draft.lot()
+    assert lot.capacity.sum() == sum(row["capacity"] for row in town.facilities)
+    assert all(1.0 <= facility.capacity < 1e5 for facility in lot.facilities if facility.is_counted)
+
+
 # ---- rules ----
 
 
