@@ -18,7 +18,7 @@ from parkenv.studies.fleet.drivers import AgentsByStay, policy_of
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
 from parkenv.world.occupancy.process import OccupancyProcess
-from parkenv.world.tariff import NO_ZONE, Tariff
+from parkenv.world.tariff import NO_ZONE, Hours, Price, Tariff, Zone
 from planners import make_agent
 from planners.heuristics import POLICIES
 
@@ -63,7 +63,7 @@ def test_a_file_says_what_options_say(tmp_path):
     ("costs", "message"),
     [
         ({"prices": {"othr": 1.0}}, "no zone 'othr'; did you mean 'other'"),
-        ({"prices": {"other": -1.0}}, "costs.prices.other is -1.0, want a number of at least 0"),
+        ({"prices": {"other": -1.0}}, "costs.prices.other is -1.0, want a number from 0"),
         ({"prices": {"other": "2"}}, "costs.prices.other is '2', want a number"),
         ({"value_of_time": 0.0}, "costs.value_of_time is 0.0, want a number above 0"),
     ],
@@ -198,3 +198,18 @@ def test_agents_in_python_know_their_own_stay(scenario):
         its.run(agents)
         slots.append(its.cars["slot"].tolist())
     assert slots[0] == slots[1]
+
+
+def test_prices_are_added_to_those_of_paid_zones():
+    """Their hours, free minutes and limits stay; zones that cost nothing, or have another name, keep their prices."""
+    day = Hours.parse("Mo-Fr 08:00-20:00")
+    paid = Zone("kerb paid Mo-Fr", Price(2.0, free_s=900.0, charged=day), max_stay_s=7200.0)
+    steps = Zone("kerb steps", Price(4.0, steps=((3600.0, 1.0), (7200.0, 3.0))))
+    others = Zone("kerb free"), Zone("garage", Price(2.0))
+    tariff = Tariff({"kerb*": "+1"})
+    assert tariff.priced(paid) == replace(paid, price=Price(3.0, free_s=900.0, charged=day))
+    assert tariff.priced(steps).price == Price(5.0, steps=((3600.0, 2.0), (7200.0, 5.0)))
+    assert tuple(map(tariff.priced, others)) == others
+    assert Tariff({"garage": "+0.5"}).priced(others[1]).price == Price(2.5)
+    with pytest.raises(InputError, match="no paid zone 'lot"):
+        Tariff({"lot*": "+1"}).require_zones([paid, *others], "town")

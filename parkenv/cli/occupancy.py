@@ -201,11 +201,9 @@ class Demand(Command):
 
     def run(self) -> None:
         """See `Command`."""
-        from parkenv.files.atomic_write import make_folder
         from parkenv.forecast.counts import Counts
         from parkenv.studies.fleet.counted_demand import PREDICTIONS, Weeks, fit_demand
 
-        make_folder(self.out)
         console = make_console()
         with stages(console) as progress:
             title, summary = fit_demand(

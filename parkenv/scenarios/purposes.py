@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field, WithJsonSchema
 
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, nearest
 from parkenv.files.known_names import MAX_CARS
 from parkenv.files.spec_file import Several, Spec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
+from parkenv.world.tariff import PUBLIC
 from parkenv.world.week import DAY_HOURS
 
 if TYPE_CHECKING:  # help and completion read fields alone
@@ -26,9 +27,11 @@ _RATES = f"a number from 0 to {MAX_RATE:g}, or {DAY_HOURS} of these, one for eac
 def _rates(value: object) -> object:
     """Expand a number to those of all hours."""
     numbers: list[Any] = list(value) if isinstance(value, list | tuple) else [value] * DAY_HOURS
-    good = [isinstance(one, int | float) and not isinstance(one, bool) for one in numbers]
-    if len(numbers) != DAY_HOURS or not all(good) or not all(0.0 <= one <= MAX_RATE for one in numbers):
+    if len(numbers) != DAY_HOURS:
         raise ValueError(_RATES)
+    for hour, one in enumerate(numbers):
+        if isinstance(one, bool) or not isinstance(one, int | float) or not 0.0 <= one <= MAX_RATE:
+            raise ValueError(f"{_RATES}" + (f": hour {hour} has {one!r:.40}" if value is not one else ""))
     return tuple(map(float, numbers))
 
 
@@ -130,8 +133,21 @@ def demand_of(
     for field, (points, of_lot) in places.items():
         some = any(getattr(one, field) for one in purposes.values())
         others[field] = weights_of_all(of_lot) or ((1.0,) * len(points) if some else ())
-    made = []
+    made, users = [], {zone.name: zone.users for zone in lot.zone_rules.values()}
+    spaces = [
+        (users.get(lot.zones[k], (PUBLIC,)), n) for k, n in zip(lot.zone_of_slot, lot.capacity, strict=True)
+    ]
     for name, one in purposes.items():
+        if unknown := [its for its in one.classes if its not in lot.classes[1:]]:
+            raise InputError(
+                f"demand.{name}.classes has {unknown[0]!r:.40}, no class of lot {lot.name!r:.40} beside {PUBLIC}; "
+                f"{nearest(unknown[0], lot.classes[1:])}"
+            )
+        room = sum(int(n) for may, n in spaces if PUBLIC in may or set(may) & set(one.classes))
+        if one.parked > room:
+            raise InputError(
+                f"demand.{name}.parked is {one.parked}, want at most the {room:,} spaces that it may use"
+            )
         chosen: dict[str, tuple[float, ...]] = {}
         for field, (points, of_lot) in places.items():
             own = getattr(one, field) or tuple(of_lot.get(name, others[field]))

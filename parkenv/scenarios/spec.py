@@ -6,6 +6,7 @@ Every table of the file has a class here, which validates it. The published JSON
 from __future__ import annotations
 
 import contextlib
+import math
 from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Self
@@ -16,6 +17,7 @@ from pydantic import (
     Field,
     GetJsonSchemaHandler,
     ValidationInfo,
+    WithJsonSchema,
     model_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
@@ -48,7 +50,7 @@ from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
-from parkenv.world.tariff import HOUR_S, NO_ZONE, VALUE_OF_TIME
+from parkenv.world.tariff import HOUR_S, NO_ZONE, VALUE_OF_TIME, added
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
@@ -398,6 +400,10 @@ class Speeds(Spec):
     v_walk_kmh: Speed = 4.0
 
 
+MAX_PRICE = 1e6
+"""Highest price of an hour."""
+
+
 def _per_hour(text: str) -> float:
     """Parse AMOUNT/h; the unit may be left out."""
     try:
@@ -407,11 +413,29 @@ def _per_hour(text: str) -> float:
 
 
 def _price(text: str) -> tuple[str, object]:
-    """Parse ZONE=AMOUNT/h."""
+    """Parse ZONE=AMOUNT/h, or ZONE=+AMOUNT/h."""
     zone, equals, amount = text.rpartition("=")
     if not (zone and equals):
         raise InputError(f"is {text!r:.60}, want ZONE=AMOUNT/h, such as centre=2/h")
-    return zone, _per_hour(amount)
+    number = _per_hour(amount)
+    return zone, f"+{number:g}" if amount.startswith("+") else number
+
+
+def _amount(value: object) -> object:
+    """Check a price, or a text such as +1 for one that is added."""
+    number = math.nan
+    if isinstance(value, int | float | str) and not isinstance(value, bool):
+        with contextlib.suppress(InputError):
+            number = added(value)
+    if not 0.0 <= number <= MAX_PRICE:
+        raise ValueError(f"a number from 0 to {MAX_PRICE:g}, or a text such as +1")
+    return value if isinstance(value, str) else number
+
+
+_PRICE = {
+    "anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_PRICE}, {"type": "string", "pattern": r"^\+"}]
+}
+_Amount = Annotated[float | str, BeforeValidator(_amount), WithJsonSchema(_PRICE)]
 
 
 def _prices(value: object) -> object:
@@ -430,12 +454,12 @@ class Costs(Spec):
     failure_s: Cost = Field(10.0, description="Failed attempt to park; planners know it.")
     wait_s: float = Field(1.0, gt=0.0, le=86_400.0, description="Move that the drive graph does not have.")
     give_up_s: Cost = Field(1800.0, description="Give-up penalty: park elsewhere and walk.")
-    prices: Annotated[dict[str, Annotated[float, Field(ge=0.0, le=1e6)]], BeforeValidator(_prices)] = option(
+    prices: Annotated[dict[str, _Amount], BeforeValidator(_prices)] = option(
         {},
-        f"Price of an hour in a zone of the lot, in any currency; {NO_ZONE}: in slots without a zone. Once for each "
-        "zone.",
+        f"Price of an hour in a zone of the lot, in any currency; {NO_ZONE}: in slots without a zone; +AMOUNT is "
+        "added. Once for each zone; * stands for any letters of the names of paid zones.",
         name="--price",
-        takes="ZONE=AMOUNT/h",
+        takes="ZONE=[+]AMOUNT/h",
         panel="Prices",
         parse=_price,
         repeat=True,

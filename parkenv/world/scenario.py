@@ -102,7 +102,7 @@ class SearchProblem:
         _require_index("goal", self.goal, len(self.lot.goals))
         if not isinstance(self.tariff, Tariff):
             raise InputError(f"tariff is a {type(self.tariff).__name__}, want a Tariff")
-        self.tariff.require_zones(self.lot.zones, self.lot.name)
+        self.tariff.require_zones(self._own_zones, self.lot.name)
         for name in ("v_drive", "v_walk", "wait_s", "value_of_time"):
             require_number(name, getattr(self, name), above=0.0)
         for name in ("failure_s", "give_up_s", "stay_s", "priced_at_s", "kwh"):
@@ -165,7 +165,11 @@ class SearchProblem:
     @cached_property
     def zone_rules(self) -> tuple[Zone, ...]:
         """Rules of the lot's zones, in their order, with the prices of the tariff."""
-        return tuple(self.tariff.priced(self.lot.zone_rules.get(name, Zone(name))) for name in self.lot.zones)
+        return tuple(map(self.tariff.priced, self._own_zones))
+
+    @property
+    def _own_zones(self) -> list[Zone]:
+        return [self.lot.zone_rules.get(name, Zone(name)) for name in self.lot.zones]
 
     def parking_cost_of(self, drivers: Drivers) -> FloatArray:
         """Return what drivers pay in each slot as time, (..., n_slots) s: that of the lot, and `zone_cost_s`."""

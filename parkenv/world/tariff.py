@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -201,6 +201,12 @@ class Price:
         """Whether any stay costs anything."""
         return any((self.per_hour, self.per_kwh, *(price for _, price in self.steps)))
 
+    def raised(self, per_hour: float) -> Price:
+        """Return the price with so much more an hour; a cap for a day stays."""
+        steps = tuple((stay_s, price + per_hour * stay_s / HOUR_S) for stay_s, price in self.steps)
+        beyond = self.per_hour + per_hour if self.per_hour or not steps else 0.0
+        return replace(self, per_hour=beyond, steps=steps)
+
     def amount(self, begin_s: ArrayLike, stay_s: ArrayLike, kwh: ArrayLike = 0.0) -> FloatArray:
         """Return what stays cost, (...) in the currency.
 
@@ -284,40 +290,70 @@ class Zone:
 
 @dataclass(frozen=True)
 class Tariff:
-    """Prices per hour that replace those of a lot's zones.
+    """Prices per hour that replace those of a lot's zones, or are added to them.
 
     Args:
-        per_hour: price of an hour by zone, at least 0, in any currency; other zones keep their prices.
+        per_hour: price of an hour by zone, at least 0, in any currency; a text such as `+1` is added to what an
+            hour of the zone costs, with its hours and steps as they are. A name may have `*` for any letters: that of
+            all such zones that cost something. The first name of a zone counts; other zones keep their prices.
 
     Raises:
         InputError: a price is no number of at least 0.
     """
 
-    per_hour: Mapping[str, float] = field(default_factory=dict)
+    per_hour: Mapping[str, float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for zone, price in self.per_hour.items():
-            require_number(f"price of zone {zone!r:.40}", price, least=0.0)
+            require_number(f"price of zone {zone!r:.40}", added(price), least=0.0)
         object.__setattr__(self, "per_hour", MappingProxyType(dict(self.per_hour)))
 
     def __bool__(self) -> bool:
         """Whether there are prices, be they 0."""
         return bool(self.per_hour)
 
-    def __reduce__(self) -> tuple[type[Tariff], tuple[dict[str, float]]]:
+    def __reduce__(self) -> tuple[type[Tariff], tuple[dict[str, float | str]]]:
         return Tariff, (dict(self.per_hour),)
 
     def priced(self, zone: Zone) -> Zone:
         """Return the zone with the price that the tariff has for it, or as it is."""
-        per_hour = self.per_hour.get(zone.name)
-        return zone if per_hour is None else replace(zone, price=Price(per_hour))
+        price = next((price for name, price in self.per_hour.items() if _means(name, zone)), None)
+        if isinstance(price, str):
+            return replace(zone, price=zone.price.raised(added(price)))
+        return zone if price is None else replace(zone, price=Price(price))
 
-    def require_zones(self, zones: tuple[str, ...], lot: str) -> None:
+    def require_zones(self, zones: Sequence[Zone], lot: str) -> None:
         """Check that a lot has every zone with a price.
 
         Raises:
             InputError: it does not; the message names the nearest zone.
         """
-        for zone in self.per_hour:
-            if zone not in zones:
-                raise InputError(f"price: lot {lot!r:.40} has no zone {zone!r:.40}; {nearest(zone, zones)}")
+        for name in self.per_hour:
+            if not any(_means(name, zone) for zone in zones):
+                near = nearest(name, [zone.name for zone in zones])
+                what = "paid zone" if "*" in name else "zone"
+                raise InputError(f"price: lot {lot!r:.40} has no {what} {name!r:.40}; {near}")
+
+
+def added(price: float | str) -> float:
+    """Return the amount of a price, of which a text that begins with + is added.
+
+    Raises:
+        InputError: it is another text.
+    """
+    if not isinstance(price, str):
+        return price
+    try:
+        if price.startswith("+"):
+            return float(price)
+    except ValueError:
+        pass
+    raise InputError(f"price is {price!r:.40}, want an amount, or one that is added, such as +1")
+
+
+def _means(name: str, zone: Zone) -> bool:
+    """Whether a name is that of a zone, or one with `*` for all zones like it that cost something."""
+    parts = [re.escape(part) for part in name.split("*")]
+    return name == zone.name or (
+        len(parts) > 1 and bool(zone.price) and bool(re.fullmatch(".*".join(parts), zone.name))
+    )

@@ -12,11 +12,10 @@ from scipy.optimize import linear_sum_assignment
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
+from parkenv.files.csv_tables import TEXT, WHOLE, Kind, typed_records
 from parkenv.files.file_names import is_plain
-from parkenv.files.limited_reading import csv_records
+from parkenv.files.limited_reading import require_file
 
-COLUMNS = ("name", "capacity", "lat", "lon")
-MAX_CAPACITY = 1_000_000
 NEAR = 100.0  # m, from a car park of the list to the entry of the facility that it is
 SAME_NAME = 4.0  # so many times as far if they share a word that few of the list have
 _SIMILAR = 3.0  # largest ratio of the capacities of facilities that share no word
@@ -31,37 +30,53 @@ class ListedCarPark(NamedTuple):
     lon: float
 
 
+def _name(text: str) -> str:
+    if not (0 < len(text) <= 80 and is_plain(text)):
+        raise ValueError(text)
+    return text
+
+
+def _capacity(text: str) -> int:
+    if len(text) > 6:
+        raise ValueError(text)
+    return int(WHOLE.parse(text or "0"))
+
+
+def _degrees(most: float) -> Kind:
+    def parse(text: str) -> float:
+        if not abs(float(text)) <= most:
+            raise ValueError(text)
+        return float(text)
+
+    return Kind(f"degrees from {-most:g} to {most:g}", parse)
+
+
+_COLUMNS = {
+    "name": Kind("a printable name of 1 to 80 letters", _name),
+    "capacity": Kind(
+        "a whole number of up to 6 digits, or nothing", lambda text: WHOLE.parse(text[:7] or "0")
+    ),
+    "lat": _degrees(90.0),
+    "lon": _degrees(180.0),
+}
+
+
 def read_listed(path: Path) -> list[ListedCarPark]:
-    """Read a list of car parks, a CSV file with `COLUMNS`; others are not read.
+    """Read a list of car parks, a CSV file with the columns name, capacity, lat and lon; others are not read.
 
     Raises:
         InputError: the file cannot be read, or a value is wrong; the message names file, line, column and value.
     """
+    require_file(path)
     found: dict[str, ListedCarPark] = {}
-    for line, record in csv_records(path):
-        if missing := [name for name in COLUMNS if name not in record]:
-            raise InputError(f"{path}: has no column {missing[0]}, want {','.join(COLUMNS)}")
-        name = record["name"]
-        if not (0 < len(name) <= 80 and is_plain(name)) or name in found:
-            raise InputError(f"{path}: line {line}: name is {name!a:.40}, want a name of its own, printable")
-        numbers = []
-        for column, least, most in (
-            ("capacity", 0.0, MAX_CAPACITY),
-            ("lat", -90.0, 90.0),
-            ("lon", -180.0, 180.0),
-        ):
-            text = record[column]
-            try:
-                value = float(text or 0.0) if column == "capacity" else float(text)
-            except ValueError:
-                value = np.nan
-            if not least <= value <= most or (column == "capacity" and value % 1):
-                wanted = "a whole number" if column == "capacity" else "degrees"
-                raise InputError(
-                    f"{path}: line {line}: {column} is {text!r:.40}, want {wanted} from {least:g} to {most:g}"
-                )
-            numbers.append(value)
-        found[name] = ListedCarPark(name, int(numbers[0]), *numbers[1:])
+    for line, row in typed_records(path, lambda name: _COLUMNS.get(name, TEXT)):
+        if missing := [name for name in _COLUMNS if name not in row]:
+            raise InputError(f"{path}: has no column {missing[0]}, want {','.join(_COLUMNS)}")
+        if row["name"] in found:
+            raise InputError(
+                f"{path}: line {line}: name is {row['name']!r:.40}, want one that no other line has"
+            )
+        found[row["name"]] = ListedCarPark(*(row[name] for name in _COLUMNS))
     if not found:
         raise InputError(f"{path}: has no car park, want a line for each")
     return list(found.values())

@@ -18,6 +18,7 @@ NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
 LEAST_DAYS = 5
 """Days below which nothing is called better or worse: with fewer, a bootstrap interval covers less than 95 %."""
+_NAMED = 3  # zones whose prices change alike, above which they are counted
 _SHOWN_S = 0.05  # a part of a change that is said
 CHANGES = (
     "change_s", "members_change_s", "others_change_s", "search_change_s", "parking_cost_change_s", "gave_up_change_s",
@@ -92,12 +93,15 @@ def _new_prices(before: Mapping[str, float], after: Mapping[str, float]) -> str 
         >>> _new_prices({"centre": 0.0, "ring": 0.5}, {"centre": 2.0, "ring": 0.5})
         'centre 0 → 2 an hour'
     """
-    new = [
-        f"{zone} {before[zone]:g} → {price:g}"
-        for zone, price in after.items()
-        if before.get(zone, price) != price
-    ]
-    return f"{', '.join(new)} an hour" if new else None
+    new: dict[str, list[str]] = {}
+    for zone, price in after.items():
+        if before.get(zone, price) != price:
+            new.setdefault(f"{before[zone]:g} → {price:g}", []).append(zone)
+    said = []
+    for prices, zones in new.items():
+        named = zones if len(zones) <= _NAMED else [zones[0], f"{len(zones) - 1} zones more"]
+        said.append(f"{', '.join(named)} {prices}")
+    return f"{', '.join(said)} an hour" if said else None
 
 
 def _change(after: Row, before: Row, zone_number: int | None) -> Row:
@@ -284,11 +288,12 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
 
 
 def shown_changes(changes: Sequence[Row]) -> list[Row]:
-    """Return the changes that are told: without members or with as many as there are, one guidance for each demand."""
+    """Return the known changes that are told: without members or with as many as there are, one guidance by demand."""
     most = max((row["share"] for row in changes), default=0.0)
     told = [
         row for row in changes
-        if row["change"] == "scenario" and row["share"] in (0.0, most) and not (row["zone"] and row["share"])
+        if row["change"] == "scenario" and is_known(row["change_s"]) and row["share"] in (0.0, most)
+        and not (row["zone"] and row["share"])
     ]  # fmt: skip
     of_guidance: dict[tuple[Any, ...], list[Row]] = {}
     for row in changes:

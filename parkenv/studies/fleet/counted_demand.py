@@ -15,7 +15,7 @@ from scipy.stats import spearmanr
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import atomic_write, make_folder
 from parkenv.files.csv_tables import csv_columns
 from parkenv.forecast.baselines import last_week
 from parkenv.forecast.counts import Counts
@@ -112,6 +112,7 @@ def fit_demand(
     forecast = forecast_days(town.counts, 0, "rolling", settings).occupancy
     done = counted(progress, "Roll-outs", weeks.roll_outs)
     roll_out = partial(_roll_out, spec, counts, agent, forecast, rounds, days, seed)
+    make_folder(folder)
     found: list[_RollOut] = []
     with Workers(jobs) as workers:
         for one in workers.in_order([partial(roll_out, *weeks.of(k)) for k in range(weeks.roll_outs)]):
