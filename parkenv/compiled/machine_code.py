@@ -1,4 +1,4 @@
-"""Machine code of a function only where Python calls it.
+"""Optimised machine code of a function only where Python calls it.
 
 Numba optimises every function with all that it calls and makes machine code of it at once. What only compiled code
 calls is then optimised and made again with each of its callers, which takes longer than everything else.
@@ -11,12 +11,13 @@ from typing import Any
 from numba.core.codegen import JITCodeLibrary
 from numba.core.environment import lookup_environment
 from numba.core.registry import cpu_target
+from numba.core.targetconfig import ConfigStack
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]
     """The code of a function for LLVM; machine code from the first time that its address is asked for."""
 
-    _made = False
+    _optimized = _made = False
 
     def _finalize_final_module(self) -> None:
         if self._object_caching_enabled and self._compiled_object:
@@ -25,6 +26,22 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
             self._finalize_dynamic_globals()
             self._verify_declare_only_symbols()
             self._finalized = True
+
+    def _optimize_functions(self, ll_module: Any) -> None:
+        """Tidy up each function lightly; numba does it at full length, and for mere declarations, too."""
+        if _before_callers():
+            super()._optimize_functions(ll_module)
+            return
+        ll_module.data_layout = self.codegen._data_layout
+        passes, builder = self.codegen._function_pass_manager(opt=1)
+        for function in ll_module.functions:
+            if not function.is_declaration:
+                passes.run(function, builder)
+
+    def _optimize_final_module(self, at_once: bool = False) -> None:
+        if not self._optimized and (at_once or _before_callers()):
+            super()._optimize_final_module()
+            self._optimized = True
 
     def _make(self) -> None:
         super()._finalize_final_module()
@@ -42,6 +59,7 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
                 self._final_module.get_function(name)
             except NameError:
                 return 0
+            self._optimize_final_module(at_once=True)
             self._make()
         return int(super().get_pointer_to_function(name))
 
@@ -52,6 +70,16 @@ class _Library(JITCodeLibrary):  # type: ignore[misc]
             state: tuple[str, str, Any] = super().serialize_using_object_code()
             return state
         return self.name, "bitcode", self._get_module_for_linking().as_bitcode()
+
+
+def _before_callers() -> bool:
+    """Return whether the function that numba compiles now is optimised before its callers are, as numba does.
+
+    With `fastmath` the order decides to what results are rounded; and numba strikes out counting of references (`_nrt`)
+    best before functions grow.
+    """
+    flags = ConfigStack.top_or_none()
+    return flags is None or bool(flags.fastmath) or flags.nrt
 
 
 def make_code_late() -> None:

@@ -19,6 +19,7 @@ from planners.belief.planning_graph import (
     PlanningGraph,
     Records,
     is_hidden,
+    leaf,
 )
 
 MOST_OPTIONS = 12  # maximum number of slots known to be free that are considered, best first
@@ -90,7 +91,11 @@ def best_path(
         belief: the belief.
         paths: buffers, one more than there are failure costs.
     """
-    return PathChoice(*_best_path(vertex, targets, failure_s, remaining_s, budget, graph, belief, paths))
+    # Nearest vertices first: with a small budget they matter most for the next step.
+    order = np.argsort(graph.drive_s[vertex], kind="stable")
+    return PathChoice(
+        *_best_path(vertex, targets, failure_s, remaining_s, budget, order, graph, belief, paths)
+    )
 
 
 @compiled(error_model="numpy")
@@ -100,6 +105,7 @@ def _best_path(
     failure_s: float,
     remaining_s: float,
     budget: Budget,
+    nearest_first: IntArray,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
     paths: PathBuffers,
@@ -107,7 +113,8 @@ def _best_path(
     """Return the fields of `PathChoice`."""
     costs = budget.failure_costs
     plans = _plans(vertex, failure_s, costs, graph, belief, paths)
-    options, fallback_s = _options_and_fallbacks(vertex, plans.search_s.min(), graph, belief)
+    c = _least(plans.search_s)
+    options, fallback_s = _options_and_fallbacks(vertex, plans.search_s[c], graph, belief)
     at_hand_s, slot = np.inf, -1
     for s in options:
         value = expected_cost_to_slot(vertex, s, belief.slots[s].p_free, 0.0, fallback_s[s], graph, belief)
@@ -120,10 +127,8 @@ def _best_path(
     n_stops, left_s = rollout_path(vertex, targets, failure_s, graph, belief, path)
     best = _evaluate(vertex, n_stops, left_s, remaining_s, options, fallback_s, graph, belief, path)
     chosen = path
-    for c in np.argsort(plans.search_s):
-        # The known free slots make the others better, too, so these cannot become the best.
-        if plans.search_s[c] >= best.onward_s:
-            break
+    # The known free slots make the others better, too, so from there on these cannot become the best.
+    while plans.search_s[c] < best.onward_s:
         plan = _path_at(c, paths)
         found = _evaluate(
             vertex, plans.n_stops[c], plans.left_s[c], np.inf, options, fallback_s, graph, belief, plan
@@ -136,11 +141,11 @@ def _best_path(
                 plan,
                 plans.n_stops[c],
             )
+        plans.search_s[c] = np.inf
+        c = _least(plans.search_s)
     if best.onward_s == np.inf:
         return np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0
 
-    # Nearest vertices first: with a small budget they matter most for the next step.
-    nearest_first = np.argsort(graph.drive_s[vertex])
     work = 0
     for _ in range(budget.depth - len(targets)):
         n_before = len(targets)
@@ -296,7 +301,17 @@ def _plan(
     return float(found.onward_s)
 
 
-@compiled(error_model="numpy")
+@leaf
+def _least(values: FloatArray) -> int:
+    """Return the index of the least value, the first of equal ones."""
+    least = 0
+    for i in range(1, len(values)):
+        if values[i] < values[least]:
+            least = i
+    return least
+
+
+@leaf
 def _are_equal(stops: Records, others: Records) -> bool:
     """Return whether two paths observe the same slots at the same times, given equal numbers of stops."""
     for k in range(len(stops)):
@@ -347,7 +362,7 @@ def _insert_target(
     return best, kept, work
 
 
-@compiled(error_model="numpy")
+@leaf
 def _evaluate(
     vertex: int,
     n_stops: int,
@@ -399,7 +414,7 @@ def _options_and_fallbacks(
     return options, fallback_s
 
 
-@compiled(error_model="numpy")
+@leaf
 def _shows_news(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
     """Return whether any slot in view of a vertex is unobserved or may have become free."""
     for i in range(graph.view_starts[vertex], graph.view_starts[vertex + 1]):

@@ -20,14 +20,14 @@ from planners.belief.planning_graph import (
     BeliefSnapshot,
     PathBuffer,
     PlanningGraph,
-    copy_weights,
     decayed_part,
+    leaf,
 )
 
 KEPT_IN_MIND = 32  # number of stops for which a passed free slot is remembered
 
 
-@compiled(error_model="numpy")
+@leaf
 def expected_cost_to_slot(
     vertex: int,
     slot: int,
@@ -91,7 +91,7 @@ def options_at_hand(
     return best
 
 
-@compiled(error_model="numpy")
+@leaf
 def evaluate_path(
     n_stops: int,
     left_s: float,
@@ -136,7 +136,7 @@ def evaluate_path(
     return value, then_s
 
 
-@compiled(error_model="numpy")
+@leaf
 def _set_costs(
     n_stops: int,
     options: IntArray,
@@ -198,10 +198,12 @@ def _set_costs(
     stops[n_stops].first_kept = n_kept
 
 
-@compiled(error_model="numpy")
+@leaf
 def _learn_on_the_way(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
     """Set P(free) of the first observations along a path, given that the car has not parked before."""
-    weights = copy_weights(belief, path)
+    weights = path.weights[: len(belief.weights)]
+    for h in range(len(weights)):
+        weights[h] = belief.weights[h]
     for j in range(path.stops[n_stops].first):
         observation = path.observations[j]
         if observation.is_first:
@@ -210,7 +212,7 @@ def _learn_on_the_way(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) ->
             )
 
 
-@compiled(error_model="numpy")
+@leaf
 def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[float, float]:
     """Evaluate a path, given its costs and P(free) of all its observations."""
     stops, observations, kept = path.stops, path.observations, path.kept
@@ -252,7 +254,7 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
     return onward + nothing, then_s
 
 
-@compiled(error_model="numpy")
+@leaf
 def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
     """Sort the observations made at one stop by the expected time of driving to their slots."""
     observations = path.observations

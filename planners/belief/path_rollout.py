@@ -10,14 +10,13 @@ import numpy as np
 
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.compiled.jit import compiled
 from planners.belief.planning_graph import (
     BeliefSnapshot,
     PathBuffer,
     PlanningGraph,
-    copy_weights,
     decayed_part,
     is_hidden,
+    leaf,
     mean_over_days,
     needs_attempt,
 )
@@ -30,7 +29,7 @@ OBSERVE_AGAIN_S = 10.0
 """s between observations of the same slot; a later observation makes up for those left out."""
 
 
-@compiled(error_model="numpy")
+@leaf
 def rollout_path(
     vertex: int,
     targets: IntArray,
@@ -69,7 +68,9 @@ def rollout_path(
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = vertex, 0.0, 0, 0
     k, n_observations, time, n_passed = 0, 0, 0.0, 0
     choose, target = True, -1
-    weights = copy_weights(belief, path)
+    weights = path.weights[: len(belief.weights)]
+    for h in range(len(weights)):
+        weights[h] = belief.weights[h]
     while k + 3 < len(stops) and n_observations < len(observations):
         while n_passed < len(targets) and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
             n_passed += 1
@@ -154,7 +155,7 @@ def rollout_path(
     return k + 1, min(left_s, _repeat_path(k, n_observations, graph, belief, path), graph.give_up_s)
 
 
-@compiled(error_model="numpy")
+@leaf
 def _is_settled(
     target: int, vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> bool:
@@ -164,7 +165,7 @@ def _is_settled(
     return not _is_attempt_due(vertex, time, graph, belief, path)
 
 
-@compiled(error_model="numpy")
+@leaf
 def is_worth_an_attempt(
     vertex: int, time: float, observed_at: float, graph: PlanningGraph, belief: BeliefSnapshot
 ) -> bool:
@@ -176,7 +177,7 @@ def is_worth_an_attempt(
     return bool(p_free_again(vertex, time, observed_at, belief) > 0.0)
 
 
-@compiled(error_model="numpy")
+@leaf
 def _is_attempt_due(
     vertex: int, time: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> bool:
@@ -186,7 +187,7 @@ def _is_attempt_due(
     return bool(is_worth_an_attempt(vertex, time, path.marks[vertex].observed_at, graph, belief))
 
 
-@compiled(error_model="numpy")
+@leaf
 def _repeat_path(
     last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
@@ -213,7 +214,7 @@ def _repeat_path(
     return best
 
 
-@compiled(error_model="numpy")
+@leaf
 def _repeat_part(
     first: int, last: int, n_observations: int, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> float:
@@ -246,7 +247,7 @@ def _repeat_part(
     return period / found + cost_s / found if found > 0.0 else np.inf
 
 
-@compiled(error_model="numpy")
+@leaf
 def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: PathBuffer) -> float:
     """Return the expected time, s, of going on to unobserved slots like those on the second half of the path."""
     stops, observations = path.stops, path.observations
@@ -258,7 +259,7 @@ def _extrapolate(last: int, n_observations: int, graph: PlanningGraph, path: Pat
     return (stops[last].time - stops[first].time) / found + cost_s / found if found > 0.0 else np.inf
 
 
-@compiled(error_model="numpy")
+@leaf
 def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnapshot) -> float:
     """Return P(free) at a given time of a slot observed taken, in fact or along a path; 0 if too low or too soon.
 
@@ -278,7 +279,7 @@ def p_free_again(slot: int, time: float, observed_at: float, belief: BeliefSnaps
     return float(p_free) if p_free >= WORTH_OBSERVING * at.p_free_usual else 0.0
 
 
-@compiled(error_model="numpy")
+@leaf
 def _next_target(
     vertex: int, time: float, failure_s: float, graph: PlanningGraph, belief: BeliefSnapshot, path: PathBuffer
 ) -> tuple[int, float]:
@@ -307,7 +308,7 @@ def _next_target(
     return chosen, best
 
 
-@compiled(error_model="numpy")
+@leaf
 def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken_follows: bool) -> float:
     """Return P(free) of a slot at its first observation, averaged over the hypotheses.
 
@@ -324,7 +325,7 @@ def p_free_when_first_observed(weights: FloatArray, p_free_if: FloatArray, taken
     return p_free
 
 
-@compiled(error_model="numpy")
+@leaf
 def _p_nothing_found(
     vertex: int, value_s: float, n_observations: int, graph: PlanningGraph, path: PathBuffer
 ) -> float:

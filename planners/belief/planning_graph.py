@@ -17,6 +17,10 @@ from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, UNOBSERVED
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 
+leaf = compiled(error_model="numpy", _nrt=False)
+"""For functions that make no arrays, nor call one that does: counting references to all arrays of `PlanningGraph` and
+of its like would take more time than the computation, and most of the time of compiling."""
+
 Records = NDArray[Any]
 """A structured array. One array of records compiles several times faster than one array per field."""
 
@@ -117,7 +121,7 @@ class BeliefSnapshot(NamedTuple):
     p_free_if: FloatArray  # (n_slots, k) float64, P(free) of an unobserved slot under each of them
 
 
-@compiled(error_model="numpy")
+@leaf
 def set_slots(
     belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray, explore: float
 ) -> None:
@@ -146,7 +150,7 @@ def set_slots(
         at.bonus_s = 4.0 * explore * forecast * (1.0 - forecast)
 
 
-@compiled(error_model="numpy")
+@leaf
 def _rate_of_return(leaving: float, usual: float, weights: FloatArray, p_free_if: FloatArray) -> float:
     """Return the rate, 1/s, at which a slot observed taken returns to its usual P(free), averaged over hypotheses.
 
@@ -192,16 +196,7 @@ def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
     )
 
 
-@compiled(error_model="numpy")
-def copy_weights(belief: BeliefSnapshot, path: PathBuffer) -> FloatArray:
-    """Return the scratch weights of a path, set to those of the belief."""
-    weights = path.weights[: len(belief.weights)]
-    for h in range(len(weights)):
-        weights[h] = belief.weights[h]
-    return weights
-
-
-@compiled(error_model="numpy")
+@leaf
 def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
     """Return the mean of values, (k,), over the hypotheses with weights (k,).
 
@@ -220,7 +215,7 @@ def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
     return (first + second) + (third + fourth)
 
 
-@compiled(error_model="numpy")
+@leaf
 def decayed_part(rate: float, seconds: float) -> float:
     """Return 1 - exp(-rate · seconds); a series up to 0.05, where its relative error stays below 1e-7."""
     x = rate * seconds
@@ -229,7 +224,7 @@ def decayed_part(rate: float, seconds: float) -> float:
     return 1.0 - math.exp(-x)
 
 
-@compiled(error_model="numpy")
+@leaf
 def detects_missed(rate: float, missed_rate: float) -> bool:
     """Return whether a view is more likely than not to detect a slot that another view has missed.
 
@@ -243,7 +238,7 @@ def detects_missed(rate: float, missed_rate: float) -> bool:
     return rate > missed_rate and rate - missed_rate >= 0.5 * (1.0 - missed_rate)
 
 
-@compiled(error_model="numpy")
+@leaf
 def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
     """Return whether a slot is expected to stay hidden in a view with the given detection rate."""
     if belief.slots[slot].state == UNOBSERVED:
@@ -252,7 +247,7 @@ def is_hidden(slot: int, rate: float, belief: BeliefSnapshot) -> bool:
     return bool(rate <= belief.slots[slot].missed_rate)
 
 
-@compiled(error_model="numpy")
+@leaf
 def needs_attempt(vertex: int, graph: PlanningGraph, belief: BeliefSnapshot) -> bool:
     """Return whether only a parking attempt can show if the slot at a vertex is free.
 
