@@ -37,7 +37,6 @@ from parkenv.engine.policy import (
     arrival_cost_s,
     has_own_price,
     known_slot,
-    least_zone_cost_s,
     p_occupied,
     recent_state,
     search_of,
@@ -72,10 +71,6 @@ TABLES = np.dtype(
         # slot at once, s.
         ("arrival_cost_s", ADDRESS),
         ("near_s", ADDRESS),
-        # By place: float64, the least arrival cost, without and with the price of the expected stay, s; zones.
-        ("least_walk_s", ADDRESS),
-        ("least_cost_s", ADDRESS),
-        ("n_zones", np.int64),
         # A slot with the lowest parking cost.
         ("least_price", np.int64),
         # What the observation of an agent holds, (n_slots,): uint8 recent states; float64 P(taken).
@@ -112,22 +107,12 @@ def heuristic_tables(heuristic: int, problems: Sequence[SearchProblem], within_m
         for one, cost_s in zip(problems, costs_s, strict=True)
     ]
     least_price = int(problems[0].parking_cost_s.argmin())
-    # Rounding must not lift a bound above the cost.
-    walks_s = [float((one.walk_s + lot.slot_parking_cost_s).min()) - 1e-6 for one in problems]
-    numbers = {
-        "n_zones": len(lot.zones),
-        "heuristic": heuristic,
-        "n_slots": lot.n_slots,
-        "n_vertices": n,
-        "least_price": least_price,
-    }
+    numbers = {"heuristic": heuristic, "n_slots": lot.n_slots, "n_vertices": n, "least_price": least_price}
     arrays: dict[str, NDArray[Any]] = {
         "neighbors": lot.neighbors.astype(np.int32),
         "move_s": np.array(problems[0].move_cost_s, np.float64),
         "arrival_cost_s": costs_s,
         "near_s": np.array(near_s, np.float64),
-        "least_walk_s": np.array(walks_s),
-        "least_cost_s": costs_s.min(axis=1) - 1e-6,
         "states": np.full(lot.n_slots, UNOBSERVED, np.uint8),
         "p_occupied": np.zeros(lot.n_slots),
         "seconds": np.full(n, np.inf),
@@ -239,15 +224,6 @@ def _near_s(tables: Any, place: int, search: int) -> float:
     return float(float64s(tables.near_s)[place] + more_s)
 
 
-@inlined_rule
-def _least_s(tables: Any, place: int, search: int) -> float:
-    """Return a lower bound on the car's arrival cost of all slots, s."""
-    if search and has_own_price(search_of(search)):
-        least_s = least_zone_cost_s(search_of(search), tables.n_zones)
-        return float(float64s(tables.least_walk_s)[place] + least_s)
-    return float(float64s(tables.least_cost_s)[place])
-
-
 # ---- the choice
 
 
@@ -350,10 +326,9 @@ def _nearest(
     seconds[vertex], reached[0], reached[1] = 0.0, 1, vertex
     size = push(keys, vertices, 0, 0.0, vertex)
     best, best_s, best_cost_s = NO_SLOT, np.inf, np.inf
-    least_s = _least_s(tables, place, search) if order == BY_TOTAL else 0.0
     while size > 0:
         far, v = keys[0], np.int64(vertices[0])
-        if far + least_s > best_s:
+        if far > best_s:
             break
         size = pop(keys, vertices, size)
         if far > seconds[v]:
