@@ -18,6 +18,7 @@ NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
 LEAST_DAYS = 5
 """Days below which nothing is called better or worse: with fewer, a bootstrap interval covers less than 95 %."""
+_ZONES_TOLD = 8  # those in which the most cars parked before
 _NAMED = 3  # zones whose prices change alike, above which they are counted
 _SHOWN_S = 0.05  # a part of a change that is said
 CHANGES = (
@@ -205,7 +206,7 @@ def where(row: Row) -> list[str]:
     """Return the prices that change, and what is equal before and after a change, in words."""
     if row["change"] == "knows":
         return place(row)
-    equal = [row["prices"]] if row["prices"] else []
+    equal = [row["prices"]] if row["prices"] and not row["zone"] else []  # said once, of all cars
     equal += [row["agents"], rate_text(row["arrivals_per_hour"])]
     equal += [] if row["knows"] == OWN else [_words("knows", row)]
     if not row["zone"]:
@@ -295,6 +296,8 @@ def shown_changes(changes: Sequence[Row]) -> list[Row]:
         if row["change"] == "scenario" and is_known(row["change_s"]) and row["share"] in (0.0, most)
         and not (row["zone"] and row["share"])
     ]  # fmt: skip
+    busiest = sorted((row["cars_a_day"] for row in told if row["zone"]), reverse=True)[:_ZONES_TOLD]
+    told = [row for row in told if not row["zone"] or row["cars_a_day"] >= busiest[-1]]
     of_guidance: dict[tuple[Any, ...], list[Row]] = {}
     for row in changes:
         if row["change"] == "knows" and not row["zone"]:
