@@ -359,6 +359,7 @@ def test_a_recorded_survey_gives_the_same_map_to_the_last_bit(tmp_path, rig, err
     driven = ("--sessions", 1, "--every", 5, *errors, "--rig", rig, "--jobs", 1, "--record", file)
     done = parkenv("survey", *words, *driven, "--out", tmp_path / "survey")
     assert done.returncode == 0, done.stderr
+    assert "--scenario mini" in " ".join(done.stdout.split())
     done = parkenv("map-drive", file, *words, "--out", tmp_path / "mapped")
     assert done.returncode == 0, done.stderr
     lot = make_scenario("mini").lot

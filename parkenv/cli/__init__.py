@@ -95,7 +95,7 @@ COMMANDS = {
 app = make_app(
     "Search for a free parking space: worlds, planners, and comparisons between them.",
     """
-    parkenv demo --quick                       the whole story on a small lot
+    parkenv demo --quick                       the whole story, in about two minutes
     parkenv compare --scenario mini -n 20      agents in the same worlds
     parkenv COMMAND --help                     every command has examples
     """,

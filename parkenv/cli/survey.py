@@ -9,7 +9,7 @@ from parkenv.cli.options import Command
 from parkenv.cli.study_command import Rerun, StudyCommand
 from parkenv.cli.tables import make_console, make_table, print_recorded, save_summary, stages
 from parkenv.errors import InputError, nearest
-from parkenv.files.known_names import LocaliserName
+from parkenv.files.known_names import SCENARIO_NAMES, LocaliserName
 from parkenv.files.option import Inside, option
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
@@ -75,7 +75,8 @@ class Survey(StudyCommand):
         if self.record is not None:
             with console.status(f"Driving the first session once more for {self.record}"):
                 record_drive(study.survey, 0, self.record)
-            console.print(f"Recorded: {self.record}; map it with: parkenv map-drive {self.record}")
+            again = f"parkenv map-drive {self.record} --scenario {study.scenario.argument}"
+            console.print(f"Recorded: {self.record}; map it with: {again}")
 
     def show(self, console: Console, result: Result) -> None:
         """Print the errors of a survey."""
@@ -168,6 +169,10 @@ class MapDrive(Command):
         console.print(
             make_table(None, ["figure", "value"], ((name, str(value)) for name, value in row.items()))
         )
+        driven_in = row["key"].partition("/")[0]
+        if driven_in in SCENARIO_NAMES and driven_in != its.name:
+            text = f"The drive was recorded in {driven_in}, and is mapped in {its.name}: see --scenario"
+            console.print(text, style="yellow")
         if not row["seen"]:
             why = f": poses ± {row['pose_error_m']:.2g} m; see --pose-error" if "pose_error_m" in row else ""
             console.print(f"No slot could be told apart{why}", style="yellow")

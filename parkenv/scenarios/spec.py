@@ -630,6 +630,11 @@ class ScenarioSpec(Spec):
         """The file that the scenario was read from, or its name, for messages."""
         return self._file or f"scenario {self.title!r}"
 
+    @property
+    def argument(self) -> str:
+        """The file that the scenario was read from, or its name, as `--scenario` takes it."""
+        return self._file or self.title
+
 
 _PACKAGED = Path(__file__).with_name("packaged")
 

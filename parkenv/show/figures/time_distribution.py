@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.show.figures.picture_files import INK, STYLE
-from parkenv.show.figures.times import AGENT_COLORS, OTHER_AGENT
+from parkenv.show.figures.times import agent_color
 from parkenv.show.plurals import plural
 
 Totals = Mapping[str, FloatArray]
@@ -101,7 +101,7 @@ def _draw_panel(ax: Axes, totals: Totals) -> None:
 
 
 def _color(name: str) -> str:
-    return INK if name in _DASHED else AGENT_COLORS.get(name, OTHER_AGENT)
+    return INK if name in _DASHED else agent_color(name)
 
 
 def _dashes(name: str) -> tuple[float, Sequence[float]] | None:

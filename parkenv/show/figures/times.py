@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
+from zlib import crc32
 
 import matplotlib as mpl
 import numpy as np
@@ -43,8 +44,14 @@ AGENT_COLORS = {
 }
 """Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
 OTHER_AGENT = "#5c4a3d"
+_OTHERS = (OTHER_AGENT, "#a6761d", "#6a3d9a", "#1b7a8c", "#b15928")
 OFF_SCALE = 3.0
 """Totals above this multiple of the median are cut off, so that they do not compress the rest."""
+
+
+def agent_color(agent: str) -> str:
+    """Return the colour of an agent; agents of your own have one of five, by their name."""
+    return AGENT_COLORS.get(agent, _OTHERS[crc32(agent.encode()) % len(_OTHERS)])
 
 
 def draw_time_split(rows: Sequence[Row]) -> Figure:
@@ -144,11 +151,12 @@ def _draw_break(ax: Axes, y: float, limit: float) -> None:
         ax.plot(limit * xy[:, 0], xy[:, 1], color="white", linewidth=2.6)
 
 
-def draw_time_against_occupancy(rows: Sequence[Row]) -> Figure:
+def draw_time_against_occupancy(rows: Sequence[Row], about: str = "") -> Figure:
     """Draw the total time against occupancy: a panel per failure cost, a line per agent.
 
     Args:
         rows: rows with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
+        about: what else the rows have in common; follows the failure cost in the titles.
 
     Raises:
         InputError: there are no rows.
@@ -164,7 +172,7 @@ def draw_time_against_occupancy(rows: Sequence[Row]) -> Figure:
         for ax, cost in zip(axes.flat, costs, strict=False):
             its = [row for row in rows if row["failure_cost_s"] == cost]
             _draw_lines(ax, its, limit, lambda row: 100.0 * float(row["occupancy"]))
-            ax.set_title(f"failure cost {cost:g} s")
+            ax.set_title(f"failure cost {cost:g} s{about}")
             ax.set_xlabel("occupancy at the arrival, %")
         for ax in axes.flat[len(costs) :]:
             ax.remove()
@@ -225,7 +233,7 @@ def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Map
         limit = _limit(rows)
         _draw_lines(ax, rows, limit, lambda row: 100.0 * forecast[row["scenario"]])
         for row in own:
-            color = AGENT_COLORS.get(row["agent"], OTHER_AGENT)
+            color = agent_color(row["agent"])
             ax.axhline(row["total_s"], color=color, linewidth=0.9, linestyle=(0, (2, 3)), zorder=1)
         ax.set_title("dashed: with the scenario's own forecast")
         ax.set_xlabel("forecast P(taken) of every slot, %")
@@ -240,7 +248,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
     places = [along(row) for row in rows]
     for agent in dict.fromkeys(row["agent"] for row in rows):
         own = sorted((row for row in rows if row["agent"] == agent), key=along)
-        color = AGENT_COLORS.get(agent, OTHER_AGENT)
+        color = agent_color(agent)
         x = np.array([along(row) for row in own])
         total = np.array([row["total_s"] for row in own])
         # NaN where there is no interval, e.g. of a single search: no band there.

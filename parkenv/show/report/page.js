@@ -17,7 +17,10 @@ part("theme").addEventListener("click", () => setTheme(document.documentElement.
 
 part("headlines").hidden = data.run.headlines.length === 0;
 part("headlines").append(...data.run.headlines.map(headline));
-part("findings").append(...data.run.findings.slice(0, 8).map((finding) => make("li", {}, finding)));
+const MOST_FINDINGS = 8;
+const { findings } = data.run;
+part("findings").append(...findings.slice(0, MOST_FINDINGS).map((finding) => make("li", {}, finding)));
+if (findings.length > MOST_FINDINGS) part("findings").append(make("li", { class: "quiet" }, `${findings.length - MOST_FINDINGS} more settings: see the table`));
 part("notes").append(...data.run.notes.map((note) => make("p", { class: "note", role: "note" }, note)));
 
 if (data.learning.length) {

@@ -371,9 +371,10 @@ class Comparison(CaseStudy):
             found = f"{name}, failure cost {failure:g} s{at}: "
             if len(leaders) == 1:
                 low, high = best["total_s_ci95"]
+                among = "of the agents that do not know the future, " if len(agents) < len(its) else ""
                 found += (
-                    f"{best['agent']} has the lowest mean total time, {best['total_s']:.1f} s [{low:.1f}, {high:.1f}], "
-                    "and the paired differences of all others to it are above 0"
+                    f"{among}{best['agent']} has the lowest mean total time, {best['total_s']:.1f} s "
+                    f"[{low:.1f}, {high:.1f}], and the paired differences of the others to it are above 0"
                 )
             else:
                 found += (

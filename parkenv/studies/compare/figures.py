@@ -100,9 +100,12 @@ def times_against_occupancy(results: ComparisonResults) -> Iterator[Drawn]:
             for row in results.occupancy_rows
             if row["scenario"] == name
         ]
+        about = ""
         if not rows:
             cases = [(case, seeds) for case, seeds in results.cases if case.scenario.name == name]
             speeds = cases[0][0].scenario.v_walk, cases[0][0].scenario.v_drive
+            if len({(case.scenario.v_walk, case.scenario.v_drive) for case, _ in cases}) > 1:
+                about = f", walking at {3.6 * speeds[0]:g} and driving at {3.6 * speeds[1]:g} km/h"
             episodes = [
                 episode
                 for case, seeds in cases
@@ -111,7 +114,7 @@ def times_against_occupancy(results: ComparisonResults) -> Iterator[Drawn]:
             ]
             rows = against_occupancy(episodes, OCCUPANCY_BINS)
         if rows:
-            yield name, None, draw_time_against_occupancy(rows)
+            yield name, None, draw_time_against_occupancy(rows, about)
 
 
 def times_against_failure_cost(results: ComparisonResults) -> Iterator[Drawn]:
