@@ -10,17 +10,16 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.demo.study import AGENTS, QUICK, Demo
 
 
-def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path, monkeypatch):
-    monkeypatch.setitem(QUICK, "more", 10)
-    monkeypatch.setitem(QUICK, "every", 8.0)
+def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     out = tmp_path / "demo"
-    done = parkenv("demo", "--scenario", "mini", "--quick", "--jobs", 1, "--out", out)
+    shorter = ("--more", 10, "--every", 8)
+    done = parkenv("demo", "--scenario", "mini", "--quick", *shorter, "--jobs", 1, "--out", out)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
     assert [row["agent"] for row in summary["rows"]] == 2 * list(AGENTS)
     through_sensors, without_images = summary["rows"][: len(AGENTS)], summary["rows"][len(AGENTS) :]
-    assert {row["episodes"] for row in through_sensors} == {2}
-    assert {row["episodes"] for row in without_images} == {QUICK["more"]}
+    assert {row["episodes"] for row in through_sensors} == {QUICK["episodes"]}
+    assert {row["episodes"] for row in without_images} == {10}
     assert all(row["leads"] for row in through_sensors if row["agent"] != "oracle"), (
         "two searches show nothing"
     )

@@ -204,6 +204,7 @@ class Import(Command):
         "Car parks that the city counts: name,capacity,lat,lon. With --town, the map's take these names and "
         "capacities; those that it lacks are added.",
         takes="FILE.csv",
+        default="none",
     )
     listed_only: bool = option(False, "Leave out kerbs, and car parks that are not in --car-parks.")
     least: int = option(10, "Number of spaces of the smallest car park, with --split.", ge=2)
