@@ -214,3 +214,11 @@ def test_the_rig_of_a_scenario_file_is_that_of_its_environments(tmp_path):
     file.write_text('lot = "mini"\nrig = "stereo"\n')
     assert SearchSensorsEnv(str(file)).rig.stereo_cameras
     assert SearchSensorsEnv(str(file), rig="laser").rig.lasers
+
+
+def test_a_command_names_the_extra_that_it_lacks():
+    code = "import sys; sys.modules['stable_baselines3'] = None; from parkenv.__main__ import main; main()"
+    words = ("train", "ppo", "--scenario", "mini", "--steps", "100", "--trainings", "1", "--jobs", "1")
+    done = subprocess.run([sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 2
+    assert "parkenv[rl]" in done.stderr

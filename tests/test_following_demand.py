@@ -123,9 +123,9 @@ def test_worlds_of_a_key_have_the_same_cars_and_more_come_if_more_are_wanted():
 
 @pytest.mark.parametrize(
     ("given", "rate"),
-    [(60, 60.0), ("60", 60.0), ("counted", "counted"), ("1x", "counted"), (" 1.20x", "1.2x")],
+    [(60, 60.0), ("60", 60.0), ("counted", "counted"), ("given", "given"), ("1x", "1x"), (" 1.20x", "1.2x")],
 )
-def test_a_demand_is_a_number_or_a_multiple_of_the_counted_one(given, rate):
+def test_a_demand_is_a_number_or_a_multiple_of_the_given_or_counted_one(given, rate):
     assert rate_of(given) == rate
     assert rate_of(str(rate)) == rate, "as read from a table"
 

@@ -11,6 +11,7 @@ import tempfile
 import traceback
 import warnings
 from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, requires
 from pathlib import Path
 from typing import Annotated
 
@@ -173,7 +174,24 @@ def _report(error: BaseException) -> int:
             errno.EFBIG,
         ):
             return _complain(": ".join(str(part) for part in (error.filename, error.strerror) if part))
+        case ModuleNotFoundError() if extra := _extra_with(error.name or ""):
+            return _complain(f"this needs the extra {extra}: pip install 'parkenv[{extra}]' ({error})")
     return _report_crash(error)
+
+
+def _extra_with(module: str) -> str | None:
+    """Return the smallest extra of the package that installs a module, if there is one."""
+    library = module.partition(".")[0].replace("_", "-")
+    extras: dict[str, set[str]] = {}
+    try:
+        lines = requires("parkenv") or ()
+    except PackageNotFoundError:  # a source tree that is not installed
+        return None
+    for line in lines:
+        if match := re.fullmatch(r"([\w-]+).*;.*extra == [\"']([\w-]+)[\"'].*", line):
+            extras.setdefault(match[2], set()).add(match[1])
+    with_it = [extra for extra, libraries in extras.items() if library in libraries]
+    return min(with_it, key=lambda extra: len(extras[extra]), default=None)
 
 
 def _complain(message: str) -> int:

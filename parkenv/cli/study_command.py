@@ -39,7 +39,7 @@ class RunCommand(Command):
     out: Annotated[Path | None, Option(short="-o")]
     resume: bool = option(
         False,
-        "Go on with the run in --out. Options that are given change it, such as more --episodes.",
+        "Go on with the run in --out. Where finished results stay valid, options may change it, such as more episodes.",
         panel="Results",
     )
     overwrite: bool = option(False, "Replace the run in --out.", panel="Results")

@@ -50,11 +50,9 @@ def rate_of(value: float | str) -> float | str:
         rate = -1.0
     if not 0.0 < rate <= MAX_PER_HOUR:
         raise ValueError(_WANTED)
-    if text == GIVEN:
-        return GIVEN
-    if text != COUNTED and not text.endswith("x"):
-        return rate
-    return COUNTED if rate == 1.0 else f"{rate:g}x"
+    if text in (GIVEN, COUNTED):
+        return text
+    return f"{rate:g}x" if text.endswith("x") else rate
 
 
 def times_demanded(rate: str) -> float:
