@@ -211,7 +211,7 @@ class Demand(Command):
                 weeks=Weeks(self.from_day, self.weeks, self.held_out, self.roll_outs), agent=self.agent,
                 rounds=self.rounds, days=self.days, seed=self.seed, jobs=self.jobs, progress=progress,
             )  # fmt: skip
-        headings = ("car park", "places", "cars a day", "stay, h", "days", "fit", *PREDICTIONS[4:])
+        headings = ("car park", "places", "cars a day", "stay, h", "days", "fit", *PREDICTIONS)
         cells = [
             [
                 row["car_park"], str(row["capacity"]), f"{row['arrivals_a_day']:,.0f}", f"{row['stay_h']:.1f}",
@@ -275,7 +275,7 @@ class Record(Command):
 def _points_of(row: Row) -> list[str]:
     from parkenv.studies.fleet.counted_demand import PREDICTIONS
 
-    errors = [(row[f"{name}_error"], *row[f"{name}_error_ci95"]) for name in PREDICTIONS[4:]]
+    errors = [(row[f"{name}_error"], *row[f"{name}_error_ci95"]) for name in PREDICTIONS]
     return [
         f"{100 * mean:.1f}" + (f" [{100 * low:.1f}, {100 * high:.1f}]" if low == low else "")
         for mean, low, high in errors

@@ -44,7 +44,6 @@ from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, inlined,
 from parkenv.world.scenario import EDGE
 
 _APART = 2  # searches between two stages of loading
-_DENSE_SLOTS = 2**24  # slots of all searches up to which their tables, a gigabyte then, are in large pages
 _SEARCH_BYTES, _EDGE_BYTES = SEARCH.itemsize, EDGE.itemsize
 
 
@@ -98,8 +97,7 @@ class Observer(ABC):
         kept: tuple[str, ...] = (),
     ) -> None:
         most_observed = None if "step_observed" in kept else 0
-        sparse = n * int(tables.records["n_slots"].max()) > _DENSE_SLOTS
-        self.searches, self.space = Searches(tables, n, full_belief, most_observed, sparse), space
+        self.searches, self.space = Searches(tables, n, full_belief, most_observed), space
         self.address = self.searches.address
         own: Any = create_empty_array(spaces.Dict({k: v for k, v in space.items() if k not in kept}), n)
         of_searches = {name: getattr(self.searches, name).reshape(n, -1) for name in kept}

@@ -367,10 +367,8 @@ class Fleet:
             cars["arrival"] = begin + np.ceil((cars["arrival"] - begin) / tick_s - 1e-9) * tick_s
         cars["entry"] = self._entries[plans.entry]
         cars["place"] = plans.goal
-        cars["stay_s"], cars["patience_s"] = (
-            plans.stay_s,
-            plans.patience_s + self._way_s[plans.goal, plans.entry],
-        )
+        cars["stay_s"] = plans.stay_s
+        cars["patience_s"] = plans.patience_s + self._way_s[plans.goal, plans.entry]
         shares = np.cumsum([kind.weight for kind in self.drivers])
         cars["kind"] = np.minimum(
             np.searchsorted(shares / shares[-1], plans.kind, side="right"), len(self.drivers) - 1
@@ -416,10 +414,10 @@ class Fleet:
         lot = self.scenario.lot
         if not lot.is_town:
             return np.zeros((len(self.scenarios), len(self._entries)))
-        metres = dijkstra(lot.drive_matrix(timed=True), indices=self._entries)[:, : lot.n_slots]
+        drive_s = drive_times(self.scenario, self._entries)
         walk_s = np.array([one.walk_s for one in self.scenarios])
-        nearest = np.where(np.isfinite(metres), walk_s[:, None], np.inf).argmin(axis=2)
-        way_s = metres[np.arange(len(metres)), nearest] / self.scenario.v_drive
+        nearest = np.where(np.isfinite(drive_s), walk_s[:, None], np.inf).argmin(axis=2)
+        way_s = drive_s[np.arange(len(drive_s)), nearest]
         return np.where(np.isfinite(way_s), way_s, 0.0)
 
     def _write_zone_costs(self) -> NDArray[np.float64]:
@@ -855,7 +853,10 @@ def _counted(lot: ParkingLot) -> NDArray[Any]:
     return counted
 
 
-def drive_times(problem: SearchProblem, vertex: int) -> NDArray[np.float64]:
-    """Return the shortest drive time from a vertex to the stop position of each slot, (n_slots,) s; inf without one."""
-    metres = dijkstra(problem.lot.drive_matrix(timed=True), indices=np.array([vertex]))
-    return np.asarray(metres[0, : problem.lot.n_slots] / problem.v_drive)
+def drive_times(problem: SearchProblem, vertex: int | NDArray[np.int64]) -> NDArray[np.float64]:
+    """Return the shortest drive time from a vertex, or several, to each slot's stop position, (..., n_slots) s.
+
+    It is infinite where there is no way.
+    """
+    metres = dijkstra(problem.lot.drive_matrix(timed=True), indices=np.asarray(vertex))
+    return np.asarray(metres[..., : problem.lot.n_slots] / problem.v_drive)

@@ -64,11 +64,8 @@ from parkenv.world.week import WEEK_HOURS
 
 MAX_STEPS = 2000
 """Steps after which `Simulations.run` ends a search, as environments do."""
-_LEVELS, _SLOPES, _REACH = (
-    33,
-    9,
-    3.5,
-)  # cells of the day's level and slope, and standard deviations that they span
+_LEVELS, _SLOPES = 33, 9  # cells of the day's level and slope
+_REACH = 3.5  # standard deviations that they span, on either side
 _LEAST_RATE = 1e-9  # 1/s, of slots that never change
 _SAME_TIME_S = 0.01
 _SEARCH_BYTES = SEARCH.itemsize
@@ -369,12 +366,14 @@ class Model:
         attempts = self._n_attempts(vertex, action, slots)
         times = np.full(len(slots), time)
         times[:attempts] = belief.slots.time
-        after, day, last_taken = belief.slots, belief.day.copy(), belief.last_taken.copy()
-        for part in (slice(attempts), slice(attempts, None)):
-            if part.stop is None:
-                after = after.decay(time - after.time)
-            after = after.update(slots[part], taken[part], *(rate[part] for rate in rates))
-            last_taken[slots[part]] = taken[part]
+        by_attempt, on_arrival = (
+            (slots[part], taken[part], *(rate[part] for rate in rates))
+            for part in (slice(attempts), slice(attempts, None))
+        )
+        attempted = belief.slots.update(*by_attempt)
+        after = attempted.decay(time - attempted.time).update(*on_arrival)
+        last_taken, day = belief.last_taken.copy(), belief.day.copy()
+        last_taken[slots] = taken
         day.update(Observations(slots, times, taken, *rates))
         return replace(
             belief, vertex=vertex, slots=after, day=day, last_taken=last_taken, n_steps=belief.n_steps + 1

@@ -246,6 +246,8 @@ SLOT = np.dtype(
 
 SPARSE_SLOTS = 4096
 """Slots from which the tables of a fleet's searches take memory only where they are written."""
+DENSE_SLOTS = 2**24
+"""Slots of all searches up to which their tables, a gigabyte then, are in large pages."""
 BLOCK_BITS = 3
 BLOCK_SIZE = 1 << BLOCK_BITS
 BLOCK = np.dtype(
@@ -654,7 +656,8 @@ class Searches:
         full_belief: whether to keep `p_occupied` and `belief` up to date.
         most_observed: maximum number of slots that a step observes; None: those in view, and one more, or 0 without
             the full belief; with 0, `step_observed` is not kept.
-        sparse: whether tables take memory only where they are written, by small pages, which are slower.
+        sparse: whether tables take memory only where they are written, by small pages, which are slower; None: if the
+            searches have more than `DENSE_SLOTS` in all.
 
     Attributes:
         records: (n,) of the dtype SEARCH.
@@ -677,7 +680,7 @@ class Searches:
         n: int,
         full_belief: bool,
         most_observed: int | None = None,
-        sparse: bool = False,
+        sparse: bool | None = None,
     ) -> None:
         m = int(scenarios.records["n_slots"].max())
         external = bool((scenarios.records["prior_kind"] == EXTERNAL_KIND).any())
@@ -685,6 +688,8 @@ class Searches:
         self._worlds: dict[int, World] = {}  # made in Python, by search
         self.scenarios = scenarios
         self.records = zeros_on_lines((n,), SEARCH)
+        if sparse is None:
+            sparse = n * m > DENSE_SLOTS
         # Zeros stand for the sentinel. A search observes a small part of a large lot.
         zeros = sparse_zeros if sparse else zeros_on_lines
         self.slots = zeros((n, m + 1), SLOT)

@@ -135,7 +135,8 @@ def demand_of(
         others[field] = weights_of_all(of_lot) or ((1.0,) * len(points) if some else ())
     made, users = [], {zone.name: zone.users for zone in lot.zone_rules.values()}
     spaces = [
-        (users.get(lot.zones[k], (PUBLIC,)), n) for k, n in zip(lot.zone_of_slot, lot.capacity, strict=True)
+        (users.get(zone, (PUBLIC,)), int(lot.capacity[lot.zone_of_slot == k].sum()))
+        for k, zone in enumerate(lot.zones)
     ]
     for name, one in purposes.items():
         if unknown := [its for its in one.classes if its not in lot.classes[1:]]:
@@ -143,7 +144,7 @@ def demand_of(
                 f"demand.{name}.classes has {unknown[0]!r:.40}, no class of lot {lot.name!r:.40} beside {PUBLIC}; "
                 f"{nearest(unknown[0], lot.classes[1:])}"
             )
-        room = sum(int(n) for may, n in spaces if PUBLIC in may or set(may) & set(one.classes))
+        room = sum(n for may, n in spaces if PUBLIC in may or set(may) & set(one.classes))
         if one.parked > room:
             raise InputError(
                 f"demand.{name}.parked is {one.parked}, want at most the {room:,} spaces that it may use"

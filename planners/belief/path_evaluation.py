@@ -22,6 +22,7 @@ from planners.belief.planning_graph import (
     PlanningGraph,
     decayed_part,
     leaf,
+    reset_weights,
 )
 
 KEPT_IN_MIND = 32  # number of stops for which a passed free slot is remembered
@@ -201,9 +202,8 @@ def _set_costs(
 @leaf
 def _learn_on_the_way(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) -> None:
     """Set P(free) of the first observations along a path, given that the car has not parked before."""
+    reset_weights(belief, path)
     weights = path.weights[: len(belief.weights)]
-    for h in range(len(weights)):
-        weights[h] = belief.weights[h]
     for j in range(path.stops[n_stops].first):
         observation = path.observations[j]
         if observation.is_first:

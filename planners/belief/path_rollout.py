@@ -19,6 +19,7 @@ from planners.belief.planning_graph import (
     leaf,
     mean_over_days,
     needs_attempt,
+    reset_weights,
 )
 
 NEGLIGIBLE = 0.002
@@ -68,9 +69,8 @@ def rollout_path(
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = vertex, 0.0, 0, 0
     k, n_observations, time, n_passed = 0, 0, 0.0, 0
     choose, target = True, -1
+    reset_weights(belief, path)
     weights = path.weights[: len(belief.weights)]
-    for h in range(len(weights)):
-        weights[h] = belief.weights[h]
     while k + 3 < len(stops) and n_observations < len(observations):
         while n_passed < len(targets) and _is_settled(targets[n_passed], vertex, time, graph, belief, path):
             n_passed += 1

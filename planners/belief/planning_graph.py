@@ -197,6 +197,13 @@ def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
 
 
 @leaf
+def reset_weights(belief: BeliefSnapshot, path: PathBuffer) -> None:
+    """Set the scratch weights of a path to those of the belief."""
+    for h in range(len(belief.weights)):
+        path.weights[h] = belief.weights[h]
+
+
+@leaf
 def mean_over_days(weights: FloatArray, values: FloatArray) -> float:
     """Return the mean of values, (k,), over the hypotheses with weights (k,).
 

@@ -27,7 +27,11 @@ STREET_WIDTH = {
 """Carriageway width, m, without parked cars, of two-way roads without the tags `width` and `lanes`."""
 LIMITS = {
     **dict.fromkeys(("primary", "secondary", "tertiary", "unclassified", "road"), 50.0),
-    **{"motorway": 100.0, "trunk": 70.0, "residential": 30.0, "living_street": 10.0, "service": 15.0},
+    "motorway": 100.0,
+    "trunk": 70.0,
+    "residential": 30.0,
+    "living_street": 10.0,
+    "service": 15.0,
 }
 """Speed limit, km/h, of roads without the tag `maxspeed`, by class."""
 _AISLE_LIMIT = 10.0  # km/h, of a `service=parking_aisle`

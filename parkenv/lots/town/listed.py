@@ -53,9 +53,7 @@ def _degrees(most: float) -> Kind:
 
 _COLUMNS = {
     "name": Kind("a printable name of 1 to 80 letters", _name),
-    "capacity": Kind(
-        "a whole number of up to 6 digits, or nothing", lambda text: WHOLE.parse(text[:7] or "0")
-    ),
+    "capacity": Kind("a whole number of up to 6 digits, or nothing", _capacity),
     "lat": _degrees(90.0),
     "lon": _degrees(180.0),
 }

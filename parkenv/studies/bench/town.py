@@ -161,8 +161,7 @@ def blocks_of(lot: ParkingLot) -> ParkingLot:
 
     drawn = Slots.of_lot(lot)[~lot.is_counted]
     each = plain(drawn, _one_way(lot.lanes), ())
-    drives = [drive_times(make_scenario(each), int(v)) for v in each.entry_vertices]
-    reached = np.isfinite(np.min(drives, axis=0))
+    reached = np.isfinite(drive_times(make_scenario(each), each.entry_vertices).min(axis=0))
     kerbs = []
     for street in streets_of(each):
         slots = [slot for slot, _ in street.slots if reached[slot]]

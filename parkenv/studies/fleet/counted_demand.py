@@ -9,11 +9,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse.csgraph import dijkstra
 from scipy.stats import spearmanr
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write, make_folder
 from parkenv.files.csv_tables import csv_columns
@@ -38,8 +37,10 @@ from parkenv.world.week import DAY_HOURS, HOUR_S
 
 KINDS: dict[str, tuple[int, ...]] = {"scenario": (0, 1, 2, 3, 4), "saturday": (5,), "sunday": (6,)}
 """Weekdays (Monday = 0) that have a demand of their own, by the name of its scenario file."""
-PREDICTIONS = ("car_park", "date", "hour", "counted", "simulated", "forecast", "last_week", "mean_followed")
-"""Columns of `predicted.csv`: shares of the places taken at the end of an hour, and what was to be expected of them."""
+PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")
+"""What was to be expected of the counts."""
+_COLUMNS = ("car_park", "date", "hour", "counted", *PREDICTIONS)
+"""Columns of `predicted.csv`, with shares of the places taken at the end of an hour."""
 PATIENCE_S = 3600.0
 """Drivers come from far, and where a car park is full another one may be far, too."""
 _STEP = 0.7  # share of what is off that a round corrects
@@ -205,15 +206,15 @@ class _Town:
         numbers = np.arange(len(self.names))
         near = (walk_m.argmin(axis=1) == numbers[:, None]) @ weight
         arrival_s = np.array([scenario.at_goal(k).arrival_cost_s[self.slots] for k in range(len(lot.goals))])
-        timed = dijkstra(lot.drive_matrix(timed=True), indices=lot.entry_vertices)[:, self.slots]
-        drive_s = timed / scenario.v_drive
+        drive_s = drive_times(scenario, lot.entry_vertices)[:, self.slots]
         best = (drive_s[:, None] + arrival_s).argmin(axis=2)  # of each entry and goal
         traffic = np.array(weights_of_all(lot.entry_weights) or np.ones(len(lot.entries)))
         share = np.array([traffic @ (best == number) for number in numbers]) / traffic.sum()
         chosen = share >= np.minimum(share.max(axis=1, keepdims=True), _NEARLY_ALL)
         own = np.where(chosen, np.maximum(weight, 1e-9), 0.0)
-        own[share.max(axis=1) == 0.0] = 0.0
-        own[share.max(axis=1) == 0.0, walk_m.argmin(axis=0)[share.max(axis=1) == 0.0]] = 1.0
+        unchosen = share.max(axis=1) == 0.0
+        own[unchosen] = 0.0
+        own[unchosen, walk_m.argmin(axis=0)[unchosen]] = 1.0
         return near, own
 
     def days_of(self, first: date, end: date) -> IntArray:
@@ -328,12 +329,10 @@ def _report(town: _Town, forecast: FloatArray, found: list[_RollOut], title: str
         [names[k] for k in index]
         for names, index in zip((town.names, dates, clock), np.nonzero(known), strict=True)
     ]
-    table = csv_columns([*labels, *(shares[name][known].round(4).tolist() for name in PREDICTIONS[3:])])
+    table = csv_columns([*labels, *(shares[name][known].round(4).tolist() for name in _COLUMNS[3:])])
     with atomic_write(folder / "predicted.csv") as beside:
-        beside.write_text(f"{','.join(PREDICTIONS)}\n{table}", encoding="utf-8")
-    errors = {
-        name: np.where(known, np.abs(shares[name] - shares["counted"]), np.nan) for name in PREDICTIONS[4:]
-    }
+        beside.write_text(f"{','.join(_COLUMNS)}\n{table}", encoding="utf-8")
+    errors = {name: np.where(known, np.abs(shares[name] - shares["counted"]), np.nan) for name in PREDICTIONS}
     errors["fit"] = np.where(known, np.abs(fit - followed) / capacity[:, None, None], np.nan)
     weeks = np.unique((days - days[0]) // 7, return_inverse=True)[1]
     rows: list[Row] = []

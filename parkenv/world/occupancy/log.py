@@ -247,7 +247,7 @@ class OccupancyLog:
         """
         if self._has_each_change:
             return self._samples(min(SAMPLE_S, max_gap_s))
-        same_record = (np.diff(self.slot) == 0) & (np.diff(self.day) == 0)
+        same_record = np.diff(self._record) == 0
         earlier = np.flatnonzero(same_record & (np.diff(self.second) <= max_gap_s))
         later = earlier + 1
         return Intervals(
