@@ -9,8 +9,9 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
+from parkenv.files.option import parse_call
 from parkenv.files.spec_file import read_tables
-from parkenv.studies.agent_spec import AgentSpec, parse_agent, split_agents
+from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.results import SPEC_FILE
 from parkenv.studies.runner import run
@@ -145,14 +146,14 @@ def test_agents_with_options_are_read_from_words_and_tables():
         "ppo:a/b.zip",
         "oracle",
     ]
-    table = parse_agent("x:Y(a=1, b=2.5,c=true,d=word)")
+    table = parse_call("x:Y(a=1, b=2.5,c=true,d=word)")
     assert table == {"name": "x:Y", "a": 1, "b": 2.5, "c": True, "d": "word"}
     spec = AgentSpec.parse(table, "test")
     assert spec.label == "x:Y(a=1,b=2.5,c=true,d=word)"
-    assert parse_agent(spec.label) == table
+    assert parse_call(spec.label) == table
     for text in ("mdp(", "mdp(a)", "mdp(a=1,a=2)", "mdp(a=(1))", "mdp(=1)", "mdp(a=)"):
         with pytest.raises(InputError, match="agent 'mdp"):
-            parse_agent(text)
+            parse_call(text)
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 import csv
 import json
 import sys
+from pathlib import Path
 
 import pytest
 from command_line import parkenv
@@ -102,3 +103,41 @@ def test_agents_on_the_command_line_are_the_users_own_choice(module, tmp_path):
     (tmp_path / f"{module}_too.py").write_text(AGENT)
     done = parkenv(*command, f"{module}:Mine,{module}_too:Mine", "--overwrite")
     assert (done.returncode, "two agents are called 'mine'" in done.stderr) == (2, True)
+
+
+WORLD = (Path(__file__).with_name("timetable_world.py")).read_text() + '\nopen("was_run", "w").close()\n'
+
+
+def test_a_world_of_ones_own_is_named_on_the_command_line_and_by_no_scenario_file(module, tmp_path):
+    mark, out = tmp_path / "was_run", tmp_path / "out"
+    (tmp_path / f"{module}.py").write_text(WORLD)
+    (tmp_path / "theirs.toml").write_text(f'lot = "mini"\noccupancy = "{module}:Timetable"')
+    refused = parkenv("compare", "--scenario", "theirs.toml")
+    assert (refused.returncode, "no class in a scenario file" in " ".join(refused.stderr.split())) == (
+        2,
+        True,
+    )
+    assert not mark.exists()
+    own = (
+        "--scenario",
+        "mini",
+        "--occupancy",
+        f"{module}:Timetable(taken_s=1100)",
+        "--jobs",
+        1,
+        "--no-figures",
+    )
+    done = parkenv("compare", *own, "--agents", "first-free,oracle", "-n", 3, "--out", out)
+    assert done.returncode == 0, done.stderr
+    first_free, oracle = json.loads((out / "summary.json").read_text())["rows"]
+    assert first_free["total_s"] > oracle["total_s"]
+    driven = parkenv(
+        "fleet", *own, "--arrivals-per-hour", 10, "--knows", "own", "-n", 1, "--out", tmp_path / "fleet"
+    )
+    assert driven.returncode == 0, driven.stderr
+    mark.unlink()
+    sys.modules.pop(module)
+    for command in (("report", out), ("compare", "--resume", "--out", out, "--hours", "08:00-09:00")):
+        refused = parkenv(*command)
+        assert (refused.returncode, "add --trust" in refused.stderr) == (2, True), refused.stderr
+    assert not mark.exists()

@@ -70,7 +70,9 @@ class StudyCommand(RunCommand):
             # The address belongs to the other backend.
             study = study.changed(address=None)
         inner = {option.name: option.path[1] for option in options if len(option.path) > 1}
-        require_trust(study, file.parent, command.trust or not command.resume, given=set(inner.values()))
+        # An option of a table in the field, such as --hours of the scenarios, leaves the rest as the file has it.
+        whole = {option.path[1] for option in options if len(option.path) == 2}
+        require_trust(study, file.parent, command.trust or not command.resume, given=whole)
         return made(cls, {name: given[name] for name in inner}, command.changed(study=study))
 
     def run(self) -> None:

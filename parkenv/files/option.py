@@ -119,3 +119,42 @@ def seconds_of_minutes(text: str) -> float:
         InputError: the text is no number.
     """
     return 60.0 * numbers_in(text, 1)[0]
+
+
+def parse_call(text: str, kind: str = "agent") -> dict[str, Any]:
+    """Parse a name with any options in brackets, such as `mdp(failure_s=90)`: the table of its `name` and its options.
+
+    Args:
+        text: the text.
+        kind: what the name is of, for messages.
+
+    Raises:
+        InputError: brackets do not match, or an option has no value.
+
+    Examples:
+        >>> parse_call("mdp(failure_s=90,solver=policy_iteration)")
+        {'name': 'mdp', 'failure_s': 90, 'solver': 'policy_iteration'}
+    """
+    name, bracket, rest = text.strip().partition("(")
+    if not bracket:
+        return {"name": name}
+    if not rest.endswith(")") or "(" in rest or ")" in rest[:-1]:
+        raise InputError(f"{kind} {text!r}, want NAME or NAME(OPTION=VALUE,...)")
+    table: dict[str, Any] = {"name": name.strip()}
+    for part in rest[:-1].split(","):
+        option, equals, value = (word.strip() for word in part.partition("="))
+        if not (option.isidentifier() and equals and value) or option in table:
+            raise InputError(f"{kind} {text!r}: option {part.strip()!r}, want OPTION=VALUE, each option once")
+        table[option] = _value(value)
+    return table
+
+
+def _value(text: str) -> bool | int | float | str:
+    if text in ("true", "false"):
+        return text == "true"
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text

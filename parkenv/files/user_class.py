@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import traceback
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -58,7 +59,13 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
 
 def find_module(name: str) -> str | None:
     """Return where the module of `MODULE:CLASS` would be imported from, without importing it; None if nowhere."""
-    found = PathFinder.find_spec(name.partition(":")[0].partition(".")[0], [*sys.path, str(Path.cwd())])
+    folders: Sequence[str] = [*sys.path, str(Path.cwd())]
+    found = None
+    for part in name.partition(":")[0].split("."):
+        found = PathFinder.find_spec(part, folders)
+        if found is None:
+            return None
+        folders = found.submodule_search_locations or ()
     return None if found is None else found.origin
 
 

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from parkenv.errors import InputError, require_keywords
+from parkenv.files.option import parse_call
+from parkenv.files.user_class import load_class
 from parkenv.lots import city_lot, grid_lot, packaged_lot, read_lot
 from parkenv.scenarios.purposes import demand_of
 from parkenv.scenarios.spec import (
@@ -245,6 +247,8 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
     if spec.counts is not None:
         assert spec.replay_from is not None
         return _counted(spec.counts, spec.replay_from, spec.forecast_from == "past", lot, goal)
+    if spec.world is not None:
+        return _own_world(spec.world, lot, goal)
     if spec.process is not None:
         process = _process(spec.process, lot, goal)
     elif spec.real_week is not None:
@@ -255,6 +259,22 @@ def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyMode
     if spec.event is None:
         return process
     return with_event(process, lot, goal=goal, share=spec.event.share, factor=spec.event.factor)
+
+
+def _own_world(text: str, lot: ParkingLot, goal: int) -> OccupancyModel:
+    """Make a world of a user's own, `MODULE:CLASS` or `MODULE:CLASS(OPTION=VALUE,...)`."""
+    options = parse_call(text, "world")
+    name = options.pop("name")
+    kind = load_class(name, "world", "forecast(arrival)")
+    if not issubclass(kind, OccupancyModel):
+        raise InputError(f"world {name!r}: derives from {kind.__base__.__name__}, want OccupancyModel")
+    try:
+        made: OccupancyModel = kind(lot, goal, **options)
+    except InputError:
+        raise
+    except Exception as error:  # a user's class may raise anything
+        raise InputError(f"world {text} cannot be made: {type(error).__name__}: {error}") from error
+    return made
 
 
 def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: int) -> CountedOccupancy:

@@ -46,6 +46,7 @@ from parkenv.files.spec_file import (
     read_tables,
     resolved_path,
 )
+from parkenv.files.user_class import find_module
 from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
@@ -176,7 +177,11 @@ def _occupancy_tables(value: object) -> object:
         return {"process": value}
     if value.endswith((".csv", ".csv.gz")):
         return {"log": value}
-    raise ValueError("typical, real-week, a process (.json), a recorded log (.csv, .csv.gz), or a table")
+    if ":" in value:
+        return {"world": value}
+    raise ValueError(
+        "typical, real-week, a process (.json), a recorded log (.csv, .csv.gz), MODULE:CLASS, or a table"
+    )
 
 
 def _several(value: object) -> object:
@@ -265,6 +270,11 @@ class OccupancySpec(Spec):
         )
     )
     counts: CountsSpec | None = None
+    world: str | None = Field(
+        None,
+        description="An `OccupancyModel` of your own, `MODULE:CLASS` with any options in brackets: a class whose first "
+        "arguments are the lot and the index of the goal. For experiments; a scenario file names none.",
+    )
     replay_from: Date | None = option(
         None,
         "First day of the log or the counts that is replayed.",
@@ -299,7 +309,9 @@ class OccupancySpec(Spec):
 
     @model_validator(mode="after")
     def _one(self) -> Self:
-        _require_one(self, ("typical", "real_week", "process", "log", "counts"), least=0)
+        _require_one(self, ("typical", "real_week", "process", "log", "counts", "world"), least=0)
+        if self.world is not None and not (self.day_error is None and self.event is None):
+            raise ValueError("day_error and event cannot be combined with a world, which has its own days")
         recorded = self.log is not None or self.counts is not None
         if self.day_error is not None and recorded:
             raise ValueError(
@@ -318,6 +330,11 @@ class OccupancySpec(Spec):
         if self.event is not None and recorded:
             raise ValueError("event cannot be combined with a log or counts, whose days have their events")
         return self
+
+    def files(self) -> list[Path]:
+        """Return every file named in the specification, and the module of a world."""
+        module = find_module(self.world) if self.world else None
+        return [*super().files(), *([Path(module)] if module else [])]
 
 
 def _forecast_tables(value: object) -> object:
@@ -572,9 +589,9 @@ class ScenarioSpec(Spec):
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
     occupancy: Annotated[OccupancySpec, BeforeValidator(_occupancy_tables), OrText()] = option(
         OccupancySpec(),
-        "Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, replayed day by day, "
-        "or a process that `parkenv occupancy fit` wrote (.json).",
-        takes="FILE[,FILE...]",
+        "Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, replayed day by day; "
+        "a process that `parkenv occupancy fit` wrote (.json); or a world of your own, MODULE:CLASS.",
+        takes="FILE[,FILE...]|MODULE:CLASS",
         panel="World",
         default="the scenario's",
         sets={"forecast": "own"},
@@ -612,7 +629,14 @@ class ScenarioSpec(Spec):
     def read(cls, path: str | Path) -> Self:
         """Read a scenario file; the default name of the scenario is that of the file."""
         path = Path(path)
-        return cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent).of_file(path)
+        spec = cls.parse({"name": path.stem, **read_tables(path)}, str(path), path.parent).of_file(path)
+        if spec.occupancy.world is not None:
+            # Scenario files hold no code.
+            raise InputError(
+                f"{path}: occupancy is {spec.occupancy.world!r:.80}, want no class in a scenario file; a world of your "
+                "own is named by --occupancy or in an experiment"
+            )
+        return spec
 
     def files(self) -> list[Path]:
         """Return every file named in the specification, and the settings beside the detector's."""

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, ConfigDict, model_validator
 
-from parkenv.errors import InputError
 from parkenv.files.known_names import DETECTOR_SUFFIXES
+from parkenv.files.option import parse_call
 from parkenv.files.spec_file import OrText, Spec
 from planners.names import FILE_AGENTS
 
@@ -36,7 +36,7 @@ class AgentSpec(Spec):
         Raises:
             InputError: brackets do not match, or an option has no value.
         """
-        return cls.parse(parse_agent(text), "--agent")
+        return cls.parse(parse_call(text), "--agent")
 
     @property
     def options(self) -> dict[str, Any]:
@@ -67,41 +67,6 @@ def _text(value: OptionValue) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def parse_agent(text: str) -> dict[str, Any]:
-    """Parse text such as `mdp(failure_s=90)` into the fields of an `AgentSpec`.
-
-    Raises:
-        InputError: brackets do not match, or an option has no value.
-
-    Examples:
-        >>> parse_agent("mdp(failure_s=90,solver=policy_iteration)")
-        {'name': 'mdp', 'failure_s': 90, 'solver': 'policy_iteration'}
-    """
-    name, bracket, rest = text.strip().partition("(")
-    if not bracket:
-        return {"name": name}
-    if not rest.endswith(")") or "(" in rest or ")" in rest[:-1]:
-        raise InputError(f"agent {text!r}, want NAME or NAME(OPTION=VALUE,...)")
-    table: dict[str, Any] = {"name": name.strip()}
-    for part in rest[:-1].split(","):
-        option, equals, value = (word.strip() for word in part.partition("="))
-        if not (option.isidentifier() and equals and value) or option in table:
-            raise InputError(f"agent {text!r}: option {part.strip()!r}, want OPTION=VALUE, each option once")
-        table[option] = _value(value)
-    return table
-
-
-def _value(text: str) -> OptionValue:
-    if text in ("true", "false"):
-        return text == "true"
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
-
-
 def split_agents(text: str) -> list[str]:
     """Split a comma-separated list of agents; commas within brackets separate options.
 
@@ -120,7 +85,7 @@ def split_agents(text: str) -> list[str]:
 
 
 def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
-    """Return the classes `MODULE:CLASS` that a specification names: agents and detectors of a user's own.
+    """Return the classes `MODULE:CLASS` that a specification names: agents, detectors and worlds of a user's own.
 
     Args:
         spec: the specification.
@@ -130,19 +95,20 @@ def classes_in(spec: Spec, without: Collection[str] = ()) -> list[str]:
     for field in (name for name in type(spec).model_fields if name not in without):
         value = getattr(spec, field)
         for part in value if isinstance(value, tuple) else (value,):
-            name = (
-                part.name if isinstance(part, AgentSpec) else part if field in ("clone", "detector") else None
-            )
+            named = field in ("clone", "detector", "world")
+            name = part.name if isinstance(part, AgentSpec) else part if named else None
             if isinstance(name, str) and not name.lower().endswith(DETECTOR_SUFFIXES):
                 before, colon, _ = name.partition(":")
-                found += [name] if colon and (field == "detector" or before not in FILE_AGENTS) else []
+                found += (
+                    [name] if colon and (field in ("detector", "world") or before not in FILE_AGENTS) else []
+                )
             elif isinstance(part, Spec):
                 found += classes_in(part)
     return list(dict.fromkeys(found))
 
 
 def _tables(value: object) -> object:
-    return parse_agent(value) if isinstance(value, str) else value
+    return parse_call(value) if isinstance(value, str) else value
 
 
 AgentItem = Annotated[AgentSpec, BeforeValidator(_tables), OrText()]
