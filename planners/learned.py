@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Mapping
 from typing import Any
 
@@ -41,6 +42,10 @@ class LearnedAgent:
         self.name = f"{algorithm}:{path}"
         self.problem = problem.public()
         self.card, self.model = load_model(algorithm, path, "search", *SEARCH_OBSERVATIONS)
+        lots = self.card.scenarios
+        if lots and not {problem.lot.name, getattr(problem, "name", "")} & {*lots, *self.card.held_out}:
+            named = ", ".join(lots[:3]) + (f" and {len(lots) - 3} more" if len(lots) > 3 else "")
+            warnings.warn(f"{path}: was trained on {named}, not on {problem.lot.name}", stacklevel=2)
         self._key = SEARCH_OBSERVATIONS[self.card.observation][0]
         self.local_k = self.card.k if self._key == "local" else None
         self.scans_k = self.card.k if self._key == "scan" else None

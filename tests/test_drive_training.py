@@ -445,7 +445,7 @@ def test_a_model_is_trained_evaluated_and_driven(trained):
     assert list(curve[0]) == list(training.columns)
     assert curve[0]["steps"] == 0
     assert curve[-1]["steps"] >= STEPS[algorithm]
-    assert {path.name for path in folder.iterdir()} == {"curve.csv", "model.safetensors"}
+    assert {path.name for path in folder.iterdir()} == {"checkpoint.pt", "curve.csv", "model.safetensors"}
     card = ModelCard.of_file(folder / "model.safetensors")
     assert (card.task, card.algorithm, card.scenarios) == ("drive", algorithm, ("mini",))
     best = next(row for row in curve if row["steps"] == card.steps)

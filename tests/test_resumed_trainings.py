@@ -10,13 +10,15 @@ from small_trainings import (
     stop_training,
 )
 
-from parkenv import make_scenario
+from parkenv import InputError, make_scenario
 from parkenv.envs.fleet_vector import FleetVectorEnv
 from parkenv.lots import grid_lot, packaged_lot
 from parkenv.studies.fleet.drivers import MixedFleet
+from parkenv.studies.runner import run
 from parkenv.studies.training.configs import SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.search import episode_times
+from parkenv.studies.training.spec import TrainingSpec
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.learned import LearnedAgent
 
@@ -49,7 +51,8 @@ def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
     assert repr([row | {"wall_s": 0.0} for row in resumed]) == repr([row | {"wall_s": 0.0} for row in whole])
     files = [tmp_path / name / "model.safetensors" for name in ("resumed", "whole")]
     assert files[0].read_bytes() == files[1].read_bytes()
-    assert {path.name for path in (tmp_path / "resumed").iterdir()} == {"curve.csv", "model.safetensors"}
+    names = {"checkpoint.pt", "curve.csv", "model.safetensors"}
+    assert {path.name for path in (tmp_path / "resumed").iterdir()} == names
     again = training.train(0, tmp_path / "resumed")
     assert repr(again) == repr(resumed), "a finished training is not repeated"
     if kind in SEARCH_CONFIGS:
@@ -57,6 +60,19 @@ def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
         seeds = training.evaluation_seeds
         times, _ = episode_times(LearnedAgent(PLACES[0], kind, files[0]).model, PLACES, seeds)
         assert times.mean() == min(row["total_s"] for row in whole)
+
+
+def test_a_finished_training_goes_on_with_more_steps(tmp_path):
+    its = {"algorithm": "ppo", "scenarios": ["mini"], "trainings": 1, "agents": [], "evaluation_episodes": 4}
+    short, long = (TrainingSpec.parse({**its, "steps": steps, "jobs": 1}, "") for steps in (600, 1_300))
+    before = run(short, tmp_path).summary["curve"]
+    after = run(long, tmp_path, resume=True).summary["curve"]
+    assert after[: len(before)] == before, "it goes on where it was"
+    assert after[-1]["steps"] >= 1_300 > before[-1]["steps"]
+    (tmp_path / "seed_0" / "checkpoint.pt").unlink()
+    assert run(short, tmp_path, resume=True).summary["curve"] == after, "no more than asked is nothing to do"
+    with pytest.raises(InputError, match="cannot go on"):
+        run(long.changed(steps=2_000), tmp_path, resume=True)
 
 
 def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):

@@ -205,6 +205,7 @@ def test_cloning_takes_the_read_only_arrays_of_a_worker():
     assert not torch.equal(before, model.policy.action_net.weight)
 
 
+@pytest.mark.filterwarnings("ignore:.*was trained on")
 def test_a_model_runs_on_lots_that_it_was_not_trained_on(trained):
     campus = make_scenario("campus")
     model = LearnedAgent(campus, "maskable-ppo", trained / "model.safetensors").model
@@ -437,6 +438,11 @@ def test_observations_of_another_kind_are_refused(trained):
         agent.predict(plain)
     with pytest.raises(InputError, match="observes 86 numbers, got 102 for its k = 5"):
         agent.predict(LocalObservation(env, k=7).reset(seed=0)[0])
+
+
+def test_a_model_says_that_it_has_never_been_on_this_lot(trained):
+    with pytest.warns(UserWarning, match="was trained on .*, not on street$"):
+        LearnedAgent(make_scenario("street"), "maskable-ppo", trained / "model.safetensors")
 
 
 def test_a_mask_that_allows_nothing_is_refused(trained):

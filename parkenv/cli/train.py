@@ -31,10 +31,12 @@ class Train(StudyCommand):
     model is kept, and tested at the end. Hyperparameters are in parkenv/studies/training/configs.py.
 
     With --resume, trainings continue from the checkpoints in --out; the models equal those of an unbroken training.
+    With more --steps, finished ones go on, too.
     """
 
     examples = """
         parkenv train maskable-ppo --scenario campus
+        parkenv train maskable-ppo --scenario campus --steps 4000000 --resume
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
         parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned

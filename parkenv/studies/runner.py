@@ -12,7 +12,7 @@ import shutil
 import time
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
@@ -136,7 +136,6 @@ def run(
         InputError: the study cannot be run, or the folder cannot be used.
         Interrupted: Ctrl-C; the exception holds the result so far.
     """
-    study.check()
     if folder is None:
         path = Path(mkdtemp(prefix="parkenv-"))
         try:
@@ -149,6 +148,12 @@ def run(
             raise
         weakref.finalize(result, shutil.rmtree, path)
         return result
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("default")
+        study.check()
+    for warning in found:
+        warnings.warn(warning.message, stacklevel=2)
+    said = {str(warning.message) for warning in found}
     path = Path(folder)
     with only_writer(path), study.workers() if workers is None else nullcontext(workers) as used:
         results = Results(path, _tables_of(study))
@@ -165,7 +170,7 @@ def run(
             _run_all("Compiling, once per installation", study.warm_up(), used, progress)
             for stage in study.stages(results):
                 done.append(stage)
-                _run_stage(stage, results, used, progress)
+                _run_stage(stage, results, used, progress, said)
             interrupted = False
         except KeyboardInterrupt:
             interrupted = True
@@ -230,8 +235,10 @@ def _run_all(doing: str, tasks: Sequence[Task[object]], workers: Workers, progre
         progress(doing, number, len(tasks))
 
 
-def _run_stage(stage: Stage, results: Results, workers: Workers, progress: Progress) -> None:
-    """Run what the results do not hold yet, and add it.
+def _run_stage(
+    stage: Stage, results: Results, workers: Workers, progress: Progress, said: Collection[str] = ()
+) -> None:
+    """Run what the results do not hold yet, and add it; warnings that the user has been told are not repeated.
 
     Raises:
         KeyboardInterrupt: passed on; finished rows are in the folder.
@@ -278,7 +285,7 @@ def _run_stage(stage: Stage, results: Results, workers: Workers, progress: Progr
         for message in messages:
             # Numbers in the text differ between items.
             topic = study.label(work), re.sub(r"\d+", "", message)
-            if topic not in shown:
+            if topic not in shown and message not in said:
                 shown.add(topic)
                 warnings.warn(f"{topic[0]}: {message}", stacklevel=2)
 

@@ -82,6 +82,8 @@ def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:
         state = torch.load(path, map_location="cpu", weights_only=True)
         if state["format"] != _FORMAT:
             raise ValueError(f"its format is {state['format']!r}, want {_FORMAT!r}")
+        if not isinstance(n_envs := state["numbers"]["n_envs"], int):
+            raise ValueError(f"n_envs is {n_envs!r:.40}")
         return state, _plain(state["curve"])
     except Exception as error:  # torch raises many types for damaged files
         raise InputError(

@@ -22,14 +22,18 @@ class TrainingConfig:
     final_learning_rate: float = 1.0
     steps: int = 0  # decisions of a training whose specification does not say how many
 
-    def for_steps(self, steps: int) -> Self:
-        """Return the settings for a training of so many decisions.
+    def for_steps(self, steps: int, n_envs: int | None = None) -> Self:
+        """Return the settings for a training of so many decisions, or for one to go on with of so many environments.
 
         The settings are for millions. A short training on-policy would update its network once or twice, and learn
         nothing: it has a quarter of the environments and of the batch, until there are `MIN_UPDATES` updates.
         """
         config = self
-        while config.n_envs >= 16 and steps < MIN_UPDATES * config.n_envs * config.settings.get("n_steps", 0):
+        while config.n_envs >= 16 and (
+            steps < MIN_UPDATES * config.n_envs * config.settings.get("n_steps", 0)
+            if n_envs is None
+            else config.n_envs > n_envs
+        ):
             batch = {"batch_size": config.settings["batch_size"] // 4}
             config = replace(config, n_envs=config.n_envs // 4, settings={**config.settings, **batch})
         return config

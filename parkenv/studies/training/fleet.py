@@ -83,8 +83,7 @@ class FleetTraining(RLTraining):
     def settings(self) -> Row:
         """See `Training`."""
         return super().settings() | {
-            "scenario": [self.scenario.name], "evaluate_every": self.evaluate_every, "fleet": self.fleet.name,
-            "demand": str(self.fleet.demand),
+            "scenario": [self.scenario.name], "fleet": self.fleet.name, "demand": str(self.fleet.demand),
         }  # fmt: skip
 
     @property

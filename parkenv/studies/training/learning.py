@@ -14,6 +14,7 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.utils import LinearSchedule
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
+from parkenv.errors import InputError
 from parkenv.files.csv_tables import write_csv
 from parkenv.studies.training.checkpoint import read_checkpoint, restore, save_checkpoint
 from parkenv.studies.training.configs import TrainingConfig
@@ -33,11 +34,16 @@ class RLTraining(Training):
     """Training config of each algorithm."""
     evaluations: ClassVar[int] = 10
     """How many evaluations there are if the specification does not say."""
+    most_between: ClassVar[int | None] = None
+    """Decisions between evaluations at most, then."""
+
+    n_envs: int | None = None
+    """Environments of the training that goes on; None for a new one."""
 
     @property
     def config(self) -> TrainingConfig:
         """Training config of the algorithm, for a training of so many steps."""
-        return self.configs[self.algorithm].for_steps(self.steps)
+        return self.configs[self.algorithm].for_steps(self.steps, self.n_envs)
 
     @property
     def steps(self) -> int:
@@ -47,7 +53,8 @@ class RLTraining(Training):
     @property
     def evaluate_every(self) -> int:
         """Decisions between evaluations."""
-        return self.spec.evaluate_every or max(1, self.steps // self.evaluations)
+        every = max(1, self.steps // self.evaluations)
+        return self.spec.evaluate_every or min(every, self.most_between or every)
 
     @abstractmethod
     def make_env(self) -> VecEnv:
@@ -64,6 +71,10 @@ class RLTraining(Training):
     @abstractmethod
     def description(self) -> dict[str, Any]:
         """Return `scenarios` and `settings` for `planners.model_file.save_model`."""
+
+    def settings(self) -> Row:
+        """See `Training`; without the steps, of which a resumed training may have more."""
+        return {name: its for name, its in super().settings().items() if name != "steps"}
 
     def settings_of_model(self, **others: Any) -> dict[str, Any]:
         """Return the settings of a model for its file: those of the config, and others."""
@@ -92,8 +103,9 @@ class RLTraining(Training):
     def train(self, seed: int, folder: Path) -> list[Row]:
         """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
 
-        `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations; the checkpoint is
-        removed at the end.
+        `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations. The checkpoint
+        stays, so that a training can be made longer: what depends on how much of it is over, such as the learning
+        rate, goes on as at that point of the longer one.
 
         Args:
             seed: seed of the network and of the worlds.
@@ -101,11 +113,20 @@ class RLTraining(Training):
 
         Returns:
             The rows of `curve.csv`.
+
+        Raises:
+            InputError: a training to go on with has lost its checkpoint.
         """
         folder.mkdir(parents=True, exist_ok=True)
         checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE, self.columns)
-        if not checkpoint.exists() and curve and curve[-1]["steps"] >= self.steps:
+        if curve and curve[-1]["steps"] >= self.steps:
             return curve
+        if len(curve) > 1 and not checkpoint.exists():
+            raise InputError(
+                f"{checkpoint}: is gone; the training cannot go on from {curve[-1]['steps']} steps"
+            )
+        begun = read_checkpoint(checkpoint) if checkpoint.exists() else None
+        self.n_envs = begun and begun[0]["numbers"]["n_envs"]
         env, rate = self.make_env(), self.config.settings["learning_rate"]
         model = algorithm_class(self.algorithm)(
             self.config.policy,
@@ -122,8 +143,8 @@ class RLTraining(Training):
         # stable-baselines3 has seeded the environment with the network's seed.
         env.seed(TRAINING_SEEDS * (seed + 1))
         self.connect(model)
-        if checkpoint.exists():
-            state, curve = read_checkpoint(checkpoint)
+        if begun is not None:
+            state, curve = begun
             require_columns(curve, self.columns, checkpoint)
             restore(state, model)
         else:
@@ -135,7 +156,6 @@ class RLTraining(Training):
             model.learn(left, callback=evaluator, reset_num_timesteps=False, tb_log_name="run")
         if curve[-1]["steps"] < model.num_timesteps:
             evaluator.evaluate(model)
-        checkpoint.unlink(missing_ok=True)
         return curve
 
 

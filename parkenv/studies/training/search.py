@@ -74,6 +74,7 @@ class SearchTraining(RLTraining):
 
     spec: SearchTrainingSpec | ScanTrainingSpec
     heading = "Mean total time, s, in held-out worlds"
+    most_between = 100_000
     evaluated_by = ("scenario", "held_out", "evaluation_episodes")
     configs: ClassVar[Mapping[str, TrainingConfig]] = SEARCH_CONFIGS
     shared: Demonstrations | None = None

@@ -46,7 +46,7 @@ Steps = Annotated[int, Field(ge=1, le=10**12, description="Decisions of a traini
 EvaluateEvery = Annotated[
     int,
     Field(ge=1, le=10**12, description="Decisions between evaluations."),
-    Option(panel="Evaluation", default="100000; in a fleet, a tenth of --steps; to drive, a twentieth"),
+    Option(panel="Evaluation", default="a tenth of --steps, to search at most 100000; to drive, a twentieth"),
 ]
 Episodes = Annotated[
     int,
@@ -227,6 +227,8 @@ class TrainingSpec(Study):
         if not continues:
             for folder in results.path.glob("seed_*"):
                 shutil.rmtree(folder)
+        short = [key for key, row in results.rows(self.table).items() if row["steps"] < self.training.steps]
+        results.drop(short, self.table)
 
     def cells(self) -> list[Cell]:
         """See `Study`."""
@@ -429,7 +431,9 @@ class SearchTrainingSpec(PlacesTrainingSpec):
             description="Decisions of a training; for network, those that belief labels.",
         ),
     ] = 2_000_000
-    evaluate_every: EvaluateEvery = 100_000
+    evaluate_every: EvaluateEvery | None = Field(
+        None, description="A tenth of the steps, at most 100000, if absent."
+    )
     tensorboard: TensorBoard = False
 
     @model_validator(mode="after")
@@ -457,7 +461,9 @@ class ScanTrainingSpec(TestedTrainingSpec):
     observation: Literal["scan"] = "scan"
     k: int = Field(4, ge=1, le=1_000, description="Scans in an observation.")
     steps: Steps = 2_000_000
-    evaluate_every: EvaluateEvery = 100_000
+    evaluate_every: EvaluateEvery | None = Field(
+        None, description="A tenth of the steps, at most 100000, if absent."
+    )
     evaluation_episodes: Episodes = Field(
         256, description="Episodes of an evaluation; the test in the end has twice as many."
     )

@@ -85,7 +85,7 @@ class DriveTraining(RLTraining):
     def settings(self) -> Row:
         """See `Training`."""
         lots = [lot.name for lot in self.lots]
-        return super().settings() | {"lot": lots, "steps": self.steps, "evaluate_every": self.evaluate_every}
+        return super().settings() | {"lot": lots}
 
     @cached_property
     def groups(self) -> tuple[SlotGroup, ...]:
