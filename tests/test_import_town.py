@@ -9,7 +9,7 @@ import pytest
 from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_maps import AISLE, SERVICE, SPACE, STREET, Map
+from made_maps import AISLE, FREIBURG, SERVICE, SPACE, STREET, Map
 from parking_rules import fit_kerbs, kerb_table
 from scipy.sparse.csgraph import dijkstra
 
@@ -18,6 +18,7 @@ from parkenv.lots import import_town, read_lot, write_lot
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.osm.elements import read_map
 from parkenv.lots.osm.roads import whole_number
+from parkenv.lots.quality import read_provenance
 from parkenv.lots.town.capacity import RULES, expected_capacity
 from parkenv.lots.town.kerbs import PLACES_PER_METRE
 from parkenv.lots.town.streets import ENTRY_WEIGHT
@@ -439,12 +440,46 @@ def test_what_is_no_town_is_refused_in_one_line(tmp_path, place, message):
 
 
 def test_a_town_is_no_place_of_entries_and_car_parks(tmp_path):
-    for option in (("--split",), ("--entry", "0,0"), ("--bounds", "0,0,9,9")):
+    for option in (("--split",), ("--entry", "0,0"), ("--bounds", "0,0,999,9")):
         done = parkenv(
             "lot", "import", tmp_path / "a.osm", "--town", *option, "--out", tmp_path / "a.geojson"
         )
         assert done.returncode == 2
         assert "--town" in done.stderr
+
+
+def test_a_part_is_cut_out_and_a_town_of_guessed_kerbs_says_so(tmp_path):
+    """A square of 400 m holds 350 m of two streets each way, and four of nine crossings."""
+    path, out = tmp_path / "town.osm", tmp_path / "part.geojson"
+    path.write_text(grid().xml(), encoding="utf-8")
+    whole = import_town(path)
+    lat, lon = FREIBURG.lat + 50 / 111_195, FREIBURG.lon + 50 / 111_195 / np.cos(np.radians(FREIBURG.lat))
+    around = ("--around", f"{lat:.7f},{lon:.7f},200")
+    done = parkenv("lot", "import", path, "--town", *around, "--untagged-kerbs", 0.5, "--out", out)
+    assert done.returncode == 0, done.stderr
+    part = read_lot(out)
+    assert "left out: clipped: outside the bounds" in done.stdout
+    assert np.ptp([p for lane in part.lanes for p in lane.points], axis=0) == pytest.approx([350, 350], abs=1)
+    assert len(part.entries) == 8
+    free, all_of_it = 4 * 2 * 350.0 - 4 * 4 * 2 * 10.1, 6 * 2 * 600.0 - 9 * 4 * 2 * 10.1
+    assert part.n_slots / whole.draft.lot().n_slots == pytest.approx(0.5 * free / all_of_it, rel=0.1)
+    caution = read_provenance(out).caution
+    assert f"{part.n_slots} of {part.n_slots} spaces (100 %)" in caution
+    driven = parkenv(
+        "fleet",
+        "--lot",
+        out,
+        "--arrivals-per-hour",
+        5,
+        "-n",
+        1,
+        "--no-figures",
+        "-j",
+        1,
+        "--out",
+        tmp_path / "f",
+    )
+    assert caution in driven.stdout, driven.stderr
 
 
 # ---- real towns ----

@@ -142,7 +142,8 @@ class Fleet(AgentStudyCommand):
         for row in shown_changes(changes):
             if row["change"] == "scenario":
                 console.print(sentence(row), soft_wrap=True)
-        told = unreached(result.summary["reach"])
+        told = [f"On {name}, {caution}" for name, caution in result.summary["cautions"].items()]
+        told += unreached(result.summary["reach"])
         for line in [*told, *departures(result.summary["hours"], result.rows)]:
             console.print(line, soft_wrap=True)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -139,6 +140,10 @@ class Check(Command):
             )
 
 
+METRES_PER_DEGREE = 111_195.0
+"""Of latitude."""
+
+
 def _points(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
     """Return the points of an option; `auto` stands for none."""
     numbers = (numbers_in(text, 2) for text in texts if text != AUTO)
@@ -168,6 +173,7 @@ class Import(Command):
         parkenv lot import spaces.geojson --entry auto --goal auto --out lot.geojson
         parkenv lot import town.geojson --split --out lots
         parkenv lot import town.osm.pbf --town --out town.geojson --picture town.png
+        parkenv lot import map.osm --town --around 49.5,11.3,800 --out part.geojson
         """
 
     place: Place
@@ -190,9 +196,15 @@ class Import(Command):
     )
     bounds: Several[float] | None = option(
         None,
-        "Import only this: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres.",
+        "Import only this: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres; with --town, latitudes and longitudes.",
         takes="BOX",
         parse=lambda text: tuple(numbers_in(text, 4)),
+    )
+    around: Several[float] | None = option(
+        None,
+        "Import only a square around this point, so far to each side.",
+        takes="LAT,LON,METRES",
+        parse=lambda text: tuple(numbers_in(text, 3)),
     )
     disabled: bool = option(False, "Also import spaces for disabled drivers.")
     split: bool = option(
@@ -207,6 +219,12 @@ class Import(Command):
         default="none",
     )
     listed_only: bool = option(False, "Leave out kerbs, and car parks that are not in --car-parks.")
+    untagged_kerbs: float = option(
+        1.0,
+        "Places of kerbs that the map says nothing of, as a multiple of the rule's, with --town.",
+        ge=0.0,
+        le=10.0,
+    )
     least: int = option(10, "Number of spaces of the smallest car park, with --split.", ge=2)
     out: Path = option(
         ..., "Lot file to write, or folder with --split.", short="-o", takes="FILE.geojson|DIR"
@@ -217,30 +235,51 @@ class Import(Command):
         points = [point for point in (*self.goal, *self.entry) if point != AUTO]
         if self.split and self.town:
             raise PydanticCustomError("whole", "--split and --town: want one of them")
-        if self.split and (points or self.bounds or self.picture):
+        if self.around is not None and self.bounds is not None:
+            raise PydanticCustomError("whole", "--bounds and --around: want one of them")
+        if self.split and (points or self.box or self.picture):
             raise PydanticCustomError(
                 "whole",
-                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --picture",
+                "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --around, "
+                "--picture",
             )
         if (self.car_parks is not None and not self.town) or (self.listed_only and self.car_parks is None):
             raise PydanticCustomError("whole", "--car-parks wants --town, --listed-only wants --car-parks")
-        if self.town and (self.entry or self.goal or self.bounds or self.disabled):
+        if self.town and (self.entry or self.goal or self.disabled):
             raise PydanticCustomError(
-                "whole", "--town reads the whole map, want no --entry, --goal, --bounds, --disabled"
+                "whole", "--town has those of the map, want no --entry, --goal, --disabled"
             )
+        if (
+            self.town
+            and self.box
+            and not all(abs(lat) <= 90.0 and abs(lon) <= 180.0 for lat, lon in self.box)
+        ):
+            raise PydanticCustomError("whole", "--bounds: want SOUTH,WEST,NORTH,EAST with --town")
         return self
+
+    @property
+    def box(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
+        """Two corners of what is imported; None for all of the map."""
+        if self.around is not None:
+            lat, lon, metres = self.around
+            up = metres / METRES_PER_DEGREE
+            right = up / max(math.cos(math.radians(lat)), 1e-6)
+            return (lat - up, lon - right), (lat + up, lon + right)
+        if self.bounds is None:
+            return None
+        south, west, north, east = self.bounds
+        return (south, west), (north, east)
 
     @property
     def _options(self) -> ImportOptions:
         from parkenv.lots.draft import ImportOptions
 
-        box = self.bounds
         return ImportOptions(
             goals=_points(self.goal),
             entries=_points(self.entry),
             guess_entry=self.split or AUTO in self.entry,
             guess_goal=self.split or AUTO in self.goal,
-            bounds=None if box is None else ((box[0], box[1]), (box[2], box[3])),
+            bounds=self.box,
             with_disabled=self.disabled,
         )
 
@@ -266,7 +305,12 @@ class Import(Command):
                 raise InputError(f"--picture {self.picture}: want a name that ends in .png")
             check_writable(self.picture)
         console = make_console(soft_wrap=True)
-        town = import_town(self.place, self.car_parks, listed_only=self.listed_only) if self.town else None
+        town = None
+        if self.town:
+            town = import_town(
+                self.place, self.car_parks, listed_only=self.listed_only, bounds=self.box,
+                untagged_kerbs=self.untagged_kerbs,
+            )  # fmt: skip
         draft = town.draft if town is not None else import_lot(self.place, self._options)
         for line in draft.found:
             console.print(line)
@@ -287,12 +331,17 @@ class Import(Command):
             lot = draft.lot()
         except InputError as error:
             raise InputError(f"{self.place}: {error}") from error
-        provenance = Provenance(self.place.name, draft.guesses, draft.issues) if draft.guesses else None
+        caution = "" if town is None else town.caution
+        provenance = None
+        if draft.guesses:
+            provenance = Provenance(self.place.name, draft.guesses, draft.issues, caution)
         write_lot(lot, self.out, provenance)
         if town is not None:
             write_csv(table, TABLE, town.facilities)
             console.print(f"Facilities: {table}")
         console.print(f"Wrote {self.out}. {_summary(lot)}")
+        if caution:
+            console.print(caution, style="yellow", markup=False)
 
     def _import_car_parks(self) -> None:
         from parkenv.files.atomic_write import write_together

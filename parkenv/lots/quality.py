@@ -28,6 +28,7 @@ class Provenance:
     source: str
     guesses: tuple[str, ...] = ()  # one sentence each
     issues: tuple[QualityIssue, ...] = ()
+    caution: str = ""  # what decides results and is a guess
 
     def document(self) -> dict[str, Any]:
         """Return the JSON object that a lot file keeps."""
@@ -38,6 +39,7 @@ class Provenance:
                 {"reason": issue.reason, "error_probability": round(issue.error_probability, 3)}
                 for issue in self.issues
             ],
+            **({"caution": self.caution} if self.caution else {}),
         }
 
 
@@ -65,8 +67,9 @@ def read_provenance(path: Path) -> Provenance | None:
             str(origin["source"]),
             tuple(str(guess) for guess in guesses),
             tuple(QualityIssue(str(issue["reason"]), float(issue["error_probability"])) for issue in issues),
+            str(origin.get("caution", "")),
         )
-    except (KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
         raise InputError(
             f"{path}: import is {origin!r:.60}, want an object with source, guesses and issues"
         ) from error

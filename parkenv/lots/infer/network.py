@@ -10,7 +10,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.world.drive_graph import node_labels
+from parkenv.world.drive_graph import NODE_TOLERANCE, node_labels
 from parkenv.world.lot import MOVES, Lane
 
 STREET = -2  # source of a public street
@@ -206,7 +206,7 @@ def limit_junctions(lanes: Sequence[Lane]) -> list[Lane]:
                 moved.update(_move_lane_end(lines, oneway, users))
         if not moved:
             break
-    return [replace(lane, points=points) for lane, points in zip(lanes, lines, strict=True)]
+    return [replace(lane, points=line) for lane, line in zip(lanes, lines, strict=True) if len(line) > 1]
 
 
 def _leaving(lines: Sequence[FloatArray], oneway: Sequence[bool], at: set[tuple[int, int]]) -> int:
@@ -257,5 +257,6 @@ def _move_lane_end(
     lines[other] = np.insert(lines[other], max(i_b, j_b), joint, axis=0)
     moved = lines[k].copy()
     moved[i] = joint
-    lines[k] = moved
+    # A short lane whose ends have both moved is a point.
+    lines[k] = moved[np.r_[True, np.hypot(*np.diff(moved, axis=0).T) > NODE_TOLERANCE]]
     return k, other

@@ -41,6 +41,7 @@ MOST_ELEMENTS = 5_000_000
 """Maximum number of nodes, ways and relations of one file: a city of a million people."""
 MOST_XML_BYTES = 512_000_000
 """Maximum size of OSM XML, unpacked."""
+_METRE = 1e-5  # degrees, about
 BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
 
 
@@ -79,6 +80,45 @@ class OsmMap:
     elements: list[OsmElement]  # the tagged nodes, ways and multipolygons, in order
     positions: Positions = field(default_factory=Positions)  # what the positions in the file are
     left_out: tuple[LeftOut, ...] = ()  # those without an outline or a line
+
+    def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> OsmMap:
+        """Cut the map at a box: roads end there; everything else stays whole if half of its corners are inside.
+
+        Args:
+            bounds: two corners, each a latitude and a longitude, degrees.
+
+        Raises:
+            InputError: the box holds nothing of the map.
+        """
+        corners = np.array(bounds)[:, ::-1]
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        inside = [
+            float(((xy >= low) & (xy <= high)).all(axis=1).mean()) if len(xy) else 0.0
+            for xy in (np.concatenate(e.lines) for e in self.elements)
+        ]
+        kept, beyond = [], []
+        for element, share in zip(self.elements, inside, strict=True):
+            if share < 1.0 and not element.is_node and "highway" in element.tags:
+                clipped = shapely.clip_by_rect(shapely.MultiLineString(list(element.lines)), *low, *high)
+                ends = (
+                    _without_stubs(shapely.get_coordinates(part), low, high)
+                    for part in shapely.get_parts(clipped)
+                )
+                lines = tuple(line for line in ends if len(line) > 1)
+                element, share = replace(element, lines=lines, cut=True), float(bool(lines))
+            if share >= 0.5:
+                kept.append(element)
+            else:
+                beyond.append(element.id)
+        if not kept:
+            raise InputError(
+                f"nothing of the map is within latitudes and longitudes {bounds[0]} to {bounds[1]}"
+            )
+        left_out = (
+            *self.left_out,
+            *([LeftOut("clipped: outside the bounds", tuple(beyond))] if beyond else []),
+        )
+        return replace(self, elements=kept, left_out=left_out)
 
 
 def read_map(path: Path) -> OsmMap:
@@ -258,6 +298,17 @@ class RawElements:
             self.left_out["multipolygons without an outline in the file"].append(name)
             return None
         return OsmElement(name, relation.tags, tuple(outer), tuple(inner), cut)
+
+
+def _without_stubs(line: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
+    """Return a line without ends at the edge of a box that are nearer than a metre to the next point."""
+    at_edge = np.any((line <= low) | (line >= high), axis=1)
+    short = np.hypot(*np.diff(line, axis=0).T) < _METRE
+    kept = np.ones(len(line), bool)
+    if len(line):
+        kept[0] = not (at_edge[0] and short[0])
+        kept[-1] &= not (at_edge[-1] and short[-1])
+    return line[kept]
 
 
 def _is_ring(line: FloatArray) -> bool:

@@ -40,7 +40,7 @@ from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
 from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of
-from parkenv.lots.town.kerbs import STRIPS, FacilityRow, kerb_sides, strip_side
+from parkenv.lots.town.kerbs import CLASS_RULE, STRIPS, FacilityRow, kerb_sides, strip_side
 from parkenv.lots.town.listed import ListedCarPark, matched, read_listed
 from parkenv.lots.town.streets import read_streets
 from parkenv.lots.town.zones import PRICE, Rules, rules_of, zones_of
@@ -81,9 +81,28 @@ class TownDraft:
     draft: LotDraft
     facilities: list[dict[str, Any]]
 
+    @property
+    def caution(self) -> str:
+        """What to know of the town where more than half of its spaces are at untagged kerbs; else empty."""
+        total = sum(row["capacity"] for row in self.facilities)
+        guessed = sum(row["capacity"] for row in self.facilities if row["rule"] == CLASS_RULE)
+        if 2 * guessed <= total:
+            return ""
+        share = f"{100 * guessed / total:.0f} %"
+        return (
+            f"{guessed:,} of {total:,} spaces ({share}) are a guess that decides how easy parking "
+            "is: kerbs that the map says nothing of, by the class of their street, free unless it names a price. To "
+            "see what depends on it, import with --untagged-kerbs 0.5, or drive with --price 'kerb free=1/h'."
+        )
+
 
 def import_town(
-    path: str | Path, car_parks: str | Path | None = None, *, listed_only: bool = False
+    path: str | Path,
+    car_parks: str | Path | None = None,
+    *,
+    listed_only: bool = False,
+    bounds: tuple[tuple[float, float], tuple[float, float]] | None = None,
+    untagged_kerbs: float = 1.0,
 ) -> TownDraft:
     """Draft a town from an OpenStreetMap file; see the module for the rules.
 
@@ -91,6 +110,8 @@ def import_town(
         path: the file.
         car_parks: list of car parks, such as those that the city counts; their names and capacities win (`listed`).
         listed_only: whether kerbs and other car parks are left out.
+        bounds: two corners, each a latitude and a longitude, at which the map is cut; None: all of it.
+        untagged_kerbs: places of kerbs that the map says nothing of, as a multiple of the rule's.
 
     Raises:
         InputError: the file is damaged or has another format, has no street or no parking, or is too large for a plane.
@@ -99,9 +120,9 @@ def import_town(
     listed = [] if car_parks is None else read_listed(Path(car_parks))
     place = read_map(path)
     with naming(path):
-        town = _Town(place_name(path), place)
+        town = _Town(place_name(path), place if bounds is None else place.within(bounds))
         town.read_drawn()
-        town.read_kerbs()
+        town.read_kerbs(untagged_kerbs)
         town.read_counted()
         if listed:
             town.use_list(listed)
@@ -227,7 +248,7 @@ class _Town:
             owner[space[::-1]] = park[::-1]
         return owner
 
-    def read_kerbs(self) -> None:
+    def read_kerbs(self, untagged: float) -> None:
         """Read the kerbs: those drawn as areas, those tagged on streets, and those by rule."""
         sides: list[FacilityRow] = []
         for k, area in enumerate(self.parking):
@@ -238,7 +259,7 @@ class _Town:
                     sides.append(side)
         crossings = [e for e in self.place.elements if e.is_node and e.tags.get("highway") == "crossing"]
         at = self.frame.to_xy(np.concatenate([np.empty((0, 2)), *(e.lines[0] for e in crossings)]))
-        sides += kerb_sides(self.roads, at, self.buildings, self.left_out)
+        sides += kerb_sides(self.roads, at, self.buildings, self.left_out, untagged)
         half_widths = [CORRIDOR * road.half_width for road in self.roads]
         corridors = shapely.buffer(self.lines, half_widths, cap_style="flat")
         # Several runs of one way are one kerb.

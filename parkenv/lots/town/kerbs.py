@@ -41,6 +41,8 @@ METRES_PER_PLACE = {"parallel": 5.4, "diagonal": 3.1, "perpendicular": 2.6}
 """Kerb taken by a place, m, by orientation; from the same kerbs."""
 STRIPS = ("street_side", "lane", "on_kerb", "half_on_kerb", "shoulder")
 """Values of `parking` of areas that are kerbs."""
+CLASS_RULE = "class of street"
+"""Name of the rule of kerbs that the map says nothing of."""
 HOUSES_WITHIN = 40.0  # m; where no building is this near, an untagged street has no places
 STATION = 20.0  # m, between the points of a street at which buildings are looked for
 STRIP_REACH = 20.0  # largest distance, m, of a drawn kerb from its street
@@ -76,7 +78,11 @@ def capacity_by_class(free_m: float, kind: str) -> float:
 
 
 def kerb_sides(
-    roads: Sequence[Road], crossings: FloatArray, buildings: Sequence[Area], left_out: Mapping[str, list[str]]
+    roads: Sequence[Road],
+    crossings: FloatArray,
+    buildings: Sequence[Area],
+    left_out: Mapping[str, list[str]],
+    untagged: float = 1.0,
 ) -> Iterator[FacilityRow]:
     """Yield the kerbs of roads that have places, under the names of their streets; of a way there may be several.
 
@@ -85,6 +91,7 @@ def kerb_sides(
         crossings: (n, 2) m, pedestrian crossings.
         buildings: its buildings; without any, all streets have houses.
         left_out: where kerbs that nobody may use are listed, by reason.
+        untagged: places of untagged kerbs, as a multiple of the rule's.
     """
     street = {k: i for i, k in enumerate(k for k, road in enumerate(roads) if road.rank is Rank.STREET)}
     corners = Junctions([roads[k] for k in street], np.empty((0, 2)))
@@ -100,7 +107,7 @@ def kerb_sides(
                 f"{key}:{at}" in road.tags for key in ("parking", "parking:lane") for at in (tagged, "both")
             )
             closed = everything.closed_intervals(k, side)
-            source, rule, said = "rule", "class of street", None
+            source, rule, said = "rule", CLASS_RULE, None
             if by_tag:
                 usable = {key: value for key, value in road.tags.items() if value not in RESERVED}
                 kerb = kerb_of(usable, tagged)
@@ -119,7 +126,8 @@ def kerb_sides(
                 closed = closed + lonely[k]
                 off_corners = corners.closed_intervals(street[k], side) + lonely[k]
                 free = sum(end - start for start, end in free_intervals(total, off_corners))
-                expected = capacity_by_class(free * (2 if _is_half(road) else 1), kind) + rest[kind]
+                free *= untagged * (2 if _is_half(road) else 1)
+                expected = capacity_by_class(free, kind) + rest[kind]
                 rest[kind] = expected % 1.0
                 kerb = Kerb("parallel", int(expected), False)
             slots = kerb_slots(road, side, kerb, closed)

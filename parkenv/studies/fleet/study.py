@@ -450,7 +450,20 @@ class FleetStudy(Study):
             "blocks": summarize_blocks(grouped, "block", prices),
             "purposes": summarize_blocks(mixed, "purpose"),
             "reach": [{"scenario": name, **roads.reach()} for name, roads in self._roads.items()],
+            "cautions": self._cautions(),
         }
+
+    def _cautions(self) -> dict[str, str]:
+        """Return what to know of the import of each lot, by scenario, if there is something."""
+        from parkenv.lots.quality import read_provenance
+
+        files = {spec.title: spec.lot.file for spec in self.scenarios}
+        found = {
+            name: read_provenance(file)
+            for name, file in files.items()
+            if file is not None and file.suffix in (".json", ".geojson")
+        }
+        return {name: its.caution for name, its in found.items() if its is not None and its.caution}
 
     @property
     def title(self) -> str:
@@ -503,7 +516,8 @@ class FleetStudy(Study):
         for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
             shown.setdefault((row["scenario"], row["agents"], row["arrivals_per_hour"]), row)
         changes = shown_changes(summary["changes"])
-        findings = [sentence(row) for row in changes if row["change"] == "scenario"]
+        findings = [f"On {name}, {caution}" for name, caution in summary.get("cautions", {}).items()]
+        findings += [sentence(row) for row in changes if row["change"] == "scenario"]
         for (scenario, agent, per_hour), row in shown.items():
             finding = (
                 f"{agent} on {scenario}, {rate_text(per_hour)}, {row['occupancy']:.0%} of the slots taken: "
