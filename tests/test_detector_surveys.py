@@ -97,6 +97,7 @@ def test_detectors_on_the_command_line(tmp_path):
     for row in every:
         assert 0.0 <= row["cars_low"] <= row["cars_rate"] <= row["cars_high"] <= 1.0
         assert row["slots"] == 20
+        assert row["slots_rate"] + row["unknown_rate"] + row["wrong_rate"] == pytest.approx(1.0)
     of_cause = [rows["laser", "hog", cause]["in_pictures"] for cause in CAUSES if cause != "dusk"]
     assert sum(of_cause) <= every[0]["in_pictures"]
     with (tmp_path / "d" / "table.csv").open() as file:

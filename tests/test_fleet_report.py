@@ -36,7 +36,7 @@ def test_the_data_keep_to_the_schema_and_replay_the_days_of_the_run(run):
     data = data_of(run / "report.html")
     jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
     assert data["run"]["title"] == "Many cars on mini"
-    assert len(data["run"]["findings"]) == 4
+    assert len(data["run"]["findings"]) == 6
     assert "the price of anarchy is" in data["run"]["findings"][0]
     assert len(data["fleets"]) == 8
     assert all(its["agrees"] for its in data["fleets"])

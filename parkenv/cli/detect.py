@@ -403,6 +403,8 @@ def _tables(table: Sequence[Row], rigs: Sequence[str], detectors: Sequence[str])
         line("cars in a picture found in it", whole, "in_pictures"),
         line("boxes that are cars", whole, "boxes"),
         line("slots right", whole, "slots"),
+        line("slots unknown: never in view", whole, "unknown"),
+        line("slots wrong", whole, "wrong"),
         numbers("error of the place, m", "place_error_m"),
         numbers("mean error of the map", "map_error"),
     ]

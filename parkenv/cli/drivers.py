@@ -13,7 +13,7 @@ from parkenv.show.plurals import plural
 from parkenv.studies.commute.study import Commute as CommuteStudy
 from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown_changes
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.fleet.tables import ONE_DAY, departures, unreached
+from parkenv.studies.fleet.tables import ONE_DAY, carried, departures, unreached
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.cost_terms import COST_TERMS
 
@@ -143,6 +143,7 @@ class Fleet(AgentStudyCommand):
             if row["change"] == "scenario":
                 console.print(sentence(row), soft_wrap=True)
         told = [f"On {name}, {caution}" for name, caution in result.summary["cautions"].items()]
+        told += carried(without_nan(result.rows), self.study.most_balked)
         told += unreached(result.summary["reach"])
         for line in [*told, *departures(result.summary["hours"], result.rows)]:
             console.print(line, soft_wrap=True)

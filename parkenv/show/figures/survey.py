@@ -269,7 +269,10 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     handles = [Patch(color=c, label=name) for name, c in names.items()]
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))
     _draw_key(ax, handles)
-    ax.set_title(f"slots: {result.slot_accuracy:.1%} classified correctly")
+    right, unknown = result.slot_accuracy, 1.0 - result.states.in_view.mean()
+    ax.set_title(
+        f"slots: {right:.1%} right, {unknown:.1%} unknown, {max(1.0 - right - unknown, 0.0):.1%} wrong"
+    )
 
 
 def _draw_key(ax: Axes, handles: Sequence[Patch | Line2D]) -> None:

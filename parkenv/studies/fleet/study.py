@@ -171,6 +171,11 @@ class FleetStudy(Study):
         ge=0.01,
         le=1e5,
     )
+    most_balked: Probability = option(
+        0.05,
+        "Share of the cars that may find no slot: of several demands, the largest with no more is told.",
+        panel="Demand",
+    )
     seed: Seed = 0
     figures: Figures = True
 
@@ -450,6 +455,7 @@ class FleetStudy(Study):
             "blocks": summarize_blocks(grouped, "block", prices),
             "purposes": summarize_blocks(mixed, "purpose"),
             "reach": [{"scenario": name, **roads.reach()} for name, roads in self._roads.items()],
+            "most_balked": self.most_balked,
             "cautions": self._cautions(),
         }
 
@@ -510,7 +516,7 @@ class FleetStudy(Study):
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: what competition costs, for each agent and demand."""
         from parkenv.studies.fleet.changes import sentence, shown_changes
-        from parkenv.studies.fleet.tables import ONE_DAY, departures, unreached
+        from parkenv.studies.fleet.tables import ONE_DAY, carried, departures, unreached
 
         shown: dict[tuple[Any, ...], Row] = {}
         for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
@@ -533,6 +539,7 @@ class FleetStudy(Study):
                     else ": reservations would save nothing measurable"
                 )
             findings.append(f"{finding}.")
+        findings += carried(summary["rows"], summary.get("most_balked", 0.05))
         findings += [sentence(row) for row in changes if row["change"] == "knows"]
         findings += [ONE_DAY] if all(row["days"] == 1 for row in summary["rows"]) else []
         findings += unreached(summary["reach"])

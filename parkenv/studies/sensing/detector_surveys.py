@@ -43,7 +43,7 @@ CAUSES = {
     "in plain view": "none of these",
 }
 """Why a car may be hard to find in a picture; the first that holds, decided by the simulated truth alone."""
-MEASURES = ("cars", "in_pictures", "boxes", "slots")
+MEASURES = ("cars", "in_pictures", "boxes", "slots", "unknown", "wrong")
 TABLE_COLUMNS = (
     "rig", "detector", "group", "part",
     *(f"{m}{c}" for m in MEASURES for c in ("", "_rate", "_low", "_high")), "place_error_m", "map_error",
@@ -122,11 +122,19 @@ def comparison_table(
     def of_drives(which: Sequence[SurveyedDrive]) -> Row:
         rows = [d.row for d in which]
         slots = scenario.lot.n_slots
+        right, unknown = ([r[name] for r in rows] for name in ("slot_accuracy", "unknown_fraction"))
+        wrong = [1.0 - a - b for a, b in zip(right, unknown, strict=True)]
+
+        def of_slots(name: str, shares: Sequence[float]) -> Row:
+            return _rate(name, [round(share * slots) for share in shares], [slots] * len(rows))
+
         place = [r["place_error_m"] for r in rows if np.isfinite(r["place_error_m"])]
         return (
             _rate("cars", [r["found"] for r in rows], [r["parked"] for r in rows])
             | _rate("boxes", [r["right"] for r in rows], [r["detections"] for r in rows])
-            | _rate("slots", [round(r["slot_accuracy"] * slots) for r in rows], [slots] * len(rows))
+            | of_slots("slots", right)
+            | of_slots("unknown", unknown)
+            | of_slots("wrong", wrong)
             | {"place_error_m": float(np.mean(place)) if place else None}
         )
 

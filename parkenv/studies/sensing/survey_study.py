@@ -201,9 +201,11 @@ class SurveyStudy(Study):
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`."""
         (row,) = summary["rows"]
+        right, unknown = row["slot_accuracy"], row["unknown_fraction"]
         return [
             f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: {row['car_detection_rate']:.1%} "
-            f"of the parked cars were detected, {row['slot_accuracy']:.1%} of the slots classified correctly. "
+            f"of the parked cars were detected; {right:.1%} of the slots are right, {unknown:.1%} unknown as they were "
+            f"never in view, {max(1.0 - right - unknown, 0.0):.1%} wrong. "
             "Ranges alone classify slots, too, so a car that was detected in no image can still be in the map."
         ]
 
