@@ -25,7 +25,7 @@ from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once,
 from parkenv.studies.workers import Workers
 from planners.driving.car_path import CarPath
 from planners.driving.clearance import clearance, is_collision_free, room_at
-from planners.driving.hybrid_astar import SearchSettings, plan_path
+from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
 from planners.driving.parking import ParkingAgent
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
@@ -291,11 +291,20 @@ def test_where_no_path_is_the_car_stays_and_that_is_said():
     env = ParkingCase(packaged_lot("mini")).environment()
     no_room = ParkingAgent(search=SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0))
     parking = next(p for p in (park_once(env, no_room, seed) for seed in range(20)) if not p.row["parked"])
-    assert parking.row["reason"] == "no path was found"
+    assert parking.row["reason"].startswith("no path was found for a car, 4.26 m")
+    assert not parking.row["contact"]
     assert parking.row["driven_m"] == 0.0
     table = parking_table([parking.row])
     assert table[-1]["success"] == 0.0
     assert table[-1]["contacts"] == 0
+
+
+@pytest.mark.parametrize(("blocked", "where"), [((0.0, 0.0), "in the slot"), ((9.0, 0.0), "where it stands")])
+def test_a_pose_without_room_is_named(blocked, where):
+    box = np.array([[-0.2, -0.2], [0.2, -0.2], [0.2, 0.2], [-0.2, 0.2]])[None] + np.array(blocked)
+    its = (VehicleParameters(), box, np.array([4]), np.array([9.0, 0.0, 0.0]), np.zeros(3))
+    assert plan_path(*its) is None
+    assert f"would touch an obstacle {where}" in why_no_path(*its)
 
 
 def test_failures_are_named_and_drawn(tmp_path, monkeypatch):

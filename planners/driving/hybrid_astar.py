@@ -138,6 +138,22 @@ def plan_path(
     return None
 
 
+def why_no_path(
+    vehicle: VehicleParameters,
+    outlines: FloatArray,
+    n_corners: IntArray,
+    start: FloatArray,
+    target: FloatArray,
+) -> str:
+    """Say why `plan_path` found none for these arguments."""
+    size = f"{vehicle.length:g} m × {vehicle.width:g} m"
+    for pose, where in ((target, "in the slot"), (start, "where it stands")):
+        space = clearance(vehicle, outlines, n_corners, pose[:2] - WINDOW_M, pose[:2] + WINDOW_M)
+        if room_at(space, *map(float, pose), 0.01) <= 0.0:
+            return f"no path was found: the car, {size}, would touch an obstacle {where}"
+    return f"no path was found for a car, {size}, that turns on a radius of {vehicle.turning_radius:.1f} m"
+
+
 @compiled(error_model="numpy")
 def _search(
     space: Clearance,

@@ -14,7 +14,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
 from parkenv.driving.vehicle import VehicleParameters
 from planners.driving.car_path import CarPath
-from planners.driving.hybrid_astar import SearchSettings, plan_path
+from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
 from planners.driving.map_agent import MapAgent, Observation
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
@@ -29,6 +29,7 @@ PATIENCE_S = 3.0
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map are farther away
 _STANDS = 0.01
+_Task = tuple[VehicleParameters, FloatArray, NDArray[np.int64], FloatArray, FloatArray]
 
 
 @dataclass
@@ -39,7 +40,7 @@ class ParkingMemory:
         tracker: tracker of the current path, if any.
         paths: all planned paths, in the slot's frame.
         planning_s: wall time of each planning call, s.
-        stuck: whether no path was found.
+        reason: why the car stands still where no path was found; else empty.
         others: (n, 2) m, positions of the moving road users at the previous step.
         waited_s: s, time that the car has waited for road users.
     """
@@ -47,7 +48,7 @@ class ParkingMemory:
     tracker: PathTracker | None = None
     paths: list[CarPath] = field(default_factory=list)
     planning_s: list[float] = field(default_factory=list)
-    stuck: bool = False
+    reason: str = ""
     others: FloatArray | None = None
     waited_s: float = 0.0
 
@@ -94,6 +95,10 @@ class ParkingAgent(MapAgent):
             observation: an observation with the obstacle map.
             around_others: whether moving road users count as obstacles at their current positions.
         """
+        return plan_path(*self._task(observation, around_others), self.search)
+
+    def _task(self, observation: Observation, around_others: bool) -> _Task:
+        """Return what a path is planned for: car, outlines, numbers of corners, start and target."""
         cars = observation["cars"]
         if around_others:
             cars = np.concatenate([cars, observation["movers"]])
@@ -102,7 +107,7 @@ class ParkingAgent(MapAgent):
         start, target = (
             self.vehicle.at_rear_axle(_pose(observation[goal])) for goal in ("achieved_goal", "desired_goal")
         )
-        return plan_path(self.vehicle, outlines, n_corners, start, target, self.search)
+        return self.vehicle, outlines, n_corners, start, target
 
     def _decide(self, observation: Observation, memory: ParkingMemory) -> NDArray[np.float32]:
         pose = self.vehicle.at_rear_axle(_pose(observation["achieved_goal"]))
@@ -122,7 +127,7 @@ class ParkingAgent(MapAgent):
                 return np.array(command, dtype=np.float32)
             if abs(speed) >= _STANDS:
                 return self._stop(speed, steering)
-        if not memory.stuck and len(memory.paths) < MOST_PLANS:
+        if not memory.reason and len(memory.paths) < MOST_PLANS:
             began = time.perf_counter()
             path = self.plan(observation, around_others=waits)
             memory.planning_s.append(time.perf_counter() - began)
@@ -130,8 +135,10 @@ class ParkingAgent(MapAgent):
                 memory.paths.append(path)
                 memory.tracker = PathTracker(self.vehicle, path, self.tracking)
                 return np.array(memory.tracker.command(pose, speed, steering), dtype=np.float32)
-        if not waits:
-            memory.stuck = True
+        if not waits and not memory.reason:
+            of_plans = f"{MOST_PLANS} paths did not lead into the slot"
+            few = len(memory.paths) < MOST_PLANS
+            memory.reason = why_no_path(*self._task(observation, around_others=False)) if few else of_plans
         return np.zeros(2, dtype=np.float32)
 
     def _stop(self, speed: float, steering: float) -> NDArray[np.float32]:

@@ -95,8 +95,9 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         every: steps between frames; 0 for none.
 
     Returns:
-        A row with lot, seed, kind, way, slot, parked, reason (of a failure), time_s, driven_m, direction_changes,
-        wheel_rad and turned_rad (total change of steering angle and heading), position_error_m,
+        A row with lot, seed, kind, way, slot, parked, reason (of a failure), contact (what was touched), time_s,
+        driven_m, direction_changes, wheel_rad and turned_rad (total change of steering angle and heading),
+        position_error_m,
         angle_error_deg; for a planner also plans, planning_s (all plans), path_m, expansions, margin_m.
     """
     recorder = _MotionRecorder()
@@ -114,6 +115,7 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
         "slot": task.slot_id,
         "parked": bool(info["is_success"]),
         "reason": reason,
+        "contact": info["contact"],
         **{k: info[k] for k in ("time_s", "driven_m", "direction_changes", "position_error_m")},
         "angle_error_deg": float(np.degrees(info["angle_error_rad"])),
         "wheel_rad": float(np.abs(np.diff(recorder.steering)).sum()),
@@ -130,8 +132,8 @@ def park_once(env: gym.Env[Any, Any], agent: Agent, seed: int, *, every: int = 0
             "expansions": sum(p.expansions for p in memory.paths),
             "margin_m": first.margin if first else np.nan,
         }
-        if not row["parked"] and not info["contact"] and not memory.paths:
-            row["reason"] = "no path was found"
+        if not row["parked"] and not info["contact"] and memory.reason:
+            row["reason"] = memory.reason
     return Parking(row, state, film[0].frames if film else [])
 
 
@@ -190,7 +192,7 @@ def _summary(kind: str, way: str, rows: Sequence[dict[str, Any]]) -> dict[str, A
         "parked": len(parked),
         "success": len(parked) / len(rows),
         "success_ci95": [float(interval.low), float(interval.high)],
-        "contacts": sum(row["reason"] not in ("", "out of time", "no path was found") for row in rows),
+        "contacts": sum(bool(row["contact"]) for row in rows),
     }
     columns = {
         "planning_ms": [1e3 * row["first_planning_s"] for row in rows if "first_planning_s" in row],
