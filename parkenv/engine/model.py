@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
@@ -146,7 +146,7 @@ def _cells(deviation: float, n: int) -> tuple[FloatArray, FloatArray, float]:
     if deviation == 0.0:
         return np.zeros(1), np.ones(1), 0.0
     edges = np.linspace(-_REACH, _REACH, n + 1)
-    p = np.diff(norm.cdf(edges))
+    p = np.diff(ndtr(edges))
     return (edges[:-1] + edges[1:]) / 2 * deviation, p / p.sum(), float(2 * _REACH / n * deviation)
 
 

@@ -14,8 +14,6 @@ from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
 from parkenv.lots.formats.contents import graph_errors
 from parkenv.lots.formats.dragon_lake import dragon_lake_lot
 from parkenv.lots.formats.geojson import read_contents
-from parkenv.lots.formats.slot_list import slot_list_draft
-from parkenv.lots.osm.draft import osm_draft
 from parkenv.lots.osm.elements import holds_osm
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.lot import ParkingLot
@@ -146,9 +144,14 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
     path = Path(path)
     options = options or ImportOptions()
     file_format = lot_format(path)
+    # What infers a lot takes longer to load than a search in a finished one.
     if file_format is LotFormat.OSM:
+        from parkenv.lots.osm.draft import osm_draft
+
         return osm_draft(path, options)
     if file_format is LotFormat.SLOT_LIST:
+        from parkenv.lots.formats.slot_list import slot_list_draft
+
         return slot_list_draft(path, options)
     if file_format is None:
         raise InputError(

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import SlotBelief
-from parkenv.perception.pipeline import PerceptionResult
 from parkenv.world.occupancy.process import Arrival, World
 from parkenv.world.scenario import Scenario
+
+if TYPE_CHECKING:
+    from parkenv.perception.pipeline import PerceptionResult
 
 
 class Moment(NamedTuple):

@@ -23,18 +23,21 @@ def search_settings(spec: Any, *fields: str) -> Row:
     Returns:
         The version, the scenarios, hashes of the files of the study and of its agents, the fields, and the detector.
     """
-    from parkenv.perception.detector_registry import detector_version
-
     scenarios = spec.scenarios if hasattr(spec, "scenarios") else (spec.scenario,)
     agents = (spec.agents or ()) if hasattr(spec, "agents") else (spec.agent,)
     detector = getattr(spec, "detector", None)
+    versions = {}
+    if detector is not None:
+        from parkenv.perception.detector_registry import detector_version
+
+        versions = {"detector": detector_version(detector)}
     return {
         "version": __version__,
         "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in scenarios},
         "files": fingerprints(spec.files()),
         "agent files": agent_fingerprints(agent.name for agent in agents),
         **{name: getattr(spec, name) for name in fields},
-        **({} if detector is None else {"detector": detector_version(detector)}),
+        **versions,
     }
 
 

@@ -11,8 +11,6 @@ import gymnasium as gym
 
 from parkenv.compiled.clock import seconds_spent
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.envs.scan_observation import ScanObservation
-from parkenv.envs.sensors import SearchSensorsEnv
 from parkenv.errors import InputError
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent, ClairvoyantAgent
@@ -178,6 +176,9 @@ def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
         InputError: the agent observes scans, and the environment has none.
     """
     if (k := getattr(agent, "scans_k", None)) is not None:
+        from parkenv.envs.scan_observation import ScanObservation
+        from parkenv.envs.sensors import SearchSensorsEnv
+
         if not isinstance(env.unwrapped, SearchSensorsEnv):
             raise InputError(
                 f"{getattr(agent, 'name', 'the agent')} observes laser scans, this environment has none"

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy.special import ndtri
 
 from parkenv.world.cost_terms import COST_FIELDS
 
@@ -41,6 +41,8 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
         return mean, np.nan, np.nan
     if np.ptp(sample) <= _ROUNDING * np.abs(sample).max():
         return mean, mean, mean
+    from scipy import stats  # processes that run searches do not need it, and it loads slowly
+
     interval = stats.bootstrap(
         (sample,),
         np.mean,
@@ -67,6 +69,8 @@ def trimmed_mean_interval(values: ArrayLike, cut: float) -> tuple[float, float, 
         1.0
     """
     sample = np.asarray(values, dtype=np.float64)
+    from scipy import stats
+
     mean = float(stats.trim_mean(sample, cut))
     if len(sample) < 2:
         return mean, np.nan, np.nan
@@ -125,7 +129,7 @@ def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, flo
     if k > 1 and 0.0 < rate < 1.0:
         variance = k / (k - 1) * float(((hits - rate * trials) ** 2).sum()) / every**2
         effective = min(every, rate * (1.0 - rate) / max(variance, 1e-12))
-    z = float(stats.norm.ppf(0.975))
+    z = float(ndtri(0.975))
     middle = (rate + z * z / (2.0 * effective)) / (1.0 + z * z / effective)
     half = z / (1.0 + z * z / effective)
     half *= np.sqrt(rate * (1.0 - rate) / effective + (z / (2.0 * effective)) ** 2)

@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import nnls
 from scipy.special import ndtri
-from scipy.stats import poisson
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import (
@@ -237,6 +236,8 @@ class PoissonArrivals:
     @property
     def max_cars(self) -> int:
         """Number of cars that is exceeded once in 10^12 worlds; further arrivals are left out."""
+        from scipy.stats import poisson  # it takes longer to load than a short comparison of agents
+
         return int(poisson.isf(_RARE, self.expected)) + 1
 
     def begin_s(self, arrival_s: float) -> float:

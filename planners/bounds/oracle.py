@@ -16,6 +16,8 @@ from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation, PlanPreview, SearchAgent
 from planners.routes import DriveRoutes
 
+_ASKED_AT_ONCE = 64  # slots, in one question to a world
+
 
 @dataclass(frozen=True)
 class BestSlot:
@@ -49,23 +51,33 @@ def best_slot(
     cost_s = problem.arrival_cost_s
     earliest = arrival - time + cost_s
     best = BestSlot(-1, 0.0, np.inf)
-    for slot in np.argsort(earliest):
+    order = np.argsort(earliest)
+    for start in range(0, len(order), _ASKED_AT_ONCE):
+        slots = order[start : start + _ASKED_AT_ONCE]
         # Slots are in the order of earliest arrival: later ones cannot win even without a wait.
-        if not earliest[slot] < best.total_s:
+        if not earliest[slots[0]] < best.total_s:
             break
-        latest = time + best.total_s - cost_s[slot]
-        parked = _first_free(world, int(slot), float(arrival[slot]), wait_s, latest)
-        if parked < latest:
-            best = BestSlot(int(slot), parked - arrival[slot], parked - time + cost_s[slot])
+        for slot, free_from in zip(slots, world.next_free(slots, time), strict=True):
+            if not earliest[slot] < best.total_s:
+                break
+            latest = time + best.total_s - cost_s[slot]
+            parked = _first_free(world, int(slot), float(arrival[slot]), wait_s, latest, float(free_from))
+            if parked < latest:
+                best = BestSlot(int(slot), parked - arrival[slot], parked - time + cost_s[slot])
     return best
 
 
-def _first_free(world: World, slot: int, arrival: float, wait_s: float, latest: float) -> float:
-    """Return the first time, s, at `arrival` or whole waits later, when the slot is free; inf if after `latest`."""
+def _first_free(
+    world: World, slot: int, arrival: float, wait_s: float, latest: float, free_from: float
+) -> float:
+    """Return the first time, s, at `arrival` or whole waits later, when the slot is free; inf if after `latest`.
+
+    `free_from`, s, is the first time from some earlier moment on: if it is after the arrival, it is the answer then.
+    """
     slots = np.array([slot])
     moment = arrival
     while moment < latest:
-        free = float(world.next_free(slots, moment)[0])
+        free = free_from if free_from >= moment else float(world.next_free(slots, moment)[0])
         if free <= moment or wait_s == 0.0:
             return free
         moment += np.ceil((free - moment) / wait_s) * wait_s

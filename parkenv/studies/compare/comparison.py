@@ -221,7 +221,6 @@ class Comparison(CaseStudy):
 
     def check(self) -> None:
         """See `Study`."""
-        from parkenv.perception.detector_registry import make_detector
         from parkenv.studies.compare.cases import check_worlds, require_distinct
         from planners.agent import make_agent
 
@@ -229,6 +228,8 @@ class Comparison(CaseStudy):
             for agent in self.agents:
                 make_agent(agent.name, scenario, **agent.options)
         if self.rig is not None:
+            from parkenv.perception.detector_registry import make_detector
+
             for name in {self.detector or scenario.detector for scenario in self._base_scenarios}:
                 make_detector(name)
         if self.grid.blind and not any(_works_blind(agent) for agent in self.agents):
