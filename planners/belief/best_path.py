@@ -447,4 +447,12 @@ def _on_route(
 @compiled(error_model="numpy")
 def _path_at(index: int, paths: PathBuffers) -> PathBuffer:
     """Return the buffer of one path. Paths share their scratch arrays."""
-    return PathBuffer(paths.stops[index], paths.observations[index], paths.marks, paths.weights, paths.kept)
+    return PathBuffer(
+        paths.stops[index],
+        paths.observations[index],
+        paths.marks,
+        paths.weights,
+        paths.remembered,
+        paths.kept_s,
+        paths.value_s,
+    )

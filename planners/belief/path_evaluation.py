@@ -146,8 +146,8 @@ def _set_costs(
     belief: BeliefSnapshot,
     path: PathBuffer,
 ) -> None:
-    """Set what does not depend on P(free) of the observations: `path.kept` and the scratch fields of the stops."""
-    stops, observations, kept = path.stops, path.observations, path.kept
+    """Set what does not depend on P(free) of the observations: the scratch fields of the path."""
+    stops, observations, remembered, kept_s = path.stops, path.observations, path.remembered, path.kept_s
     # Lower bound on the time after any later observation. A slot that is better than the bound is taken at once. Others
     # are remembered for some stops; their value cannot improve in the meantime.
     ahead = np.inf
@@ -157,46 +157,53 @@ def _set_costs(
             slot = observations[j].slot
             ahead = min(ahead, graph.drive_s[stops[k].vertex, slot] + graph.cost_s[slot])
         ahead += stops[k].time - stops[k - 1].time
-    n_kept, oldest = 0, 0
+    n_kept, oldest, newest = 0, 0, 0
     for k in range(1, n_stops):
-        vertex, time, first, last = stops[k].vertex, stops[k].time, stops[k].first, stops[k + 1].first
-        stop_s = np.inf
+        stop = stops[k]
+        vertex, time, first, last = stop.vertex, stop.time, stop.first, stops[k + 1].first
+        drive_s, stop_s = graph.drive_s[vertex], np.inf
         for s in options:
             # Most are farther than the best so far, whatever becomes of them in the meantime.
-            if graph.drive_s[vertex, s] + min(graph.cost_s[s], fallback_s[s] + graph.failure_s) < stop_s:
+            if drive_s[s] + min(graph.cost_s[s], fallback_s[s] + graph.failure_s) < stop_s:
                 p_free = belief.slots[s].p_free
                 option_s = expected_cost_to_slot(vertex, s, p_free, time, fallback_s[s], graph, belief)
                 stop_s = min(stop_s, option_s)
-        stops[k].stop_s, stops[k].bonus_s, stops[k].first_kept = stop_s, 0.0, n_kept
-        newest = n_kept
-        for i in range(oldest, newest):
-            observation = observations[kept[i].observation]
-            if observation.kept_until < k:
-                continue
-            drive = graph.drive_s[vertex, observation.slot]
-            decayed = decayed_part(observation.decay_rate, time - observation.time + drive)
-            back_s = drive + observation.cost_s + observation.loss_s * decayed if drive < np.inf else np.inf
-            kept[n_kept].observation, kept[n_kept].stop_s = kept[i].observation, min(stop_s, back_s)
-            n_kept += 1
+        while oldest < newest and remembered[oldest].until < k:
+            oldest += 1
+        stop.stop_s, stop.first_kept, stop.oldest, stop.newest = stop_s, n_kept, oldest, newest
+        in_mind, back_s = remembered[oldest:newest], kept_s[n_kept : n_kept + newest - oldest]
+        for i in range(len(in_mind)):
+            seen = in_mind[i]
+            drive = drive_s[seen.slot]
+            decayed = decayed_part(seen.decay_rate, time - seen.time + drive)
+            then_s = drive + seen.cost_s + seen.loss_s * decayed if drive < np.inf else np.inf
+            back_s[i] = min(stop_s, then_s)
+        n_kept += newest - oldest
+        bonus_s = 0.0
         for j in range(first, last):
             observation = observations[j]
             slot = observation.slot
-            at, cost_s, drive = belief.slots[slot], graph.cost_s[slot], graph.drive_s[vertex, slot]
+            at, cost_s, drive = belief.slots[slot], graph.cost_s[slot], drive_s[slot]
             # As in `expected_cost_to_slot` for P(free) = 1
-            observation.cost_s, observation.decay_rate = cost_s, at.decay_rate
-            observation.loss_s = (1.0 - at.p_free_usual) * (fallback_s[slot] + graph.failure_s - cost_s)
-            at_once = drive + cost_s + observation.loss_s * decayed_part(at.decay_rate, drive)
-            observation.kept_until = k if at_once <= stops[k].ahead_s else min(k + KEPT_IN_MIND, n_stops - 1)
-            observation.parks = False
+            loss_s = (1.0 - at.p_free_usual) * (fallback_s[slot] + graph.failure_s - cost_s)
+            observation.expected_s = drive + cost_s + loss_s * decayed_part(at.decay_rate, drive)
+            observation.loss_s = loss_s
             if observation.is_first:
-                stops[k].bonus_s += belief.slots[slot].bonus_s
-            observation.expected_s = at_once
+                bonus_s += at.bonus_s
+        stop.bonus_s = bonus_s
         _sort_observations(first, last, path)
         for j in range(first, last):
-            kept[n_kept].observation, kept[n_kept].stop_s = j, min(stop_s, observations[j].expected_s)
-            n_kept += 1
-        oldest = newest
-    stops[n_stops].first_kept = n_kept
+            observation = observations[j]
+            observation.memory = -1
+            if observation.expected_s > stop.ahead_s:
+                seen, slot = remembered[newest], observation.slot
+                seen.slot, seen.time, seen.until = slot, time, min(k + KEPT_IN_MIND, n_stops - 1)
+                seen.cost_s, seen.loss_s = graph.cost_s[slot], observation.loss_s
+                seen.decay_rate = belief.slots[slot].decay_rate
+                observation.memory = newest
+                newest += 1
+            observation.expected_s = min(stop_s, observation.expected_s)
+    stops[n_stops].oldest = newest
 
 
 @leaf
@@ -215,42 +222,43 @@ def _learn_on_the_way(n_stops: int, belief: BeliefSnapshot, path: PathBuffer) ->
 @leaf
 def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[float, float]:
     """Evaluate a path, given its costs and P(free) of all its observations."""
-    stops, observations, kept = path.stops, path.observations, path.kept
+    stops, observations, kept_s, value_s = path.stops, path.observations, path.kept_s, path.value_s
     nothing, onward, then_s = left_s, 0.0, left_s
     for k in range(n_stops - 1, 0, -1):
-        # `value` of the observations and `nothing` hold the values at the next stop; `onward` is the drive there.
-        first, last, ahead_s = stops[k].first, stops[k + 1].first, stops[k].ahead_s
-        first_kept, last_kept = stops[k].first_kept, stops[k + 1].first_kept
-        for i in range(first_kept, last_kept):
-            observation, expected_s = observations[kept[i].observation], kept[i].stop_s
-            later = onward + (nothing if observation.kept_until == k else observation.value)
-            # The stop at which the slot is observed is processed last and decides.
-            observation.parks = expected_s <= max(ahead_s, later)
-            observation.value = expected_s if observation.parks else later
-            observation.expected_s = expected_s
+        # `value_s` and `nothing` hold the values at the next stop; `onward` is the drive there.
+        stop = stops[k]
+        first, last, ahead_s, bonus_s = stop.first, stops[k + 1].first, stop.ahead_s, stop.bonus_s
+        oldest, newest = stop.oldest, stop.newest
+        # From here on these are forgotten.
+        for r in range(oldest, stops[k + 1].oldest):
+            value_s[r] = nothing
         then_s = onward + nothing
-        nothing = min(stops[k].stop_s, then_s)
-        # Value before the observations at this stop: the best slot that they show replaces a worse one.
-        for i in range(first_kept, last_kept - (last - first)):
-            before = observations[kept[i].observation]
-            rest, expected = 1.0, 0.0
-            for j in range(first, last):
-                if observations[j].expected_s >= before.expected_s:
-                    break
-                expected += rest * observations[j].p_free * observations[j].value
-                rest *= 1.0 - observations[j].p_free
-            before.value = expected + rest * before.value
+        # Up to each of the slots observed here, best first: P(none is free), and what the others add to the value.
         rest, expected = 1.0, 0.0
-        for i in range(first, last):
-            expected += rest * observations[i].p_free * observations[i].value
-            rest *= 1.0 - observations[i].p_free
-        nothing = expected + rest * nothing
-        bonus_s = stops[k].bonus_s
-        if bonus_s > 0.0:
-            nothing -= bonus_s
-            for i in range(first_kept, last_kept - (last - first)):
-                observations[kept[i].observation].value -= bonus_s
-        onward = stops[k].time - stops[k - 1].time
+        for j in range(first, last):
+            observation = observations[j]
+            later = then_s if observation.memory < 0 else onward + value_s[observation.memory]
+            observation.parks = observation.expected_s <= max(ahead_s, later)
+            expected += rest * observation.p_free * (observation.expected_s if observation.parks else later)
+            rest *= 1.0 - observation.p_free
+            observation.rest, observation.value = rest, expected
+        nothing = expected + rest * min(stop.stop_s, then_s) - bonus_s
+        in_mind_s, back_s = (
+            value_s[oldest:newest],
+            kept_s[stop.first_kept : stop.first_kept + newest - oldest],
+        )
+        for i in range(len(in_mind_s)):
+            later = onward + in_mind_s[i]
+            in_mind_s[i] = back_s[i] if back_s[i] <= max(ahead_s, later) else later
+        if first < last:
+            # The best slot that they show replaces a worse one.
+            for i in range(len(in_mind_s)):
+                for j in range(last - 1, first - 1, -1):
+                    if observations[j].expected_s < back_s[i]:
+                        in_mind_s[i] = observations[j].value + observations[j].rest * in_mind_s[i]
+                        break
+                in_mind_s[i] -= bonus_s
+        onward = stop.time - stops[k - 1].time
     return onward + nothing, then_s
 
 
@@ -266,9 +274,6 @@ def _sort_observations(first: int, last: int, path: PathBuffer) -> None:
             a.slot, b.slot = b.slot, a.slot
             a.p_free, b.p_free = b.p_free, a.p_free
             a.expected_s, b.expected_s = b.expected_s, a.expected_s
-            a.cost_s, b.cost_s = b.cost_s, a.cost_s
             a.loss_s, b.loss_s = b.loss_s, a.loss_s
-            a.decay_rate, b.decay_rate = b.decay_rate, a.decay_rate
-            a.kept_until, b.kept_until = b.kept_until, a.kept_until
             a.is_first, b.is_first = b.is_first, a.is_first
             j -= 1

@@ -61,10 +61,11 @@ STOP = np.dtype(
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
         ("stop_s", np.float64),  # scratch: expected time of driving to the best slot that is known now
         ("bonus_s", np.float64),  # scratch: value of its first observations for later searches
-        (
-            "first_kept",
-            np.int64,
-        ),  # scratch: index of the first slot remembered here; the rest as with `first`
+        # scratch: `PathBuffer.remembered` from `oldest` on, before `newest`, are in mind on arrival here; the expected
+        # times of driving back to them begin at `first_kept`
+        ("oldest", np.int64),
+        ("newest", np.int64),
+        ("first_kept", np.int64),
     ]
 )
 """A stop of a path."""
@@ -75,23 +76,30 @@ OBSERVATION = np.dtype(
         ("p_free", np.float64),  # given that the search has reached this stop
         ("time", np.float64),
         ("expected_s", np.float64),  # scratch: expected time of driving to the slot
-        ("cost_s", np.float64),  # scratch: the slot's arrival cost
-        (
-            "loss_s",
-            np.float64,
-        ),  # scratch: how much longer the search is expected to take once the slot has decayed
-        ("decay_rate", np.float64),  # scratch: the slot's
-        ("value", np.float64),  # scratch: value of what follows
-        ("kept_until", np.int64),  # scratch: the last stop at which the slot is remembered
+        # scratch: s, how much longer the search is expected to take once the slot has decayed
+        ("loss_s", np.float64),
+        # scratch: of the slots observed at the same stop, up to this one: P(none is free), s, and what the others add
+        # to the expected time, s
+        ("rest", np.float64),
+        ("value", np.float64),
+        ("memory", np.int64),  # scratch: index in `PathBuffer.remembered`; -1 if it is not remembered
         ("is_first", np.bool_),  # whether the slot was not observed before, in fact or along the path
         ("parks", np.bool_),  # whether the car parks in the slot if it is free
     ]
 )
 """An observation of a slot along a path."""
 
-KEPT = np.dtype([("observation", np.int64), ("stop_s", np.float64)])
-"""A slot observed along a path that is remembered at a stop: its observation, and the expected time of driving from
-that stop to this slot or to the best of those known before."""
+REMEMBERED = np.dtype(
+    [
+        ("slot", np.int64),
+        ("time", np.float64),  # of the observation
+        ("cost_s", np.float64),  # the slot's arrival cost
+        ("loss_s", np.float64),  # as in `OBSERVATION`
+        ("decay_rate", np.float64),  # the slot's
+        ("until", np.int64),  # the last stop at which the slot is remembered
+    ]
+)
+"""A slot observed along a path that is remembered at later stops."""
 
 MARK = np.dtype([("observed_at", np.float64), ("scratch", np.float64)])
 """Time at which a path last observed a slot; -1: not yet; -inf: not needed, the slot is known to be free."""
@@ -170,7 +178,12 @@ class PathBuffer(NamedTuple):
     observations: Records  # `OBSERVATION` records in order
     marks: Records  # (n_slots,) `MARK` records
     weights: FloatArray  # float64, scratch: probabilities of the hypotheses along the path
-    kept: Records  # `KEPT` records, scratch: the slots remembered at each stop, oldest first
+    remembered: Records  # `REMEMBERED` records, scratch, in the order of the observations
+    # float64, s, scratch: expected times from each stop to the slots in mind, or to the best of those known before
+    kept_s: FloatArray
+    value_s: (
+        FloatArray  # float64, s, scratch: value at a stop of what follows with each of `remembered` in mind
+    )
 
 
 class PathBuffers(NamedTuple):
@@ -180,7 +193,9 @@ class PathBuffers(NamedTuple):
     observations: Records  # (n_paths, ...)
     marks: Records
     weights: FloatArray
-    kept: Records
+    remembered: Records
+    kept_s: FloatArray
+    value_s: FloatArray
 
 
 def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
@@ -192,7 +207,9 @@ def path_buffers(n_paths: int, n_slots: int, n_vertices: int) -> PathBuffers:
         np.zeros((n_paths, most_observations), OBSERVATION),
         np.zeros(n_slots, MARK),
         np.zeros(MOST_HYPOTHESES),
-        np.zeros(most_stops * most_observations, KEPT),
+        np.zeros(most_observations, REMEMBERED),
+        np.zeros(most_stops * most_observations),
+        np.zeros(most_observations),
     )
 
 
