@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 
 import jsonschema
+import numpy as np
 import pytest
 from command_line import parkenv
 
@@ -18,9 +19,11 @@ from parkenv.scenarios.spec import scenario_specs
 from parkenv.show.report.page import SCHEMA
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark import suite as benchmark
-from parkenv.studies.benchmark.suite import Suite, by_group, check_result, result_of, suite_lots
+from parkenv.studies.benchmark.page import Entry, precision
+from parkenv.studies.benchmark.result_file import by_group, check_result, fingerprint, result_of, write_result
+from parkenv.studies.benchmark.suite import CONTROLS, Stratum, Suite, suite_lots, worlds_of
 from parkenv.studies.lots.census import slots_by_kind
-from parkenv.studies.results import DECISIONS, EPISODES, write_summary
+from parkenv.studies.results import DECISIONS, EPISODES
 from parkenv.studies.training.search import SearchTraining
 from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.world.occupancy.day_error import DayError
@@ -55,7 +58,7 @@ def test_a_suite_without_its_timings_is_refused(small):
 
 def checked(content, small, path, monkeypatch):
     monkeypatch.setattr(benchmark.Suite, "named", classmethod(lambda cls, name: small))
-    write_summary(path, content, "result.json")
+    write_result(path, content, "result.json")
     return check_result(path / "result.json")
 
 
@@ -67,65 +70,129 @@ def test_a_result_passes_its_own_check_and_scores_are_shares_of_the_bound(
         (agent, task.name) for agent in AGENTS for task in small.tasks
     }
     for row in result["rows"]:
-        searches = result["episodes"][row["agent"]][row["task"]]
-        assert row["score"] == pytest.approx(sum(searches["bound_s"]) / sum(searches["total_s"]))
-        assert row["total_s"] - row["regret_s"] == pytest.approx(sum(searches["bound_s"]) / 6, abs=1e-5)
+        times = result["episodes"][row["agent"]][row["task"]]["total_s"]
+        bound = worlds_of(next(t for t in small.tasks if t.name == row["task"]), small)[:, 0]
+        assert row["score"] == pytest.approx(sum(bound) / sum(times), abs=1e-4)
+        assert row["total_s"] - row["regret_s"] == pytest.approx(sum(bound) / 6, abs=1e-5)
 
 
-def faster(content):
-    for tasks in content["episodes"].values():
-        for searches in tasks.values():
-            searches["total_s"][0] = searches["bound_s"][0] - 1.0
+TIMES = "episodes.first-free.mini.total_s"
 
 
-def other_worlds(content):
-    content["episodes"]["first-free"]["mini"]["bound_s"][-1] += 1.0
-    content["episodes"]["first-free"]["mini"]["total_s"][-1] += 1.0
+def slower(content):
+    content["episodes"]["first-free"]["mini"]["total_s"][2] += 1.0
 
 
 @pytest.mark.parametrize(
     ("change", "wanted"),
     [
-        (faster, "beats the clairvoyant bound"),
-        (other_worlds, "first-free in mini: was not run in the suite's worlds"),
-        (lambda c: c["episodes"]["first-free"]["mini"]["total_s"].pop(), "wants 6 searches, has 5"),
-        (lambda c: c["rows"].pop(), "rows or scores are not those of its agents"),
-        (lambda c: c["episodes"]["first-free"].pop("mini"), "first-free in mini: wants 6 searches, has 0"),
-        (lambda c: c["rows"][0].update(total_s=20.0), "its row does not match its searches"),
-        (lambda c: c["scores"].update({"greedy-goal": 0.99}), "the score of greedy-goal"),
-        (lambda c: c.update(suite_sha256="0" * 64), "settings that are not those of suite v1"),
+        (
+            lambda c: times_of(c).__setitem__(0, 1.0),
+            rf"{TIMES}\[0\] is 1, want at least the clairvoyant bound",
+        ),
+        (lambda c: times_of(c).pop(), f"{TIMES} is 5, want 6 searches"),
+        (lambda c: c["rows"].pop(), "rows has none of greedy-goal in campus-full, want one"),
+        (lambda c: c["rows"].append(c["rows"][0] | {"agent": "x"}), "rows or scores are of others than"),
+        (lambda c: c["episodes"]["first-free"].pop("mini"), f"{TIMES} is 0, want 6"),
+        (
+            lambda c: c["rows"][0].update(total_s=20.0),
+            r"rows\[0\].total_s is 20.0, want \d+\.\d+, of the searches of",
+        ),
+        (lambda c: c["rows"][0].update(episodes=60), r"rows\[0\].episodes is 60, want 6 searches"),
+        (slower, r"rows\[0\].total_s is"),
+        (
+            lambda c: c["rows"][0].update(decision_ms=0.0),
+            "sha256 is [0-9a-f]{64}, want [0-9a-f]{64}, the hash",
+        ),
+        (lambda c: c["scores"].update({"greedy-goal": 0.99}), "scores.greedy-goal is 0.99, want"),
+        (lambda c: c.update(suite_sha256="0" * 64), "suite_sha256 is 0{64}, want .*, that of suite v1"),
+        (lambda c: c.update(suite="v7"), "suite is 'v7', want one of v1, "),
         (lambda c: c.pop("scores"), "scores is missing"),
     ],
 )
 def test_what_was_altered_or_left_out_is_found(result, small, tmp_path, monkeypatch, change, wanted):
     altered = json.loads(json.dumps(result))
     change(altered)
-    with pytest.raises(InputError, match=wanted):
+    with pytest.raises(InputError, match=wanted) as refused:
         checked(altered, small, tmp_path, monkeypatch)
+    assert str(tmp_path / "result.json") in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def times_of(content):
+    return content["episodes"]["first-free"]["mini"]["total_s"]
+
+
+def test_a_suite_with_strata_weights_its_searches_and_uses_their_known_means(small, tmp_path, monkeypatch):
+    """Both strata of `mini` have the same worlds and known means of their own: the estimate is theirs, by hand."""
+    mini = next(task for task in small.tasks if task.name == "mini")
+    worlds = worlds_of(mini, small)
+    means = tuple(worlds.mean(axis=0))
+    parts = tuple(Stratum(share, tuple(small.seeds), means) for share in (0.25, 0.75))
+    task = replace(mini, strata=parts)
+    suite = replace(small, seeds=range(0), tasks=(task,))
+    cases = suite.cases([AgentSpec(name="first-free")])
+    content = result_of(suite, cases, episodes_of(cases), ["parkenv"])
+    (row,) = content["rows"]
+    times = content["episodes"]["first-free"]["mini"]["total_s"]
+    assert (row["episodes"], len(times)) == (12, 12)
+    assert row["total_s"] == pytest.approx(sum(times) / 12, abs=1e-3)
+    assert row["score"] == pytest.approx(means[0] / row["total_s"], abs=1e-5)
+    assert row["total_s_ci95"][0] < row["total_s"] < row["total_s_ci95"][1]
+    assert checked(content, suite, tmp_path, monkeypatch)["sha256"] == content["sha256"]
+    content["rows"][0]["total_s_ci95"][1] += 1.0
+    with pytest.raises(InputError, match=r"rows\[0\].total_s_ci95 is"):
+        checked(content, suite, tmp_path, monkeypatch)
+
+
+def test_control_variates_and_strata_leave_the_share_of_the_error_that_they_should(small):
+    """Of a time that follows the bound but for noise, a control variate leaves the noise."""
+    suite = replace(small, seeds=range(200), tasks=small.tasks[:1])
+    worlds = worlds_of(suite.tasks[0], suite)
+    rng = np.random.default_rng(0)
+    noise, spread = rng.normal(0.0, 0.1, 200), worlds[:, 0].std()
+    one, other = (
+        Entry(name, {}, {"mini": k * worlds[:, 0] + noise * k}) for name, k in (("a", 3.0), ("b", 2.0))
+    )
+    row = precision(suite, one, other)
+    assert row["error.independent"] == pytest.approx(np.sqrt(9 + 4) * spread / np.sqrt(200), rel=0.01)
+    assert row["error.paired"] == pytest.approx(spread / np.sqrt(200), rel=0.01)
+    assert row["error.paired, controls"] == pytest.approx(0.1 / np.sqrt(200), rel=0.2)
+    assert row["searches.paired"] == pytest.approx(200 * (1.96 * row["error.paired"]) ** 2, rel=1e-3)
 
 
 def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, tmp_path, monkeypatch):
     monkeypatch.setattr(benchmark.Suite, "named", classmethod(lambda cls, name: small))
     theirs = json.loads(json.dumps(result)) | {"by": "</script><b>", "command": ["parkenv", "run", "a b"]}
+    theirs["sha256"] = fingerprint(theirs)
     for name, content in (("ours", result), ("theirs", theirs)):
         (tmp_path / name).mkdir()
-        write_summary(tmp_path / name, content, "result.json")
+        write_result(tmp_path / name, content, "result.json")
     page = tmp_path / "page.html"
     made = parkenv("benchmark", "page", tmp_path, "--out", page)
     assert (made.returncode, "4 agents in 2 results" in made.stdout) == (0, True), made.stderr
     data = json.loads(re.search(r'id="report-data">(.*?)</script>', page.read_text(), flags=re.DOTALL)[1])
     jsonschema.validate(data, json.loads(SCHEMA.read_text()))
-    scores, commands, tasks = data["tables"]
+    tables = {table["name"]: table for table in data["tables"]}
+    scores, commands, tasks = tables["scores"], tables["commands"], tables["tasks"]
     rows = [dict(zip([c["key"] for c in scores["columns"]], row, strict=True)) for row in scores["rows"]]
-    assert {row["agent"]: row["score"][0] for row in rows} == pytest.approx(result["scores"])
+    assert {row["agent"]: row["score"][0] for row in rows} == pytest.approx(result["scores"], abs=1e-4)
     assert [row["score"] for row in rows] == sorted((row["score"] for row in rows), reverse=True)
     assert all(low < score < high for score, low, high in (row["score"] for row in rows))
+    assert rows[0]["behind_s"] == [0.0, 0.0, 0.0]
+    assert all(row["behind_s"][0] >= 0.0 for row in rows)
     assert {row["by"] for row in rows} == {"", "</script><b>"}
     assert {row["date"] for row in rows} == {result["date"]}
     assert "parkenv run 'a b'" in [row[1] for row in commands["rows"]]
     assert len(tasks["rows"]) == 2 * len(result["rows"])
     page.unlink()
-    write_summary(tmp_path / "theirs", theirs | {"suite_sha256": "0" * 64}, "result.json")
+    unknown = json.loads(json.dumps(theirs).replace("first-free", "my_agents:Own"))
+    unknown["sha256"] = fingerprint(unknown)
+    write_result(tmp_path / "theirs", unknown, "result.json")
+    bad = parkenv("benchmark", "page", tmp_path, "--out", page)
+    assert (bad.returncode, page.exists()) == (2, False)
+    assert "code is '', want the address of the code of my_agents:Own" in bad.stderr
+    write_result(tmp_path / "theirs", theirs | {"suite_sha256": "0" * 64}, "result.json")
     bad = parkenv("benchmark", "page", tmp_path, "--out", page)
     assert (bad.returncode, bad.stderr.count("\n"), page.exists()) == (2, 1, False)
     assert "theirs" in bad.stderr
@@ -136,6 +203,22 @@ def test_suites_do_not_change():
     assert len(suite.tasks) == 8
     assert suite.fingerprint == "eb8b33585e781fa69eb00fe155aefb44a18fee96789c25a0b65ef4199264b03b"
     assert {task.day_error for task in suite.tasks} == {(0.0,)}
+
+
+def test_the_third_suite_is_a_stratified_sample_of_the_tasks_of_the_second():
+    suite, second = Suite.named("v3"), Suite.named("v2")
+    assert [replace(task, strata=()) for task in suite.tasks] == list(second.tasks)
+    seeds = [seed for task in suite.tasks for seed in suite.seeds_of(task)]
+    assert len(set(seeds)) == len(seeds) == sum(len(second.seeds) for _ in second.tasks) / 4
+    for task in suite.tasks:
+        assert sum(part.share for part in task.strata) == pytest.approx(1.0)
+        full = [part.means[CONTROLS.index("occupancy")] for part in task.strata]
+        assert full == sorted(full)
+    # The strata divide the worlds by their occupancy at arrival.
+    mini = next(task for task in suite.tasks if task.name == "mini")
+    numbers = np.repeat(np.arange(len(mini.strata)), [len(part.seeds) for part in mini.strata])
+    full = worlds_of(mini, suite)[:, CONTROLS.index("occupancy")]
+    assert all(full[numbers == h].max() <= full[numbers == h + 1].min() for h in range(len(mini.strata) - 1))
 
 
 def test_the_days_of_the_second_suite_differ_from_their_forecast():
@@ -215,7 +298,7 @@ def test_the_command_tells_of_suites_and_refuses_what_is_none(tmp_path):
     assert shown.returncode == 0
     assert "campus-full" in shown.stdout
     unknown = parkenv("benchmark", "run", "v7", "--out", tmp_path / "out")
-    assert (unknown.returncode, "known: v1, v2, v2-places" in unknown.stderr) == (2, True)
+    assert (unknown.returncode, "known: v1, v2, v2-places, v3" in unknown.stderr) == (2, True)
     for content in ('{"format": "park', "[" * 100_000):
         (tmp_path / "torn.json").write_text(content)
         torn = parkenv("benchmark", "check", tmp_path / "torn.json")

@@ -32,7 +32,8 @@ from parkenv.scenarios.build import build
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.report.page import write_page
-from parkenv.studies.benchmark.suite import Suite, check_result
+from parkenv.studies.benchmark.result_file import check_result
+from parkenv.studies.benchmark.suite import Suite
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.fleet.changes import CHANGES
 from parkenv.studies.fleet.study import FleetStudy
@@ -187,9 +188,10 @@ MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text()
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
 SUITE = Suite.named("v1")
-SEARCHES = {"total_s": [100.0] * 3, "bound_s": [90.0] * 3}
+SEARCHES = {"total_s": [100.0] * 3}
 RESULT = {
-    "format": "parkenv-benchmark-result", "version": 1, "suite": "v1", "suite_sha256": SUITE.fingerprint,
+    "format": "parkenv-benchmark-result", "version": 2, "suite": "v1", "suite_sha256": SUITE.fingerprint,
+    "commit": "", "by": "", "code": "", "date": "2026-01-01", "sha256": "0" * 64,
     "parkenv": "0.1.0", "command": ["parkenv", "benchmark"], "scores": {"mdp": 0.9},
     "rows": [
         {

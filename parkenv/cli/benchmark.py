@@ -65,8 +65,8 @@ class RunSuite(AgentStudyCommand):
 class Check(Command):
     """Every episode must be present. Means, scores and the clairvoyant bounds of all episodes are recomputed.
 
-    The bounds differ in other worlds or at other costs and speeds. The times of an agent cannot be verified without
-    running it.
+    An agent that beats the bound of a search was in another world, or had other costs and speeds. The times of an agent
+    cannot be verified without running it.
     """
 
     examples = "parkenv benchmark check results/v2/result.json others.json"
@@ -75,7 +75,7 @@ class Check(Command):
 
     def run(self) -> None:
         """See `Command`."""
-        from parkenv.studies.benchmark.suite import check_result
+        from parkenv.studies.benchmark.result_file import check_result
 
         console = make_console()
         with console.status("Checking"):
@@ -89,13 +89,20 @@ class Check(Command):
 class Page(Command):
     """The page needs no network and no other file. Its tables sort by a click on a heading.
 
-    A result that fails `parkenv benchmark check` is refused, and no page is written.
+    A result that fails `parkenv benchmark check`, or whose agents do not come with parkenv and have no address of their
+    code, is refused, and no page is written.
     """
 
-    examples = "parkenv benchmark page results/v2 yours/result.json --out v2.html"
+    examples = """
+        parkenv benchmark page results/v2 yours/result.json --out v2.html
+        parkenv benchmark page docs/leaderboard/results --out leaderboard.html
+        """
 
     results: Several[Path] = option(
-        ..., "Result files, or folders with result.json files in them.", takes="FILE|DIR", argument=True
+        ...,
+        "Result files, or folders: of these every result.json below them, or if there is none every .json.",
+        takes="FILE|DIR",
+        argument=True,
     )
     out: Path = option(Path("results/benchmark.html"), "The page.", short="-o", takes="FILE.html")
 
@@ -103,16 +110,10 @@ class Page(Command):
         """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.show.report.page import write_page
-        from parkenv.studies.benchmark.page import benchmark_data
-        from parkenv.studies.benchmark.suite import check_result
+        from parkenv.studies.benchmark.page import benchmark_data, result_files
+        from parkenv.studies.benchmark.result_file import check_result
 
-        files = [
-            each
-            for path in self.results
-            for each in (sorted(path.rglob(RESULT)) if path.is_dir() else [path])
-        ]
-        if not files:
-            raise InputError(f"{self.results[0]}: no {RESULT} below it")
+        files = [file for path in self.results for file in result_files(path)]
         make_folder(self.out.parent)
         console = make_console()
         with console.status("Checking"):
@@ -160,15 +161,20 @@ class Show(Command):
         scenario = "scenario" if its.tasks[0].group is None else "kind of place"
         headings = ["task", scenario, "slots", "mean occupancy", "day error", "sensor model", "walking"]
         console.print(make_table(None, headings, cells))
-        console.print(
-            f"{len(its.seeds)} episodes a task, seeds {its.seeds[0]} to {its.seeds[-1]}; suite {its.fingerprint[:16]}"
-        )
+        counts = [len(its.seeds_of(task)) for task in its.tasks]
+        if its.seeds:
+            drawn = f"{counts[0]} episodes a task, seeds {its.seeds[0]} to {its.seeds[-1]}"
+        else:
+            drawn = (
+                f"{min(counts)} to {max(counts)} episodes a task, {sum(counts):,} in all, weighted by stratum"
+            )
+        console.print(f"{drawn}; suite {its.fingerprint[:16]}")
         if its.name + PLACES in SUITES:
             console.print(f"Its places, real car parks: parkenv benchmark show {its.name} --places")
 
 
 def _print(console: Console, results: list[dict[str, Any]]) -> None:
-    from parkenv.studies.benchmark.suite import by_group
+    from parkenv.studies.benchmark.result_file import by_group
 
     lines = []
     columns: list[str] = []

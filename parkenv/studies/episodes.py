@@ -154,6 +154,12 @@ class EpisodeRunner:
         )
 
     @property
+    def occupancy(self) -> float:
+        """Share of the slots that are taken at the arrival of the present episode."""
+        state = self._state
+        return float(state.world.occupied(np.arange(self.scenario.lot.n_slots), state.arrival.time).mean())
+
+    @property
     def _state(self) -> SearchState:
         state: SearchState = self.env.unwrapped.state  # type: ignore[attr-defined]
         return state

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri
+from scipy.special import ndtri, stdtrit
 
 from parkenv.world.cost_terms import COST_FIELDS
 
@@ -134,6 +134,96 @@ def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, flo
     half = z / (1.0 + z * z / effective)
     half *= np.sqrt(rate * (1.0 - rate) / effective + (z / (2.0 * effective)) ** 2)
     return float(rate), float(max(middle - half, 0.0)), float(min(middle + half, 1.0))
+
+
+class Estimate(NamedTuple):
+    """An estimated mean.
+
+    Attributes:
+        mean: the mean.
+        error: its standard error.
+        freedom: degrees of freedom of the standard error.
+    """
+
+    mean: float
+    error: float
+    freedom: float
+
+    def interval(self, confidence: float = 0.95) -> tuple[float, float, float]:
+        """Return the mean and the ends of its interval (Student's t)."""
+        half = self.error * float(stdtrit(self.freedom, (1.0 + confidence) / 2.0)) if self.error else 0.0
+        return self.mean, self.mean - half, self.mean + half
+
+    @classmethod
+    def combined(cls, parts: Iterable[tuple[float, Estimate]]) -> Self:
+        """Return a weighted sum of independent estimates, given as (weight, estimate) (Welch and Satterthwaite).
+
+        Examples:
+            >>> Estimate.combined([(0.5, Estimate(1.0, 0.3, 9.0)), (0.5, Estimate(2.0, 0.4, 9.0))]).mean
+            1.5
+        """
+        weights, estimates = zip(*parts, strict=True)
+        means, errors, freedom = np.array(estimates).T
+        variances = np.square(np.multiply(weights, errors))
+        total = float(variances.sum())
+        shares = variances / total if total else np.full(len(variances), 1.0 / len(variances))
+        return cls(float(np.dot(weights, means)), total**0.5, float(1.0 / (shares**2 / freedom).sum()))
+
+
+def stratified_estimate(
+    values: ArrayLike,
+    strata: ArrayLike,
+    shares: ArrayLike,
+    controls: ArrayLike | None = None,
+    control_means: ArrayLike | None = None,
+) -> Estimate:
+    """Estimate the mean of a population from a stratified sample, with control variates whose means are known.
+
+    The combined regression estimator: one regression coefficient for each control, which minimises the variance of the
+    estimate (Cochran, *Sampling Techniques*, 1977, section 7.10; Owen, *Monte Carlo theory, methods and examples*,
+    2013, section 8.9). A single stratum is a plain random sample.
+
+    Args:
+        values: (n,) numbers.
+        strata: (n,) int, stratum of each; each stratum has at least two.
+        shares: (h,) share of each stratum in the population; their sum is 1.
+        controls: (n, k) control variates of each, k >= 1; None for none.
+        control_means: (h, k) means of the controls over each stratum's whole population; None for no controls.
+
+    Raises:
+        ValueError: a stratum has fewer than two values.
+
+    Examples:
+        >>> stratified_estimate([1.0, 3.0, 10.0, 10.0], [0, 0, 1, 1], [0.75, 0.25]).mean
+        4.0
+        >>> stratified_estimate([2.0, 4.0, 6.0], [0, 0, 0], [1.0], [[1.0], [2.0], [3.0]], [[1.5]])[:2]
+        (3.0, 0.0)
+    """
+    sample, weights = np.asarray(values, np.float64), np.asarray(shares, np.float64)
+    member = np.asarray(strata)[:, None] == np.arange(len(weights))
+    counts = member.sum(axis=0)
+    if (counts < 2).any():
+        raise ValueError(f"strata have {counts.tolist()} values, want at least 2 each")
+    averages = member / counts
+    residual, mean = sample - averages @ (member.T @ sample), float(weights @ (averages.T @ sample))
+    fitted = 0
+    if controls is not None:
+        known = np.asarray(controls, np.float64)
+        found = averages.T @ known
+        # The standard error's own weights make its minimum a least-squares problem.
+        scale = (member @ (weights / np.sqrt(counts * (counts - 1.0))))[:, None]
+        deviations = scale * (known - member @ found)
+        slopes, _, fitted, _ = np.linalg.lstsq(deviations, scale[:, 0] * residual)
+        mean += float(weights @ (np.asarray(control_means) - found) @ slopes)
+        residual = residual - (known - member @ found) @ slopes
+    squares = member.T @ residual**2
+    squares[squares <= (_ROUNDING * np.abs(sample).max()) ** 2 * counts] = 0.0
+    free = len(sample) - len(weights)
+    variances = squares / (counts - 1.0) * free / max(free - fitted, 1)
+    return Estimate.combined(
+        (w, Estimate(0.0, float(np.sqrt(v / c)), c - 1.0))
+        for w, v, c in zip(weights, variances, counts, strict=True)
+    )._replace(mean=mean)
 
 
 def columns_of(name: str, interval: tuple[float, float, float]) -> dict[str, Any]:

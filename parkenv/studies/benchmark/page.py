@@ -1,24 +1,153 @@
-"""A page of the results that were submitted for a benchmark suite."""
+"""A page of the results that were submitted for a benchmark suite: the leaderboard."""
 
 from __future__ import annotations
 
+import itertools
 import shlex
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtri
 
 from parkenv import __version__
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.show.report.page import Page, page_data
-from parkenv.show.report.tables import Cell, Column, described, table_of
-from parkenv.studies.benchmark.suite import Suite, score_interval
+from parkenv.show.report.tables import Column, table_of
+from parkenv.studies.benchmark.study import RESULT
+from parkenv.studies.benchmark.suite import Suite, Task, mean_time, score_interval, worlds_of
 from parkenv.studies.results import Row
+from parkenv.studies.statistics import columns_of
+from planners.names import AGENTS
 
+PAIRS = 5
+"""Pairs of neighbours whose precision is shown."""
+DESIGNS = ("independent", "paired", "paired, controls", "stratified", "stratified, controls")
+"""Ways to measure the difference of two agents with the same number of searches, see `precision`."""
+_WIDE = float(ndtri(0.975))
 _WHO = (
     Column("by", "submitted by"),
+    Column("code", "code", help="Address of the agent's code; parkenv if it comes with it"),
+    Column("commit", "commit", help="Of parkenv"),
     Column("date", "date"),
-    Column("parkenv", "parkenv", help="Version that made the result"),
 )
-_COMMAND = Column("command", "command")
+
+
+def result_files(path: Path) -> list[Path]:
+    """Return the result files in a folder: each `result.json` below it, or else each `.json`; a file is itself.
+
+    Raises:
+        InputError: there is none.
+    """
+    if not path.is_dir():
+        return [path]
+    if not (found := sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json"))):
+        raise InputError(f"{path}: no {RESULT} below it")
+    return found
+
+
+class Entry(NamedTuple):
+    """An agent of a result file."""
+
+    agent: str
+    result: Row
+    times: Mapping[str, FloatArray]  # total time of each search, s, by task
+
+    @property
+    def rows(self) -> list[Row]:
+        """Its rows, one for each task."""
+        return [row for row in self.result["rows"] if row["agent"] == self.agent]
+
+    def minus(self, other: Entry) -> dict[str, FloatArray]:
+        """Return the paired differences of the times, s, by task."""
+        return {task: its - other.times[task] for task, its in self.times.items()}
+
+
+def entries_of(results: Sequence[Row]) -> tuple[Suite, list[Entry]]:
+    """Return the suite of results, and their agents, the best score first.
+
+    Raises:
+        InputError: the results are of different suites, or an agent that does not come with parkenv has no address.
+    """
+    names = list(dict.fromkeys(result["suite"] for result in results))
+    if len(names) != 1:
+        raise InputError(f"a page is about one suite, the results are of {', '.join(names) or 'none'}")
+    suite, entries = Suite.named(names[0]), []
+    for result in results:
+        for agent, tasks in result["episodes"].items():
+            if agent.partition("(")[0] not in AGENTS and not result["code"].startswith("http"):
+                raise InputError(f"code is {result['code']!r}, want the address of the code of {agent}")
+            times = {task: np.array(its["total_s"]) for task, its in tasks.items()}
+            entries.append(Entry(agent, result, times))
+    return suite, sorted(entries, key=lambda entry: -entry.result["scores"][entry.agent])
+
+
+def ranking(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
+    """Return a row for each agent: its score, its mean time over the tasks, and how far it is behind the best.
+
+    The oracle, which knows the future, is no competitor.
+    """
+    best = next((entry for entry in entries if entry.agent != "oracle"), entries[0])
+    return [
+        {
+            "agent": entry.agent,
+            **columns_of("score", score_interval(suite, entry.times)),
+            **columns_of("mean_s", mean_time(suite, entry.times).interval()),
+            **columns_of("behind_s", mean_time(suite, entry.minus(best)).interval()),
+            "decision_ms": float(np.mean([row["decision_ms"] for row in entry.rows])),
+            "searches": sum(row["episodes"] for row in entry.rows),
+            **{column.key: entry.result[column.key] for column in _WHO},
+        }
+        for entry in entries
+    ]
+
+
+def precision(suite: Suite, one: Entry, other: Entry) -> Row:
+    """Return how precisely a run of a suite tells two agents apart, and how precisely other designs would.
+
+    With as many searches as the suite has, spread evenly over the tasks: in worlds of their own (`independent`), in the
+    same worlds (`paired`), and with control variates; and, if the suite has strata, as it is. Standard errors are of
+    the mean difference over the tasks, s; `searches` are those of each agent for an interval of ±1 s at 95 %.
+    """
+    difference, count = one.minus(other), sum(len(times) for times in one.times.values())
+    variances = np.zeros(3)
+    for task in suite.tasks:
+        worlds = worlds_of(task, suite)
+        mine, theirs, paired = (
+            _variances(task, times[task.name], worlds) for times in (one.times, other.times, difference)
+        )
+        variances += (mine[0] + theirs[0], paired[0], paired[1])
+    errors = dict(zip(DESIGNS, np.sqrt(variances / (len(suite.tasks) * count)).tolist(), strict=False))
+    if suite.tasks[0].strata:
+        plain = [mean_time(suite, difference, controls=used).error for used in (False, True)]
+        errors |= dict(zip(DESIGNS[3:], plain, strict=True))
+    return {
+        "agents": f"{one.agent}, {other.agent}",
+        **columns_of("behind_s", mean_time(suite, difference).interval()),
+        **{f"error.{design}": error for design, error in errors.items()},
+        **{f"searches.{design}": count * (_WIDE * error) ** 2 for design, error in errors.items()},
+    }
+
+
+def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
+    """Return the `precision` of neighbours in the ranking, of the first `PAIRS`, the oracle apart."""
+    rivals = [entry for entry in entries if entry.agent != "oracle"][: PAIRS + 1]
+    return [precision(suite, worse, better) for better, worse in itertools.pairwise(rivals)]
+
+
+def _variances(task: Task, values: ArrayLike, worlds: FloatArray) -> tuple[float, float]:
+    """Estimate a number's variance over a task's worlds, and what control variates leave of it."""
+    parts = [part.share / len(part.seeds) for part in task.strata for _ in part.seeds]
+    weights = np.array(parts) if parts else np.full(len(worlds), 1.0 / len(worlds))
+    sample = np.asarray(values) - weights @ np.asarray(values)
+    scale = np.sqrt(weights)
+    controls = scale[:, None] * (worlds - weights @ worlds)
+    slopes = np.linalg.lstsq(controls, scale * sample)[0]
+    left = scale * sample - controls @ slopes
+    return float(weights @ sample**2), float(left @ left)
 
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
@@ -29,57 +158,55 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
         command: the command that makes the page.
 
     Raises:
-        InputError: the results are of different suites.
+        InputError: see `entries_of`.
     """
-    names = list(dict.fromkeys(result["suite"] for result in results))
-    if len(names) != 1:
-        raise InputError(f"a page is about one suite, the results are of {', '.join(names) or 'none'}")
-    suite = Suite.named(names[0])
-    tasks = [task.name for task in suite.tasks]
-    columns = [
-        Column("agent", "agent"),
-        Column(
-            "score",
-            "score",
-            share=True,
-            help="Mean time of the clairvoyant bound over the agent's; 95 % interval",
-        ),
-        *(Column(task, task, "s", help="Mean total time, 95 % interval") for task in tasks),
-        *_WHO,
-    ]
-    lines: list[list[Cell]] = []
-    for result in results:
-        times = {
-            (row["agent"], row["task"]): [row["total_s"], *row["total_s_ci95"]] for row in result["rows"]
-        }
-        for agent, searches in result["episodes"].items():
-            score: list[float | None] = list(score_interval(searches))
-            lines.append([agent, score, *(times[agent, task] for task in tasks), *_origin(result).values()])
-    lines.sort(key=lambda line: -line[1][0])  # type: ignore[index, operator]
-    details = [{**row, **_origin(result)} for result in results for row in result["rows"]]
-    commands: list[list[Cell]] = [
-        [", ".join(r["episodes"]), shlex.join(r["command"]), *_origin(r).values()] for r in results
-    ]
+    suite, entries = entries_of(results)
+    pairs, searches = neighbours(suite, entries), sum(map(len, entries[0].times.values()))
     findings = [
         suite.description,
-        f"{len(tasks)} tasks of {len(suite.seeds)} searches each, the same worlds for every agent. The score is the "
+        f"{len(suite.tasks)} tasks, {searches:,} searches of each agent, the same worlds for all. The score is the "
         "mean time of the clairvoyant lower bound over the agent's, averaged over the tasks.",
     ]
-    tables = [
-        _table("scores", "Scores", columns, lines),
-        _table(
-            "commands", "How the results were made", [Column("agent", "agent"), _COMMAND, *_WHO], commands
-        ),
-        table_of("tasks", "Every task", details),
+    if pairs:
+        errors = [row[f"error.{DESIGNS[-1 if suite.tasks[0].strata else 1]}"] for row in pairs]
+        findings.append(
+            f"Neighbours among the first {len(pairs) + 1} are told apart if their mean times differ by "
+            f"{_WIDE * min(errors):.1f} to {_WIDE * max(errors):.1f} s."
+        )
+    times = [
+        {"agent": entry.agent}
+        | {f"{row['task']}{end}": row[f"total_s{end}"] for row in entry.rows for end in ("", "_ci95")}
+        for entry in entries
     ]
-    made = {"command": command, "version": __version__, "seed": suite.seeds[0]}
-    return page_data("benchmark", Page(f"Benchmark suite {suite.name}", findings, tables), made)
+    made = [
+        {"agent": ", ".join(result["episodes"]), "command": shlex.join(result["command"])}
+        | {column.key: result[column.key] for column in _WHO}
+        for result in results
+    ]
+    in_tasks = {task.name: Column(task.name, task.name, "s", help=_TIMES) for task in suite.tasks}
+    tables = [
+        table_of("scores", "Ranking", ranking(suite, entries), columns=_COLUMNS),
+        table_of("times", "Mean total time in each task", times, columns=in_tasks),
+        table_of("pairs", "How many searches tell neighbours apart", pairs, columns=_COLUMNS),
+        table_of("commands", "How the results were made", made, columns=_COLUMNS),
+        table_of("tasks", "Every task", [row for result in results for row in result["rows"]]),
+    ]
+    summary = {"command": command, "version": __version__, "seed": None}
+    return page_data("benchmark", Page(f"Benchmark suite {suite.name}", findings, tables), summary)
 
 
-def _origin(result: Row) -> Row:
-    return {column.key: result[column.key] for column in _WHO}
-
-
-def _table(name: str, title: str, columns: Sequence[Column], rows: list[list[Cell]]) -> dict[str, Any]:
-    shown = [described(column) for column in columns]
-    return {"name": name, "title": title, "facts": False, "columns": shown, "rows": rows, "same": []}
+_TIMES = "Mean total time, 95 % interval"
+_SCORE = "Mean time of the clairvoyant bound over the agent's; 95 % interval"
+_BEHIND = "Mean time minus that of the best, or of the second agent, in the same worlds; 95 % interval"
+_COLUMNS = {
+    column.key: column
+    for column in (
+        Column("score", "score", share=True, help=_SCORE),
+        Column("mean_s", "mean time", "s", help="Over the tasks, each with the same weight; 95 % interval"),
+        Column("behind_s", "behind", "s", 2, signed=True, help=_BEHIND),
+        Column("searches", "searches", digits=0),
+        *(Column(f"error.{d}", f"standard error, {d}", "s", 2) for d in DESIGNS),
+        *(Column(f"searches.{d}", f"searches for ±1 s, {d}", digits=0, help="At 95 %") for d in DESIGNS),
+        *_WHO,
+    )
+}

@@ -12,7 +12,7 @@ from parkenv.files.option import option
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
 from parkenv.studies.fields import Agents
-from parkenv.studies.results import Results, Row, write_summary
+from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task
 
@@ -29,8 +29,13 @@ class Benchmark(CaseStudy):
 
     kind: Literal["benchmark"] = "benchmark"
     suite: str = Field("v2", description="The suite.")
-    by: str = option(
-        "", "Who submits the result: a name, an address of the code.", default="nobody", max_length=200
+    by: str = option("", "Who submits the result.", default="nobody", max_length=200)
+    code: str = option(
+        "",
+        "Address of the agents' code, with its commit; needed on a leaderboard unless they come with parkenv.",
+        takes="URL",
+        default="parkenv's own",
+        max_length=200,
     )
     agents: Agents = tuple(AgentSpec(name=name) for name in AGENTS)
 
@@ -66,14 +71,15 @@ class Benchmark(CaseStudy):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.benchmark.suite import score_rows
+        from parkenv.studies.benchmark.result_file import score_rows
 
-        return {"rows": score_rows(self.cells(), results.rows(self.table))}
+        return {"rows": score_rows(self.made_suite, self.cells(), results.rows(self.table))}
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: the result file."""
-        from parkenv.studies.benchmark.suite import result_of
+        from parkenv.studies.benchmark.result_file import result_of, write_result
 
         finished = result.results.rows(self.table)
-        content = result_of(self.made_suite, self.cells(), finished, result.summary["command"], self.by)
-        return [partial(write_summary, result.folder, content, RESULT)]
+        command = result.summary["command"]
+        content = result_of(self.made_suite, self.cells(), finished, command, self.by, self.code)
+        return [partial(write_result, result.folder, content, RESULT)]

@@ -3,6 +3,10 @@
 A suite is a JSON file in the folder `suites`. The places of a suite, real car parks, are a suite of their own
 (`v2-places`), so that a result of either part can be complete. A published suite never changes; improvements go into a
 new suite. A result file names its suite, contains the total time of every search, and can be checked by anybody.
+
+The searches of `v3` are a stratified sample of a population of worlds for each task: more of them where the times of
+agents differ most, such as on full days, each with its weight. The means of the clairvoyant bound and of the occupancy
+at arrival are known for the whole population, and serve as control variates (`choose_searches` made it).
 """
 
 from __future__ import annotations
@@ -10,25 +14,23 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
-from pydantic import Field
+from numpy.typing import ArrayLike
 
-from parkenv import __version__
+from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
-from parkenv.files.spec_file import Several, Spec, read_tables
 from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct, table
+from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import Key, Row
+from parkenv.studies.statistics import Estimate, stratified_estimate
 from parkenv.studies.study import Cell
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
@@ -36,12 +38,19 @@ from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent
 
-RESULT_FORMAT = "parkenv-benchmark-result"
-RESULT_VERSION = 1
-SUITES = ("v1", "v2", "v2-places")
-RESAMPLES = 2000
-_ROUNDING = 1e-6
-_FOLDER = Path(__file__).parent / "suites"
+SUITES = ("v1", "v2", "v2-places", "v3")
+CONTROLS = ("bound_s", "occupancy")
+"""Columns of an episode that its world alone determines: the control variates."""
+SUITE_FOLDER = Path(__file__).parent / "suites"
+
+
+@dataclass(frozen=True)
+class Stratum:
+    """A part of the population of a task's worlds, such as its full days."""
+
+    share: float  # in the population
+    seeds: tuple[int, ...]  # the searches
+    means: tuple[float, ...]  # of `CONTROLS`, over the part's whole population
 
 
 @dataclass(frozen=True)
@@ -57,6 +66,7 @@ class Task:
     # how far days differ from the forecast, logits: (level,) or (level, slope)
     day_error: tuple[float, ...] = (0.0,)
     group: str | None = None  # kind of place, for tables; None in suites of packaged scenarios
+    strata: tuple[Stratum, ...] = ()  # parts of the population; none if the searches are a plain sample
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """Make the scenario, named after the task."""
@@ -77,7 +87,7 @@ class Suite:
     name: str  # name, such as v1
     description: str  # one sentence
     arrival: ArrivalWindow  # when searches begin
-    seeds: range  # seeds; every task has one search per seed
+    seeds: range  # seeds; every task without strata has one search per seed
     tasks: tuple[Task, ...]
     fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
 
@@ -97,15 +107,19 @@ class Suite:
             raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
         content = _packaged(name)
         canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
-        first = content["first_seed"]
+        first = content.get("first_seed", 0)
         return cls(
             name,
             content["description"],
             ArrivalWindow.parse(content["arrival"], content["days"]),
-            range(first, first + content["episodes"]),
+            range(first, first + content.get("episodes", 0)),
             tuple(_task(**task) for task in content["tasks"]),
             hashlib.sha256(canonical.encode()).hexdigest(),
         )
+
+    def seeds_of(self, task: Task) -> Sequence[int]:
+        """Return the seeds of the searches of a task."""
+        return tuple(seed for part in task.strata for seed in part.seeds) if task.strata else self.seeds
 
     def cases(self, agents: Sequence[AgentSpec]) -> list[Cell]:
         """Return the cases: every agent in every task.
@@ -117,190 +131,104 @@ class Suite:
         for world in worlds:
             for agent in agents:
                 make_agent(agent.name, world, **agent.options)
-        cases = [Case(world, agent.name, options=agent.options) for world in worlds for agent in agents]
-        require_distinct(cases)
-        return [Cell(case, self.seeds) for case in cases]
-
-
-Share = Annotated[float, Field(ge=0.0, le=1.0)]
-Seconds = Annotated[float, Field(ge=0.0)]
-Ends = Annotated[tuple[float | None, float | None], Field(strict=False)]
-
-
-class _ResultRow(Spec, extra="allow"):
-    """An agent in a task, in seconds and milliseconds."""
-
-    task: str
-    agent: str
-    episodes: int = Field(ge=1)
-    parked_fraction: Share
-    total_s: float
-    total_s_ci95: Ends
-    regret_s: float
-    regret_s_ci95: Ends
-    failed_parks: float
-    decision_ms: float
-    decision_ms_p99: float
-    score: Share
-
-
-METRICS = tuple(_ResultRow.model_fields)[2:-1]
-"""Metrics of an agent in a task, named as in `parkenv compare`; a result also has the score."""
-
-
-class _Searches(Spec):
-    """Times of each search, in the order of the seeds."""
-
-    total_s: Several[Seconds]
-    bound_s: Several[Seconds]
-
-
-class ResultFile(Spec):
-    """Result of a benchmark suite: scores by agent, and searches by agent and task."""
-
-    format: Literal["parkenv-benchmark-result"]
-    version: Literal[1]
-    suite: str
-    suite_sha256: str = Field(pattern="^[0-9a-f]{64}$")
-    parkenv: str
-    command: Several[str]
-    by: str = Field(max_length=200)
-    date: str = Field(pattern="^[0-9]{4}-[0-9]{2}-[0-9]{2}$")
-    rows: Several[_ResultRow] = Field(min_length=1)
-    scores: dict[str, Share]
-    episodes: dict[str, dict[str, _Searches]]
+        cells = [
+            Cell(Case(world, agent.name, options=agent.options), self.seeds_of(task))
+            for task, world in zip(self.tasks, worlds, strict=True)
+            for agent in agents
+        ]
+        require_distinct(case for case, _ in cells)
+        return cells
 
 
 def _task(
-    sight: str = "perfect", day_error: Sequence[float] = (0.0,), lot_share: float | None = None, **fields: Any
+    sight: str = "perfect",
+    day_error: Sequence[float] = (0.0,),
+    lot_share: float | None = None,
+    strata: Sequence[Mapping[str, Any]] = (),
+    **fields: Any,
 ) -> Task:
     """Return a task of a suite's file; v1 is older than days that differ from their forecast."""
     del lot_share  # see `suite_lots`
-    return Task(sensor_model=sight, day_error=tuple(day_error), **fields)
+    parts = tuple(Stratum(each["share"], tuple(each["seeds"]), tuple(each["means"])) for each in strata)
+    return Task(sensor_model=sight, day_error=tuple(day_error), strata=parts, **fields)
 
 
-def score_rows(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]) -> list[Row]:
-    """Return a row for each task and agent with finished episodes: its metrics, where known, and its score."""
-    searches = {
-        (case.scenario.name, case.label): _searches(rows)
-        for case, seeds in cells
-        if (rows := [finished[key] for s in seeds if (key := case.key(s)) in finished])
-    }
-    return [
-        {
-            "task": row["scenario"],
-            "agent": row["agent"],
-            **{metric: row.get(metric) for metric in METRICS},
-            "score": _score(searches[row["scenario"], row["agent"]]),
-        }
-        for row in table(cells, finished)
-    ]
+def estimate(task: Task, values: ArrayLike, worlds: FloatArray, *, controls: bool = True) -> Estimate:
+    """Estimate the mean of a number over a task's worlds.
+
+    Args:
+        task: the task.
+        values: (n,) the number in each search, in the order of `Suite.seeds_of`.
+        worlds: (n, 2) `CONTROLS` of each search.
+        controls: whether to use them as control variates; a task without strata does not, as their means are unknown.
+    """
+    if not task.strata:
+        return stratified_estimate(values, np.zeros(len(worlds)), [1.0])
+    numbers = np.repeat(np.arange(len(task.strata)), [len(part.seeds) for part in task.strata])
+    shares, means = [part.share for part in task.strata], [part.means for part in task.strata]
+    if not controls:
+        return stratified_estimate(values, numbers, shares)
+    return stratified_estimate(values, numbers, shares, worlds, means)
 
 
-def _searches(rows: Sequence[Row]) -> dict[str, list[float]]:
-    return {column: [round(row[column], 6) for row in rows] for column in ("total_s", "bound_s")}
-
-
-def result_of(
-    suite: Suite,
-    cells: Sequence[tuple[Case, Sequence[int]]],
-    finished: Mapping[Key, Row],
-    command: Sequence[str],
-    by: str = "",
-) -> Row:
-    """Build the content of a result file from finished cases.
+def mean_time(suite: Suite, times: Mapping[str, ArrayLike], *, controls: bool = True) -> Estimate:
+    """Estimate the mean over the tasks of a suite of times, or of paired differences of two agents, s.
 
     Args:
         suite: the suite.
-        cells: all cases with their seeds.
-        finished: rows of all their episodes, by `Case.key`.
-        command: the command that ran them.
-        by: who submits the result; dated today.
-
-    Raises:
-        InputError: the wall times of an agent's decisions are lost.
+        times: (n,) s, those of each search, by task.
+        controls: see `estimate`.
     """
-    rows = score_rows(cells, finished)
-    for row in rows:
-        if missing := [metric for metric in METRICS if row[metric] is None]:
-            raise InputError(
-                f"no {missing[0]} of {row['agent']} in {row['task']}, as timings.csv is not whole; run the suite again "
-                "with --overwrite"
-            )
-    episodes: dict[str, dict[str, dict[str, list[float]]]] = {}
-    for case, seeds in cells:
-        of_agent = episodes.setdefault(case.label, {})
-        of_agent[case.scenario.name] = _searches([finished[case.key(s)] for s in seeds])
-    return {
-        "format": RESULT_FORMAT,
-        "version": RESULT_VERSION,
-        "suite": suite.name,
-        "suite_sha256": suite.fingerprint,
-        "parkenv": __version__,
-        "command": list(command),
-        "by": by,
-        "date": datetime.now(UTC).date().isoformat(),
-        "rows": rows,
-        "scores": {agent: _mean_score(tasks) for agent, tasks in episodes.items()},
-        "episodes": episodes,
-    }
+    share = 1.0 / len(suite.tasks)
+    if suite.seeds:  # the tasks share their seeds: their searches are not independent
+        means = np.mean([np.asarray(times[task.name]) for task in suite.tasks], axis=0)
+        return stratified_estimate(means, np.zeros(len(means)), [1.0])
+    return Estimate.combined(
+        (share, estimate(task, times[task.name], worlds_of(task, suite), controls=controls))
+        for task in suite.tasks
+    )
 
 
-def check_result(path: Path) -> Row:
-    """Read a result file, and check that it is complete, consistent, and from the suite's own worlds.
+def score_of(task: Task, total: FloatArray, worlds: FloatArray) -> float:
+    """Return an agent's score in a task: the mean of the clairvoyant bound over that of its total times.
 
-    The check recomputes the clairvoyant bounds of all searches, which differ in other worlds or with other costs and
-    speeds. It cannot verify the times of an agent; for that, run the agent again.
-
-    Raises:
-        InputError: the check failed; the message says where, with agent and task.
+    Args:
+        task: the task.
+        total: (n,) total time of each search, s.
+        worlds: (n, 2) `CONTROLS` of each search.
     """
-    result: Row = read_tables(path)
-    ResultFile.parse(result, str(path))
-    suite = Suite.named(result["suite"])
-    if result["suite_sha256"] != suite.fingerprint:
-        raise InputError(f"{path}: made with settings that are not those of suite {suite.name}")
-    bounds = {task.name: _bounds(task, suite) for task in suite.tasks}
-    by_row = {(row["agent"], row["task"]): row for row in result["rows"]}
-    wanted = {(agent, task.name) for agent in result["episodes"] for task in suite.tasks}
-    if by_row.keys() != wanted or result["scores"].keys() != result["episodes"].keys():
-        raise InputError(f"{path}: rows or scores are not those of its agents in the suite's tasks")
-    for agent, tasks in result["episodes"].items():
-        for task in suite.tasks:
-            _check_task(path, agent, task.name, tasks.get(task.name), by_row[agent, task.name], suite, bounds)
-        if abs(result["scores"][agent] - _mean_score(tasks)) > _ROUNDING:
-            raise InputError(f"{path}: the score of {agent} does not match its searches")
-    return result
+    if task.strata:  # the bound's mean over the whole population is known
+        bound = sum(part.share * part.means[0] for part in task.strata)
+        return min(1.0, bound / estimate(task, total, worlds).mean)
+    return float(np.round(worlds[:, 0], 6).mean() / np.round(total, 6).mean())
 
 
-def _check_task(
-    path: Path,
-    agent: str,
-    task: str,
-    searches: Mapping[str, Sequence[float]] | None,
-    row: Row,
-    suite: Suite,
-    bounds: Mapping[str, Sequence[float]],
-) -> None:
-    where = f"{path}: {agent} in {task}"
-    counts = {len(times) for times in searches.values()} if searches else {0}
-    if searches is None or counts != {len(suite.seeds)} or row["episodes"] != len(suite.seeds):
-        raise InputError(f"{where}: wants {len(suite.seeds)} searches, has {min(counts)}")
-    if not np.allclose(searches["bound_s"], bounds[task], rtol=0.0, atol=2 * _ROUNDING):
-        raise InputError(f"{where}: was not run in the suite's worlds, at its costs and speeds")
-    total, bound = np.array(searches["total_s"]), np.array(searches["bound_s"])
-    if (total < bound - 2 * _ROUNDING).any():
-        raise InputError(f"{where}: a search beats the clairvoyant bound")
-    stated = row["total_s"], row["regret_s"], row["score"]
-    if not np.allclose(stated, (total.mean(), (total - bound).mean(), _score(searches)), atol=1e-4):
-        raise InputError(f"{where}: its row does not match its searches")
+def score_interval(suite: Suite, times: Mapping[str, FloatArray]) -> tuple[float, float, float]:
+    """Return an agent's score in a suite and its 95 % interval (delta method).
+
+    Args:
+        suite: the suite.
+        times: (n,) s, those of each search, by task.
+    """
+    scores, slopes = [], {}
+    for task in suite.tasks:
+        total, worlds = times[task.name], worlds_of(task, suite)
+        scores.append(score_of(task, total, worlds))
+        bound = 0.0 if task.strata else worlds[:, 0]
+        slopes[task.name] = (bound - scores[-1] * total) / estimate(task, total, worlds).mean
+    return mean_time(suite, slopes)._replace(mean=float(np.mean(scores))).interval()
 
 
 @functools.cache
-def _bounds(task: Task, suite: Suite) -> list[float]:
-    scenario = task.made(suite.arrival)
+def worlds_of(task: Task, suite: Suite) -> FloatArray:
+    """Return the `CONTROLS` of a task's searches, (n, 2)."""
+    return controls_of(task.made(suite.arrival), suite.seeds_of(task))
+
+
+def controls_of(scenario: Scenario, seeds: Sequence[int]) -> FloatArray:
+    """Return the `CONTROLS` of the worlds of seeds, (n, 2)."""
     runner = EpisodeRunner(scenario, "mdp", make_agent("mdp", scenario))
-    return [runner.bound_s(seed) for seed in suite.seeds]
+    return np.array([(runner.bound_s(seed), runner.occupancy) for seed in seeds])
 
 
 @functools.cache
@@ -312,39 +240,5 @@ def suite_lots() -> Mapping[float, str]:
     }
 
 
-def by_group(result: Row) -> list[tuple[str, str, float, float]]:
-    """Return a suite's result by kind of place: agent, kind, mean total time, s, and mean score, over its places."""
-    groups: dict[str, list[str]] = {}
-    for task in Suite.named(result["suite"]).tasks:
-        if task.group is not None:
-            groups.setdefault(task.group, []).append(task.name)
-    rows = {(row["agent"], row["task"]): row for row in result["rows"]}
-    return [
-        (agent, group, *(float(np.mean([rows[agent, name][key] for name in names])) for key in ("total_s", "score")))
-        for agent in result["scores"]
-        for group, names in groups.items()
-    ]  # fmt: skip
-
-
-def _score(searches: Mapping[str, Sequence[float]]) -> float:
-    return float(np.mean(searches["bound_s"]) / np.mean(searches["total_s"]))
-
-
-def score_interval(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> tuple[float, float, float]:
-    """Return an agent's score and its 95 % bootstrap interval; equal searches have equal intervals."""
-    rng = np.random.default_rng(0)
-    resampled = np.zeros(RESAMPLES)
-    for searches in tasks.values():
-        bound, total = np.array(searches["bound_s"]), np.array(searches["total_s"])
-        drawn = rng.integers(len(total), size=(RESAMPLES, len(total)))
-        resampled += bound[drawn].mean(axis=1) / total[drawn].mean(axis=1) / len(tasks)
-    low, high = np.quantile(resampled, (0.025, 0.975))
-    return _mean_score(tasks), float(low), float(high)
-
-
-def _mean_score(tasks: Mapping[str, Mapping[str, Sequence[float]]]) -> float:
-    return float(np.mean([_score(searches) for searches in tasks.values()]))
-
-
 def _packaged(name: str) -> Any:
-    return read_json(_FOLDER / f"{name}.json")
+    return read_json(SUITE_FOLDER / f"{name}.json")
