@@ -36,6 +36,7 @@ COMMANDS = {
     "commute": Entry("Let drivers come day after day, with a map that learns.", "drivers:Commute", SEARCH),
     "fleet": Entry("Let many cars search one lot, and compare what they know.", "drivers:Fleet", SEARCH),
     "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
+    "pomdp": Entry("Write the search in a small lot for POMDP solvers of others.", "compare:Pomdp", SEARCH),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),
     "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", SEARCH),
     "run": Entry("Run an experiment file.", "study_command:Run", SEARCH),

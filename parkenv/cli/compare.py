@@ -266,3 +266,40 @@ class Plan(Command):
         title = f"{self.scenario.title}: plans of {self.agent.label}, seed {self.seed}"
         console.print(make_table(title, headings, cells))
         console.print(f"Picture and summary are in {self.out}")
+
+
+class Pomdp(Command):
+    """The file holds the model of the planner exact: while the car searches, slots stay as they are.
+
+    They are observed without error, and the level and the slope of the day are on a grid. A move is a step; a reward is
+    minus its seconds.
+
+    Each slot doubles the number of states, so the lot has to be small: mini, of ten slots, has 12,289.
+    """
+
+    examples = """
+        parkenv pomdp --scenario mini --out mini.pomdp
+        parkenv pomdp --lot small.geojson --seed 3 --discount 0.999 --out small.pomdp
+        """
+
+    scenario: Annotated[OneScenario, Inside(without=TRAFFIC)] = scenario_spec("mini")
+    seed: Seed = Field(0, description="Seed of the entry and the time of arrival.")
+    discount: float = option(1.0, "Discount of each step; many solvers want less than 1.", gt=0.0, le=1.0)
+    out: Path = option(..., "File to write.", short="-o", takes="FILE.pomdp")
+
+    def run(self) -> None:
+        """See `Command`."""
+        import gymnasium as gym
+
+        from parkenv.scenarios.build import build
+        from planners.bounds.pomdp_file import write_first
+
+        scenario = build(self.scenario)
+        observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=self.seed)
+        console = make_console(soft_wrap=True)
+        with console.status("Writing"):
+            size, expected_s = write_first(self.out, scenario.public(), observation, self.discount)
+        console.print(
+            f"Wrote {self.out}: {size.n_states:,} states, {size.n_actions} actions, "
+            f"{plural(size.n_observations, 'observation')}. Least expected time, by exact: {expected_s:.6f} s"
+        )
