@@ -178,26 +178,11 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
             return recorded
         learned: Agent = import_module("planners.learned").LearnedAgent(scenario, before, after)
         return learned
-    agent: Callable[..., Agent]
     if colon and before == NETWORK:
         options, name, colon = {"weights": after, **options}, NETWORK, ""
+    agent, known = _class_of(name), agent_options(name)
     if colon:
-        agent = load_class(
-            name,
-            "agent",
-            "predict(observation, state, episode_start, deterministic)",
-            alternatives=f"; nor is it an algorithm ({', '.join(FILE_AGENTS)})",
-        )
         scenario = scenario.public()
-    elif name in AGENTS:
-        module, class_name = AGENTS[name]
-        agent = getattr(import_module(module), class_name)
-    else:
-        raise InputError(
-            f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
-            "your own"
-        )
-    known = [p for p in inspect.signature(agent).parameters if p != "problem"]
     for option in options:
         if option not in known:
             raise InputError(f"agent {name!r} has no option {option!r}; {nearest(option, known)}")
@@ -211,6 +196,45 @@ def make_agent(name: str, scenario: SearchProblem, **options: Any) -> Agent:
             raise
         given = ", ".join(f"{option}={value!r:.60}" for option, value in options.items())
         raise InputError(f"{name}({given}) cannot be made: {type(error).__name__}: {error}") from error
+
+
+def agent_options(name: str) -> tuple[str, ...]:
+    """Return the names of the options that an agent has; none if it comes from a file.
+
+    Args:
+        name: a name that `make_agent` accepts.
+
+    Raises:
+        InputError: an unknown name.
+
+    Examples:
+        >>> agent_options("exact")
+        ('most_states',)
+    """
+    before, colon, _ = name.partition(":")
+    if colon and before in FILE_AGENTS:
+        return ()
+    return tuple(inspect.signature(_class_of(name)).parameters)[1:]
+
+
+def _class_of(name: str) -> Callable[..., Agent]:
+    """Return the class of an agent, one of `AGENTS` or `MODULE:CLASS`."""
+    if ":" in name:
+        own: Callable[..., Agent] = load_class(
+            name,
+            "agent",
+            "predict(observation, state, episode_start, deterministic)",
+            alternatives=f"; nor is it an algorithm ({', '.join(FILE_AGENTS)})",
+        )
+        return own
+    if name not in AGENTS:
+        raise InputError(
+            f"unknown agent {name!r}; {nearest(name, AGENTS)}, ALGORITHM:FILE for a trained model, MODULE:CLASS for "
+            "your own"
+        )
+    module, class_name = AGENTS[name]
+    found: Callable[..., Agent] = getattr(import_module(module), class_name)
+    return found
 
 
 def shown_name(name: str) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import time
+from abc import abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import ClassVar
@@ -28,7 +29,7 @@ _SURELY_TAKEN = 0.999  # P(taken) from which on an attempt to park is left out
 
 
 @dataclass
-class RolloutSearch:
+class ModelSearch:
     """Memory of an episode: the belief, the last action, and the random numbers of its worlds."""
 
     belief: Belief
@@ -36,7 +37,50 @@ class RolloutSearch:
     action: int | None = None
 
 
-class RolloutAgent(SearchAgent[RolloutSearch]):
+class ModelAgent(SearchAgent[ModelSearch]):
+    """Base class of planners on `parkenv.model`: it keeps the belief up to date, a subclass chooses by it.
+
+    Args:
+        problem: the problem.
+        seed: of the worlds that are drawn; they also depend on the time and the place of arrival.
+    """
+
+    def __init__(self, problem: SearchProblem, seed: int = 0) -> None:
+        super().__init__(problem)
+        self.seed, self.model = seed, Model(self.problem)
+
+    def begin(self, observation: Observation, belief: SlotBelief) -> ModelSearch:
+        """Start with the forecast, and random numbers that depend on the seed and the time of arrival alone."""
+        del belief
+        moment = int(np.float32(observation["time"][0]).view(np.uint32))
+        rng = np.random.default_rng([self.seed, moment, int(observation["vertex"])])
+        return ModelSearch(self.model.initial_belief(observation), rng)
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: ModelSearch) -> int:
+        """Update the belief, and choose among the actions that the mask allows."""
+        del belief
+        before, action = memory.belief, memory.action
+        if action is not None:
+            goes_on = self.problem.edges["target"][before.vertex, action] == observation["vertex"]
+            # Among many cars one may have to wait, and then stands where its action did not lead.
+            memory.belief = (
+                self.model.update(before, action, observation)
+                if goes_on
+                else self.model.initial_belief(observation)
+            )
+        here = int(observation["vertex"])
+        actions = np.flatnonzero(observation["action_mask"])
+        if here < self.problem.lot.n_slots and memory.belief.slots.p_occupied[here] > _SURELY_TAKEN:
+            actions = actions[actions != PARK]
+        memory.action = self.choose(actions, memory) if len(actions) else self.wait(here)
+        return memory.action
+
+    @abstractmethod
+    def choose(self, actions: IntArray, memory: ModelSearch) -> int:
+        """Return one of the actions, (n,) int64; of `memory`, `action` is the one before."""
+
+
+class RolloutAgent(ModelAgent):
     """`rollout`: takes the first action that costs least on average, if a heuristic drives on from there.
 
     All actions are tried in the same worlds, drawn from the belief; after each of several rounds, the worse half of
@@ -64,43 +108,16 @@ class RolloutAgent(SearchAgent[RolloutSearch]):
         base: str = "greedy-total",
         seed: int = 0,
     ) -> None:
-        super().__init__(problem)
+        super().__init__(problem, seed)
         require_whole("simulations", simulations, least=1)
         require_one_of("base", base, POLICIES)
         if budget_ms is not None:
             require_number("budget_ms", budget_ms, above=0.0)
-        self.simulations, self.budget_ms, self.seed = simulations, budget_ms, seed
-        self._model, self._base = Model(self.problem), POLICIES[base]
+        self.simulations, self.budget_ms, self._base = simulations, budget_ms, POLICIES[base]
 
-    def begin(self, observation: Observation, belief: SlotBelief) -> RolloutSearch:
-        """Start with the forecast, and random numbers that depend on the seed and the time of arrival alone."""
-        del belief
-        moment = int(np.float32(observation["time"][0]).view(np.uint32))
-        rng = np.random.default_rng([self.seed, moment, int(observation["vertex"])])
-        return RolloutSearch(self._model.initial_belief(observation), rng)
-
-    def decide(self, observation: Observation, belief: SlotBelief, memory: RolloutSearch) -> int:
-        """Update the belief, and choose among the actions that the mask allows."""
-        del belief
-        before, action = memory.belief, memory.action
-        if action is not None:
-            goes_on = self.problem.edges["target"][before.vertex, action] == observation["vertex"]
-            # Among many cars one may have to wait, and then stands where its action did not lead.
-            memory.belief = (
-                self._model.update(before, action, observation)
-                if goes_on
-                else self._model.initial_belief(observation)
-            )
-        here = int(observation["vertex"])
-        actions = np.flatnonzero(observation["action_mask"])
-        if here < self.problem.lot.n_slots and memory.belief.slots.p_occupied[here] > _SURELY_TAKEN:
-            actions = actions[actions != PARK]
-        memory.action = self._best(actions, memory) if len(actions) else self.wait(here)
-        return memory.action
-
-    def _best(self, actions: IntArray, memory: RolloutSearch) -> int:
+    def choose(self, actions: IntArray, memory: ModelSearch) -> int:
         """Return the action with the least mean cost; that of the heuristic, if none is surely better."""
-        base = self._model.sample(memory.belief, memory.rng).choose(self._base)[0]
+        base = self.model.sample(memory.belief, memory.rng).choose(self._base)[0]
         rounds = max(math.ceil(math.log2(len(actions))), 1)
         cost_s = np.empty((len(actions), 0))  # by action and world
         for _ in range(rounds):
@@ -126,9 +143,9 @@ class RolloutAgent(SearchAgent[RolloutSearch]):
         while time.perf_counter() < end:
             yield _BATCH
 
-    def _costs_s(self, actions: IntArray, memory: RolloutSearch, n: int) -> FloatArray:
+    def _costs_s(self, actions: IntArray, memory: ModelSearch, n: int) -> FloatArray:
         """Return the cost of each action in n worlds, the same for all actions, (n_actions, n) s."""
-        worlds = self._model.sample(memory.belief, memory.rng, n, copies=len(actions))
+        worlds = self.model.sample(memory.belief, memory.rng, n, copies=len(actions))
         first_s, _ = worlds.step(np.repeat(actions, n))
         total_s: FloatArray = (first_s + worlds.run(self._base)).reshape(len(actions), n)
         return total_s

@@ -15,9 +15,10 @@ from parkenv.cli.options import Command
 from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, make_table, save_summary
 from parkenv.errors import InputError, nearest
-from parkenv.files.option import option
+from parkenv.files.option import numbers_in, option
 from parkenv.files.spec_file import Several
-from parkenv.studies.fields import Seed
+from parkenv.studies.compare.comparison import Milliseconds
+from parkenv.studies.fields import MAX_EPISODES, Seed
 from parkenv.studies.study import STUDIES, schemas
 from parkenv.studies.verify.study import Verification
 
@@ -92,18 +93,31 @@ PARTS = {
     "town": "town_rows",
 }
 """Modules of `parkenv.studies.bench`, and the function of each that measures."""
+IN_TIME = "pomdp"
+"""The part that is a comparison of planners, and takes hours."""
 
 
 class Bench(Command):
-    """A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine."""
+    """A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine.
+
+    The part pomdp compares planners, ours and those of pomdp-py, at several times for a decision in the same worlds. It
+    is a comparison in the folder OUT/pomdp, and goes on there when it is run again.
+    """
 
     examples = """
         parkenv bench sensors
         parkenv bench --seconds 2 --out results/bench
+        parkenv bench pomdp --episodes 20 --budget-ms 10,100,1000
         """
 
-    parts: Several[Literal["sensors", "perception", "planning", "env", "drive", "fleet", "town"]] = option(
-        (), f"Some of {', '.join(PARTS)}.", takes="PART", argument=True, default="all"
+    parts: Several[Literal["sensors", "perception", "planning", "env", "drive", "fleet", "town", "pomdp"]] = (
+        option(
+            (),
+            f"Some of {', '.join(PARTS)}, {IN_TIME}.",
+            takes="PART",
+            argument=True,
+            default=f"all but {IN_TIME}",
+        )
     )
     seconds: float = option(0.6, "How long each figure is measured.", ge=0.01, le=3600)
     seed: Seed = Field(0, description="Of the lots and the noise.")
@@ -113,15 +127,32 @@ class Bench(Command):
         name="--lot",
         takes="FILE[,...]",
     )
+    episodes: int = option(
+        20, "Searches of each planner in each scenario, of the part pomdp.", short="-n", ge=1, le=MAX_EPISODES
+    )
+    budget_ms: tuple[Milliseconds, ...] = option(
+        (10.0, 100.0, 1000.0),
+        "Times for a decision in the part pomdp, ms.",
+        takes="MS[,...]",
+        parse=numbers_in,
+        min_length=1,
+    )
     out: Path | None = option(
-        None, "Folder for summary.json, and a table of each part for a page.", short="-o", default="none"
+        None,
+        "Folder for summary.json, and a table of each part for a page.",
+        short="-o",
+        default="none; results/bench for pomdp",
     )
 
     def run(self) -> None:
         """See `Command`."""
         from parkenv.files.atomic_write import make_folder
 
-        chosen = self.parts or PARTS
+        chosen = [part for part in self.parts or PARTS if part != IN_TIME]
+        if IN_TIME in self.parts:
+            self.compare_planners()
+            if not chosen:
+                return
         if self.out is not None:
             make_folder(self.out)
         console = make_console()
@@ -146,6 +177,22 @@ class Bench(Command):
         if self.out is not None:
             save_summary(self.out, self.seed, rows)
             console.print(f"Written: {self.out / 'summary.json'}, and a table of each part, PART.md")
+
+    def compare_planners(self) -> None:
+        """Run the part pomdp, or go on with it."""
+        from parkenv.cli.compare import Compare
+        from parkenv.studies.bench.pomdp import missing_peers, planners_in_time
+        from parkenv.studies.results import SPEC_FILE
+
+        if missing := missing_peers():
+            make_console().print(f"Without the planners of pomdp-py: {missing}", soft_wrap=True)
+        study, out = (
+            planners_in_time(self.seed, self.episodes, self.budget_ms),
+            self.out or Path("results/bench"),
+        )
+        folder = out / IN_TIME
+        begun = (folder / SPEC_FILE).exists()
+        Compare.parse({"study": study, "out": folder, "resume": begun}, "").run()
 
 
 def _markdown(rows: list[BenchRow]) -> str:

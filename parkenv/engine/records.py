@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from copy import copy
 from typing import Any
 
 import numpy as np
@@ -792,6 +793,23 @@ class Searches:
     def n_bytes(self) -> int:
         """Memory of the searches, bytes, without the shared tables of the scenarios."""
         return sum(array.nbytes for array in (self.records, *self._arrays().values()))
+
+    def row(self, i: int) -> Searches:
+        """Return one of the searches by itself, in the same memory: what changes one changes the other."""
+        one, rows = copy(self), slice(i, i + 1)
+        one.records = self.records[rows]
+        for name in (
+            "slots",
+            "_blocks",
+            "_columns",
+            "day_error",
+            "external_forecast",
+            "p_occupied",
+            "belief",
+        ):
+            setattr(one, name, getattr(self, name)[rows])
+        one.step_observed = self.step_observed[rows]
+        return one
 
     def save(self, rows: IntArray | None = None) -> tuple[NDArray[Any], ...]:
         """Return copies of everything that a search changes; of some searches, (k,), which may occur several times."""

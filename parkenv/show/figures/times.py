@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+from matplotlib.ticker import NullFormatter
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
@@ -180,6 +181,68 @@ def draw_time_against_occupancy(rows: Sequence[Row], about: str = "") -> Figure:
             ax.set_ylabel("mean total time, s; 95 % interval")
         _name(figure, rows)
     return figure
+
+
+def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figure:
+    """Draw the total time against that of a decision: a panel per scenario, a line per planner; oracles are left out.
+
+    Args:
+        panels: rows of each scenario with planner, total_s, total_s_ci95 and decision_ms, the median.
+
+    Raises:
+        InputError: there are no rows.
+    """
+    panels = {name: [row for row in rows if row["agent"] != "oracle"] for name, rows in panels.items()}
+    _require_rows([row for rows in panels.values() for row in rows])
+    columns = min(len(panels), 4)
+    lines = -(-len(panels) // columns)
+    planners = list(dict.fromkeys(row["planner"] for rows in panels.values() for row in rows))
+    keys = min(len(planners), 2 + columns)
+    with mpl.rc_context(STYLE):
+        size = max(3.0 * columns, 4.6), 2.7 * lines + 0.2 * -(-len(planners) // keys)
+        figure = Figure(figsize=size, layout="constrained")
+        axes = figure.subplots(lines, columns, squeeze=False, sharex=True)
+        for ax, (name, rows) in zip(axes.flat, panels.items(), strict=False):
+            # The first planner lies on top of the others.
+            for order, planner in enumerate(reversed(planners)):
+                own = sorted(
+                    (r for r in rows if r["planner"] == planner), key=lambda r: float(r["decision_ms"])
+                )
+                _draw_in_time(ax, own, agent_color(planner.partition("(")[0]), 2.0 + 0.01 * order)
+            episodes = {row["episodes"] for row in rows}
+            each = f" ({plural(episodes.pop(), 'search', 'searches')})" if len(episodes) == 1 else ""
+            ax.set_title(f"{name}{each}", weight="bold")
+            ax.set(xscale="log")
+            ax.xaxis.set_major_formatter("{x:g}")
+            ax.xaxis.set_minor_formatter(NullFormatter())
+            ax.grid(axis="y")
+        for ax in axes.flat[len(panels) :]:
+            ax.remove()
+        for i, ax in enumerate(axes.flat[: len(panels)]):
+            if i % columns == 0:
+                ax.set_ylabel("mean total time, s; 95 % interval")
+            if i + columns >= len(panels):
+                ax.tick_params(labelbottom=True)
+                ax.set_xlabel("time of a decision, ms")
+        handles = [
+            Line2D([], [], color=agent_color(p.partition("(")[0]), linewidth=2.0, marker="o", label=p)
+            for p in planners
+        ]
+        figure.legend(handles=handles, loc="outside lower center", ncols=keys, columnspacing=1.4)
+    return figure
+
+
+def _draw_in_time(ax: Axes, rows: Sequence[Row], color: str, order: float) -> None:
+    """Draw a planner's totals with their intervals; one that takes no longer for more is also a level line."""
+    x = np.array([row["decision_ms"] for row in rows])
+    total = np.array([row["total_s"] for row in rows])
+    low, high = np.array([_interval(row) for row in rows], dtype=np.float64).reshape(-1, 2).T
+    ax.errorbar(
+        x, total, [total - low, high - total], color=color, linewidth=1.8, marker="o", markersize=4.0,
+        elinewidth=1.0, capsize=2.0, zorder=order,
+    )  # fmt: skip
+    if len(rows) == 1:
+        ax.axhline(total[0], color=color, linestyle=(0, (1, 2)), linewidth=1.0, zorder=order - 1.0)
 
 
 def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]) -> Figure:

@@ -25,6 +25,8 @@ from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 
+BUDGET = "budget_ms"
+"""The option of agents that plan for a time, ms a decision."""
 BLOCK = 50  # episodes per task of searches that are not saved
 
 
@@ -46,6 +48,12 @@ class Case:
     def label(self) -> str:
         """Name of the agent with its options, for tables."""
         return label_of(shown_name(self.agent), dict(self.options))
+
+    @property
+    def planner(self) -> str:
+        """The label without the time for a decision, `BUDGET`, of which the agent may have several."""
+        options = {name: value for name, value in self.options.items() if name != BUDGET}
+        return label_of(shown_name(self.agent), options)
 
     @property
     def columns(self) -> Row:
@@ -183,6 +191,7 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     """Return a row for every case with finished episodes, in order; differences are to the first agent.
 
     `leads` says whether no other agent of the setting, the oracle apart, is shown to be faster (`_mark_leaders`).
+    If some agents plan for a given time, `planner` and `budget_ms` tell the two apart.
     If some cases are blind, `blind` says which: no slot is observed before an attempt.
     If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
 
@@ -192,6 +201,7 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     """
     rows, cells = [], list(cells)
     by_setting: dict[tuple[Any, ...], list[tuple[Row, list[Row]]]] = {}
+    timed = any(BUDGET in case.options for case, _ in cells)
     blind = {case.scenario.name: case.scenario.sensor_model == SensorModel.blind() for case, _ in cells}
     for case, seeds in cells:
         episodes = [finished[key] for s in seeds if (key := case.key(s)) in finished]
@@ -202,6 +212,8 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
         times = list(itertools.chain.from_iterable(decision_s(row) for row in episodes))
         its = by_setting.setdefault(setting, [])
         rows.append(summarize(columns, episodes, its[0][1] if its else None, times))
+        if timed:
+            rows[-1] |= {"planner": case.planner, BUDGET: case.options.get(BUDGET)}
         if any(blind.values()):
             rows[-1]["blind"] = blind[case.scenario.name]
         its.append((rows[-1], episodes))

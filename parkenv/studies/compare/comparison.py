@@ -60,6 +60,7 @@ def _failure_costs(text: str) -> object:
 
 
 _COSTS = "Costs and speeds"
+Milliseconds = Annotated[float, Field(gt=0.0, le=600_000.0)]
 
 
 class Grid(Spec):
@@ -103,6 +104,15 @@ class Grid(Spec):
             strict=False,
             max_length=100,
         )
+    )
+    budget_ms: Annotated[tuple[Milliseconds, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = option(
+        (),
+        "Run agents that have the option budget_ms, time for a decision, with each of these, ms; draws total time "
+        "against the time of a decision. Use an idle machine.",
+        takes="MS[,...]",
+        default="none",
+        strict=False,
+        max_length=100,
     )
     blind: bool = Field(
         False,
@@ -174,7 +184,24 @@ class Comparison(CaseStudy):
         settings = (
             failure * walk * drive + (walk if grid.calibrated else 0) + failure * len(grid.occupancy_levels)
         )
-        return len(self.agents) * worlds * settings * self.episodes
+        return len(self.agents) * max(len(grid.budget_ms), 1) * worlds * settings * self.episodes
+
+    @cached_property
+    def budgeted_agents(self) -> list[AgentSpec]:
+        """The agents; those that have the option `budget_ms`, and were not given it, once with each of the grid."""
+        from parkenv.studies.compare.cases import BUDGET
+        from planners.agent import agent_options
+
+        budgets = self.grid.budget_ms
+        return [
+            one
+            for agent in self.agents
+            for one in (
+                [AgentSpec(name=agent.name, **agent.options, **{BUDGET: ms}) for ms in budgets]
+                if budgets and BUDGET not in agent.options and BUDGET in agent_options(agent.name)
+                else [agent]
+            )
+        ]
 
     @cached_property
     def _base_scenarios(self) -> list[Scenario]:
@@ -221,7 +248,7 @@ class Comparison(CaseStudy):
 
     def check(self) -> None:
         """See `Study`."""
-        from parkenv.studies.compare.cases import check_worlds, require_distinct
+        from parkenv.studies.compare.cases import BUDGET, check_worlds, require_distinct
         from planners.agent import make_agent
 
         for scenario in self._base_scenarios:
@@ -236,6 +263,11 @@ class Comparison(CaseStudy):
             raise InputError(
                 "blind searches have no observations, and all agents plan on observations: "
                 f"{', '.join(agent.label for agent in self.agents)}; add one that does not, such as mdp"
+            )
+        if self.grid.budget_ms and self.budgeted_agents == list(self.agents):
+            raise InputError(
+                f"{BUDGET} is {', '.join(f'{ms:g}' for ms in self.grid.budget_ms)}, and no agent takes it: "
+                f"{', '.join(agent.label for agent in self.agents)}; add one that does, such as rollout"
             )
         names = [scenario.name for scenario in self.built]
         if repeated := [name for name in names if names.count(name) > 1]:
@@ -296,7 +328,7 @@ class Comparison(CaseStudy):
         from parkenv.world.sensor_model import SensorModel
 
         blind = scenario.sensor_model == SensorModel.blind()
-        return [agent for agent in self.agents if not blind or _works_blind(agent)]
+        return [agent for agent in self.budgeted_agents if not blind or _works_blind(agent)]
 
     def _case(self, scenario: Scenario, agent: AgentSpec, level: float | None = None) -> Case:
         from parkenv.studies.compare.cases import Case

@@ -22,6 +22,7 @@ from parkenv.show.figures.picture_files import save_picture
 from parkenv.show.figures.searches import draw_searches
 from parkenv.show.figures.time_distribution import BOUND, draw_time_distribution
 from parkenv.show.figures.times import (
+    draw_time_against_decision_time,
     draw_time_against_failure_cost,
     draw_time_against_map,
     draw_time_against_occupancy,
@@ -185,6 +186,18 @@ def searches(results: ComparisonResults) -> Iterator[Drawn]:
         yield name, setting, draw_searches([case.runner().run(results.seed) for case in drawn])
 
 
+def times_against_decision_time(results: ComparisonResults) -> Iterator[Drawn]:
+    """Yield a figure for each setting of costs and speeds in which agents plan for different times."""
+    settings: dict[Setting, dict[str, list[Row]]] = {}
+    for row in results.rows:
+        if row["scenario"] in results.scenarios and "decision_ms" in row:
+            panels = settings.setdefault(tuple(row[name] for name in SETTING_AXES), {})
+            panels.setdefault(row["scenario"], []).append(row)
+    for setting, panels in settings.items():
+        if len({row.get("budget_ms") for rows in panels.values() for row in rows} - {None}) > 1:
+            yield "", setting, draw_time_against_decision_time(panels)
+
+
 def _setting_of(row: Mapping[str, Any]) -> tuple[Any, ...]:
     return tuple(row[name] for name in ("scenario", *SETTING_AXES))
 
@@ -221,6 +234,9 @@ FIGURES = (
     ),
     ComparisonFigure("time_against_failure_cost", "What failed attempts cost", times_against_failure_cost),
     ComparisonFigure("time_against_map", "If the forecast is the same for every slot", times_against_map),
+    ComparisonFigure(
+        "time_against_decision_time", "What time to think is worth", times_against_decision_time
+    ),
     ComparisonFigure("searches", "Searches on the same day", searches),
 )
 """All figures, in the order of reports."""

@@ -1,0 +1,50 @@
+"""Benchmark of planners by the time that they are given for a decision: ours, and those of other libraries."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from importlib.util import find_spec
+
+from parkenv.files.user_class import find_module
+from parkenv.lots.lot_files import PLACES
+from parkenv.scenarios.spec import lot_scenario, scenario_spec
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.comparison import Comparison
+
+OURS = ("belief(budget_ms=1)", "mdp", "network", "rollout")
+PEERS = ("examples.pomdp_py_agents:POUCT", "examples.pomdp_py_agents:POMCP")
+"""Planners of other libraries, the adapters of which are among the examples of the source tree."""
+LIBRARY = "pomdp_py"
+SCENARIOS = ("mini", "campus", "street", "jam")
+REAL_PLACES = ("place-01", "place-09", "place-17")
+
+
+def missing_peers() -> str:
+    """Return why `PEERS` cannot be measured here; empty if they can."""
+    if find_spec(LIBRARY) is None:
+        return "pomdp-py is not installed: pip install 'parkenv[pomdp]'"
+    if find_module(PEERS[0]) is None:
+        return "their adapters, examples/pomdp_py_agents.py, are not in the working directory"
+    return ""
+
+
+def planners_in_time(seed: int, episodes: int, budgets_ms: Sequence[float]) -> Comparison:
+    """Return the study of `parkenv bench pomdp`: ours, and the peers that are here, in the same worlds.
+
+    Args:
+        seed: first seed of the worlds.
+        episodes: searches of each planner in each scenario.
+        budgets_ms: times for a decision, ms, of the planners that have a limit.
+    """
+    agents = (*OURS, *(() if missing_peers() else PEERS))
+    scenarios = [
+        *map(scenario_spec, SCENARIOS),
+        *(lot_scenario(PLACES / f"{name}.geojson") for name in REAL_PLACES),
+    ]
+    return Comparison().changed(
+        agents=tuple(map(AgentSpec.of, agents)),
+        scenarios=tuple(scenarios),
+        grid={"budget_ms": tuple(budgets_ms)},
+        seed=seed,
+        episodes=episodes,
+    )
