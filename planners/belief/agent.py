@@ -210,7 +210,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         # Nothing is observed at the moment of arrival.
         if here >= 0 and belief.time > max(memory.time, 0.0):
             views = near.in_view(here)
-            missed = views[~np.isin(views["slot"], known.observations.slots)]
+            seen = np.zeros(near.n_slots, np.bool_)
+            seen[known.observations.slots] = True
+            missed = views[~seen[views["slot"]]]
             np.maximum.at(memory.missed_rate, missed["slot"], missed["rate"])
         memory.time = belief.time
         return known

@@ -85,7 +85,7 @@ class Grid(Spec):
     )
     occupancy_levels: Annotated[tuple[Level, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = option(
         (),
-        "Also set the lot's mean occupancy to these values, with a third of the episodes each, for the "
+        "Also set the lot's mean occupancy to these values, with a sixth of the episodes each, for the "
         "figure of time against occupancy. Searches in a recorded log are binned instead.",
         takes="P[,...]|none",
         default="0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep",
@@ -310,11 +310,11 @@ class Comparison(CaseStudy):
 
     @cached_property
     def occupancy_cases(self) -> list[Cell]:
-        """The cases at the occupancy levels, with a third of the episodes, at the first speeds of the grid."""
+        """The cases at the occupancy levels, with a sixth of the episodes, at the first speeds of the grid."""
         from parkenv.studies.compare.cases import at_occupancy
 
         return [
-            Cell(self._case(setting, agent, level), self.seeds[: max(1, self.episodes // 3)])
+            Cell(self._case(setting, agent, level), self.seeds[: max(1, self.episodes // 6)])
             for scenario in self.built
             if scenario.occupancy.adjustable and scenario.name not in self.constant_forecasts
             for level in self.grid.occupancy_levels
