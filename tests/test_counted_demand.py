@@ -8,11 +8,19 @@ import numpy as np
 import pytest
 from car_park_counts import write_counts
 from command_line import parkenv
-from made_maps import FREIBURG
+from made_maps import FREIBURG, STREET
 from test_import_town import grid
 
+from parkenv import make_scenario
+from parkenv.engine.fleet import drive_times
 from parkenv.errors import InputError
 from parkenv.lots import import_town, write_lot
+from parkenv.lots.generators import NO_SLOTS, Slots
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.elements import read_map
+from parkenv.lots.town.streets import read_streets
+from parkenv.world.facility import Facility
+from parkenv.world.lot import ParkingLot
 from parkenv.world.tariff import PUBLIC
 
 LIST = {"P1": (100, 100.0, 205.0), "Parkhaus P0": (100, 260.0, 330.0), "empty": (100, 300.0, 205.0)}
@@ -35,6 +43,7 @@ def a_map(folder):
     place.box(
         370, 305, 390, 325, {"amenity": "parking", "parking": "multi-storey", "name": "P0"}, capacity="30"
     )
+    place.way([(200, 200), (150, 150)], STREET)
     (folder / "town.osm").write_text(place.xml(), encoding="utf-8")
     return folder / "town.osm"
 
@@ -57,7 +66,30 @@ def test_car_parks_of_a_list_have_its_names_and_capacities(tmp_path):
     assert len({zone.price for zone in zones}) == 1  # nothing is known, so that none draws drivers
     alone = import_town(a_map(tmp_path), listed(tmp_path), listed_only=True).draft.lot()
     assert set(alone.slot_ids) == set(rows)
-    assert len(alone.lanes) > 0
+
+
+def test_only_streets_that_cars_need_are_left_and_no_way_is_longer(tmp_path):
+    place = grid(maxspeed="50").way([(200, 200), (150, 150)], STREET)
+    place.way([(100, 200), (100, 300), (100, 400)], STREET, oneway="yes", maxspeed="20")
+    (tmp_path / "town.osm").write_text(place.xml(), encoding="utf-8")
+    elements = read_map(tmp_path / "town.osm").elements
+    lines = [line for one in elements if "highway" in one.tags for line in one.lines]
+    streets, _ = read_streets(elements, LocalFrame.around(np.concatenate(lines)))
+    entries, _ = streets.entries()
+    doors = np.array([streets.points(piece).mean(axis=0) + 3.0 for piece in (1, 6, 10, 13)])
+    facilities = tuple(Facility(f"P{k}", capacity=9, xy=tuple(xy)) for k, xy in enumerate(doors.tolist()))
+    drives = []
+    for lanes in (streets.lanes(doors), streets.lanes(doors, entries)):
+        drawn = Slots.joined([NO_SLOTS]).columns()
+        lot = ParkingLot(
+            "doors", (), **drawn, lanes=tuple(lanes), entries=entries, goals=doors[:1], facilities=facilities
+        )
+        ends = np.r_[lot.entry_vertices, np.arange(lot.n_slots)]
+        metres = sum(np.hypot(*np.diff(lane.points, axis=0).T).sum() for lane in lanes)
+        drives.append((metres, drive_times(make_scenario(lot), ends)))
+    # Crowded junctions are moved by some metres.
+    assert drives[0][1] == pytest.approx(drives[1][1], abs=1.0)
+    assert drives[0][0] - drives[1][0] > 50.0
 
 
 @pytest.mark.parametrize(
@@ -93,7 +125,7 @@ def predicted(town, counts, *more):
     out = counts.with_suffix("")
     result = parkenv(
         "occupancy", "demand", counts, "--scenario", town / "town.toml", "--from", "2024-01-01", "--weeks", "2",
-        "--held-out", "1", "--roll-outs", "2", "--rounds", "2", "-n", "2", "--out", out, *more,
+        "--held-out", "1", "--roll-outs", "2", "--rounds", "2", "-n", "1", "-j", "1", "--out", out, *more,
     )  # fmt: skip
     assert result.returncode == 0, result.stderr
     with (out / "predicted.csv").open() as file:
@@ -129,3 +161,14 @@ def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path)
     assert summary["simulated_error"] < 1.5 * summary["forecast_error"] + 0.02
     for name in ("scenario", "saturday", "sunday"):
         assert set(json.loads((folder / f"{name}.json").read_text())["demand"]) >= {"P1", "Parkhaus P0"}
+    # A run that was stopped goes on there, to the same end.
+    names = ("fitted.jsonl", "days.jsonl", "predicted.csv", "scenario.json", "summary.json")
+    whole = {name: (folder / name).read_text() for name in names}
+    for name in names[:2]:
+        (folder / name).write_text(whole[name][: -len(whole[name]) // 5])
+    (folder / "summary.json").unlink()
+    result = parkenv("run", folder, "--resume", "-j", "1")
+    assert result.returncode == 0, result.stderr
+    again = {name: (folder / name).read_text() for name in names}
+    assert {name for name in names if again[name] != whole[name]} <= {"summary.json"}  # another command
+    assert json.loads(again["summary.json"])["rows"] == summary["rows"]

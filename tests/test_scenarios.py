@@ -7,6 +7,7 @@ from small_lots import CAR_PARKS
 
 from parkenv import InputError, make_scenario
 from parkenv.cli.options import made as changed_by
+from parkenv.engine.records import FORECAST
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.learned_map import LearnedMap
@@ -117,7 +118,8 @@ def test_a_file_says_it_all(tmp_path):
     assert made.traffic.cars == 2
 
     env = gym.make("parkenv/Search-v2", scenario=str(file), failure_s=7.0)
-    env.reset(seed=3)
+    observation, _ = env.reset(seed=3)
+    assert (observation["belief"][FORECAST] == 0.25).all()
     assert env.unwrapped.scenario.failure_s == 7.0
     assert env.unwrapped.scenario.lot.n_slots == 12
     assert make_scenario(tmp_path / "lot.geojson").name == "lot", "a lot file alone"

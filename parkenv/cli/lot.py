@@ -218,7 +218,10 @@ class Import(Command):
         takes="FILE.csv",
         default="none",
     )
-    listed_only: bool = option(False, "Leave out kerbs, and car parks that are not in --car-parks.")
+    listed_only: bool = option(
+        False,
+        "Leave out kerbs, car parks that are not in --car-parks, and streets on no shortest way to these.",
+    )
     untagged_kerbs: float = option(
         1.0,
         "Places of kerbs that the map says nothing of, as a multiple of the rule's, with --town.",

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from parkenv.cli.options import Command
+from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, make_table, save_summary, stages
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
@@ -15,10 +16,13 @@ from parkenv.scenarios.spec import Date, scenario_spec
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
+from parkenv.studies.fleet.demand_study import PREDICTIONS, DemandStudy
 from parkenv.studies.results import Row
 
 if TYPE_CHECKING:
     from rich.console import Console
+
+    from parkenv.studies.runner import Result
 
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
@@ -156,7 +160,7 @@ class Evaluate(Command):
         console.print(f"Pictures and summary are in {self.out}")
 
 
-class Demand(Command):
+class Demand(StudyCommand):
     """Counts of car parks, and a town that has them: cars come and stay such that they become as full as counted.
 
     Each car park gets a purpose of its own: arrivals by hour by least squares, and cars that are there at first. Their
@@ -172,56 +176,31 @@ class Demand(Command):
         parkenv fleet --scenario results/demand/scenario.json
         """
 
-    counts: Annotated[Path, Option("COUNTS", takes="FILE", argument=True)] = Field(
-        description="Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), as .csv or .csv.gz."
-    )
-    scenario: OneScenario = scenario_spec("town")
-    from_day: Date = option(..., "First day that is followed.", name="--from", takes="DATE")
-    weeks: int = option(8, "Weeks that are followed.", ge=1, le=520)
-    held_out: int = option(4, "Weeks after these, which are predicted.", ge=1, le=520)
-    roll_outs: int = option(1, "How often, each time that many weeks later.", ge=1, le=520)
-    agent: OneAgent = AgentSpec(name="usual")
-    rounds: int = option(3, "How often the town is driven for a fit.", ge=1, le=100)
-    days: int = option(
-        3,
-        "Days of the fleet in each round, and for each day predicted.",
-        name="--episodes",
-        short="-n",
-        ge=1,
-        le=1_000,
-    )
-    jobs: int | None = option(1, "Processes; roll-outs are shared among them.", short="-j", ge=1, le=1_024)
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
-    seed: Seed = Field(0, description="Seed of these days.")
+    study: DemandStudy = DemandStudy()
     out: Path = option(
         Path("results/demand"),
-        "Folder for scenario.json, saturday.json, sunday.json, summary.json, predicted.csv and demand.png.",
+        "Folder for scenario.json, saturday.json, sunday.json, summary.json, predicted.csv, demand.png, and what is "
+        "finished: fitted.jsonl and days.jsonl.",
         short="-o",
     )
 
-    def run(self) -> None:
-        """See `Command`."""
-        from parkenv.forecast.counts import Counts
-        from parkenv.studies.fleet.counted_demand import PREDICTIONS, Weeks, fit_demand
-
-        console = make_console()
-        with stages(console) as progress:
-            title, summary = fit_demand(
-                self.scenario, Counts.read(self.counts, self.timezone), self.out,
-                weeks=Weeks(self.from_day, self.weeks, self.held_out, self.roll_outs), agent=self.agent,
-                rounds=self.rounds, days=self.days, seed=self.seed, jobs=self.jobs, progress=progress,
-            )  # fmt: skip
+    def show(self, console: Console, result: Result) -> None:
+        """Print how far the town, and simpler predictions, are from the counts of the days held out that are done."""
+        if not result.rows:
+            return
         headings = ("car park", "places", "cars a day", "stay, h", "days", "fit", *PREDICTIONS)
         cells = [
             [
                 row["car_park"], str(row["capacity"]), f"{row['arrivals_a_day']:,.0f}", f"{row['stay_h']:.1f}",
                 str(row["days_held_out"]), f"{100 * row['fit_error']:.1f}", *_points_of(row),
             ]
-            for row in summary["rows"]
+            for row in result.rows
         ]  # fmt: skip
+        summary = result.summary
         mean = ["all", "", "", "", "", f"{100 * summary['fit_error']:.1f}", *_points_of(summary)]
+        what = f"{plural(len(cells), 'car park')}, {plural(summary['days_held_out'], 'day')} held out"
         names = [name.replace("_", " ") for name in headings]
-        console.print(make_table(title, names, [*cells, mean]))
+        console.print(make_table(f"{self.study.scenario.title}: {what}", names, [*cells, mean]))
         console.print(
             "Mean absolute differences from the counts by car park and hour, points of 100 %: of the fit on the weeks "
             "followed, and on each day held out of the town driven with the day's demand, of the forecast that it "
@@ -230,8 +209,6 @@ class Demand(Command):
         )
         if summary["not_in_lot"]:
             console.print(f"Not in the lot: {', '.join(summary['not_in_lot'])}", soft_wrap=True)
-        save_summary(self.out, self.seed, **summary)
-        console.print(f"The scenarios with this demand, predictions, picture and summary are in {self.out}")
 
 
 class Record(Command):
@@ -273,8 +250,6 @@ class Record(Command):
 
 
 def _points_of(row: Row) -> list[str]:
-    from parkenv.studies.fleet.counted_demand import PREDICTIONS
-
     errors = [(row[f"{name}_error"], *row[f"{name}_error_ci95"]) for name in PREDICTIONS]
     return [
         f"{100 * mean:.1f}" + (f" [{100 * low:.1f}, {100 * high:.1f}]" if low == low else "")

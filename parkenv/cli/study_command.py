@@ -135,6 +135,7 @@ COMMANDS = {
     "compare": "compare:Compare",
     "commute": "drivers:Commute",
     "fleet": "drivers:Fleet",
+    "demand": "occupancy:Demand",
     "benchmark": "benchmark:RunSuite",
     "survey": "survey:Survey",
     "detectors": "detect:CompareDetectors",
@@ -150,7 +151,8 @@ class Run(RunCommand, ExecutionSpec):
     """Settings that the file leaves out have the defaults of its command.
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
-    command: compare (the default), commute, fleet, benchmark, survey, detectors, demo, calibrate, verify or train.
+    command: compare (the default), commute, fleet, demand, benchmark, survey, detectors, demo, calibrate, verify,
+    train.
     """
 
     examples = """

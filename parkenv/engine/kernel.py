@@ -857,7 +857,9 @@ def _init_process_prior(search: Any) -> None:
     for slot in range(n):
         arrival = factors[slot] * arriving
         rate = arrival + factors[n + slot] * leaving
-        p = worlds.marginal_later(start[hour * n + slot], arrival, rate, second)
+        p = process.flat
+        if not p >= 0.0:
+            p = worlds.marginal_later(start[hour * n + slot], arrival, rate, second)
         belief[FORECAST * width + slot] = min(max(p, worlds.MIN_PROBABILITY), worlds.MAX_PROBABILITY)
         belief[DECAY_RATE * width + slot] = rate
 

@@ -39,6 +39,7 @@ STUDIES: Mapping[str, str] = {
     "compare": "parkenv.studies.compare.comparison:Comparison",
     "commute": "parkenv.studies.commute.study:Commute",
     "fleet": "parkenv.studies.fleet.study:FleetStudy",
+    "demand": "parkenv.studies.fleet.demand_study:DemandStudy",
     "benchmark": "parkenv.studies.benchmark.study:Benchmark",
     "survey": "parkenv.studies.sensing.survey_study:SurveyStudy",
     "detectors": "parkenv.studies.sensing.detector_study:DetectorStudy",

@@ -109,7 +109,8 @@ def import_town(
     Args:
         path: the file.
         car_parks: list of car parks, such as those that the city counts; their names and capacities win (`listed`).
-        listed_only: whether kerbs and other car parks are left out.
+        listed_only: whether kerbs, other car parks, and streets on no shortest way between entries and these are left
+            out.
         bounds: two corners, each a latitude and a longitude, at which the map is cut; None: all of it.
         untagged_kerbs: places of kerbs that the map says nothing of, as a multiple of the rule's.
 
@@ -408,7 +409,8 @@ class _Town:
         parts = [row.slots for row in self.rows]
         slots = Slots.joined(parts)
         mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
-        lanes = self.streets.lanes(mouths)
+        entries, traffic = self.streets.entries()
+        lanes = self.streets.lanes(mouths, entries if self.beside is not None else None)
         of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
         zone = [rules.zone(row.kind).name for row in self.rows for rules in row.slot_rules]
         slots = replace(
@@ -432,7 +434,6 @@ class _Town:
             for row in self.rows
             for rules in (*row.slot_rules, *(r for _, _, r in row.counted), row.rules)
         ]
-        entries, traffic = self.streets.entries()
         goals, weights = find_goals(self.place.elements, self.buildings, self.frame, self.tree, self.beside)
         draft = LotDraft(
             name=self.name,

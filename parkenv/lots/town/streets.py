@@ -18,7 +18,7 @@ from typing import Literal
 import numpy as np
 import shapely
 from scipy.sparse import csr_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.errors import InputError
@@ -248,21 +248,61 @@ class Streets:
         """Return the connected part as roads, each a run of pieces of one way."""
         return [replace(self.roads[k], points=points) for k, points in self._runs(self.kept, set())]
 
-    def lanes(self, mouths: FloatArray) -> list[Lane]:
+    def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> list[Lane]:
         """Return the lanes: the connected part without service roads that lead to none of the mouths, (n, 2) m.
 
-        Ways are cut at junctions with more than four ways out, so that `limit_junctions` can split these.
+        Ways are cut at junctions with more than four ways out, so that `limit_junctions` can split these. With entries,
+        (m, 2) m, only the shortest ways between these and the mouths are left, each as long lanes as there can be.
         """
         kept = self._useful(mouths)
+        if entries is not None:
+            kept = self._between(kept, mouths, entries)
         a, b = self.nodes[kept].T
         back = ~self.oneway[kept]
         ways_out = np.bincount(np.r_[a, b[back]], minlength=len(self.node_xy))
         crowded = set(np.flatnonzero(ways_out > len(MOVES)).tolist())
-        return limit_junctions([self._lane(self.roads[k], points) for k, points in self._runs(kept, crowded)])
+        lanes = limit_junctions(
+            [self._lane(self.roads[k], points) for k, points in self._runs(kept, crowded)]
+        )
+        return lanes if entries is None else _joined(lanes, mouths)
 
     @staticmethod
     def _lane(road: Road, points: FloatArray) -> Lane:
-        return Lane(points, road.oneway, round(float(np.clip(road.limit / BASE_LIMIT, *SPEEDS)), 3))
+        return Lane(points, road.oneway, _speed(road))
+
+    def _between(self, kept: BoolArray, mouths: FloatArray, entries: FloatArray) -> BoolArray:
+        """Return the pieces of those kept that are on a shortest way between entries and mouths, (n,) bool."""
+        index = np.flatnonzero(kept)
+        seconds = self.length[index] / np.array([_speed(self.roads[k]) for k in self.road[index].tolist()])
+        lines = linestrings([self.points(piece) for piece in index.tolist()])
+        nearest = index[shapely.STRtree(lines).query_nearest(shapely.points(mouths))[1]]
+        ends = [self.node_xy - xy for xy in entries]
+        stops = np.unique(
+            np.r_[[int(np.hypot(*away.T).argmin()) for away in ends], self.nodes[nearest].ravel()]
+        )
+        back = np.flatnonzero(~self.oneway[index])
+        (a, b), piece = self.nodes[np.r_[index, index[back]]].T, np.r_[index, index[back]]
+        a[len(index) :], b[len(index) :] = self.nodes[index[back]].T[::-1]
+        seconds = np.r_[seconds, seconds[back]]
+        # Of several pieces between two junctions the fastest counts.
+        order = np.lexsort((seconds, b, a))
+        _, first = np.unique(np.stack([a, b])[:, order], axis=1, return_index=True)
+        quickest = order[first]
+        of = {(int(a[k]), int(b[k])): int(piece[k]) for k in quickest}
+        n = len(self.node_xy)
+        graph = csr_array((seconds[quickest], (a[quickest], b[quickest])), shape=(n, n))
+        before = dijkstra(graph, indices=stops, return_predecessors=True)[1]
+        wanted = np.zeros(len(kept), bool)
+        wanted[nearest] = True
+        for tree in before.tolist():
+            seen = set[int]()
+            for stop in stops.tolist():
+                node = stop
+                while tree[node] >= 0 and node not in seen:
+                    seen.add(node)
+                    wanted[of[tree[node], node]] = True
+                    node = tree[node]
+        return wanted
 
     def tagged_limits(self) -> float:
         """Return the share of the streets whose speed limit is tagged, by length, 0 to 1."""
@@ -310,6 +350,28 @@ class Streets:
                 at[end].discard(piece)
                 loose.append(end)
         return kept
+
+
+def _speed(road: Road) -> float:
+    """Return the speed of a road's lanes, a multiple of the scenario's."""
+    return round(float(np.clip(road.limit / BASE_LIMIT, *SPEEDS)), 3)
+
+
+def _joined(lanes: Sequence[Lane], mouths: FloatArray) -> list[Lane]:
+    """Join lanes of the same speed where two meet end to end, but for those nearest to mouths."""
+    tree = shapely.STRtree(linestrings([lane.points for lane in lanes]))
+    left = set(tree.query_nearest(shapely.points(mouths))[1].tolist())
+    alike: dict[tuple[bool, float], list[FloatArray]] = {}
+    for k, lane in enumerate(lanes):
+        if k not in left:
+            alike.setdefault((lane.oneway, lane.speed), []).append(lane.points)
+    return [lanes[k] for k in sorted(left)] + [
+        Lane(shapely.get_coordinates(line), *kind)
+        for kind, parts in alike.items()
+        for line in shapely.get_parts(
+            shapely.line_merge(shapely.multilinestrings(linestrings(parts)), directed=kind[0])
+        )
+    ]
 
 
 def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, list[LeftOut]]:

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.errors import require_number
+from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.kernel import MAX_PROBABILITY, MIN_PROBABILITY
-from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
+from parkenv.world.occupancy.kernel import EXTERNAL_KIND, MAX_PROBABILITY, MIN_PROBABILITY, PROCESS_KIND
+from parkenv.world.occupancy.process import Arrival, CompiledModel, Forecast, OccupancyModel, PriorModel
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +33,20 @@ class FlatMap(PriorModel):
 
     def __post_init__(self) -> None:
         require_number("p_occupied", self.p_occupied, least=0.0, most=1.0)
+
+    @property
+    def kind(self) -> int:  # type: ignore[override]
+        """See `PriorModel`: the records of a process say its rates."""
+        return PROCESS_KIND if self.true.kind == PROCESS_KIND else EXTERNAL_KIND
+
+    def compiled(self, window: ArrivalWindow) -> CompiledModel | None:
+        """See `PriorModel`."""
+        model = self.true.compiled(window) if self.kind == PROCESS_KIND else None
+        if model is None:
+            return None
+        record = model.record.copy()
+        record["flat"] = min(max(self.p_occupied, MIN_PROBABILITY), MAX_PROBABILITY)
+        return model._replace(record=record)
 
     @property
     def n_slots(self) -> int:

@@ -58,6 +58,7 @@ PROCESS = np.dtype(
         ("centring", ADDRESS),
         ("nearness", ADDRESS),
         ("day_error", np.float64, (2,)),
+        ("flat", np.float64),
     ],
     align=True,
 )
@@ -66,7 +67,7 @@ PROCESS = np.dtype(
 factors (2, n_slots); profiles (2, 168), 1/s; hazards (2, 169), integrals of the profiles from Monday 00:00 to full
 hours; hourly_marginals (168, n_slots), P(taken) at full hours, computed when first needed, 0 before; centring, see
 `centring_table`; nearness (n_slots,), or no address without one. All float64. day_error: standard deviations over days
-of level and slope, logits.
+of level and slope, logits. flat: P(taken) of every slot in the forecasts of a `FlatMap`; NaN: as the process says.
 """
 
 WORLD_FIELDS = [
@@ -393,9 +394,11 @@ def process_forecast(process: Any, hour: int, second: float, slot: int) -> tuple
     """Return P(taken) of a slot at a second of an hour of the week, and its decay rate there, 1/s."""
     n = process.n_slots
     factors, profiles = float64s(process.factors), float64s(process.profiles)
-    start = _marginal_at_full_hour(process, hour, slot)
     arrival = factors[slot] * profiles[hour]
     rate = arrival + factors[n + slot] * profiles[WEEK_HOURS + hour]
+    if process.flat >= 0.0:
+        return process.flat, rate
+    start = _marginal_at_full_hour(process, hour, slot)
     return marginal_later(start, arrival, rate, second), rate
 
 

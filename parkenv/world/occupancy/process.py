@@ -381,7 +381,7 @@ class OccupancyProcess(OccupancyModel):
         addresses = [address_of(a, np.float64) for a in (factors, profiles, hazards, marginals, centring)]
         near_at = 0 if near is None else address_of(near, np.float64)
         sizes = self.day_error.level, self.day_error.slope
-        record = np.array([(arrival.size, *addresses, near_at, sizes)], kernels.PROCESS)
+        record = np.array([(arrival.size, *addresses, near_at, sizes, np.nan)], kernels.PROCESS)
         object.__setattr__(self, "record", record)
         for name, row in zip(_RATES, (factors[0], profiles[0], factors[1], profiles[1]), strict=True):
             object.__setattr__(self, name, row)

@@ -1,0 +1,360 @@
+"""Demand of a town that fills its car parks as counted: fitted on some weeks, and measured on the weeks after."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import date, timedelta
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from parkenv.errors import InputError
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.csv_tables import csv_columns
+from parkenv.files.option import option
+from parkenv.files.spec_file import FilePath
+from parkenv.scenarios.purposes import PurposeSpec
+from parkenv.scenarios.spec import Date, scenario_spec
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import OneAgent, OneScenario, Seed
+from parkenv.studies.results import JsonTable, Results, Row, Table
+from parkenv.studies.study import Cell, Stage, Study, counted
+from parkenv.world.week import HOUR_S
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from parkenv.compiled.arrays import FloatArray, IntArray
+    from parkenv.studies.fleet.counted_demand import CountedTown
+    from parkenv.studies.runner import Result
+    from parkenv.studies.workers import Task
+
+PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")
+"""What was to be expected of the counts."""
+KINDS: dict[str, tuple[int, ...]] = {"scenario": (0, 1, 2, 3, 4), "saturday": (5,), "sunday": (6,)}
+"""Weekdays (Monday = 0) that have a demand of their own, by the name of its scenario file."""
+
+
+class _RollOut(NamedTuple):
+    """Weeks that are followed, and later ones that are held out.
+
+    Attributes:
+        number: of the roll-out.
+        fit: of the kind of a day held out, by car park; see `CountedTown.fitted`.
+        expected: `before` and `expected` of that day; see `CountedTown.predicted`.
+    """
+
+    number: int
+    fit: Mapping[str, Row] = {}
+    expected: tuple[FloatArray, ...] = ()
+
+    @property
+    def columns(self) -> Row:
+        """Columns that identify it."""
+        return {"roll_out": self.number}
+
+
+def _fitted(row: Row) -> Row:
+    for its in row["car_parks"].values():
+        PurposeSpec.parse(its["purpose"], "purpose")
+        np.array([its[column] for column in ("followed", "driven", "aim")], np.float64)
+    return row
+
+
+def _driven(row: Row) -> Row:
+    numbers = np.array([row[column] for column in ("hour", "counted", *PREDICTIONS)], np.float64)
+    if numbers.shape[1:] != (len(row["car_park"]),):
+        raise ValueError(numbers.shape)
+    return row
+
+
+FITTED = JsonTable("fitted.jsonl", ("roll_out", "kind"), _fitted, "fitted demand")
+DAYS = JsonTable("days.jsonl", ("date",), _driven, "day held out")
+"""Days held out; see `CountedTown.predicted`."""
+
+
+class DemandStudy(Study):
+    """Demand of a town that follows the counts of its car parks, and each later day as it was to be expected.
+
+    The cars of a purpose have the goals, by the lot's weights, from which nearly all cars go to one car park, and its
+    counts tell when they come and how many are there at first (`parkenv.world.counted_demand`). Where they park is up
+    to them; so the fleet is driven, and what a car park lacks or has too much is added to what the next round follows.
+
+    Each day that is held out is driven for itself: its demand follows the forecast that was made before it
+    (`parkenv.forecast.day_curves`), with the stays and corrections of the weeks followed, and the cars that were
+    counted when it began.
+    """
+
+    table: ClassVar[Table] = DAYS
+    all_tables: ClassVar = (DAYS, FITTED)
+    block: ClassVar = 1
+    doing: ClassVar = "Driving days held out"
+    unit: ClassVar = ""
+    heading: ClassVar = "Demand as counted"
+
+    kind: Literal["demand"] = "demand"
+    counts: FilePath | None = option(
+        None,
+        "Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), as .csv or .csv.gz.",
+        takes="FILE",
+        argument=True,
+    )
+    scenario: OneScenario = scenario_spec("town")
+    from_day: Date | None = option(
+        None, "First day that is followed.", name="--from", takes="DATE", default="the first one counted"
+    )
+    weeks: int = option(8, "Weeks that are followed.", ge=1, le=520)
+    held_out: int = option(4, "Weeks after these, which are predicted.", ge=1, le=520)
+    roll_outs: int = option(1, "How often, each time that many weeks later.", ge=1, le=520)
+    agent: OneAgent = AgentSpec(name="usual")
+    rounds: int = option(3, "How often the town is driven for a fit.", ge=1, le=100)
+    episodes: int = option(
+        3, "Days of the fleet in each round, and for each day predicted.", short="-n", ge=1, le=1_000
+    )
+    timezone: str = Field("Europe/Berlin", description="Local time of counts in UTC.")
+    seed: Seed = Field(0, description="Seed of these days.")
+
+    @cached_property
+    def town(self) -> CountedTown:
+        """The town and its counts.
+
+        Raises:
+            InputError: there are no counts, no counted facility of the lot has some, or the hours are not full ones.
+        """
+        from parkenv.forecast.counts import Counts
+        from parkenv.studies.fleet.counted_demand import CountedTown
+
+        if self.counts is None:
+            raise InputError("counts is missing, want a file of counts")
+        return CountedTown(self.scenario, Counts.read(self.counts, self.timezone), self.agent)
+
+    def days(self, roll_out: int) -> tuple[IntArray, IntArray]:
+        """Return the days that are followed, and those held out, as indices into those of the counts."""
+        first = self._first + timedelta(weeks=self.held_out * roll_out)
+        later = first + timedelta(weeks=self.weeks)
+        end = later + timedelta(weeks=self.held_out)
+        return self.town.days_of(first, later), self.town.days_of(later, end)
+
+    @property
+    def _first(self) -> date:
+        return self.from_day or self.town.counts.days[0]
+
+    @property
+    def _first_held_out(self) -> int:
+        return self.town.counts.day_index(self._first + timedelta(weeks=self.weeks))
+
+    def check(self) -> None:
+        """See `Study`."""
+        counts = self.town.counts
+        if not 0 < self._first_held_out < len(counts.days):
+            from parkenv.show.plurals import plural
+
+            raise InputError(
+                f"--from is {self._first}: {counts.source} has counts from {counts.days[0]} to {counts.days[-1]}, "
+                f"want {plural(self.weeks, 'week')} and days after these among them"
+            )
+
+    def settings(self) -> Row:
+        """See `Study`: further roll-outs may be added."""
+        from parkenv.studies.fingerprints import search_settings
+
+        more = ("weeks", "held_out", "rounds", "episodes", "timezone", "seed")
+        return search_settings(self, *more) | {"from": str(self._first), "agent": self.agent.label}
+
+    def cells(self) -> list[Cell]:
+        """See `Study`: the days held out."""
+        days = self.town.counts.days
+        return [
+            Cell(_RollOut(number), [days[day].isoformat() for day in self.days(number)[1].tolist()])
+            for number in range(self.roll_outs)
+        ]
+
+    def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`: days are driven with what was fitted to the weeks before."""
+        from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
+
+        fits = _Fits(**{name: getattr(self, name) for name in DemandStudy.model_fields})
+        yield Stage(fits.doing, fits, fits.cells())
+        counts = self.town.counts
+        done = counted(results.progress, "Forecasting", FIT_STEPS)
+        settings = fit_settings(counts, self._first_held_out, done)
+        results.kept["forecast"] = forecast_days(counts, 0, "rolling", settings).occupancy
+        yield Stage(self.doing, self, self.cells())
+
+    def input_of(self, work: _RollOut, items: Sequence[Any], results: Results) -> _RollOut:
+        """See `Study`: the fit of the weeks before, and the forecast."""
+        town = self.town
+        day = town.counts.day_index(date.fromisoformat(items[0]))
+        before, expected = town.expected(results.kept["forecast"], np.array([day]))
+        fit = results.rows(FITTED)[work.number, kind_of(town.counts.weekday[day])]
+        return work._replace(fit=fit["car_parks"], expected=(before[0], expected[0]))
+
+    def run(self, work: _RollOut, items: Sequence[Any]) -> list[Row]:
+        """See `Study`."""
+        day = self.town.counts.day_index(date.fromisoformat(items[0]))
+        before, expected = work.expected
+        lines = self.town.predicted(day, work.fit, before, expected, self.episodes, self.seed)
+        return [{"date": items[0], **lines}]
+
+    def label(self, work: _RollOut) -> str:
+        """See `Study`."""
+        del work
+        return self.agent.label
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`: mean absolute errors of the fits on the weeks followed, and of all predictions on later days."""
+        from scipy.stats import spearmanr
+
+        town, found = self.town, self._found(results)
+        used = np.flatnonzero(np.isfinite(found.shares["counted"]).any(axis=(1, 2)))
+        if not used.size:
+            if len(found.days) == sum(len(cell.items) for cell in self.cells()):
+                raise InputError(
+                    f"{town.counts.source}: no car park is counted both on days followed and on days held out, want "
+                    "--from others"
+                )
+            return {"rows": []}
+        counts = found.shares["counted"]
+        errors = {name: np.abs(found.shares[name] - counts) for name in PREDICTIONS}
+        errors["fit"] = np.where(np.isfinite(counts), found.fit_error, np.nan)
+        weeks = np.unique((found.days - found.days[0]) // 7, return_inverse=True)[1]
+        come, stay_h = np.nanmean(found.come[used], axis=1), np.nanmean(found.stay_h[used], axis=1)
+        rows: list[Row] = [
+            {
+                "car_park": town.names[number],
+                "capacity": int(town.capacity[number]),
+                "arrivals_a_day": float(come[row]),
+                "stay_h": float(stay_h[row]),
+                "map_weight": float(town.map_weight[number]),
+                "days_held_out": int(np.isfinite(counts[number]).any(axis=1).sum()),
+                **_errors({name: error[[number]] for name, error in errors.items()}, weeks),
+            }
+            for row, number in enumerate(used.tolist())
+        ]
+        return {
+            "rows": rows,
+            **_errors(errors, weeks),
+            "days_held_out": len(found.days),
+            "map_rank_correlation": float(spearmanr(town.map_weight[used], come).statistic)
+            if len(used) > 2
+            else None,
+            "not_in_lot": town.others,
+        }
+
+    def _found(self, results: Results) -> _Found:
+        """Return what is finished as arrays."""
+        town, rows, fits = self.town, results.rows(DAYS), results.rows(FITTED)
+        done = [(cell.work.number, item) for cell in self.cells() for item in cell.items if (item,) in rows]
+        days = np.array([town.counts.day_index(date.fromisoformat(item)) for _, item in done], np.int64)
+        shape = len(town.names), len(done), len(town.hours)
+        shares = {name: np.full(shape, np.nan) for name in ("counted", *PREDICTIONS)}
+        fit_error, come, stay_h = np.full(shape, np.nan), *np.full((2, *shape[:2]), np.nan)
+        for k, (number, item) in enumerate(done):
+            row = rows[item,]
+            at = [town.names.index(name) for name in row["car_park"]]
+            for name, its in shares.items():
+                its[at, k, np.searchsorted(town.hours, row["hour"])] = row[name]
+            for name, fit in fits[number, kind_of(town.counts.weekday[days[k]])]["car_parks"].items():
+                i, purpose = town.names.index(name), PurposeSpec.parse(fit["purpose"], FITTED.file)
+                driven, followed = (np.array(fit[column], np.float64) for column in ("driven", "followed"))
+                fit_error[i, k] = np.abs(driven - followed) / town.capacity[i]
+                come[i, k], stay_h[i, k] = sum(purpose.arrivals_per_hour), purpose.stay_s / HOUR_S
+        return _Found(days, shares, fit_error, come, stay_h)
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: the predictions, scenarios with the demand of the last roll-out, its weekdays as a picture."""
+        from parkenv.show.figures.counted_demand import CarParkDays, save_counted_demand
+
+        town, found, fits = self.town, self._found(result.results), result.results.rows(FITTED)
+        fitted = {kind: fits[self.roll_outs - 1, kind]["car_parks"] for kind in KINDS}
+        tasks: list[Task[object]] = [
+            partial(
+                self.scenario.changed(
+                    demand=self.scenario.demand | {name: its["purpose"] for name, its in car_parks.items()}
+                ).write,
+                result.folder / f"{kind}.json",
+            )
+            for kind, car_parks in fitted.items()
+            if car_parks
+        ]
+        kind = next(kind for kind, car_parks in fitted.items() if car_parks)
+        shown = np.isin(found.days, self.days(self.roll_outs - 1)[1])
+        shown &= np.isin(town.counts.weekday[found.days], KINDS[kind])
+        cars = {name: its[:, shown] * town.capacity[:, None, None] for name, its in found.shares.items()}
+        its = [
+            CarParkDays(
+                town.names[k],
+                town.capacity[k],
+                np.nanmean(cars["simulated"][k], axis=0),
+                cars["mean_followed"][k][0],
+                cars["counted"][k],
+            )
+            for k in np.flatnonzero(np.isfinite(cars["counted"]).any(axis=(1, 2)))
+        ]
+        hours = town.hours.astype(np.float64) + 1.0
+        return [
+            *tasks,
+            partial(_write_predictions, list(result.results.rows(DAYS).values()), result.folder),
+            partial(save_counted_demand, its, hours, result.folder / "demand.png"),
+        ]
+
+
+class _Found(NamedTuple):
+    """What is finished, of n car parks on d days held out; NaN: unknown."""
+
+    days: IntArray  # (d,) indices into the days of the counts
+    shares: dict[str, FloatArray]  # (n, d, n_hours) by column of `PREDICTED`
+    fit_error: FloatArray  # (n, d, n_hours), share of the places that the fit is off, of the weeks before
+    come: FloatArray  # (n, d), cars that come on such a day, by the fit
+    stay_h: FloatArray  # (n, d), their mean stay
+
+
+class _Fits(DemandStudy):
+    """The first stage: demands of the weeks followed, a kind of day each."""
+
+    table: ClassVar[Table] = FITTED
+    doing: ClassVar = "Fitting weeks followed"
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [Cell(_RollOut(number), tuple(KINDS)) for number in range(self.roll_outs)]
+
+    def input_of(self, work: _RollOut, items: Sequence[Any], results: Results) -> _RollOut:
+        """See `Study`."""
+        del items, results
+        return work
+
+    def run(self, work: _RollOut, items: Sequence[Any]) -> list[Row]:
+        """See `Study`."""
+        (kind,), (followed, _) = items, self.days(work.number)
+        days = followed[np.isin(self.town.counts.weekday[followed], KINDS[kind])]
+        fit = self.town.fitted(days, self.rounds, self.episodes, self.seed)
+        return [{**work.columns, "kind": kind, "car_parks": fit}]
+
+
+def _write_predictions(days: Sequence[Row], folder: Path) -> None:
+    """Write what was counted and predicted, a line for each car park and hour of the days held out."""
+    columns = ("car_park", "hour", "counted", *PREDICTIONS)
+    lines = [[line for day in days for line in day[column]] for column in columns]
+    dates = [day["date"] for day in days for _ in day["hour"]]
+    with atomic_write(folder / "predicted.csv") as beside:
+        beside.write_text(f"{','.join(('date', *columns))}\n{csv_columns([dates, *lines])}", encoding="utf-8")
+
+
+def kind_of(weekday: int) -> str:
+    """Return the kind of a day."""
+    return next(kind for kind, weekdays in KINDS.items() if weekday in weekdays)
+
+
+def _errors(errors: Mapping[str, FloatArray], weeks: IntArray) -> Row:
+    """Return mean errors, (n, d, n_hours) each, with intervals over weeks, (d,): the mean of the car parks of each."""
+    from parkenv.studies.statistics import columns_of, mean_interval
+
+    row: Row = {}
+    for name, error in errors.items():
+        by_week = (error[:, weeks == week] for week in range(int(weeks.max()) + 1))
+        means = [[np.nanmean(its) for its in one if np.isfinite(its).any()] for one in by_week]
+        row |= columns_of(f"{name}_error", mean_interval([np.mean(its) for its in means if its]))
+    return row
