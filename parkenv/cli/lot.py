@@ -204,6 +204,7 @@ class Import(Command):
         None,
         "Import only a square around this point, so far to each side.",
         takes="LAT,LON,METRES",
+        default="all of the map",
         parse=lambda text: tuple(numbers_in(text, 3)),
     )
     disabled: bool = option(False, "Also import spaces for disabled drivers.")
