@@ -16,6 +16,8 @@ if is_command():
 
 from gymnasium.envs.registration import register, registry
 
+from parkenv.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from parkenv.engine.model import model
     from parkenv.errors import InputError
@@ -38,8 +40,6 @@ if sys.flags.safe_path:
     from parkenv.files.working_folder import skip_settings
 
     skip_settings()
-
-__version__ = "0.1.0"
 
 _EXPORTS = {
     "ArrivalWindow": "parkenv.world.occupancy.arrival_window",

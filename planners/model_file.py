@@ -19,11 +19,11 @@ from gymnasium import spaces
 from pydantic import Field, JsonValue
 from pydantic_core import to_jsonable_python
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
+from parkenv.version import __version__
 from parkenv.world.lot import ACTIONS
 from planners.model_header import CARD_KEY, read_header
 from planners.names import ALGORITHMS

@@ -17,10 +17,10 @@ from typing import Annotated
 
 import typer
 
-from parkenv import __version__
 from parkenv.cli.command import Entry, make_app
 from parkenv.cli.stop_signals import stop_signals
 from parkenv.errors import InputError
+from parkenv.version import __version__
 from sim_sensors.errors import SensorError
 
 START, SEARCH, SENSE, DRIVE, DATA = (

@@ -10,8 +10,8 @@ from pathlib import Path
 from threading import Event, Thread
 from typing import TYPE_CHECKING, Any
 
-from parkenv import __version__
 from parkenv.files.file_names import is_plain
+from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from rich.console import Console

@@ -7,10 +7,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.spec_file import Spec
 from parkenv.studies.results import Row, read_settings
+from parkenv.version import __version__
 
 
 def search_settings(spec: Any, *fields: str) -> Row:

@@ -9,7 +9,6 @@ from typing import Any, NamedTuple, Protocol, Self
 
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.limited_reading import read_json
@@ -21,6 +20,7 @@ from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import PAGE, SETTINGS, SPEC_FILE, SUMMARY, SUMMARY_PARTIAL
 from parkenv.studies.study import STUDIES, Progress, Study, read_study, study_class
 from parkenv.studies.workers import SERIAL, Task, Workers
+from parkenv.version import __version__
 
 MOST_SLOTS = 20_000
 """Lots with more slots are not replayed: the page would not load."""

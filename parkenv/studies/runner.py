@@ -22,13 +22,13 @@ from tempfile import mkdtemp
 from typing import Any
 from uuid import uuid4
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.folder_lock import only_writer
 from parkenv.files.limited_reading import read_json
 from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row, Table
 from parkenv.studies.study import Progress, Stage, Study, read_study
 from parkenv.studies.workers import Task, Workers
+from parkenv.version import __version__
 
 SYNC_S = 1.0
 """Least time between two flushes of finished rows to disk if they come faster, s."""

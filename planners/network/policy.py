@@ -14,12 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
-from parkenv import __version__
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
+from parkenv.version import __version__
 from planners.model_header import CARD_KEY, read_header
 from planners.network.features import (
     ACTION_COUNT,

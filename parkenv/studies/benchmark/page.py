@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
-from parkenv import __version__
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.show.report.page import Page, page_data
@@ -21,6 +20,7 @@ from parkenv.studies.benchmark.study import RESULT
 from parkenv.studies.benchmark.suite import Suite, Task, mean_time, score_interval, worlds_of
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of
+from parkenv.version import __version__
 from planners.names import AGENTS
 
 PAIRS = 5

@@ -15,7 +15,6 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
@@ -25,6 +24,7 @@ from parkenv.studies.benchmark.suite import CONTROLS, SUITES, Suite, Task, estim
 from parkenv.studies.compare.cases import Case, table
 from parkenv.studies.results import Key, Row, without_nan
 from parkenv.studies.statistics import columns_of
+from parkenv.version import __version__
 
 RESULT_FORMAT = "parkenv-benchmark-result"
 RESULT_VERSION = 2

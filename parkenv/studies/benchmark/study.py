@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.files.option import option
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import CaseStudy
@@ -15,6 +14,7 @@ from parkenv.studies.fields import Agents
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell
 from parkenv.studies.workers import Task
+from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.studies.benchmark.suite import Suite

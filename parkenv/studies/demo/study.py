@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.files.known_names import RigName
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
@@ -21,6 +20,7 @@ from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.sensing.survey_study import PICTURES, SHOWN, SurveyStudy
 from parkenv.studies.study import Cell, Stage
 from parkenv.studies.workers import Task
+from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.mapping.inference import SessionLog

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple, Self
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.known_names import SCENARIO_NAMES
@@ -20,6 +19,7 @@ from parkenv.studies.training.spec import PlacesTrainingSpec, TrainingSpec
 from parkenv.studies.training.training import FIGURE, TEST_SEED
 from parkenv.studies.training.training import MODEL as TRAINED
 from parkenv.studies.workers import SERIAL, Workers
+from parkenv.version import __version__
 from planners.model_file import ModelCard
 
 

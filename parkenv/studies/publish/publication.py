@@ -13,7 +13,6 @@ from typing import ClassVar
 import numpy as np
 import yaml
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.scenarios.build import build
@@ -29,6 +28,7 @@ from parkenv.studies.simulate import FrameRecorder, make_search, simulate
 from parkenv.studies.training.spec import FleetTrainingSpec, TrainingSpec
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.studies.workers import Workers
+from parkenv.version import __version__
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.driving.parking_agents import make_parking_agent

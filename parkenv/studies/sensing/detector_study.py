@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal, get_args
 
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.files.known_names import RigName
 from parkenv.files.spec_file import Axis, DetectorName
 from parkenv.scenarios.spec import scenario_spec
@@ -20,6 +19,7 @@ from parkenv.studies.sensing.sessions import MAP_FILE, SESSION_COLUMNS, SessionT
 from parkenv.studies.sensing.survey_study import DRIVEN, SurveyStudy
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
+from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.studies.runner import Result

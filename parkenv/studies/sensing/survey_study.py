@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import AfterValidator, Field
 
-from parkenv import __version__
 from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
@@ -20,6 +19,7 @@ from parkenv.studies.results import Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
+from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.mapping.survey import SessionResult, Survey, SurveySettings

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, NamedTuple,
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 from pydantic_core import PydanticCustomError
 
-from parkenv import __version__
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import WHOLE
 from parkenv.files.known_names import KnowledgeName
@@ -34,6 +33,7 @@ from parkenv.studies.fields import (
 from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row, without_nan
 from parkenv.studies.study import Cell, Stage, Study
 from parkenv.studies.training.curve_file import CURVE, read_curve
+from parkenv.version import __version__
 from planners.names import PARKING_PLANNER
 
 if TYPE_CHECKING:

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple
 
 from pydantic import Field
 
-from parkenv import __version__
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import VERIFY_CASES
 from parkenv.files.option import option
@@ -17,6 +16,7 @@ from parkenv.files.spec_file import Axis
 from parkenv.studies.fields import Seed
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
+from parkenv.version import __version__
 
 if TYPE_CHECKING:
     from parkenv.studies.runner import Result
