@@ -125,6 +125,29 @@ def test_the_command_compares_lots_and_goes_on_with_another(tmp_path):
     assert "after instead of before" in done.stdout
 
 
+def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
+    demand = {
+        "shoppers": {"arrivals_per_hour": (30.0,) * 24, "stay_s": 900.0},
+        "commuters": {"arrivals_per_hour": (15.0,) * 24, "stay_s": 7200.0},
+    }
+    specs = [
+        BEFORE | {"demand": demand},
+        BEFORE | {"name": "after", "costs": {"give_up_s": 60.0}, "demand": demand},
+    ]
+    its = study(*specs, knows=("own",), arrivals_per_hour=None)
+    days = [[its.run_day(one, day) for day in range(4)] for one in its.fleet_settings]
+    whole, *parts = without_nan(summarize_changes(days, purposes={"before": list(demand)}))
+    assert [row["purpose"] for row in parts] == list(demand)
+    cars = [row["cars_a_day"] for row in parts]
+    assert sum(cars) == pytest.approx(whole["cars_a_day"])
+    assert np.average([row["change_s"] for row in parts], weights=cars) == pytest.approx(
+        whole["change_s"], rel=0.1
+    )
+    assert all(low <= row["change_s"] <= high for row in parts for low, high in [row["change_s_ci95"]])
+    assert "commuters" in sentence(parts[1])
+    assert not [row for row in headlines([], [whole, *parts]) if "commuters" in row["where"]]
+
+
 def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
     lot = make_scenario("campus").lot
     zone = np.where(lot.walk_m() <= np.median(lot.walk_m()), "near", "far")

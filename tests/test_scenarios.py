@@ -1,6 +1,7 @@
 """Scenario files: their scenarios, and errors of invalid files."""
 
 import gymnasium as gym
+import jsonschema
 import numpy as np
 import pytest
 from small_lots import CAR_PARKS
@@ -13,6 +14,7 @@ from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore, Session
 from parkenv.scenarios.spec import ScenarioSpec, scenario_spec
+from parkenv.studies.study import schemas
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.constant_map import FlatMap
 from parkenv.world.occupancy.day_error import DayError, nearness
@@ -127,6 +129,26 @@ def test_a_file_says_it_all(tmp_path):
     # What was read can be written and read again, from anywhere.
     scenario_spec(file).write(tmp_path / "copy.json")
     assert ScenarioSpec.read(tmp_path / "copy.json") == scenario_spec(file)
+
+
+def test_a_base_has_what_a_file_leaves_out(tmp_path):
+    path = tmp_path / "dear.toml"
+    path.write_text(
+        'base = "town"\ncosts = { prices = { centre = 3 } }\narrivals = { hours = "09:00-10:00" }\n'
+        "[demand.shoppers]\nstay_s = 60"
+    )
+    its, town = ScenarioSpec.read(path), scenario_spec("town")
+    changed = ("costs", "arrivals", "demand", "name")
+    assert all(
+        getattr(its, name) == getattr(town, name) for name in type(town).model_fields if name not in changed
+    )
+    assert (its.title, its.costs.give_up_s, its.costs.prices["centre"]) == ("dear", town.costs.give_up_s, 3.0)
+    assert its.arrivals == town.arrivals.changed(hours="09:00-10:00")
+    shoppers = town.demand["shoppers"].changed(stay_s=60.0)
+    assert its.demand == {**town.demand, "shoppers": shoppers}
+    jsonschema.validate({"base": "town"}, schemas()["scenario"])
+    with pytest.raises(InputError, match="base is 'campsu', want"):
+        ScenarioSpec.parse({"base": "campsu"}, "")
 
 
 def test_logs_and_maps(tmp_path):

@@ -123,13 +123,16 @@ class Fleet(AgentStudyCommand):
         if changes:
             groups = ["members s [95 %]", "others s [95 %]"] if mixed else []
             zone = ["zone before"] if any(row["zone"] for row in changes) else []
+            purpose = ["purpose"] if any(row["purpose"] for row in changes) else []
             paid = ["paid a car"] if any(is_known(row["paid_change"]) for row in changes) else []
             headings = [
-                "after", "before", *zone, *setting, "all cars s [95 %]", *groups, *paid, "better off", "worse off"
+                "after", "before", *zone, *purpose, *setting, "all cars s [95 %]", *groups, *paid, "better off",
+                "worse off",
             ]  # fmt: skip
             cells = [
                 [
                     row["after"], row["before"], *([row["zone"] or "all"] if zone else []),
+                    *([row["purpose"] or "all"] if purpose else []),
                     *_setting(row, names), _interval(row, "change_s", "+.1f"),
                     *(_interval(row, f"{group.split()[0]}_change_s", "+.1f") for group in groups),
                     *(_interval(row, "paid_change", "+.2f") for _ in paid),

@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections.abc import Mapping
 from datetime import date, datetime
 from pathlib import Path
-from typing import Annotated, Self
+from typing import Annotated, Any, Self
 
 from pydantic import (
     AfterValidator,
     BeforeValidator,
+    ConfigDict,
     Field,
     GetJsonSchemaHandler,
     ValidationInfo,
@@ -21,7 +23,7 @@ from pydantic import (
     model_validator,
 )
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema
+from pydantic_core import CoreSchema, PydanticCustomError
 
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import (
@@ -573,8 +575,24 @@ def _name(value: str) -> str:
     return value
 
 
+_MERGED = ("arrivals", "costs", "demand", "speeds")
+"""Tables of a scenario of which each value may be another one than the base's; others are replaced whole."""
+
+
+def _merged(base: object, value: object) -> object:
+    if not (isinstance(base, Mapping) and isinstance(value, Mapping)):
+        return value
+    return {**base, **{name: _merged(base.get(name), its) for name, its in value.items()}}
+
+
+def _lot_or_base(schema: dict[str, Any]) -> None:
+    schema["anyOf"] = [{"required": schema.pop("required")}, {"required": ["base"]}]
+
+
 class ScenarioSpec(Spec):
     """A scenario file: lot, occupancy, forecast, sensor model, goal, speeds and costs."""
+
+    model_config = ConfigDict(json_schema_extra=_lot_or_base)
 
     name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
     lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
@@ -618,6 +636,28 @@ class ScenarioSpec(Spec):
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."
     )
+    base: PackagedLot | None = Field(
+        None,
+        description="A packaged scenario for what is left out, also single values of arrivals, costs, demand, speeds.",
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _complete(cls, tables: Any) -> Any:
+        """Add what the base has."""
+        if not isinstance(tables, Mapping) or tables.get("base") is None:
+            return tables
+        if tables["base"] not in SCENARIO_NAMES:
+            given, known = repr(tables["base"])[:80], ", ".join(SCENARIO_NAMES)
+            raise PydanticCustomError(
+                "whole", "base is {given}, want {known}", {"given": given, "known": known}
+            )
+        base = cls.read(_PACKAGED / f"{tables['base']}.toml").tables() | {"name": ""}
+        return base | {
+            name: _merged(base.get(name), value) if name in _MERGED else value
+            for name, value in tables.items()
+            if name != "base"
+        }
 
     @property
     def title(self) -> str:

@@ -33,7 +33,9 @@ GUIDANCE = {
 
 
 def summarize_changes(
-    settings: Sequence[list[Row]], prices: Mapping[str, Mapping[str, float]] = MappingProxyType({})
+    settings: Sequence[list[Row]],
+    prices: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
+    purposes: Mapping[str, Sequence[str]] = MappingProxyType({}),
 ) -> list[Row]:
     """Return a row for each change between two settings, from the days of each setting, at least one.
 
@@ -41,12 +43,13 @@ def summarize_changes(
     else is equal. Days are paired, and on each of them the cars: members, and others, are the same cars before and
     after. Differences are those after minus those before, so that negative times are gains. Where a lot has several
     zones, further rows are about the cars that parked in each `zone` before, and about those that found no slot, if
-    there are some on each day: those who park gain less than the others by any change, as they had luck before. `zone`
-    is None for all cars.
+    there are some on each day: those who park gain less than the others by any change, as they had luck before. Of
+    several purposes, further rows are about the cars of each `purpose`. Both are None for all cars.
 
     Args:
         settings: the days of each setting.
         prices: of each scenario, the price of an hour in each zone of the lot, in the order of the zones.
+        purposes: of each scenario, those of its own demand, in their order, where there are several.
     """
     settings = [[_with_lists(day) for day in days] for days in settings]
     by_setting = {tuple(days[0][name] for name in SETTING_COLUMNS): days for days in settings}
@@ -65,12 +68,18 @@ def summarize_changes(
                 old, new = (prices.get(str(one["scenario"]), {}) for one in (its | before, its))
                 head["prices"] = _new_prices(old, new)
                 zones = enumerate((NOWHERE, *old)) if len(old) > 1 else ()
-                for zone_number, zone in ((None, None), *zones):
-                    changes = [_change(*pair, zone_number) for pair in pairs]
-                    if zone != NOWHERE or all(change["cars_a_day"] for change in changes):
-                        rows.append(
-                            head | {"zone": zone} | day_means(changes, ("cars_a_day", *CHANGES), CHANGES)
-                        )
+                mixed = all(len(day["purpose"]) for day in pairs[0])
+                named = enumerate(purposes.get(str((its | before)["scenario"]), ())) if mixed else ()
+                parts = [
+                    ("", None, None),
+                    *(("zone", *one) for one in zones),
+                    *(("purpose", *one) for one in named),
+                ]
+                for column, number, name in parts:
+                    changes = [_change(*pair, column, number) for pair in pairs]
+                    if name != NOWHERE or all(change["cars_a_day"] for change in changes):
+                        part = {"zone": None, "purpose": None} | ({column: name} if column else {})
+                        rows.append(head | part | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
     return sorted(rows, key=lambda row: row["change"] != "scenario")
 
 
@@ -105,13 +114,14 @@ def _new_prices(before: Mapping[str, float], after: Mapping[str, float]) -> str 
     return f"{', '.join(said)} an hour" if said else None
 
 
-def _change(after: Row, before: Row, zone_number: int | None) -> Row:
-    """Return what changes on a day, with its lists, for cars that parked in a zone before; NaN where it is not known.
+def _change(after: Row, before: Row, column: str, number: int | None) -> Row:
+    """Return what changes on a day, with its lists, for some cars; NaN where it is not known.
 
-    Zones have the numbers of `CAR_LISTS`: from 1, and 0 for no slot. None is for all cars.
+    They are those that have a number in a column of `CAR_LISTS` before: that parked in a `zone`, or are of a `purpose`.
+    None is for all cars.
     """
     row = dict.fromkeys(("cars_a_day", *CHANGES), float("nan"))
-    if zone_number is None:
+    if number is None:
         row |= {
             "cars_a_day": after["cars"],
             "change_s": after["total_s"] - before["total_s"],
@@ -123,14 +133,14 @@ def _change(after: Row, before: Row, zone_number: int | None) -> Row:
     times, earlier, member = after["total_cs"], before["total_cs"], after["member"]
     if not len(times) == len(earlier) == len(member) > 0:
         return row
-    its = np.ones(len(times), bool) if zone_number is None else before["zone"] == zone_number
+    its = np.ones(len(times), bool) if number is None else before[column] == number
     gained = (times - earlier) / 100.0
     cents, earlier_cents = after["paid_cents"], before["paid_cents"]
     if len(cents) or len(earlier_cents):
         free = np.zeros(len(times))  # in a lot without prices
         cents, earlier_cents = (known if len(known) else free for known in (cents, earlier_cents))
         row["paid_change"] = _mean((cents - earlier_cents)[its] / 100.0)
-    if zone_number is not None:
+    if number is not None:
         row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])}
     return row | {
         "members_change_s": _mean(gained[its & (member == 1.0)]),
@@ -206,13 +216,20 @@ def where(row: Row) -> list[str]:
     """Return the prices that change, and what is equal before and after a change, in words."""
     if row["change"] == "knows":
         return place(row)
-    equal = [row["prices"]] if row["prices"] and not row["zone"] else []  # said once, of all cars
+    equal = [row["prices"]] if row["prices"] and not of_part(row) else []  # said once, of all cars
     equal += [row["agents"], rate_text(row["arrivals_per_hour"])]
     equal += [] if row["knows"] == OWN else [_words("knows", row)]
+    if row["purpose"]:
+        return [*equal, str(row["purpose"])]
     if not row["zone"]:
         return equal
     found = "found no slot" if row["zone"] == NOWHERE else f"parked in zone {row['zone']}"
     return [*equal, f"cars that {found} before"]
+
+
+def of_part(row: Row) -> bool:
+    """Return whether a change is about the cars of a zone or of a purpose, not about all."""
+    return bool(row["zone"] or row["purpose"])
 
 
 def place(row: Row) -> list[str]:
@@ -255,7 +272,7 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
 
     Each has a `label`, a `value` in words, and for a change the shares `better` and `worse`, if they are known.
     """
-    if not (chosen := [row for row in shown_changes(changes) if not row["zone"]]):
+    if not (chosen := [row for row in shown_changes(changes) if not of_part(row)]):
         totals = [
             {"label": ", ".join(place(row)), "value": f"{row['total_s']:.1f} s a car"} for row in rows[:most]
         ]
@@ -294,13 +311,13 @@ def shown_changes(changes: Sequence[Row]) -> list[Row]:
     told = [
         row for row in changes
         if row["change"] == "scenario" and is_known(row["change_s"]) and row["share"] in (0.0, most)
-        and not (row["zone"] and row["share"])
+        and not (of_part(row) and row["share"])
     ]  # fmt: skip
     busiest = sorted((row["cars_a_day"] for row in told if row["zone"]), reverse=True)[:_ZONES_TOLD]
     told = [row for row in told if not row["zone"] or row["cars_a_day"] >= busiest[-1]]
     of_guidance: dict[tuple[Any, ...], list[Row]] = {}
     for row in changes:
-        if row["change"] == "knows" and not row["zone"]:
+        if row["change"] == "knows" and not of_part(row):
             key = row["scenario"], row["agents"], row["arrivals_per_hour"]
             of_guidance.setdefault(key, []).append(row)
     # A choice by the result would be a winner of chance.

@@ -184,6 +184,8 @@ def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     if has_zones(fleet.scenario):
         zone = np.where(cars["slot"] >= 0, 1 + lot.zone_of_slot[cars["slot"]], 0)
         lists |= {"zone": zone, "paid_cents": 100.0 * paid(fleet)[arrives]}
+    if len(fleet.demand.purposes) > 1:
+        lists["purpose"] = cars["purpose"]
     return {name: " ".join(map(str, np.rint(values).astype(int).tolist())) for name, values in lists.items()}
 
 

@@ -27,9 +27,10 @@ MEASURES = (
     "bound_s", "clairvoyant_s", *COST_FIELDS, "paid", "paying_share",
 )  # fmt: skip
 """Measures of a day, of which a summary has the mean over days."""
-CAR_LISTS = ("total_cs", "member", "zone", "paid_cents")
+CAR_LISTS = ("total_cs", "member", "zone", "paid_cents", "purpose")
 """Lists over the cars of a day, in the order of their arrivals: total time in centiseconds; 1 for members; and in lots
-with zones or prices, number of the zone that a car parks in, from 1, or 0, and what it pays for its stay."""
+with zones or prices, number of the zone that a car parks in, from 1, or 0, and what it pays for its stay; of several
+purposes, number of the car's, from 0."""
 BY_HOUR = ("occupancy_by_hour", "counted_by_hour")
 """Columns with the mean share of taken slots in each hour of the day's arrivals, simulated and as counted."""
 _WANTED = (

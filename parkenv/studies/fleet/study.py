@@ -445,11 +445,16 @@ class FleetStudy(Study):
             name: {zone.name: float(zone.price.amount(its.priced_at_s, HOUR_S)) for zone in its.zone_rules}
             for name, its in self.built.items()
         }
+        purposes = {
+            name: [purpose.name for purpose in its.demand.purposes]
+            for name, its in self.built.items()
+            if its.demand is not None
+        }
         return {
             "manoeuvre_s": self.blocked_s,
             **options,
             "rows": summarize_days(days),
-            "changes": summarize_changes(days, prices),
+            "changes": summarize_changes(days, prices, purposes),
             "hours": summarize_hours(days, int(first)),
             "zones": summarize_blocks(zoned, "zone", prices),
             "blocks": summarize_blocks(grouped, "block", prices),
