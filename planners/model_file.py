@@ -324,6 +324,11 @@ def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
         )
 
 
+def _no_rate(progress: float) -> float:
+    """Return the rate of a model that is not trained further."""
+    return 0.0 * progress
+
+
 def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
     """Convert an archive of stable-baselines3's `model.save` to a model file beside it.
 
@@ -342,8 +347,9 @@ def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
     made = Path(path).with_suffix(SUFFIX)
     if made.exists():
         raise InputError(f"{made}: exists; name it instead of {path}, or remove it")
-    # A model that is not trained further needs no replay buffer.
+    # A model that is not trained further needs no replay buffer, and no schedules, which may be another package's.
     unneeded: dict[str, Any] = {"replay_buffer_class": None, "replay_buffer_kwargs": {}, "buffer_size": 1}
+    unneeded |= {"learning_rate": 0.0} | dict.fromkeys(("lr_schedule", "clip_range"), _no_rate)
     kind = algorithm_class(algorithm)
     try:
         model = kind.load(Path(path), device="cpu", custom_objects=unneeded)

@@ -109,6 +109,11 @@ class Surroundings(NamedTuple):
     columns: NDArray[np.int32]  # (5k,) int32, scratch space for the columns of a row's slots
 
     @property
+    def n_numbers(self) -> int:
+        """Length of the observation, 46 + 8k."""
+        return FIRST_NEAR + PER_NEAR * (self.columns.size // (N_MOVES + 1))
+
+    @property
     def n_bytes(self) -> int:
         """Memory, bytes."""
         return sum(array.nbytes for array in self)

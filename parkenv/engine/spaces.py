@@ -2,21 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from operator import index
 from typing import Any
 
 import numpy as np
 from gymnasium import spaces
+from numpy.typing import NDArray
 
 from parkenv.engine.records import NEVER_OBSERVED, most_observed_in
 from parkenv.errors import InputError
 from parkenv.world.lot import ACTIONS, PARK
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.scenario import SearchProblem
+from parkenv.world.week import DAY_S
 
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
+OBSERVATIONS = ("full", "occupancy", "local", "truth", "step")
+"""What a search may observe; see `parkenv.envs.search.SearchEnv`."""
+BELIEF_PARTS = ("belief", "step_observed")
+"""What `occupancy` and its twins leave out of `full`."""
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
+_FLAT = ("p_occupied", "day_error", "action_mask")
 
 
 def space_of(scenarios: Sequence[SearchProblem], most_observed: int | None = None) -> spaces.Dict:
@@ -42,6 +49,55 @@ def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Di
             "action_mask": spaces.Box(0, 1, (len(ACTIONS),), np.int8),
         }
     )
+
+
+class FlatLayout:
+    """Turns observations into one vector each, for learners that take no `Dict`.
+
+    A vector is `local` or `scan`, if the observation has it: they tell which moves there are. Else it has these parts:
+
+    | Part | Size | Meaning |
+    |---|---|---|
+    | vertex | n_vertices | 1 at the vertex of the car, 0 elsewhere |
+    | time | 3 | s / (s + 60) of the s seconds since the search began; sine and cosine of the time of day |
+    | `p_occupied` | n_slots | as observed |
+    | `day_error` | 2 | as observed |
+    | `action_mask` | 5 | as observed |
+
+    Args:
+        space: of the observations.
+
+    Attributes:
+        space: of the vectors, float32.
+
+    Raises:
+        InputError: the observations have a belief, or none of these parts.
+    """
+
+    def __init__(self, space: spaces.Dict) -> None:
+        self._whole = next((name for name in ("local", "scan") if name in space.spaces), None)
+        if self._whole is not None:
+            self.space = space[self._whole]
+            return
+        if "p_occupied" not in space.spaces or "belief" in space.spaces:
+            raise InputError("flat is True, want an observation other than full, such as local or occupancy")
+        place: Any = space["vertex"]
+        self._places = np.eye(int(place.n), dtype=np.float32)
+        rest = [space[name] for name in _FLAT]
+        low = np.concatenate([np.zeros(place.n + 1), [-1.0, -1.0], *(one.low for one in rest)])  # type: ignore[attr-defined]
+        high = np.concatenate([np.ones(place.n + 3), *(one.high for one in rest)])  # type: ignore[attr-defined]
+        self.space = spaces.Box(low.astype(np.float32), high.astype(np.float32))
+
+    def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.float32]:
+        """Return the vector of an observation, or those of a batch, (n, size) float32."""
+        if self._whole is not None:
+            whole: NDArray[np.float32] = observation[self._whole]
+            return whole
+        now, elapsed = np.moveaxis(observation["time"], -1, 0)
+        angle = now * (2.0 * np.pi / DAY_S)
+        times = np.stack([elapsed / (elapsed + 60.0), np.sin(angle), np.cos(angle)], axis=-1)
+        parts = [self._places[observation["vertex"]], times, *(observation[name] for name in _FLAT)]
+        return np.concatenate(parts, axis=-1, dtype=np.float32)
 
 
 def _box_of_parts(bounds: Sequence[tuple[float, float]], length: int) -> spaces.Box:

@@ -109,7 +109,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
     ## Arguments
     | Name | Default | Meaning |
     |------|---------|---------|
-    | `scenario`, `render_mode`, `observation`, `k`, changes | | as in `parkenv/Search-v2` |
+    | `scenario`, `render_mode`, `observation`, `k`, `flat`, `reward_scale`, changes | | as in `parkenv/Search-v2` |
     | `rig` | the scenario's | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 2 | largest number of captures on an edge |
@@ -153,13 +153,15 @@ class SearchPerceptionEnv(SensingSearchEnv):
         picture_width: int | None = None,
         observation: str = "full",
         k: int | None = None,
+        flat: bool = False,
+        reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
         require_changes((type(self),), changes)
         world = make_scenario(scenario, **changes)
         sensors = make_rig(rig, world, picture_width)
         self.perception = OnboardPerception(world, sensors, weather, captures, every, detector)
-        super().__init__(self.perception.scenario, render_mode, observation, k)
+        super().__init__(self.perception.scenario, render_mode, observation, k, flat, reward_scale)
         self._sampler = self.perception.sampler
 
     def reset(

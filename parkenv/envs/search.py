@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import seed_state
+from parkenv.engine.batch import observe_last_step, observe_truth
 from parkenv.engine.kernel import (
     begin_search_at,
     init_external_forecast_at,
@@ -27,10 +28,10 @@ from parkenv.engine.local_observation import (
     observe_surroundings_at,
 )
 from parkenv.engine.records import ScenarioRecords, Searches
-from parkenv.engine.spaces import action_number, space_of
+from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout, action_number, space_of
 from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError, require_one_of, reset_options
+from parkenv.errors import InputError, require_number, require_one_of, reset_options
 from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.world.lot import ACTIONS
 from parkenv.world.occupancy.python_functions import raise_error
@@ -39,9 +40,8 @@ from parkenv.world.scenario import Scenario
 if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
-OBSERVATIONS = ("full", "occupancy", "local")
-BELIEF_PARTS = ("belief", "step_observed")
-"""What `occupancy` leaves out."""
+TWINS = {"truth": observe_truth, "step": observe_last_step}
+"""Twins of `occupancy` by name: the functions of the address of searches that write `p_occupied`, (n, n_slots)."""
 _REBUILT = {
     "searches", "scenario", "_state", "_address", "_copiers", "_place", "_step", "_copy_mask", "_copy_masks",
     "_seeded_with", "_begun", "_over",
@@ -169,7 +169,12 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
       slots are truly taken, hidden from the agent, and as colours the agent's belief.
     - `observation`: `full`, as above; `occupancy`, the same without `belief` and `step_observed`; or `local`, a `Dict`
       of `local` and `action_mask` that describes the car's surroundings, see `parkenv.engine.local_observation`.
+      For studies of what information is worth, `occupancy` has two twins with other numbers in `p_occupied`: `step`
+      has what the last step observed, 1 taken, 0 free and 0.5 for all other slots, and `truth` has the hidden state
+      of all slots, which no driver knows. `parkenv compare` gives neither to any agent.
     - `k`: number of slots that `local` describes, 5 if None.
+    - `flat`: whether the observation is one vector, see `parkenv.engine.spaces.FlatLayout`; not with `full`.
+    - `reward_scale`: factor of the rewards and of `reward_terms`; times and metrics in `info` remain in seconds.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`; unknown ones raise a TypeError.
 
     ```python
@@ -219,6 +224,8 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         render_mode: str | None = None,
         observation: str = "full",
         k: int | None = None,
+        flat: bool = False,
+        reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
@@ -227,19 +234,27 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         require_changes((type(self),), changes)
         if k is not None and observation != "local":
             raise InputError(f"k is {k!r}, want None unless observation is local")
+        require_number("reward_scale", reward_scale, above=0.0)
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.render_mode = render_mode
         self.action_space = spaces.Discrete(len(ACTIONS))
         self.observation_space = space_of(self.scenarios)
         self._is_full = observation == "full"
         self._around: Surroundings | None = None
-        if observation == "occupancy":
+        self._twin = observation if observation in TWINS else None
+        if observation == "occupancy" or self._twin:
             self.observation_space = spaces.Dict(
                 {name: one for name, one in self.observation_space.items() if name not in BELIEF_PARTS}
             )
         elif observation == "local":
             k = NEAR_SLOTS if k is None else k
             self._around, self.observation_space = Surroundings.of(self.scenarios, k), local_space(k)
+        self._flat: FlatLayout | None = None
+        if flat:
+            self._flat = FlatLayout(self.observation_space)
+            self.observation_space = self._flat.space  # type: ignore[assignment]
+            self._is_full = False
+        self.reward_scale = float(reward_scale)
         self._vertices = list(np.arange(max(one.lot.n_vertices for one in self.scenarios)))
         self._renderer: SearchRenderer | None = None
         self._make_search()
@@ -343,6 +358,9 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         if vertex != path[-1]:
             path.append(vertex)
         self._over = over
+        if self.reward_scale != 1.0:
+            reward *= self.reward_scale
+            info["reward_terms"] = {n: term * self.reward_scale for n, term in info["reward_terms"].items()}
         if self.render_mode == "human":
             self.render()
         return self._observation(vertex), reward, over, False, info
@@ -395,9 +413,10 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             self._renderer.window.close()
             self._renderer = None
 
-    def _observation(self, vertex: int) -> dict[str, Any]:
+    def _observation(self, vertex: int) -> Any:
         if not self._is_full:
-            return self._smaller_observation(vertex)
+            smaller = self._smaller_observation(vertex)
+            return smaller if self._flat is None else self._flat(smaller)
         time, p_occupied, belief, step_observed, day_error = self._copiers
         return {
             "vertex": self._vertices[vertex],
@@ -412,11 +431,15 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     def _smaller_observation(self, vertex: int) -> dict[str, Any]:
         mask = self._copy_mask[vertex]()
         if self._around is not None:
-            local = np.empty(self.observation_space["local"].shape or (), np.float32)
+            local = np.empty(self._around.n_numbers, np.float32)
             observe_surroundings_at(self._address, self._around, local)
             return {"local": local, "action_mask": mask}
         time, p_occupied, _, _, day_error = self._copiers
-        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": p_occupied()}
+        occupied = p_occupied()
+        if self._twin is not None:
+            occupied[:] = 1.0
+            TWINS[self._twin](self._address, occupied[None])
+        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": occupied}
         return {**observation, "day_error": day_error(), "action_mask": mask}
 
 

@@ -20,16 +20,18 @@ from parkenv.engine.batch import (
     LocalObserver,
     Observer,
     Steps,
+    TwinObserver,
     arrive_all,
     copy_fields,
     first_wrong,
 )
 from parkenv.engine.local_observation import NEAR_SLOTS
 from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecords
+from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout
 from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
-from parkenv.envs.search import BELIEF_PARTS, OBSERVATIONS
-from parkenv.errors import InputError, require_whole, reset_options
+from parkenv.envs.search import TWINS
+from parkenv.errors import InputError, require_number, require_whole, reset_options
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios, require_changes
 from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
@@ -67,6 +69,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     - `observation="occupancy"`: the same without `belief` and `step_observed`, which saves copying them.
     - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.engine.local_observation`. Its size and
       cost are the same on every lot.
+    - `observation="truth"` and `"step"`: twins of `occupancy` with other numbers in `p_occupied`.
     - `observation="scan"`: a `Dict` of `scan` and `action_mask`, in one scenario; see
       `parkenv.envs.scan_observation`.
 
@@ -99,9 +102,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ## Arguments
     - `num_envs`: number of environments.
     - `scenario`: as in `parkenv/Search-v2`: a scenario, its name, a file, a folder of files, or a sequence of these.
-    - `observation`: full, occupancy, local or scan; or a function of `ScenarioRecords` and `num_envs` that returns a
-      `parkenv.engine.batch.Observer`.
+    - `observation`: full, occupancy, local, truth, step or scan; or a function of `ScenarioRecords` and `num_envs` that
+      returns a `parkenv.engine.batch.Observer`.
     - `k`: number of slots that `local` describes, 5 if None; or of scans in `scan`, 4 if None.
+    - `flat`, `reward_scale`: as in `parkenv/Search-v2`; `flat` takes `scan`, too.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
     - `copy`: False returns arrays that the next step overwrites, which saves copying them.
@@ -141,6 +145,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         copy: bool = True,
         render_mode: str | None = None,
+        flat: bool = False,
+        reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
         _require_count("num_envs", num_envs, MAX_ENVS)
@@ -156,6 +162,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         require_changes((type(self), ParkSearchVectorEnv), changes)
         if k is not None and observation not in ("local", "scan"):
             raise InputError(f"k is {k!r}, want None unless observation is local or scan")
+        require_number("reward_scale", reward_scale, above=0.0)
         observer = _observer(observation, k) if isinstance(observation, str) else observation
         self.scenarios = tuple(make_scenarios(scenario, **changes))
         self.num_envs = n = int(num_envs)
@@ -165,7 +172,9 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         self.observer = observer(self._tables, n)
         self._searches, self._seen = self.observer.searches, self.observer.seen
         self.single_action_space = spaces.Discrete(N_ACTIONS)
-        self.single_observation_space = self.observer.space
+        self._flat = FlatLayout(self.observer.space) if flat else None
+        self.single_observation_space = self.observer.space if self._flat is None else self._flat.space
+        self.reward_scale = float(reward_scale)
         self.action_space = batch_space(self.single_action_space, n)
         self.observation_space = batch_space(self.single_observation_space, n)
         self._names = np.array([one.name for one in self.scenarios])
@@ -183,7 +192,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     def reward_terms(self) -> dict[str, FloatArray]:
         """The terms of the last step's rewards, (n_envs,) each."""
         records = self._searches.records
-        return {name: -records[field] for name, field in zip(REWARD_TERMS, STEP_FIELDS, strict=True)}
+        fields = zip(REWARD_TERMS, STEP_FIELDS, strict=True)
+        return {name: records[field] * -self.reward_scale for name, field in fields}
 
     @property
     def place_of(self) -> IntArray:
@@ -326,6 +336,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         results = steps.rewards, steps.terminated, steps.truncated
         if self._copy or self._mode is AutoresetMode.SAME_STEP:
             results = steps.rewards.copy(), steps.terminated.copy(), steps.truncated.copy()
+        if self.reward_scale != 1.0:
+            results = results[0] * self.reward_scale, *results[1:]
         if self._mode is AutoresetMode.SAME_STEP and done.any():
             self._arrive(done)
             self._step(actions, done, ~done)
@@ -365,13 +377,15 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         for i in np.flatnonzero(which):
             searches.complete_arrival(int(i))
 
-    def _observations(self) -> dict[str, NDArray[Any]]:
-        return self.observer.observations() if self._copy else dict(self._seen)
+    def _observations(self) -> Any:
+        observations = self.observer.observations() if self._copy else dict(self._seen)
+        return observations if self._flat is None else self._flat(observations)
 
     def _final_observations(self, done: BoolArray) -> NDArray[np.object_]:
         final = np.full(self.num_envs, None, dtype=object)
         for i in np.flatnonzero(done):
-            final[i] = {name: a[i].copy() for name, a in self._seen.items()}
+            one = {name: a[i].copy() for name, a in self._seen.items()}
+            final[i] = one if self._flat is None else self._flat(one)
         return final
 
     def _metrics(self, done: BoolArray) -> dict[str, Any]:
@@ -382,7 +396,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         views = [words.view(dtype)[:, :: 8 // dtype.itemsize] for dtype in _TYPES]
         metrics: dict[str, Any] = {name: views[dtype][i] for i, (name, dtype) in enumerate(_METRIC_TYPES)}
         costs = words[len(METRICS) :].view(np.float64)
-        terms = dict(zip(REWARD_TERMS, np.negative(costs, out=costs), strict=True))
+        terms = dict(zip(REWARD_TERMS, np.multiply(costs, -self.reward_scale, out=costs), strict=True))
         metrics["reward_terms"] = terms | dict.fromkeys(_WHICH_TERMS, done)
         metrics["place"] = self._names[self.place_of]
         return metrics | dict.fromkeys(_WHICH, done)
@@ -460,6 +474,8 @@ def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int
         return BeliefObserver
     if observation == "occupancy":
         return lambda tables, n: BeliefObserver(tables, n, without=BELIEF_PARTS)
+    if observation in TWINS:
+        return partial(TwinObserver, observe=TWINS[observation])
     if observation == "local":
         return lambda tables, n: LocalObserver(tables, n, NEAR_SLOTS if k is None else k)
     if observation == "scan":

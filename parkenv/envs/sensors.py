@@ -104,7 +104,8 @@ class SearchSensorsEnv(SensingSearchEnv):
     ## Arguments
     | Name | Default | Meaning |
     |------|---------|---------|
-    | `scenario`, `render_mode`, changes | | as in `parkenv/Search-v2`; `traffic=Traffic(4, 6)` adds road users |
+    | `scenario`, `render_mode`, `reward_scale`, changes | | as in `parkenv/Search-v2`; `traffic=Traffic(4, 6)` adds \
+road users |
     | `rig` | the scenario's | `laser` (the thesis's camera and 270° laser), `stereo`, `both_sides`, or a `SensorRig` |
     | `weather` | `None` | `sunny`, `overcast`, `low_sun`, `dusk`, `rain`; `None`: drawn for each episode |
     | `captures` | 4 | largest number of captures on an edge |
@@ -139,12 +140,13 @@ class SearchSensorsEnv(SensingSearchEnv):
         every: float = 1.0,
         observation: str = "full",
         picture_width: int | None = None,
+        reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
         if observation not in OBSERVATIONS:
             raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
         require_changes((type(self),), changes)
-        super().__init__(make_scenario(scenario, **changes), render_mode)
+        super().__init__(make_scenario(scenario, **changes), render_mode, reward_scale=reward_scale)
         sensors = make_rig(rig, self.scenario, picture_width)
         if observation == "scan":
             if not sensors.lasers:
@@ -171,7 +173,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     def _observation(self, vertex: int) -> dict[str, Any]:
         state = self._state
         self._captures = [] if state.parked else self._sampler.sample_step(state, self._before)
-        observation = super()._observation(vertex)
+        observation: dict[str, Any] = super()._observation(vertex)
         for name in _NOT_SENSED:
             del observation[name]
         for name, space in self.observation_space.items():
