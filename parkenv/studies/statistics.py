@@ -280,11 +280,22 @@ def summarize(
         row |= columns_of("difference_s", mean_interval(paired_differences(episodes, first)))
     row |= {name: float(_column(episodes, name).mean()) for name in MEANS}
     row |= columns_of("regret_s", mean_interval(total - _column(episodes, "bound_s")))
+    return row | decision_columns(decision_s)
+
+
+def decision_columns(decision_s: ArrayLike) -> dict[str, float]:
+    """Return median and 99th percentile of wall times of decisions, ms, as columns; none without times.
+
+    Args:
+        decision_s: (k,) wall time of single decisions, s.
+    """
     milliseconds = 1e3 * np.asarray(decision_s, dtype=np.float64)
-    if len(milliseconds):
-        row["decision_ms"] = float(np.median(milliseconds))
-        row["decision_ms_p99"] = float(np.quantile(milliseconds, 0.99))
-    return row
+    if not len(milliseconds):
+        return {}
+    return {
+        "decision_ms": float(np.median(milliseconds)),
+        "decision_ms_p99": float(np.quantile(milliseconds, 0.99)),
+    }
 
 
 def paired_differences(

@@ -22,8 +22,8 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
 from parkenv.studies.benchmark.suite import CONTROLS, SUITES, Suite, Task, estimate, score_of, worlds_of
 from parkenv.studies.compare.cases import Case, table
-from parkenv.studies.results import Key, Row, without_nan
-from parkenv.studies.statistics import columns_of
+from parkenv.studies.results import Key, Row, decision_s, without_nan
+from parkenv.studies.statistics import columns_of, decision_columns
 from parkenv.version import __version__
 
 RESULT_FORMAT = "parkenv-benchmark-result"
@@ -91,24 +91,35 @@ def score_rows(
     rows have none.
     """
     cells, tasks, rows = list(cells), {task.name: task for task in suite.tasks}, []
-    done = {
-        (case.scenario.name, case.label): [finished[key] for s in seeds if (key := case.key(s)) in finished]
-        for case, seeds in cells
-    }
-    for row in table(cells, finished):
-        task, its = tasks[row["scenario"]], done[row["scenario"], row["agent"]]
-        row = {"task": task.name, "agent": row["agent"], **{metric: row.get(metric) for metric in METRICS}}
+    plain = table(cells, finished) if suite.seeds else []
+    summaries = {(row["scenario"], row["agent"]): row for row in plain}
+    for case, seeds in cells:
+        task = tasks[case.scenario.name]
+        its = [finished[key] for seed in seeds if (key := case.key(seed)) in finished]
+        if len(its) < (len(seeds) if task.strata else 1):
+            continue
         total = np.array([search["total_s"] for search in its])
         worlds = np.array([[search[name] for name in CONTROLS] for search in its])
-        if task.strata:
-            if len(its) < len(suite.seeds_of(task)):
-                continue
-            row |= _estimates(task, total, worlds)
-            for name, column in (("parked_fraction", "parked"), ("failed_parks", "failed_parks")):
-                row[name] = estimate(task, [float(search[column]) for search in its], worlds).mean
-            row["parked_fraction"] = min(max(row["parked_fraction"], 0.0), 1.0)
-        rows.append({**row, "score": score_of(task, total, worlds)})
+        row = summaries.get((task.name, case.label)) or _stratified(task, its, total, worlds)
+        metrics = {metric: row.get(metric) for metric in METRICS}
+        rows.append(
+            {"task": task.name, "agent": case.label, **metrics, "score": score_of(task, total, worlds)}
+        )
     return rows
+
+
+def _stratified(task: Task, searches: Sequence[Row], total: FloatArray, worlds: FloatArray) -> Row:
+    parked, failed = (
+        estimate(task, [float(search[name]) for search in searches], worlds, controls=False).mean
+        for name in ("parked", "failed_parks")
+    )
+    return {
+        "episodes": len(searches),
+        "parked_fraction": min(parked, 1.0),
+        "failed_parks": failed,
+        **_estimates(task, total, worlds),
+        **decision_columns([time for search in searches for time in decision_s(search)]),
+    }
 
 
 def result_of(
