@@ -157,6 +157,7 @@ def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path)
         its = [one for (park, *_), one in rows.items() if park == row["car_park"]]
         error = np.mean([abs(float(one["simulated"]) - float(one["counted"])) for one in its])
         assert row["simulated_error"] == pytest.approx(error, abs=1e-3)
+        assert row["counted"] == pytest.approx(np.mean([float(one["counted"]) for one in its]), abs=1e-3)
     # Days differ by half a logit from their forecasts, and the town by little more.
     assert summary["simulated_error"] < 1.5 * summary["forecast_error"] + 0.02
     for name in ("scenario", "saturday", "sunday"):

@@ -115,6 +115,14 @@ def test_a_single_search_has_no_interval(tmp_path, interval):
     picture(tmp_path / "occupancy.png")
 
 
+def test_legends_of_long_names_are_within_the_figure():
+    names = [f"my_agents:{'Long' * k}(retry_s=300)" for k in range(1, 7)]
+    figure = draw_time_distribution({"mini": {name: np.array([30.0, 40.0]) for name in names}})
+    figure.draw_without_rendering()
+    (legend,), width = figure.legends, figure.bbox.width
+    assert 0.0 <= legend.get_window_extent().x0 < legend.get_window_extent().x1 <= width
+
+
 def test_rows_without_a_bound_are_drawn(tmp_path):
     rows = [row()]
     del rows[0]["bound_s"]

@@ -340,6 +340,8 @@ def test_intervals_and_nested_figures_become_cells():
     )
     assert [c["key"] for c in table["columns"]] == ["a_s", "error_m.median", "error_m.p95"]
     assert table["rows"] == [[[1.0, 0.5, 2.0], 0.1, 0.3]]
+    few = table_of("x", "X", [{"episodes": 2, "a_s": a, "a_s_ci95": [0.5, 2.0]} for a in (1.0, 2.0)])
+    assert few["rows"] == [[[1.0, None, None]], [[2.0, None, None]]], "two searches have no interval"
 
 
 @pytest.mark.slow

@@ -413,3 +413,25 @@ def test_it_fits_a_phone_and_follows_the_theme(browser, run, dark):
     one(browser, "#theme").click()
     assert browser.execute_script("return document.documentElement.dataset.theme") != before
     assert browser.get_log("browser") == []
+
+
+def test_of_many_zones_those_with_the_most_cars_are_shown_first(browser, tmp_path):
+    lot = packaged_lot("campus")
+    zones = np.array([f"Z{14 * i // lot.n_slots:02d}" for i in range(lot.n_slots)])
+    write_lot(replace(lot, slot_zone=zones), tmp_path / "zones.geojson")
+    command = ["fleet", "--lot", "zones.geojson", "--hours", "08:00-09:00", "--arrivals-per-hour", "90", "--knows",
+               "own", "-n", "1", "--jobs", "1", "--no-figures", "--out", "out"]  # fmt: skip
+    assert parkenv(*command, cwd=tmp_path).returncode == 0
+    make_report(tmp_path / "out", ExecutionSpec(jobs=1))
+    screen(browser, 390)
+    browser.get((tmp_path / "out" / "report.html").as_uri())
+
+    def cars(shown):
+        rows = every(browser, "table[data-table=zones] tbody tr")
+        cells = [one(row, "td[data-key=parked_a_day]") for row in rows if row.is_displayed() == shown]
+        return [json.loads(cell.get_attribute("data-value")) for cell in cells]
+
+    assert (len(cars(True)), len(cars(False))) == (10, 4)
+    assert min(np.ravel(its)[0] for its in cars(True)) >= max(np.ravel(its)[0] for its in cars(False))
+    one(browser, ".chips.after button").click()
+    assert len(cars(True)) == 14

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
     from parkenv.studies.runner import Result
 
+FAR_OFF = 0.15
+"""Mean difference from the counts, share of the places, above which a car park is said not to be followed."""
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
 
@@ -207,6 +209,15 @@ class Demand(StudyCommand):
             "follows, of the same hour a week before, and of the mean of the weeks followed",
             soft_wrap=True,
         )
+        for row in result.rows:
+            if row["simulated_error"] > FAR_OFF:
+                console.print(
+                    f"warning: {row['car_park']} is not followed: {row['counted']:.0%} of its places are counted as "
+                    f"taken, {row['simulated']:.0%} when driven. Compare its name, capacity and price in the lot with "
+                    "the city's (lot import --car-parks), look for free places beside it that may be a guess (lot "
+                    "import --untagged-kerbs 0.3), or correct longer (--rounds 8).",
+                    style="yellow", soft_wrap=True,
+                )  # fmt: skip
         if summary["not_in_lot"]:
             console.print(f"Not in the lot: {', '.join(summary['not_in_lot'])}", soft_wrap=True)
 

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.table import Table
 
-WIDE = 200
-"""Width assumed if output goes to a file or a pipe, characters."""
+WIDE = 1000
+"""Width assumed if output goes to a file or a pipe, characters: no column of a table is cut there."""
 
 
 def make_console(*, soft_wrap: bool = False) -> Console:

@@ -1,6 +1,9 @@
-"""Numbers with their nouns, for titles and sentences."""
+"""Numbers with their nouns, for titles and sentences, and how many searches have an interval."""
 
 from __future__ import annotations
+
+LEAST_SEARCHES = 5
+"""Searches below which no interval is shown: a bootstrap of fewer covers less than 95 %."""
 
 
 def plural(number: int, noun: str, several: str | None = None) -> str:

@@ -41,7 +41,7 @@ MOST_ELEMENTS = 5_000_000
 """Maximum number of nodes, ways and relations of one file: a city of a million people."""
 MOST_XML_BYTES = 512_000_000
 """Maximum size of OSM XML, unpacked."""
-_METRE = 1e-5  # degrees, about
+_SAME = 1e-6  # degrees, some 0.1 m: a cut nearer to a node is at the node
 BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
 
 
@@ -100,11 +100,8 @@ class OsmMap:
         for element, share in zip(self.elements, inside, strict=True):
             if share < 1.0 and not element.is_node and "highway" in element.tags:
                 clipped = shapely.clip_by_rect(shapely.MultiLineString(list(element.lines)), *low, *high)
-                ends = (
-                    _without_stubs(shapely.get_coordinates(part), low, high)
-                    for part in shapely.get_parts(clipped)
-                )
-                lines = tuple(line for line in ends if len(line) > 1)
+                parts = shapely.get_parts(shapely.remove_repeated_points(clipped, _SAME))
+                lines = tuple(shapely.get_coordinates(part) for part in parts if shapely.length(part) > _SAME)
                 element, share = replace(element, lines=lines, cut=True), float(bool(lines))
             if share >= 0.5:
                 kept.append(element)
@@ -298,17 +295,6 @@ class RawElements:
             self.left_out["multipolygons without an outline in the file"].append(name)
             return None
         return OsmElement(name, relation.tags, tuple(outer), tuple(inner), cut)
-
-
-def _without_stubs(line: FloatArray, low: FloatArray, high: FloatArray) -> FloatArray:
-    """Return a line without ends at the edge of a box that are nearer than a metre to the next point."""
-    at_edge = np.any((line <= low) | (line >= high), axis=1)
-    short = np.hypot(*np.diff(line, axis=0).T) < _METRE
-    kept = np.ones(len(line), bool)
-    if len(line):
-        kept[0] = not (at_edge[0] and short[0])
-        kept[-1] &= not (at_edge[-1] and short[-1])
-    return line[kept]
 
 
 def _is_ring(line: FloatArray) -> bool:

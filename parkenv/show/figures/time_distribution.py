@@ -12,7 +12,7 @@ from matplotlib.lines import Line2D
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.show.figures.picture_files import INK, STYLE
+from parkenv.show.figures.picture_files import INK, STYLE, legend_columns
 from parkenv.show.figures.times import agent_color
 from parkenv.show.plurals import plural
 
@@ -39,9 +39,10 @@ def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
     columns = len(panels) if len(panels) < 4 else 2 if len(panels) == 4 else 3
     lines = -(-len(panels) // columns)
     names = list(dict.fromkeys(name for totals in panels.values() for name in totals))
-    keys = min(len(names) + 1, 3 if columns == 1 else 5)
+    width, mean = (4.6, 7.2, 9.6)[columns - 1], "mean (▸ beyond the axis)"
+    keys = legend_columns([*names, mean], width, min(len(names) + 1, 3 if columns == 1 else 5))
     with mpl.rc_context(STYLE):
-        size = (4.6, 7.2, 9.6)[columns - 1], 2.6 * lines + 0.3 + 0.2 * -(-(len(names) + 1) // keys)
+        size = width, 2.6 * lines + 0.3 + 0.2 * -(-(len(names) + 1) // keys)
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(lines, columns, squeeze=False, sharey=True)
         for ax, (name, totals) in zip(axes.flat, panels.items(), strict=False):
@@ -61,7 +62,7 @@ def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
         handles.append(
             Line2D(
                 [], [], linestyle="none", marker="o", markersize=6, color="#777777", markeredgecolor="white",
-                label="mean (▸ beyond the axis)",
+                label=mean,
             )
         )  # fmt: skip
         figure.legend(

@@ -17,8 +17,8 @@ from matplotlib.ticker import NullFormatter
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
 from parkenv.show.columns import SETTING_AXES
-from parkenv.show.figures.picture_files import INK, STYLE
-from parkenv.show.plurals import plural
+from parkenv.show.figures.picture_files import INK, STYLE, legend_columns
+from parkenv.show.plurals import LEAST_SEARCHES, plural
 from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
@@ -94,7 +94,9 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
         handles.append(
             Line2D([], [], color=INK, linestyle=(0, (3, 2)), linewidth=1.2, label="clairvoyant lower bound")
         )
-        figure.legend(handles=handles, loc="outside lower center", ncols=5 if columns > 1 else 3)
+        labels, most = [handle.get_label() for handle in handles], 5 if columns > 1 else 3
+        keys = legend_columns(labels, figure.get_figwidth(), most)
+        figure.legend(handles=handles, loc="outside lower center", ncols=keys)
         _name(figure, rows)
     return figure
 
@@ -361,7 +363,9 @@ def _limit(rows: Sequence[Row]) -> float:
 
 
 def _interval(row: Row) -> tuple[float, float]:
-    """Return the confidence interval of the total; the mean twice if there is none."""
+    """Return the confidence interval of the total; the mean twice if there is none, or of too few searches."""
+    if row.get("episodes", LEAST_SEARCHES) < LEAST_SEARCHES:
+        return row["total_s"], row["total_s"]
     low, high = (row["total_s"] if end is None or end != end else end for end in row["total_s_ci95"])
     return low, high
 

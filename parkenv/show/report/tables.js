@@ -2,6 +2,8 @@
 
 /** Columns of a row that a phone shows at once. */
 const AT_ONCE = 10;
+/** Zones or blocks of a table that a page shows at once. */
+const PLACES_AT_ONCE = 10;
 const SETTING = ["scenario", "task", "test_scenario", "occupancy_level", "failure_cost_s", "v_walk_kmh", "v_drive_kmh"];
 /** Columns of numbers that somebody chose, which are not rounded. */
 const GIVEN = [...SETTING, "arrivals_per_hour"];
@@ -57,6 +59,20 @@ function factsTable(table) {
   });
   // The style sheet lays it out in columns; the roles keep it a table for screen readers.
   return make("table", { role: "table", class: "facts", "data-table": table.name, "aria-label": table.title }, body);
+}
+
+/** Return which rows are folded away: those of all zones or blocks but the ten with the most cars, or the largest changes of all their cars. */
+function foldedRows(columns, rows) {
+  const at = (...keys) => keys.map((key) => columns.findIndex((column) => column.key === key)).find((k) => k >= 0);
+  const [place, cars, change] = [at("block", "zone"), at("parked_a_day", "cars_a_day"), at("change_s")];
+  if (place === undefined || cars === undefined) return rows.map(() => false);
+  const number = (row, k) => Math.abs(sortValue(row[k]) ?? 0);
+  const weights = new Map();
+  for (const row of rows) {
+    if (row[place] !== null) weights.set(row[place], (weights.get(row[place]) ?? 0) + number(row, cars) * (change === undefined ? 1 : 0.01 + number(row, change)));
+  }
+  const shown = new Set([...weights].sort((a, b) => b[1] - a[1]).slice(0, PLACES_AT_ONCE).map(([name]) => name));
+  return rows.map((row) => weights.size > PLACES_AT_ONCE + 2 && row[place] !== null && !shown.has(row[place]));
 }
 
 function sortableTable(table) {
@@ -116,7 +132,9 @@ function sortableTable(table) {
     });
     return heading;
   });
-  const element = make("table", { class: "rows", "data-table": table.name, "aria-label": table.title }, make("thead", {}, make("tr", {}, ...headings)), body);
+  const folded = foldedRows(columns, rows);
+  lines.forEach((line, i) => line.classList.toggle("rest", folded[i]));
+  const element = make("table", { class: folded.includes(true) ? "rows folded" : "rows", "data-table": table.name, "aria-label": table.title }, make("thead", {}, make("tr", {}, ...headings)), body);
 
   const groups = [...new Set(rows.map(settingOf))];
   if (agent < 0 || groups.length < 2 || groups.length > 24) return [element, null];
@@ -150,6 +168,15 @@ function showTables(root, tables) {
     const box = make("div", { class: "card scroll", tabindex: 0, role: "region", "aria-label": table.title }, element);
     const hint = make("p", { class: "more", hidden: true }, "Scroll the table sideways for more columns →");
     root.append(hint, box);
+    if (element.classList.contains("folded")) {
+      const texts = [`All ${table.rows.length} rows`, `The ${PLACES_AT_ONCE} that matter most`];
+      const button = make("button", { type: "button", class: "chip", "aria-expanded": "false", onclick: () => {
+        const isFolded = element.classList.toggle("folded");
+        button.textContent = texts[isFolded ? 0 : 1];
+        button.setAttribute("aria-expanded", String(!isFolded));
+      } }, texts[0]);
+      root.append(make("div", { class: "chips after" }, button));
+    }
     new ResizeObserver(() => { hint.hidden = box.scrollWidth <= box.clientWidth + 1; }).observe(box);
   }
 }

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from parkenv.show.plurals import LEAST_SEARCHES
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 
 Row = Mapping[str, Any]
@@ -310,6 +311,8 @@ def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:
                 made |= _flat(value, f"{name}.")
         elif key.endswith("_ci95"):
             base = name.removesuffix("_ci95")
+            if row.get("episodes", LEAST_SEARCHES) < LEAST_SEARCHES:
+                value = [None, None]
             known = made.get(base) is not None or value != [None, None]
             made[base] = [made.get(base), *value] if known else None  # type: ignore[list-item]
         elif isinstance(value, (list, tuple)):

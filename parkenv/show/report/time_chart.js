@@ -84,7 +84,7 @@ function showTimeChart(root, table) {
   const keys = used.map((term) => make("span", { class: "key" }, make("span", { class: "swatch", style: `background: ${termColor(term)}` }), term.label));
   const line = makeSvg("svg", { width: 22, height: 14 }, makeSvg("path", { class: "whisker", d: "M2 7H20M2 3V11M20 3V11", fill: "none" }));
   const dashes = makeSvg("svg", { width: 10, height: 16 }, makeSvg("line", { class: "bound", x1: 5, x2: 5, y1: 0, y2: 16 }));
-  keys.push(make("span", { class: "key" }, line, "95 % interval of the mean"));
+  if (rows.some((row) => row.total_s[1] !== null)) keys.push(make("span", { class: "key" }, line, "95 % interval of the mean"));
   if (rows.some((row) => row.bound_s)) keys.push(make("span", { class: "key" }, dashes, "clairvoyant lower bound"));
   root.append(
     make("p", { class: "quiet" }, `Mean seconds from the entry of the lot to the goal; in bold, the agents that no other, the oracle apart, is shown to be faster than.${rows.some((row) => row.total_s[0] > end) ? " Bars far longer than the others are cut off." : ""}`),

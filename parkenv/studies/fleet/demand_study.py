@@ -229,6 +229,8 @@ class DemandStudy(Study):
                 "stay_h": float(stay_h[row]),
                 "map_weight": float(town.map_weight[number]),
                 "days_held_out": int(np.isfinite(counts[number]).any(axis=1).sum()),
+                "counted": float(counts[number][np.isfinite(counts[number])].mean()),
+                "simulated": float(found.shares["simulated"][number][np.isfinite(counts[number])].mean()),
                 **_errors({name: error[[number]] for name, error in errors.items()}, weeks),
             }
             for row, number in enumerate(used.tolist())
