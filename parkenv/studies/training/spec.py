@@ -43,11 +43,7 @@ if TYPE_CHECKING:
     from parkenv.studies.training.training import Training
 
 Steps = Annotated[int, Field(ge=1, le=10**12, description="Decisions of a training.")]
-EvaluateEvery = Annotated[
-    int,
-    Field(ge=1, le=10**12, description="Decisions between evaluations."),
-    Option(panel="Evaluation", default="a tenth of --steps, to search at most 100000; to drive, a twentieth"),
-]
+EvaluateEvery = Annotated[int, Field(ge=1, le=10**12)]
 Episodes = Annotated[
     int,
     Field(ge=2, le=1_000_000),
@@ -431,8 +427,11 @@ class SearchTrainingSpec(PlacesTrainingSpec):
             description="Decisions of a training; for network, those that belief labels.",
         ),
     ] = 2_000_000
-    evaluate_every: EvaluateEvery | None = Field(
-        None, description="A tenth of the steps, at most 100000, if absent."
+    evaluate_every: EvaluateEvery | None = option(
+        None,
+        "Decisions between evaluations.",
+        panel="Evaluation",
+        default="a tenth of --steps, to search at most 100000; to drive, a twentieth",
     )
     tensorboard: TensorBoard = False
 
