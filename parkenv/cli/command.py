@@ -290,7 +290,9 @@ def _typed(option: FieldOption) -> Parameter:
     texts: dict[str, Any] = {
         "help": option.help,
         "metavar": option.takes,
-        "autocompletion": completer(option.choices) if option.choices else COMPLETERS.get(option.parameter),
+        "autocompletion": completer(option.choices)
+        if option.choices
+        else COMPLETERS.get(option.parameter.rstrip("_")),
     }
     kind: Any = bool if option.is_switch else list[str] if option.is_repeated else str
     default = Parameter.empty if option.is_required else None

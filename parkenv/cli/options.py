@@ -86,7 +86,8 @@ class FieldOption:
     def parameter(self) -> str:
         """Its name among the parameters of a command."""
         name = self.name.lstrip("-").replace("-", "_").lower()
-        return f"{name}_" if iskeyword(name) else name
+        # An argument and an option of the same name set the same field.
+        return f"{name}_" if iskeyword(name) or self.option.argument else name
 
     @property
     def is_required(self) -> bool:

@@ -23,7 +23,7 @@ from scipy.special import ndtr
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.memory import address_of, call_at
+from parkenv.compiled.memory import call_at
 from parkenv.engine.batch import first_wrong
 from parkenv.engine.kernel import (
     column_of,
@@ -40,12 +40,9 @@ from parkenv.engine.kernel import (
     write_clock,
 )
 from parkenv.engine.policy import CompiledPolicy, car_of
+from parkenv.engine.policy_batch import PolicyBatch
 from parkenv.engine.records import (
-    CAR,
-    FLEET,
     N_ACTIONS,
-    NO_SLOT,
-    SEARCH,
     ScenarioRecords,
     Searches,
     most_observed_in,
@@ -69,7 +66,6 @@ _LEVELS, _SLOPES = 33, 9  # cells of the day's level and slope
 _REACH = 3.5  # standard deviations that they span, on either side
 _LEAST_RATE = 1e-9  # 1/s, of slots that never change
 _SAME_TIME_S = 0.01
-_SEARCH_BYTES = SEARCH.itemsize
 
 
 class Observation(NamedTuple):
@@ -239,16 +235,8 @@ class Simulations:
         return actions
 
     def _drive(self, policy: CompiledPolicy, max_steps: int, cost_s: FloatArray, actions: IntArray) -> None:
-        n, problem = len(self), self.searches.scenarios.scenarios[0]
-        cars, fleet = np.zeros(n, CAR), np.zeros(1, FLEET)
-        moves = np.zeros((n, 2 * problem.lot.n_vertices), np.uint8)
-        self.searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
-        cars["search"] = self.searches.address + np.arange(n) * _SEARCH_BYTES
-        cars["target"] = NO_SLOT
-        data = policy.data_for([problem])
-        at = np.array([0 if data is None else data.address], np.int64)
-        fleet["cars"], fleet["policy_data"] = address_of(cars, CAR), address_of(at, np.int64)
-        _run_at(address_of(fleet, FLEET), policy.address, max_steps, cost_s, actions)
+        cars = PolicyBatch(self.searches, policy)
+        _run_at(cars.address, policy.address, max_steps, cost_s, actions)
 
 
 class Model:

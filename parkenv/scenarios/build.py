@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import date, timedelta
 from functools import lru_cache
 from pathlib import Path
@@ -54,7 +54,7 @@ LOT_KMH, TOWN_KMH = 10.0, 20.0
 """Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean."""
 MIN_PAST_DAYS = 7
 """Days of counts that a forecast needs at least."""
-ScenarioSource = str | Path | ScenarioSpec | ParkingLot | Scenario
+ScenarioSource = str | Path | Mapping[str, Any] | ScenarioSpec | ParkingLot | Scenario
 ScenarioSources = ScenarioSource | Sequence[ScenarioSource]
 
 
@@ -81,8 +81,8 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
     Args:
         source: name of a packaged scenario (campus, jam, street, mini); a scenario file (.toml); a lot file
             (.geojson, .yml), which has a week and days as in busy real car parks; a folder of scenario and
-            lot files; a `ScenarioSpec`; a `ParkingLot` (with a typical week, and days as forecast); a `Scenario`; or a
-            sequence of these.
+            lot files; the tables of a scenario file; a `ScenarioSpec`; a `ParkingLot` (with a typical week, and days as
+            forecast); a `Scenario`; or a sequence of these.
         changes: fields of `Scenario` to replace in all of them, and `day_error`, how far whole days differ from the
             forecast (a `DayError`, or a number, its level): 0 for days that are as forecast.
 
@@ -101,14 +101,16 @@ def make_scenarios(source: ScenarioSources, **changes: Any) -> list[Scenario]:
         return [source.replace(**changes)]
     if isinstance(source, ParkingLot):
         return [_of_lot(source, changes)]
+    if isinstance(source, Mapping):
+        source = ScenarioSpec.parse(source, "scenario")
     if isinstance(source, ScenarioSpec):
         return [build(source).replace(**changes)]
     if isinstance(source, str | Path):
         return [build(spec).replace(**changes) for spec in scenario_specs(source)]
     if not isinstance(source, Sequence):
         raise InputError(
-            f"scenario is a {type(source).__name__}, want a Scenario, its name or file, a ScenarioSpec, a ParkingLot, "
-            "or a sequence of these"
+            f"scenario is a {type(source).__name__}, want a Scenario, its name, file or tables, a ScenarioSpec, a "
+            "ParkingLot, or a sequence of these"
         )
     if not source:
         raise InputError("scenario is an empty sequence, want at least one scenario")

@@ -55,7 +55,12 @@ def _with_folders(value: object, info: ValidationInfo) -> object:
     return listed
 
 
-def _one_word(text: str) -> str:
+def one_word(text: str) -> str:
+    """Return the name of the one scenario of an option.
+
+    Raises:
+        InputError: there are several.
+    """
     words = words_in(text)
     if len(words) > 1:
         raise InputError(f"names {len(words)} scenarios, want one")
@@ -93,12 +98,12 @@ Scenarios = Annotated[
 OneScenario = Annotated[
     ScenarioItem,
     Field(description=f"{_NAMES}, a scenario file (.toml), or a lot (.geojson)."),
-    Option("--scenario", takes="NAME|FILE", parse=_one_word),
+    Option("--scenario", takes="NAME|FILE", parse=one_word),
     Option(
         "--lot",
         takes="NAME|FILE",
         panel="World",
-        parse=lambda text: _lots(_one_word(text))[0],
+        parse=lambda text: _lots(one_word(text))[0],
         description=_LOT_ALONE,
     ),
 ]

@@ -225,7 +225,7 @@ def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
 def _draw(result: Result, progress: Progress) -> None:
     """Write the outputs, in processes of this machine: only they can write the folder."""
     with Workers(result.study.jobs or None) as workers:
-        _run_all("Drawing figures", result.study.outputs(result), workers, progress)
+        _run_all(result.study.writing, result.study.outputs(result), workers, progress)
 
 
 def _run_all(doing: str, tasks: Sequence[Task[object]], workers: Workers, progress: Progress) -> None:

@@ -47,6 +47,7 @@ STUDIES: Mapping[str, str] = {
     "calibrate": "parkenv.studies.trips.calibration_study:CalibrationStudy",
     "verify": "parkenv.studies.verify.study:Verification",
     "train": "parkenv.studies.training.spec:TrainingSpec",
+    "dataset": "parkenv.studies.dataset.study:DatasetStudy",
 }
 """`MODULE:CLASS` of each kind of study, by the key `kind` of its files."""
 
@@ -118,6 +119,7 @@ class Study(ExecutionSpec):
         all_tables: all tables of the folder, the most important first, if there are several.
         block: items in a task: an interruption loses few of them, and starting a task costs little.
         doing, unit: what the progress bar says and counts.
+        writing: what it says while `outputs` are written.
         goes_on: when a run continues the one in its folder: if `asked` to resume; also if that is `unfinished`,
             otherwise it replaces it; or `always`, whatever the settings, which the keys of rows hold.
         keeps_order: whether rows are stored in the order of the items, instead of as they finish.
@@ -133,6 +135,7 @@ class Study(ExecutionSpec):
     unit: ClassVar[str] = "episodes"
     goes_on: ClassVar[GoesOn] = "asked"
     keeps_order: ClassVar[bool] = False
+    writing: ClassVar[str] = "Drawing figures"
     heading: ClassVar[str] = ""
     table_titles: ClassVar[Mapping[str, str]] = {"rows": "Results"}
 

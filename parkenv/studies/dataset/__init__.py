@@ -1,0 +1,1 @@
+"""Data sets of recorded searches, for offline reinforcement learning."""
