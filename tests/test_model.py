@@ -167,6 +167,9 @@ def test_bad_input_is_answered_in_one_line():
             other.sample(other.initial_belief(other_env.reset(seed=0)[0]), rng), 0
         ),
         "holds 2": lambda: model.step(model.sample(belief, rng, 2), 0),
+        "policy is 'first-free'": lambda: state.run("first-free"),
+        "i is 1": lambda: state.one(1),
+        "n is 2.5": lambda: model.sample(belief, rng, 2.5),
         "of vertex": lambda: model.update(belief, 3, {**observation, "vertex": 10_000}),
     }
     for message, call in calls.items():

@@ -51,7 +51,7 @@ from parkenv.engine.records import (
     slot_at,
 )
 from parkenv.engine.spaces import action_number
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_whole
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError, nearness
@@ -199,6 +199,7 @@ class Simulations:
 
     def one(self, i: int) -> Simulations:
         """Return search i by itself, not a copy: its steps are those of search i, and take a tenth of `Model.step`."""
+        require_whole("i", i, most=len(self) - 1)
         alone = copy(self)
         alone.searches = self.searches.row(i)
         alone._costs, alone._over = np.zeros(1), np.zeros(1, np.bool_)
@@ -235,6 +236,10 @@ class Simulations:
         return actions
 
     def _drive(self, policy: CompiledPolicy, max_steps: int, cost_s: FloatArray, actions: IntArray) -> None:
+        if not isinstance(policy, CompiledPolicy):
+            raise InputError(
+                f"policy is {policy!r:.60}, want a CompiledPolicy, such as one of planners.heuristics.policies.POLICIES"
+            )
         cars = PolicyBatch(self.searches, policy)
         _run_at(cars.address, policy.address, max_steps, cost_s, actions)
 
@@ -293,6 +298,8 @@ class Model:
         its observation has decayed, and others with that of the day; from now on all change at their rates.
         """
         self._require_own(belief)
+        require_whole("n", n)
+        require_whole("copies", copies, least=1)
         seen = np.flatnonzero(belief.slots.observed)
         p_day, p_taken = belief.day.on_days(seen, belief.slots.time)
         day = rng.choice(len(p_day), n, p=p_day)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib import import_module
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -55,6 +55,24 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
     if not isinstance(found, type) or not callable(getattr(found, method.partition("(")[0], None)):
         raise InputError(f"{kind} {name!r}: has no method {method}")
     return found
+
+
+def failure_of(error: Exception, names: Iterable[str]) -> InputError | None:
+    """Return what to tell of an error that came by way of a user's class; None if none of them had to do with it.
+
+    Args:
+        error: what was raised.
+        names: classes, `MODULE:CLASS`.
+    """
+    files = {
+        str(file_of_class(name)): name for name in names if name.partition(":")[0] in sys.modules
+    }  # in this process
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if name := files.get(frame.filename):
+            return InputError(
+                f"{name} fails: {type(error).__name__}: {error} ({frame.filename}, line {frame.lineno})"
+            )
+    return None
 
 
 def find_module(name: str) -> str | None:

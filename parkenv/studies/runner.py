@@ -25,6 +25,8 @@ from uuid import uuid4
 from parkenv.errors import InputError
 from parkenv.files.folder_lock import only_writer
 from parkenv.files.limited_reading import read_json
+from parkenv.files.user_class import failure_of
+from parkenv.studies.agent_spec import classes_in
 from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row, Table
 from parkenv.studies.study import Progress, Stage, Study, read_study
 from parkenv.studies.workers import Task, Workers
@@ -303,5 +305,12 @@ def _run_block(token: str, study: Study, work: Any, items: Sequence[Any]) -> tup
         study = _KEPT[token]
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("default")
-        rows = study.run(work, items)
+        try:
+            rows = study.run(work, items)
+        except InputError:
+            raise
+        except Exception as error:
+            if failure := failure_of(error, classes_in(study)):
+                raise failure from error
+            raise
     return rows, [str(w.message) for w in caught]

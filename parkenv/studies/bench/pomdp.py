@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
 
-from parkenv.files.user_class import find_module
 from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.spec import lot_scenario, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
@@ -14,7 +14,7 @@ from parkenv.studies.compare.comparison import Comparison
 OURS = ("belief(budget_ms=1)", "mdp", "network", "rollout")
 PEERS = ("examples.pomdp_py_agents:POUCT", "examples.pomdp_py_agents:POMCP")
 """Planners of other libraries, the adapters of which are among the examples of the source tree."""
-LIBRARY = "pomdp_py"
+LIBRARY, ADAPTERS = "pomdp_py", Path("examples/pomdp_py_agents.py")
 SCENARIOS = ("mini", "campus", "street", "jam")
 REAL_PLACES = ("place-01", "place-09", "place-17")
 
@@ -23,8 +23,8 @@ def missing_peers() -> str:
     """Return why `PEERS` cannot be measured here; empty if they can."""
     if find_spec(LIBRARY) is None:
         return "pomdp-py is not installed: pip install 'parkenv[pomdp]'"
-    if find_module(PEERS[0]) is None:
-        return "their adapters, examples/pomdp_py_agents.py, are not in the working directory"
+    if not ADAPTERS.exists():
+        return f"their adapters, {ADAPTERS}, are not in the working directory"
     return ""
 
 
