@@ -136,8 +136,11 @@ def test_a_row_that_disagrees_is_said_and_makes_the_exit_code(monkeypatch):
 
 
 @pytest.mark.slow
-def test_every_row_is_inside_its_interval():
-    study = Verification(jobs=2)
+def test_every_row_is_inside_its_interval(monkeypatch):
+    """The mean of an eighth of the searches has an interval that is nearly three times as wide."""
+    monkeypatch.setattr(line, "SEARCHES", 1_000)
+    monkeypatch.setattr(line, "INSPECTED", 3_000)
+    study = Verification(jobs=1)
     rows = study.statements(run(study).results)
     assert not disagreeing(rows)
     assert len(rows) >= 70

@@ -45,6 +45,7 @@ PIECE = 16  # slots of a piece of the line that `exact` solves at once
 BEYOND_ASKED = 10  # slots beyond the goal for which agents are asked whether they take them
 FARTHEST_SIGHT = 0.97
 """q from which `belief` cannot see the end: it looks ahead at most 400 stops, and extrapolates from there."""
+SEARCHES = 8000  # of `exact` and of `mdp`; half as many of `belief`
 BELIEF_TOLERANCE = 0.002  # share of the least mean cost by which its rule may then be worse
 
 
@@ -303,9 +304,9 @@ def _line(seed: int) -> list[Task]:
         partial(belief_row, 0.9, THESIS_SPEEDS),
         partial(mdp_row, 0.9, THESIS_SPEEDS),
         partial(mdp_row, 0.9, THESIS_SPEEDS, 10.0),
-        partial(searches_row, "exact", short, 8000, seed),
-        partial(searches_row, "mdp", short, 8000, seed + 8000, **cautious),
-        partial(searches_row, "belief", longer, 4000, seed, day=False),
+        partial(searches_row, "exact", short, SEARCHES, seed),
+        partial(searches_row, "mdp", short, SEARCHES, seed + 8000, **cautious),
+        partial(searches_row, "belief", longer, SEARCHES // 2, seed, day=False),
     ]
 
 
