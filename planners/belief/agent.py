@@ -143,6 +143,16 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         self._neighborhoods = Neighborhoods(self.problem, most_vertices)
         self._routes = DriveRoutes(self.problem)
 
+    def compile_ahead(self, belief: SlotBelief) -> None:
+        """Compile the search of a path, which takes as long as all else that a search needs, without an environment.
+
+        Args:
+            belief: any belief about the lot.
+        """
+        memory = self._search_of(self._neighborhoods.toward(int(self.problem.lot.entry_vertices[0])), belief)
+        near = memory.near
+        self._follow_best_path(int(near.vertices[0]), 0, belief.take(near.slots), memory)
+
     def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch:
         """Choose the part of the lot to search."""
         vertex = int(observation["vertex"])

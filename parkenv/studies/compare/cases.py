@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
 from parkenv.scenarios.selection import seeds_by_scenario
@@ -24,6 +25,7 @@ from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
+from planners.belief.agent import BeliefAgent
 
 BUDGET = "budget_ms"
 """The option of agents that plan for a time, ms a decision."""
@@ -74,12 +76,22 @@ class Case:
     def run(self, seeds: Sequence[int]) -> list[Row]:
         """Run one episode per seed; return their rows of `episodes.csv`, with the wall times of their decisions."""
         runner = self.runner()
+        if isinstance(runner.agent, BeliefAgent):
+            # First runs: workers that all begin with the environment would wait for the one that compiles it.
+            runner.agent.compile_ahead(_forecast_of(self.scenario, seeds[0]))
         return [{**self.columns, **timed_row(runner.run(seed))} for seed in seeds]
 
     def runner(self) -> EpisodeRunner:
         """Return a runner of this case's episodes."""
         agent = make_agent(self.agent, self.scenario, **self.options)
         return EpisodeRunner(self.scenario, self.label, agent, self.rig, self.detector, self.every)
+
+
+def _forecast_of(scenario: Scenario, seed: int) -> SlotBelief:
+    """Return the belief with which the search of a seed begins."""
+    forecast = scenario.forecast(scenario.occupancy.draw_arrival(scenario.arrival, world_key(seed, 0)))
+    days = forecast.day_error.level, forecast.day_error.slope
+    return SlotBelief.of_forecast(forecast.p_occupied, forecast.decay_rate, days)
 
 
 def require_distinct(cases: Iterable[Case]) -> None:
