@@ -39,7 +39,10 @@ def listed(folder, changes=()):
 
 
 def a_map(folder):
-    place = grid().box(95, 210, 115, 230, {"amenity": "parking"}, capacity="80", fee="no", access="customers")
+    place = grid().box(
+        95, 210, 115, 230, {"amenity": "parking"}, capacity="80", fee="no", access="customers",
+        opening_hours="Mo-Fr 08:00-18:00",
+    )  # fmt: skip
     place.box(
         370, 305, 390, 325, {"amenity": "parking", "parking": "multi-storey", "name": "P0"}, capacity="30"
     )
@@ -62,7 +65,7 @@ def test_car_parks_of_a_list_have_its_names_and_capacities(tmp_path):
     assert rows["empty"]["element"] == ""
     lot = town.draft.lot()
     zones = {lot.zone_rules[facility.zone] for facility in lot.facilities if facility.name in rows}
-    assert {zone.users for zone in zones} == {(PUBLIC,)}
+    assert {(zone.users, zone.hours) for zone in zones} == {((PUBLIC,), None)}  # counted at night, too
     assert len({zone.price for zone in zones}) == 1  # nothing is known, so that none draws drivers
     alone = import_town(a_map(tmp_path), listed(tmp_path), listed_only=True).draft.lot()
     assert set(alone.slot_ids) == set(rows)

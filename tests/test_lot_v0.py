@@ -40,6 +40,12 @@ def test_pettingzoo_s_tests_of_the_interface(scenario, options):
     parallel_api_test(lot_v0.parallel_env(scenario=scenario, tick_s=5.0, **options), num_cycles=300)
 
 
+@pytest.mark.slow
+def test_a_town_passes_them_too():
+    api_test(lot_v0.env(scenario="town"), num_cycles=20)
+    parallel_api_test(lot_v0.parallel_env(scenario="town", tick_s=5.0), num_cycles=20)
+
+
 @LOTS
 def test_pettingzoo_s_tests_of_seeds(scenario):
     seed_test(lambda: lot_v0.env(scenario=scenario), num_cycles=50)

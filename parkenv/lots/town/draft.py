@@ -354,12 +354,13 @@ class _Town:
             else:
                 row = of_map[k]
                 self.listed.append(f"{one.name}: {row.name}, {places[k]:.0f} places in the map")
-            # It is counted as a whole, and open to everybody.
+            # It is counted as a whole, open to everybody, and cars stand there when it is closed, too.
             capacity = one.capacity or int(places[k])
             self.names.discard(row.name)
             row.name = self._named({"name": one.name}, row.element)
             row.slots, row.slot_rules = NO_SLOTS, []
-            row.rules = replace(row.rules, users=PUBLIC, **({} if row.rules.per_hour else PAID))
+            paid = {} if row.rules.per_hour else PAID
+            row.rules = replace(row.rules, users=PUBLIC, hours="", **paid)
             row.counted = [(row.name, capacity, row.rules)]
             row.capacity_from, row.rule = "list", ""
 
