@@ -22,8 +22,6 @@ PACKAGES = {
     "rl-zoo3": ["rl_zoo3"],
     "cleanrl": ["tyro", "tensorboard"],
     "torchrl": ["torchrl"],
-    "rllib": ["ray[rllib]"],
-    "tianshou": ["tianshou"],
 }
 """What each learner needs beside parkenv and PyTorch."""
 
