@@ -20,6 +20,7 @@ from parkenv.studies.fleet.measures import Roads, gini, looks_s
 from parkenv.studies.fleet.setting import MEASURES, Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import carried, summarize_days
+from parkenv.studies.runner import open_run
 from parkenv.world.scenario import SearchProblem
 
 
@@ -179,6 +180,7 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
         days = list(csv.DictReader(file))
     assert len(days) == 2 * len(rows)
     assert done.stdout.count("reserve ") >= 4
+    assert [path.name for path in open_run(tmp_path / "a").figures()] == ["fleet.png"]
     again = parkenv("fleet", *words, "--out", tmp_path / "b")
     assert again.returncode == 0
     assert (tmp_path / "b" / "days.csv").read_bytes() == (tmp_path / "a" / "days.csv").read_bytes()

@@ -51,7 +51,7 @@ def save_fleet_figure(
     """
     whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
     mixed = [row for row in rows if 0.0 < row["share"] < 1.0]
-    priced = [row for row in whole if np.isfinite(row["price_of_anarchy"])]
+    priced = [row for row in whole if np.isfinite(np.float64(row["price_of_anarchy"]))]
     panels: dict[str, Callable[[Axes], None]] = {}
     if len(whole) > 1 or not hours:  # a single point says little
         panels["search time"] = lambda ax: _draw_search(ax, whole, closed_form)
@@ -155,7 +155,7 @@ def _draw_shares(ax: Axes, rows: Sequence[Row]) -> None:
             key=lambda row: row["share"],
         )
         for group, face in (("members_difference_s", color), ("others_difference_s", "white")):
-            there = [row for row in known if np.isfinite(row[group])]
+            there = [row for row in known if np.isfinite(np.float64(row[group]))]
             if there:
                 x, y = [100.0 * row["share"] for row in there], [row[group] for row in there]
                 ax.errorbar(
