@@ -178,8 +178,8 @@ def test_options_that_pages_name_exist():
         assert named - known <= OTHERS, name
 
 
-OTHERS = {"--version", "--install-completion", "--show-completion"}
-"""Options of programs, and of `parkenv` itself."""
+OTHERS = {"--version", "--install-completion", "--show-completion", "--num-envs"}
+"""Options of `parkenv` itself, and of other programs, such as CleanRL's."""
 
 
 def parameters(command):
