@@ -304,7 +304,8 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
     files = draw_figures(results, tmp_path)
     assert sorted(files) == sorted(tmp_path.iterdir())
     drawn = {kind.name for kind in FIGURES if any(file.name.startswith(kind.name) for file in files)}
-    assert drawn == {kind.name for kind in FIGURES} - {"time_against_failure_cost", "time_against_map"}
+    of_sweeps = {f"time_against_{what}" for what in ("failure_cost", "map", "decision_time")}
+    assert drawn == {kind.name for kind in FIGURES} - of_sweeps
     (tmp_path / "map.png").touch()
     remove_figures(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["map.png"]
