@@ -1,0 +1,54 @@
+"""The tables on the page of the leaderboard, made from its result files: `python docs/leaderboard.py`."""
+
+from pathlib import Path
+
+from parkenv.studies.benchmark.page import DESIGNS, entries_of, neighbours, ranking, result_files
+from parkenv.studies.benchmark.result_file import check_result
+
+ROOT = Path(__file__).parents[1]
+FOLDER = ROOT / "docs" / "leaderboard"
+PAGE = FOLDER / "index.md"
+START, END = "<!-- {}: made by docs/leaderboard.py -->\n", "<!-- end -->\n"
+
+
+def tables():
+    """Make the tables of the page, by name."""
+    suite, entries = entries_of([check_result(file) for file in result_files(FOLDER / "results")])
+    lines = [
+        "| | agent | score, % | mean time, s | behind the best, s | ms a decision | submitted by | code | commit |",
+        "|---|---|---|---|---|---|---|---|---|",
+    ]
+    for place, row in enumerate(ranking(suite, entries), 1):
+        score, low, high = (f"{100 * value:.1f}" for value in (row["score"], *row["score_ci95"]))
+        code = f"[code]({row['code']})" if row["code"].startswith("http") else row["code"]
+        lines.append(
+            f"| {place} | {row['agent']} | {score} [{low}, {high}] | {interval(row, 'mean_s')} | "
+            f"{interval(row, 'behind_s', '+')} | {row['decision_ms']:.2f} | {row['by']} | {code} | {row['commit']} |"
+        )
+    pairs = [
+        "| agents | difference, s | " + " | ".join(DESIGNS) + " |",
+        "|---|---|" + "---|" * len(DESIGNS),
+    ]
+    for row in neighbours(suite, entries):
+        cells = [f"{row[f'searches.{d}']:,.0f}" for d in DESIGNS if f"searches.{d}" in row]
+        pairs.append(f"| {row['agents']} | {interval(row, 'behind_s', '+')} | " + " | ".join(cells) + " |")
+    return {"ranking": "\n".join(lines), "pairs": "\n".join(pairs)}
+
+
+def interval(row, name, sign=""):
+    """Write a value with its interval."""
+    value, (low, high) = row[name], row[f"{name}_ci95"]
+    return f"{value:{sign}.1f} [{low:{sign}.1f}, {high:{sign}.1f}]" if high > low else ""
+
+
+def page(text):
+    """Return the page with its tables made anew."""
+    for name, table in tables().items():
+        start = START.format(name)
+        before, _, rest = text.partition(start)
+        text = f"{before}{start}\n{table}\n\n{END}{rest.partition(END)[2]}"
+    return text
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
