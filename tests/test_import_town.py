@@ -99,6 +99,19 @@ def test_dual_carriageways_are_joined_beyond_the_edge(tmp_path):
     assert town.draft.lot().entries[:, 0].max() > town.draft.goals[:, 0].max() + 300
 
 
+def test_one_way_streets_that_meet_at_the_edge_lead_on_beyond_it(tmp_path):
+    """Two that end in one place, and two that begin in another one: the edge has cut off the others there."""
+    place = grid()
+    for ends in (
+        [(500, 0), (600, 60)],
+        [(500, 200), (600, 60)],
+        [(600, 300), (500, 200)],
+        [(600, 300), (500, 400)],
+    ):
+        place.way(ends, STREET, oneway="yes")
+    assert "100.0% of them connected" in draft(place, tmp_path).draft.found[0]
+
+
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.sampled_from([0, 1, -1]), min_size=5, max_size=9), st.randoms(use_true_random=False))
 def test_junctions_of_many_streets_are_split_and_lead_where_they_led(directions, random):

@@ -164,11 +164,15 @@ class Streets:
         """Return where streets leave the map: their traffic, 0 elsewhere, whether cars come in, and leave, (n_nodes,).
 
         That is where the edge cuts them, where one of a class that leads on ends, and where another one ends near the
-        hull of all streets; one-way streets do not end, and may be farther from it.
+        hull of all streets; one-way streets do not end, and may be farther from it. Where several of these meet and
+        none leads on, or several begin and none leads there, it does so beyond the edge.
         """
         real = np.flatnonzero(~self._is_beyond)
         n = len(self.node_xy)
         users = np.bincount(self.nodes[real].ravel(), minlength=n)
+        two_way = self.nodes[real[~self.oneway[real]]].ravel()
+        # Ways that lead to each junction, and away from it.
+        ways = [np.bincount(np.r_[self.nodes[real, end], two_way], minlength=n) for end in (1, 0)]
         hull = shapely.concave_hull(shapely.multipoints(self.node_xy), ratio=0.4)
         away = np.asarray(shapely.distance(shapely.points(self.node_xy), shapely.boundary(hull)))
         traffic, enters, leaves = np.zeros(n), np.zeros(n, bool), np.zeros(n, bool)
@@ -181,6 +185,7 @@ class Streets:
                 near, cut = away[node] <= AT_EDGE * (4 if road.oneway else 1), road.id in self.cut
                 # Where the edge cuts a way at a junction, other streets end there, too.
                 leads_on = users[node] == 1 and (near or kind in THROUGH or cut)
+                leads_on |= road.oneway and near and not ways[end][node]
                 if leads_on or (is_end[end] and cut and away[node] <= AT_EDGE):
                     traffic[node] = max(traffic[node], weight)
                     enters[node] |= end == 0 or not road.oneway
