@@ -28,6 +28,9 @@ STUDY = DatasetStudy(
 )
 
 
+DATA = "parkenv/mini/greedy-goal-v0/data/main_data.hdf5"
+
+
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A finished run."""
@@ -114,6 +117,7 @@ def test_a_run_that_goes_on_gives_the_data_set_of_an_unbroken_one(recorded, tmp_
     folder = run(short, tmp_path / "grown").folder
     # A crash before the data set is written, and after: both go on.
     shutil.rmtree(folder / ".parts")
+    (folder / ".minari-killed").mkdir()
     run(short.changed(steps=600), folder, resume=True)
     _, grown = episodes(folder, "mini/greedy-total", monkeypatch)
     _, once = episodes(recorded.folder, "mini/greedy-total", monkeypatch)
@@ -130,10 +134,12 @@ def test_what_was_recorded_and_lost_is_recorded_again(tmp_path, monkeypatch):
     study = STUDY.changed(policies=(AgentSpec(name="greedy-goal"),))
     folder = run(study, tmp_path / "lost").folder
     _, before = episodes(folder, "mini/greedy-goal", monkeypatch)
+    content = (folder / DATA).read_bytes()
     shutil.rmtree(folder / ".parts")
     shutil.rmtree(folder / "parkenv")
     run(study, folder, resume=True)
     _, after = episodes(folder, "mini/greedy-goal", monkeypatch)
+    assert (folder / DATA).read_bytes() == content
     assert [a["seed"] for _, a in after] == [a["seed"] for _, a in before]
     np.testing.assert_array_equal(after[-1][0].rewards, before[-1][0].rewards)
 

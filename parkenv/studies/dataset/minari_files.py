@@ -22,6 +22,8 @@ from parkenv.studies.results import Row
 
 PARTS = ".parts"
 """Folder in that of a run with the searches that are in no data set yet."""
+TORN = ".minari-"
+"""How the names of folders begin in which data sets are written; killed processes leave them."""
 _MOST_BYTES = 1 << 33  # of a part
 
 
@@ -108,7 +110,7 @@ class DatasetFile:
     def write(self) -> None:
         """Write the data set, after what an earlier one of the name holds; it appears whole or not at all."""
         if episodes_in(self.root, self.name) < self.n:
-            with tempfile.TemporaryDirectory(prefix=".minari-", dir=self.root) as beside:
+            with tempfile.TemporaryDirectory(prefix=TORN, dir=self.root) as beside:
                 new, old, final = Path(beside) / "new", Path(beside) / "old", self.root / self.name
                 if final.exists():
                     shutil.copytree(final, new)
@@ -160,6 +162,8 @@ class DatasetFile:
 
         nested = h5p.create(h5p.LINK_CREATE)
         nested.set_create_intermediate_group(True)
+        timeless = h5p.create(h5p.DATASET_CREATE)
+        timeless.set_obj_track_times(False)  # equal runs write equal files
         wanted, total = range(self.seed + done, self.seed + self.n), 0
         parts = [part for part, seeds in seeds_in(self.root / PARTS / self.name) if seeds[-1] >= wanted.start]
         with h5py.File(file, "a") as opened:
@@ -172,6 +176,6 @@ class DatasetFile:
                     group.attrs[name] = value
                 for name, array in arrays.items():
                     kind, space = h5t.py_create(array.dtype, logical=True), h5s.create_simple(array.shape)
-                    made = h5d.create(group.id, name.encode(), kind, space, lcpl=nested)
+                    made = h5d.create(group.id, name.encode(), kind, space, timeless, lcpl=nested)
                     made.write(h5s.ALL, h5s.ALL, np.ascontiguousarray(array))
         return total

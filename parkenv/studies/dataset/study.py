@@ -161,8 +161,10 @@ class DatasetStudy(Study):
 
     def prepare(self, results: Results, *, continues: bool) -> None:
         """See `Study`: what is recorded and in no file runs again."""
-        from parkenv.studies.dataset.minari_files import PARTS, episodes_in, seeds_in
+        from parkenv.studies.dataset.minari_files import PARTS, TORN, episodes_in, seeds_in
 
+        for torn in results.path.glob(f"{TORN}*"):
+            shutil.rmtree(torn, ignore_errors=True)
         if not continues:
             for folder in (PARTS, Path(self._name(self.works[0])).parent):
                 shutil.rmtree(results.path / folder, ignore_errors=True)
