@@ -251,7 +251,7 @@ SURVEY_SUMMARY = {
     "rows": [
         {
             "scenario": "mini", "sessions": 1, "slots": 10, "car_detection_rate": 0.6, "slot_accuracy": 1.0,
-            "range_abs_error_m": {"median": 0.002, "p95": 0.003},
+            "unknown_fraction": 0.0, "range_abs_error_m": {"median": 0.002, "p95": 0.003},
             "by_weather": {"dusk": {"sessions": 1, "car_detection_rate": 0.6, "slot_accuracy": 1.0}},
             "detection_by_distance": [
                 {"weather": "dusk", "distance_m": [0.0, 4.0], "in_frame": 2, "detected": 2, "rate_ci95": [0.3, 1.0]}
@@ -297,7 +297,7 @@ FLEET_SUMMARY = {
     "changes": [
         {
             "change": "knows", "before": "own observations", "after": "a live map for 50 %", "zone": None,
-            "prices": None, "scenario": "mini",
+            "purpose": None, "prices": None, "scenario": "mini",
             "agents": "random", "knows": "shared", "share": 0.5, "arrivals_per_hour": 20.0, "days": 2,
             "cars_a_day": 20.0,
         }

@@ -13,12 +13,12 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from parkenv import __version__
 from parkenv.errors import InputError
 from parkenv.files.archives import read_arrays
 from parkenv.files.atomic_write import atomic_write
 from parkenv.studies.dataset.recording import PROBABILITIES, RecordedSearch
 from parkenv.studies.results import Row
+from parkenv.version import __version__
 
 PARTS = ".parts"
 """Folder in that of a run with the searches that are in no data set yet."""
