@@ -101,7 +101,8 @@ class DemandStudy(Study):
         takes="FILE",
         argument=True,
     )
-    scenario: OneScenario = scenario_spec("town")
+    # A factory, since a default with the paths of its files would stand in the schema.
+    scenario: OneScenario = Field(default_factory=lambda: scenario_spec("town"))
     from_day: Date | None = option(
         None, "First day that is followed.", name="--from", takes="DATE", default="the first one counted"
     )
