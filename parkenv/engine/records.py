@@ -648,6 +648,19 @@ def _arrays_in(kept: Sequence[Any]) -> Iterator[NDArray[Any]]:
             yield from (value for value in vars(one).values() if isinstance(value, np.ndarray))
 
 
+_ARRAYS = {
+    "slots": "slots",
+    "blocks": "_blocks",
+    "columns": "_columns",
+    "external_forecast": "external_forecast",
+    "day_error": "day_error",
+    "p_occupied": "p_occupied",
+    "belief": "belief",
+    "step_observed": "step_observed",
+}
+"""Attributes of `Searches` with a row for each search, by the SEARCH field that holds the row's address."""
+
+
 class Searches:
     """One or more running searches as records, and the arrays that the records point to.
 
@@ -773,16 +786,7 @@ class Searches:
 
     def _arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays with a row for each search, keyed by the SEARCH field that holds the row's address."""
-        return {
-            "slots": self.slots,
-            "blocks": self._blocks,
-            "columns": self._columns,
-            "external_forecast": self.external_forecast,
-            "day_error": self.day_error,
-            "p_occupied": self.p_occupied,
-            "belief": self.belief,
-            "step_observed": self.step_observed,
-        }
+        return {field: getattr(self, name) for field, name in _ARRAYS.items()}
 
     @property
     def address(self) -> int:
@@ -798,17 +802,8 @@ class Searches:
         """Return one of the searches by itself, in the same memory: what changes one changes the other."""
         one, rows = copy(self), slice(i, i + 1)
         one.records = self.records[rows]
-        for name in (
-            "slots",
-            "_blocks",
-            "_columns",
-            "day_error",
-            "external_forecast",
-            "p_occupied",
-            "belief",
-        ):
+        for name in _ARRAYS.values():
             setattr(one, name, getattr(self, name)[rows])
-        one.step_observed = self.step_observed[rows]
         return one
 
     def save(self, rows: IntArray | None = None) -> tuple[NDArray[Any], ...]:

@@ -18,13 +18,14 @@ import gymnasium as gym
 OPTIONS: dict[str, Any] = {"observation": "local", "flat": True, "reward_scale": 0.01}
 """Of `gymnasium.make("parkenv/Search-v2", ...)`, besides the scenario."""
 
+_search = gym.spec("parkenv/Search-v2")
 for _name in ("campus", "jam", "street", "mini"):
     if f"parkenv-flat/{_name}-v2" not in gym.registry:
         gym.register(
             id=f"parkenv-flat/{_name}-v2",
-            entry_point="parkenv.envs.search:SearchEnv",
-            vector_entry_point="parkenv.envs.search_vector:ParkSearchVectorEnv",
-            max_episode_steps=2000,
-            order_enforce=False,
+            entry_point=_search.entry_point,
+            vector_entry_point=_search.vector_entry_point,
+            max_episode_steps=_search.max_episode_steps,
+            order_enforce=_search.order_enforce,
             kwargs={"scenario": _name, **OPTIONS},
         )

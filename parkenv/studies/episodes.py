@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.belief.slot_belief import Observations, SlotBelief
+from parkenv.compiled.arrays import BoolArray
 from parkenv.engine.state import SearchState
 from parkenv.mapping.trips import Trip
 from parkenv.show.search_record import Moment, SearchRecord
@@ -143,7 +144,7 @@ class EpisodeRunner:
             arrival=state.arrival,
             world=state.world,
             path=list(state.path),
-            occupied=state.world.occupied(np.arange(scenario.lot.n_slots), state.arrival.time),
+            occupied=self._occupied(),
             forecast=scenario.forecast(state.arrival).p_occupied,
             policy=recorder.policy,
             metrics=metrics | {"replans": int(getattr(result.memory, "replans", 0))},
@@ -156,8 +157,11 @@ class EpisodeRunner:
     @property
     def occupancy(self) -> float:
         """Share of the slots that are taken at the arrival of the present episode."""
+        return float(self._occupied().mean())
+
+    def _occupied(self) -> BoolArray:
         state = self._state
-        return float(state.world.occupied(np.arange(self.scenario.lot.n_slots), state.arrival.time).mean())
+        return state.world.occupied(np.arange(self.scenario.lot.n_slots), state.arrival.time)
 
     @property
     def _state(self) -> SearchState:

@@ -98,6 +98,11 @@ def best_path(
     )
 
 
+def is_compiled() -> bool:
+    """Return whether this process has the code of `best_path`."""
+    return bool(getattr(_best_path, "signatures", True))
+
+
 @compiled(error_model="numpy")
 def _best_path(
     vertex: int,

@@ -199,9 +199,10 @@ def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figu
     columns = min(len(panels), 4)
     lines = -(-len(panels) // columns)
     planners = list(dict.fromkeys(row["planner"] for rows in panels.values() for row in rows))
-    keys = min(len(planners), 2 + columns)
+    width = max(3.0 * columns, 4.6)
+    keys = legend_columns(planners, width, min(len(planners), 2 + columns))
     with mpl.rc_context(STYLE):
-        size = max(3.0 * columns, 4.6), 2.7 * lines + 0.2 * -(-len(planners) // keys)
+        size = width, 2.7 * lines + 0.2 * -(-len(planners) // keys)
         figure = Figure(figsize=size, layout="constrained")
         axes = figure.subplots(lines, columns, squeeze=False, sharex=True)
         for ax, (name, rows) in zip(axes.flat, panels.items(), strict=False):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import re
 import subprocess
@@ -20,7 +19,16 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
-from parkenv.studies.benchmark.suite import CONTROLS, SUITES, Suite, Task, estimate, score_of, worlds_of
+from parkenv.studies.benchmark.suite import (
+    CONTROLS,
+    SUITES,
+    Suite,
+    Task,
+    estimate,
+    score_of,
+    sha256_of,
+    worlds_of,
+)
 from parkenv.studies.compare.cases import Case, table
 from parkenv.studies.results import Key, Row, decision_s, without_nan
 from parkenv.studies.statistics import columns_of, decision_columns
@@ -271,9 +279,8 @@ def _require(path: Path, field: str, value: Any, wanted: Any, why: str, unit: st
 
 
 def fingerprint(content: Row) -> str:
-    """Return the SHA-256 of a result, as JSON without white space and its own entry."""
-    its = {key: value for key, value in content.items() if key != "sha256"}
-    return hashlib.sha256(json.dumps(its, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
+    """Return the SHA-256 of a result, without its own entry."""
+    return sha256_of({key: value for key, value in content.items() if key != "sha256"})
 
 
 def by_group(result: Row) -> list[tuple[str, str, float, float]]:

@@ -106,7 +106,6 @@ class Suite:
         if name not in SUITES:
             raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
         content = _packaged(name)
-        canonical = json.dumps(content, sort_keys=True, separators=(",", ":"))
         first = content.get("first_seed", 0)
         return cls(
             name,
@@ -114,7 +113,7 @@ class Suite:
             ArrivalWindow.parse(content["arrival"], content["days"]),
             range(first, first + content.get("episodes", 0)),
             tuple(_task(**task) for task in content["tasks"]),
-            hashlib.sha256(canonical.encode()).hexdigest(),
+            sha256_of(content),
         )
 
     def seeds_of(self, task: Task) -> Sequence[int]:
@@ -238,6 +237,11 @@ def suite_lots() -> Mapping[float, str]:
     return {
         task["lot_share"]: task["name"] for suite in suites for task in suite["tasks"] if "lot_share" in task
     }
+
+
+def sha256_of(content: Any) -> str:
+    """Return the SHA-256 of a content, as JSON without white space."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
 
 
 def _packaged(name: str) -> Any:

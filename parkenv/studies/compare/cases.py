@@ -26,6 +26,7 @@ from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 from planners.belief.agent import BeliefAgent
+from planners.belief.best_path import is_compiled
 
 BUDGET = "budget_ms"
 """The option of agents that plan for a time, ms a decision."""
@@ -76,7 +77,7 @@ class Case:
     def run(self, seeds: Sequence[int]) -> list[Row]:
         """Run one episode per seed; return their rows of `episodes.csv`, with the wall times of their decisions."""
         runner = self.runner()
-        if isinstance(runner.agent, BeliefAgent):
+        if isinstance(runner.agent, BeliefAgent) and not is_compiled():
             # First runs: workers that all begin with the environment would wait for the one that compiles it.
             runner.agent.compile_ahead(_forecast_of(self.scenario, seeds[0]))
         return [{**self.columns, **timed_row(runner.run(seed))} for seed in seeds]
