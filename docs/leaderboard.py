@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from parkenv.show.plurals import interval_text
 from parkenv.studies.benchmark.page import DESIGNS, entries_of, neighbours, ranking, result_files
 from parkenv.studies.benchmark.result_file import check_result
 
@@ -37,8 +38,8 @@ def tables():
 
 def interval(row, name, sign=""):
     """Write a value with its interval."""
-    value, (low, high) = row[name], row[f"{name}_ci95"]
-    return f"{value:{sign}.1f} [{low:{sign}.1f}, {high:{sign}.1f}]" if high > low else ""
+    ends = row[f"{name}_ci95"]
+    return interval_text(row[name], ends, f"{sign}.1f") if ends[1] > ends[0] else ""
 
 
 def page(text):

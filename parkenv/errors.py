@@ -17,6 +17,11 @@ class InputError(ValueError):
     """
 
 
+def needs_extra(what: str, extra: str) -> str:
+    """Say that something needs an extra of the package, and how to install it."""
+    return f"{what} needs the extra {extra}: pip install 'parkenv[{extra}]'"
+
+
 @contextmanager
 def naming(source: object) -> Iterator[None]:
     """Let the messages of InputErrors in the block begin with the source that they are about, such as a file."""

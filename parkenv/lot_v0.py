@@ -15,18 +15,17 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from numpy.typing import NDArray
 
+from parkenv.errors import InputError, needs_extra, require_whole
+
 try:
     from pettingzoo import AECEnv, ParallelEnv
     from pettingzoo.utils import wrappers
 except ImportError as error:
-    raise DependencyNotInstalled(
-        'parkenv.lot_v0 needs pettingzoo, which is not installed: pip install "parkenv[multi]"'
-    ) from error
+    raise DependencyNotInstalled(needs_extra("parkenv.lot_v0", "multi")) from error
 
 from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
-from parkenv.errors import InputError, require_whole
 from parkenv.files.known_names import MAX_CARS
 from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
 from parkenv.world.demand import Demand, Headways, TownDemand

@@ -19,7 +19,7 @@ from gymnasium import spaces
 from pydantic import Field, JsonValue
 from pydantic_core import to_jsonable_python
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
@@ -181,7 +181,7 @@ def algorithm_class(name: str) -> Any:
     try:
         return getattr(import_module(module), class_name)
     except ImportError as error:
-        raise InputError(f'{name} needs the extra rl: pip install "parkenv[rl]"') from error
+        raise InputError(needs_extra(name, "rl")) from error
 
 
 def save_model(

@@ -242,7 +242,7 @@ def test_window(monkeypatch):
 
 def test_a_window_without_pygame_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "pygame", None)
-    with pytest.raises(gym.error.DependencyNotInstalled, match=r'pip install "parkenv\[human\]"'):
+    with pytest.raises(gym.error.DependencyNotInstalled, match=r"pip install 'parkenv\[human\]'"):
         check_env(gym.make("parkenv/Search-v2", scenario="mini").unwrapped)
 
 

@@ -19,7 +19,7 @@ import typer
 
 from parkenv.cli.command import Entry, make_app
 from parkenv.cli.stop_signals import stop_signals
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.version import __version__
 from sim_sensors.errors import SensorError
 
@@ -177,7 +177,7 @@ def _report(error: BaseException) -> int:
         ):
             return _complain(": ".join(str(part) for part in (error.filename, error.strerror) if part))
         case ModuleNotFoundError() if extra := _extra_with(error.name or ""):
-            return _complain(f"this needs the extra {extra}: pip install 'parkenv[{extra}]' ({error})")
+            return _complain(f"{needs_extra('this', extra)} ({error})")
     return _report_crash(error)
 
 

@@ -16,7 +16,7 @@ from parkenv.cli.tables import WIDE, make_console, make_table, print_recorded, s
 from parkenv.errors import InputError
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.plurals import plural
+from parkenv.show.plurals import number_text, plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import Comparison, Grid
 from parkenv.studies.fields import TRAFFIC, OneAgent, OneScenario, Seed
@@ -159,7 +159,7 @@ def result_tables(rows: list[Row], width: int) -> list[Table]:
             ("regret s", lambda r: _seconds(r["regret_s"])),
         )
         if any("gap_to_exact" in row for row in its_rows):
-            results = (*results, ("over exact", lambda r: f"{r['gap_to_exact']:+.2%}"))
+            results = (*results, ("over exact", lambda r: number_text(r["gap_to_exact"], "+.2%")))
         title = (
             f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
             f"{plural(max(r['episodes'] for r in its_rows), 'episode')}"
@@ -214,8 +214,7 @@ def _interval(mean: float, ends: list[float], *, signed: bool = False) -> str:
 
 
 def _seconds(value: float, signed: bool = False) -> str:
-    # Adding zero turns the -0.0 of a rounded difference into 0.0.
-    return f"{round(value, 1) + 0.0:{'+' if signed else ''}{'.0f' if abs(value) >= 1000 else '.1f'}}"
+    return number_text(value, f"{'+' if signed else ''}{'.0f' if abs(value) >= 1000 else '.1f'}")
 
 
 class Plan(Command):

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from parkenv.cli.study_command import AgentStudyCommand
 from parkenv.cli.tables import make_table
 from parkenv.files.option import option
-from parkenv.show.plurals import plural
+from parkenv.show.plurals import interval_text, number_text, plural
 from parkenv.studies.commute.study import Commute as CommuteStudy
 from parkenv.studies.fleet.changes import interval_of, is_known, sentence, shown_changes
 from parkenv.studies.fleet.study import FleetStudy
@@ -233,12 +233,10 @@ def _cells(row: Row, *, mixed: bool) -> list[str]:
     ]
 
 
-def _number(value: float | None, digits: str) -> str:
-    return format(value, digits) if is_known(value) else ""
+def _number(value: float | None, spec: str) -> str:
+    return "" if value is None or not is_known(value) else number_text(value, spec)
 
 
-def _interval(row: Row, name: str, digits: str) -> str:
+def _interval(row: Row, name: str, spec: str) -> str:
     """Return a value and its interval, each as far as it is known."""
-    ends = interval_of(row, name)
-    shown = f" [{', '.join(format(end, digits) for end in ends)}]" if ends else ""
-    return _number(row[name], digits) + shown
+    return interval_text(row[name], interval_of(row, name), spec) if is_known(row[name]) else ""

@@ -241,7 +241,7 @@ def arrive_all(address: int, which: BoolArray) -> None:
 
 @inlined
 def advance(search: Any, e: int, action: int, fresh: bool, limit: int, steps: Steps) -> None:
-    """Step a search unless it is fresh, and write its results."""
+    """Step a search unless it is fresh, and write its results, and the time, which policies read, too."""
     if fresh:
         steps.rewards[e] = 0.0
         steps.terminated[e] = steps.truncated[e] = False
@@ -250,6 +250,7 @@ def advance(search: Any, e: int, action: int, fresh: bool, limit: int, steps: St
         steps.rewards[e] = -step_cost_s(search)
         steps.terminated[e] = search.over
         steps.truncated[e] = search.n_steps >= limit
+    write_clock(search)
     masks = uint8s(scenario_at(search.scenario, 0).action_masks)
     for move in range(N_ACTIONS):
         steps.mask[e, move] = masks[search.vertex * N_ACTIONS + move]
@@ -279,7 +280,6 @@ def step_with_belief(
             init_prior(search)
         else:
             refresh_belief(search)
-        write_clock(search)
         vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
 
 

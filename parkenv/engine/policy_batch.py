@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import EXPLORATION_STREAM, keyed_uniform
 from parkenv.compiled.memory import address_of, call_at
-from parkenv.engine.kernel import write_clock
 from parkenv.engine.policy import CompiledPolicy, car_of, search_of
 from parkenv.engine.records import CAR, FLEET, N_ACTIONS, NO_SLOT, SEARCH, Searches
 from parkenv.world.occupancy.kernel import kernel
@@ -98,7 +97,6 @@ def explore_at(
             continue
         car = car_of(fleet, e)
         search = search_of(car.search)
-        write_clock(search)  # a batch with local observations keeps none
         planned = call_at(policy, fleet, e)
         if not 0 <= planned < N_ACTIONS:
             planned = waits[search.vertex]

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from parkenv.compiled.arrays import Image
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.files.images import decode_image
 from parkenv.files.limited_reading import Counted, read_yaml, require_file
 from parkenv.files.videos import USUAL_FPS, VideoFrame
@@ -55,7 +55,7 @@ def require_rosbags() -> None:
     try:
         import rosbags.rosbag2  # noqa: F401
     except ImportError as error:
-        raise InputError("recorded drives need the extra bags: pip install 'parkenv[bags]'") from error
+        raise InputError(needs_extra("a recorded drive", "bags")) from error
 
 
 @contextmanager

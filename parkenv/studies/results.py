@@ -401,12 +401,20 @@ class Results:
             self.read()
         return dict(settings), continues
 
+    def recorded_command(self) -> tuple[str, ...]:
+        """Return the command of the run that the folder holds; empty if it is lost."""
+        for file in (self.path / SUMMARY, self.path / SUMMARY_PARTIAL):
+            if file.exists() and isinstance(summary := read_json(file), dict):
+                return tuple(map(str, summary.get("command", ())))
+        return ()
+
     def begin(self, settings: Mapping[str, Any]) -> None:
         """Write the settings of the run, and the rows that it goes on with.
 
         A line that a crash has truncated is dropped, and runs again.
         """
         (self.path / SUMMARY).unlink(missing_ok=True)
+        write_summary(self.path, {"command": self.command, "complete": False}, SUMMARY_PARTIAL)
         _write_text(self.path / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
         for table in self._tables:
             table.write(self.path, list(self._rows[table.file].values()))

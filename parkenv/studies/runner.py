@@ -28,7 +28,7 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.user_class import failure_of
 from parkenv.studies.agent_spec import classes_in
 from parkenv.studies.results import SETTINGS, SPEC_FILE, SUMMARY, Key, Results, Row, Table
-from parkenv.studies.study import Progress, Stage, Study, read_study
+from parkenv.studies.study import ExecutionSpec, Progress, Stage, Study, read_study
 from parkenv.studies.workers import Task, Workers
 from parkenv.version import __version__
 
@@ -133,6 +133,7 @@ def run(
         progress: called as rows finish; see `Progress`.
         workers: where tasks run, if not as the study says; results do not depend on it.
         command: command line to record in the summary; by default the one that runs the specification in the folder.
+            A run that goes on with the same specification keeps its first one.
 
     Raises:
         InputError: the study cannot be run, or the folder cannot be used.
@@ -164,6 +165,10 @@ def run(
         settings, continues = results.claim(
             study.settings(), study.kind, resume=resume, overwrite=overwrite, goes_on=study.goes_on
         )
+        if continues and (path / SPEC_FILE).exists():
+            machines = {name: getattr(study, name) for name in ExecutionSpec.model_fields}
+            if type(study).read(path / SPEC_FILE).changed(**machines) == study:
+                results.command = results.recorded_command() or results.command
         study.prepare(results, continues=continues)
         results.begin(settings)
         study.write(path / SPEC_FILE)

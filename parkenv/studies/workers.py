@@ -25,7 +25,7 @@ from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky import process_executor, reusable_executor
 from joblib.externals.loky.backend import resource_tracker
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
@@ -343,6 +343,4 @@ def _required(module: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise InputError(
-            f'--backend {extra} needs the extra {extra}: pip install "parkenv[{extra}]"'
-        ) from error
+        raise InputError(needs_extra(f"--backend {extra}", extra)) from error

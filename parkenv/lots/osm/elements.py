@@ -27,7 +27,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, needs_extra
 from parkenv.files.limited_reading import is_there, open_limited, read_json, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.positions import Positions
@@ -573,9 +573,7 @@ def _read_pbf(path: Path) -> OsmMap:
     try:
         import osmium
     except ImportError as error:
-        raise InputError(
-            f"{path}: .osm.pbf is read with osmium; install it by: pip install 'parkenv[osm]'"
-        ) from error
+        raise InputError(f"{path}: {needs_extra('.osm.pbf', 'osm')}") from error
     if not is_there(path):
         raise InputError(f"{path}: No such file or directory")
     raw = RawElements()

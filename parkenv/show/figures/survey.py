@@ -27,7 +27,7 @@ from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
 from parkenv.show.figures.picture_files import INK, STYLE, save_picture
 from parkenv.show.painters.axes import paint
 from parkenv.show.painters.opencv import write_tag
-from parkenv.show.plurals import plural
+from parkenv.show.plurals import plural, slots_text
 from parkenv.show.scene import DISC, Lines, Marks, posed
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import View
@@ -270,9 +270,7 @@ def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:
     handles.append(Patch(fill=False, edgecolor=WRONG, linewidth=2.0, label=f"wrong ({wrong.sum()})"))
     _draw_key(ax, handles)
     right, unknown = result.slot_accuracy, 1.0 - result.states.in_view.mean()
-    ax.set_title(
-        f"slots: {right:.1%} right, {unknown:.1%} unknown, {max(1.0 - right - unknown, 0.0):.1%} wrong"
-    )
+    ax.set_title(f"slots: {slots_text(right, unknown)}")
 
 
 def _draw_key(ax: Axes, handles: Sequence[Patch | Line2D]) -> None:

@@ -8,6 +8,8 @@ import numpy as np
 from gymnasium.error import DependencyNotInstalled
 from numpy.typing import NDArray
 
+from parkenv.errors import needs_extra
+
 
 class Window:
     """A window that opens with the first frame.
@@ -30,9 +32,7 @@ class Window:
         try:
             import pygame
         except ImportError as error:
-            raise DependencyNotInstalled(
-                'render_mode "human" needs pygame, which is not installed: pip install "parkenv[human]"'
-            ) from error
+            raise DependencyNotInstalled(needs_extra('render_mode "human"', "human")) from error
         if self._screen is None:
             pygame.display.init()
             self._screen = pygame.display.set_mode(frame.shape[1::-1])

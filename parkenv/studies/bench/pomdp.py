@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from parkenv.errors import needs_extra
 from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.spec import lot_scenario, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
@@ -22,7 +23,7 @@ REAL_PLACES = ("place-01", "place-09", "place-17")
 def missing_peers() -> str:
     """Return why `PEERS` cannot be measured here; empty if they can."""
     if find_spec(LIBRARY) is None:
-        return "pomdp-py is not installed: pip install 'parkenv[pomdp]'"
+        return needs_extra("pomdp-py", "pomdp")
     if not ADAPTERS.exists():
         return f"their adapters, {ADAPTERS}, are not in the working directory"
     return ""

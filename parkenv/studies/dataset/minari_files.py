@@ -13,7 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.files.archives import read_arrays
 from parkenv.files.atomic_write import atomic_write
 from parkenv.studies.dataset.recording import PROBABILITIES, RecordedSearch
@@ -36,7 +36,7 @@ def require_minari() -> None:
     try:
         import_module("minari.dataset._storages.hdf5_storage")
     except ImportError as error:
-        raise InputError(f"data sets need Minari: pip install 'parkenv[offline]' ({error})") from error
+        raise InputError(f"{needs_extra('a data set', 'offline')} ({error})") from error
 
 
 def write_part(folder: Path, searches: Sequence[RecordedSearch]) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.show.plurals import plural
+from parkenv.show.plurals import interval_text, number_text, plural
 from parkenv.studies.fleet.setting import CAR_LISTS, GIVEN, NOWHERE, OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.fleet.tables import day_means, paired_days
 from parkenv.studies.results import Row
@@ -250,7 +250,8 @@ def _gain(row: Row, name: str, saves: str, loses: str, who: str) -> str:
         return f"{saves if value < 0.0 else loses} {abs(value):.1f} s [{low:.1f}, {high:.1f}]"
     if ends == (0.0, 0.0):
         return f"{who}: no difference"
-    shown = f"{value:+.1f} s" + (f" [{ends[0]:+.1f}, {ends[1]:+.1f}]" if ends else "")
+    number, _, interval = interval_text(value, ends, "+.1f").partition(" ")
+    shown = f"{number} s {interval}".rstrip()
     if row["days"] < LEAST_DAYS:
         return f"{who}: {shown} on {plural(row['days'], 'day')}, too few to tell"
     return f"{who}: no clear difference on average, {shown}"
@@ -293,7 +294,7 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
         value = "no clear difference on average" if row["days"] >= LEAST_DAYS else "too few days to tell"
         interval, ends = "no interval", interval_of(row, "change_s")
         if ends:
-            interval = f"95 % interval {ends[0]:+.1f} to {ends[1]:+.1f} s"
+            interval = "95 % interval {} to {} s".format(*(number_text(end, "+.1f") for end in ends))
         if is_clear(row, "change_s"):
             value = f"{abs(row['change_s']):.1f} s {'less' if row['change_s'] < 0.0 else 'more'} a car"
             interval = "95 % interval {:.1f} to {:.1f} s".format(*sorted(map(abs, ends or ())))

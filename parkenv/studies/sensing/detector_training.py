@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.files.atomic_write import atomic_write, check_writable
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several, Spec
@@ -163,9 +163,7 @@ class DetectorTraining(Spec):
         try:
             from parkenv.perception.lab.center_training import CenterTrainingSettings, build_network
         except ImportError as error:
-            raise InputError(
-                f"--simulated needs {error.name}, which is not installed: pip install 'parkenv[detector]'"
-            ) from error
+            raise InputError(needs_extra("--simulated", "detector")) from error
         settings = CenterTrainingSettings(steps=self.steps, seed=self.seed)
         built = build_network(streets, settings, self.pictures, progress=progress)
         files = out, out.with_suffix(".toml")

@@ -13,7 +13,7 @@ from parkenv.files.known_names import LocaliserName, RigName, WeatherName
 from parkenv.files.option import Inside, option
 from parkenv.files.spec_file import Several
 from parkenv.scenarios.spec import Hours, scenario_spec
-from parkenv.show.plurals import plural
+from parkenv.show.plurals import plural, slots_text
 from parkenv.studies.fields import PRICES, CaptureDistance, Detector, OneScenario, Seed, with_traffic
 from parkenv.studies.results import Key, Results, Row, without_nan
 from parkenv.studies.sensing.sessions import MAP_FILE, SESSIONS
@@ -204,8 +204,7 @@ class SurveyStudy(Study):
         right, unknown = row["slot_accuracy"], row["unknown_fraction"]
         return [
             f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: {row['car_detection_rate']:.1%} "
-            f"of the parked cars were detected; {right:.1%} of the slots are right, {unknown:.1%} unknown as they were "
-            f"never in view, {max(1.0 - right - unknown, 0.0):.1%} wrong. "
+            f"of the parked cars were detected. Slots: {slots_text(right, unknown)}; unknown were never in view. "
             "Ranges alone classify slots, too, so a car that was detected in no image can still be in the map."
         ]
 

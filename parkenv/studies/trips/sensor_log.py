@@ -15,7 +15,7 @@ from matplotlib import colormaps
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, needs_extra
 from parkenv.files.atomic_write import atomic_write
 from parkenv.studies.episodes import SearchRecorder
 from parkenv.studies.simulate import STEP_LIMIT, simulate
@@ -210,7 +210,7 @@ def require_viewer() -> None:
         InputError: the SDK is missing.
     """
     if find_spec("rerun") is None:
-        raise InputError("a recording needs the Rerun SDK; install it with: pip install 'parkenv[viewer]'")
+        raise InputError(needs_extra("a recording", "viewer"))
 
 
 @contextmanager
