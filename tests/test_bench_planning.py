@@ -1,6 +1,7 @@
 """The planning part of the bench: its rows, and that it measures what an agent does."""
 
 import numpy as np
+import pytest
 
 from parkenv.lots import grid_lot
 from parkenv.studies.bench.planning import drive, forecast_process, planning_rows, transitions
@@ -8,6 +9,7 @@ from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import StoppingGraph, set_labels
 
 
+@pytest.mark.slow
 def test_rows_have_the_keys_of_every_bench_and_stand_beside_the_thesis():
     rows = planning_rows(seconds=0.01, largest=2_000)
     keys = {"part", "case", "value", "unit", "peer", "peer_value", "ratio"}

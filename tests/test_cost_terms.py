@@ -65,7 +65,7 @@ def tries(mask, rng):
     [
         ("Search-v2", {}, 3),
         ("SearchSensors-v2", {"observation": "scan"}, 3),
-        ("SearchPerception-v2", {"captures": 1, "picture_width": 160}, 1),
+        pytest.param("SearchPerception-v2", {"captures": 1, "picture_width": 160}, 1, marks=pytest.mark.slow),
     ],
 )
 def test_single_searches(scenario, name, options, searches):
@@ -109,7 +109,7 @@ def test_the_batch(scenario):
     assert ended > 10
 
 
-@pytest.mark.parametrize("of_many", [False, True])
+@pytest.mark.parametrize("of_many", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_stable_baselines3(scenario, of_many):
     if of_many:
         demand = Demand(PoissonArrivals(30, 8 * 3600, 9 * 3600))

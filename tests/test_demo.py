@@ -2,6 +2,7 @@
 
 import json
 
+import pytest
 from command_line import parkenv
 from PIL import Image
 
@@ -10,6 +11,7 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.demo.study import AGENTS, QUICK, Demo
 
 
+@pytest.mark.slow
 def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     out = tmp_path / "demo"
     shorter = ("--more", 10, "--every", 8)

@@ -362,6 +362,7 @@ def test_a_model_wants_weights_of_its_window():
         CarModel(Descriptor(), np.zeros(3, np.float32), 0.0, 2.5)
 
 
+@pytest.mark.slow
 def test_held_out_blocks_are_judged_once_each(crops, monkeypatch):
     monkeypatch.setattr("parkenv.perception.lab.cross_validation.MADE_PHOTOS", 2)
     scores = cross_validated(Crops(*crops), folds=2, seed=1, settings=TrainingSettings(rounds=0, jitter=0))

@@ -150,6 +150,7 @@ def means(knows, demand, **options):
     return np.mean(found)
 
 
+@pytest.mark.slow
 def test_knowing_more_helps_and_guidance_helps_most():
     demand = Demand(PoissonArrivals(120.0, 32400.0, 36000.0), ExponentialTime(3600.0), ConstantTime(900.0))
     own, late, shared, full, reserve = (
@@ -162,6 +163,7 @@ def test_knowing_more_helps_and_guidance_helps_most():
     assert own > late > shared > full > reserve
 
 
+@pytest.mark.slow
 def test_others_may_take_a_reserved_slot():
     demand = Demand(PoissonArrivals(240.0, 32400.0, 36000.0), ExponentialTime(3600.0), ConstantTime(600.0))
     kinds = [

@@ -130,6 +130,7 @@ def test_a_demand_is_a_number_or_a_multiple_of_the_given_or_counted_one(given, r
     assert rate_of(str(rate)) == rate, "as read from a table"
 
 
+@pytest.mark.slow
 def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     write_counts(tmp_path / "counts.csv", change=lambda park, day, taken: 0.85 * taken)
     words = ("--scenario", "campus", "--occupancy", tmp_path / "counts.csv", "--car-park", "P0")

@@ -28,6 +28,7 @@ def write(path, days, fault=False):
     return path
 
 
+@pytest.mark.slow
 def test_an_evaluation_has_a_row_and_a_picture_for_each_model(tmp_path):
     counts = write(tmp_path / "counts.csv", 60, fault=True)
     ended = parkenv("occupancy", "evaluate", counts, "--from", "2024-02-10", "--out", tmp_path / "out")

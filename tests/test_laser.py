@@ -241,6 +241,7 @@ def test_orientation_and_corners_on_a_straight_edge_do_not_matter():
     np.testing.assert_allclose(LASER.scan(ScanPlane([with_midpoints]), pose), wanted, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_thousands_of_footprints():
     x, y = np.meshgrid(np.arange(100) * 2.5, np.arange(50) * 8.0)
     rectangles = np.column_stack([x.ravel(), y.ravel()])[:, None] + [

@@ -251,6 +251,7 @@ def test_stable_baselines_evaluates_the_planner():
     np.testing.assert_allclose(rewards, -0.1 * (np.array(lengths) - 1), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_planner_waits_for_those_who_move():
     env = gym.make(
         "parkenv/Drive-v1", lot="campus", obstacle_map=True, traffic=Traffic(cars=6, pedestrians=10)

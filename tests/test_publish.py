@@ -22,6 +22,7 @@ def model(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_a_published_model_repeats_its_results(model, tmp_path):
     out = tmp_path / "hub"
     done = parkenv("publish", model, "--out", out, "--episodes", 3, "--jobs", 1)

@@ -196,6 +196,7 @@ def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
         Fleet(its, Demand(Headways(2), classes={"permit-b": 1.0})).reset()
 
 
+@pytest.mark.slow
 def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
     town = make_scenario("town")
     fleet = Fleet(town, town.demand, drivers=[DriverKind(policy=POLICIES["usual"])])
@@ -208,6 +209,7 @@ def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
     assert np.isfinite(of_car).all()
 
 
+@pytest.mark.slow
 def test_in_a_town_the_way_to_the_goal_takes_no_patience():
     town = make_scenario("town")
     goals = tuple(np.ones(len(town.lot.goals)))
@@ -223,6 +225,7 @@ def test_in_a_town_the_way_to_the_goal_takes_no_patience():
     assert np.mean(fleet.cars["slot"] >= 0) > 0.2  # those whose goal has a free space beside it
 
 
+@pytest.mark.slow
 def test_hardly_anybody_who_drives_as_usual_gives_up_before_the_town_is_full():
     town = make_scenario("town")
     fleet = Fleet(town, town.demand.scaled(1.5), drivers=[DriverKind(policy=POLICIES["usual"])])

@@ -287,6 +287,7 @@ def pairs():
     return stereo, mount, looks
 
 
+@pytest.mark.slow
 def test_cars_are_placed_from_stereo_alone(pairs):
     stereo, mount, looks = pairs
     errors = {"fitted": [], "thesis": []}

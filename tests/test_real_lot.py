@@ -28,6 +28,7 @@ def totals(scenario, agent, episodes):
     return np.array([row["total_s"] for row in Case(scenario, agent).run(range(episodes))])
 
 
+@pytest.mark.slow
 @needs_data
 def test_the_world_is_the_log_and_the_forecast_is_not(scenario):
     """Searches fall on recorded weekdays in the window, with the occupancy of the log."""

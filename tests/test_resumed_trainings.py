@@ -40,7 +40,12 @@ def small(monkeypatch):
     make_small(monkeypatch)
 
 
-@pytest.mark.parametrize("kind", TRAININGS)
+SLOW = ("recurrent-ppo", "drive, sac")
+
+
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind in SLOW)) for kind in TRAININGS]
+)
 def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
     """Killed right before its third checkpoint: the evaluation before it is repeated."""
     training = TRAININGS[kind]()

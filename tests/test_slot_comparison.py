@@ -11,6 +11,7 @@ from parkenv.forecast.slot_comparison import OURS, compare_slot_days
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
 
 
+@pytest.mark.slow
 def test_ours_is_first_where_slots_have_habits_and_the_lot_drifts():
     weekdays, _ = simulated(20, 0.6, seed=5, drift=0.06)
     weekend, _ = simulated(5, 0.6, seed=6)

@@ -33,7 +33,9 @@ def halves(name="mini"):
     return make_scenario(name, occupancy=world, traffic=BUSY), taken
 
 
-@pytest.mark.parametrize(("rig", "every"), [("laser", 4.0), ("stereo", 1.25)])
+@pytest.mark.parametrize(
+    ("rig", "every"), [("laser", 4.0), pytest.param("stereo", 1.25, marks=pytest.mark.slow)]
+)
 def test_a_session_finds_which_slots_are_taken(rig, every):
     scenario, taken = halves()
     result = Survey(scenario, SurveySettings(rig=rig, weather="overcast", every=every)).drive(0, pictures=2)
