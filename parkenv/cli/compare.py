@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
@@ -12,16 +12,17 @@ from pydantic import Field
 
 from parkenv.cli.options import Command, Given
 from parkenv.cli.study_command import AgentStudyCommand, Rerun
-from parkenv.cli.tables import WIDE, make_console, make_table, print_recorded, save_summary
+from parkenv.cli.tables import make_console, make_table, print_recorded, print_rows, save_summary
 from parkenv.errors import InputError
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.plurals import number_text, plural
+from parkenv.show.columns import SETTING_AXES
+from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.comparison import Comparison, Grid
 from parkenv.studies.fields import TRAFFIC, OneAgent, OneScenario, Seed
 from parkenv.studies.results import Row
-from parkenv.world.cost_terms import COST_TERMS
+from parkenv.world.cost_terms import COST_FIELDS
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -32,8 +33,13 @@ if TYPE_CHECKING:
 
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Default occupancy levels of a comparison."""
-MOST_TABLES = 12
-"""Maximum number of settings to print; see the figures and files for larger grids."""
+MOST_SETTINGS = 12
+"""Maximum number of settings to print in full; see the figures and files for larger grids."""
+SHOWN = (
+    "scenario", *SETTING_AXES, "agent", "episodes", "total_s", "median_s", "gave_up_fraction", "difference_s",
+    "regret_s", "gap_to_exact", *COST_FIELDS, "parked_fraction", "replans", "decision_ms", "decision_ms_p99",
+)  # fmt: skip
+"""Columns that are printed."""
 
 
 class Compare(AgentStudyCommand):
@@ -98,12 +104,14 @@ class Compare(AgentStudyCommand):
         """Print the tables of a comparison."""
         from parkenv.world.scenario import KMH
 
-        count = setting_count(result.rows)
-        few = count <= MOST_TABLES
-        tables = result_tables(result.rows, console.width) if few else cost_tables(result.rows)
-        for printed in tables if few or len(tables) <= MOST_TABLES else []:
-            console.print(printed)
-        if not few:
+        rows = with_short_labels(result.rows)
+        count = len({tuple(row[name] for name in ("scenario", *SETTING_AXES)) for row in rows})
+        if count <= MOST_SETTINGS:
+            print_rows(console, "Results", rows, SHOWN)
+        else:
+            tables = cost_tables(rows)
+            for printed in tables if len(tables) <= MOST_SETTINGS else []:
+                console.print(printed)
             console.print(f"{count} settings: intervals and paired differences are in summary.json")
         if (measured := result.summary.get("calibrated")) is not None:
             console.print(
@@ -111,11 +119,6 @@ class Compare(AgentStudyCommand):
                 f"drive {measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for "
                 "the manoeuvre into the slot, under either cost; the tables leave that out."
             )
-
-
-def setting_count(rows: list[Row]) -> int:
-    """Return the number of different scenarios and settings in rows."""
-    return len({(r["scenario"], r["failure_cost_s"], r["v_walk_kmh"], r["v_drive_kmh"]) for r in rows})
 
 
 def _record(case: Case, seeds: Sequence[int], path: Path) -> None:
@@ -129,92 +132,26 @@ def _record(case: Case, seeds: Sequence[int], path: Path) -> None:
         record_search(env, make_agent(case.agent, env.scenario, **case.options), seeds[0], log)
 
 
-Column = tuple[str, Callable[[Row], str]]
-
-_DETAILS: tuple[Column, ...] = (
-    ("parked", lambda r: f"{r['parked_fraction']:.0%}"),
-    ("replans", lambda r: f"{r['replans']:.1f}"),
-    ("ms/decision", lambda r: f"{r['decision_ms']:.2f}" if "decision_ms" in r else ""),
-    ("p99 ms", lambda r: f"{r['decision_ms_p99']:.2f}" if "decision_ms" in r else ""),
-)
-_OF_GIVING_UP: tuple[Column, ...] = (
-    ("median s", lambda r: _seconds(r["median_s"])),
-    ("found no slot", lambda r: f"{r['gave_up_fraction']:.0%}"),
-)
-
-
-def result_tables(rows: list[Row], width: int) -> list[Table]:
-    """Make the tables of each setting: one, or two if the terminal is narrow."""
-    settings: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        key = (row["scenario"], row["failure_cost_s"], row["v_walk_kmh"], row["v_drive_kmh"])
-        settings.setdefault(key, []).append(row)
-    tables, short = [], _short_labels(row["agent"] for row in rows)
-    for (name, failure, walk, drive), its_rows in settings.items():
-        first = its_rows[0]["agent"]
-        results: tuple[Column, ...] = (
-            ("total s [95 %]", lambda r: _interval(r["total_s"], r["total_s_ci95"])),
-            *(_OF_GIVING_UP if any(row["gave_up_fraction"] for row in its_rows) else ()),
-            (f"minus {short[first]} [95 %]", lambda r, a=first: _difference(r, a)),  # type: ignore[misc]
-            ("regret s", lambda r: _seconds(r["regret_s"])),
-        )
-        if any("gap_to_exact" in row for row in its_rows):
-            results = (*results, ("over exact", lambda r: number_text(r["gap_to_exact"], "+.2%")))
-        title = (
-            f"{name}: failure cost {failure:g} s, walk {walk:g} km/h, drive {drive:g} km/h, "
-            f"{plural(max(r['episodes'] for r in its_rows), 'episode')}"
-        )
-        details = (*_cost_columns(its_rows), *_DETAILS)
-        for columns in [results + details] if width >= WIDE else [results, details]:
-            headings = ("agent", *(heading for heading, _ in columns))
-            cells = ((short[row["agent"]], *(text(row) for _, text in columns)) for row in its_rows)
-            tables.append(make_table(title if columns is not details else None, headings, cells))
-    return tables
-
-
 def cost_tables(rows: list[Row]) -> list[Table]:
     """Make the tables of mean total times by failure cost: one of each scenario and speeds."""
     grids: dict[tuple[Any, ...], dict[str, dict[float, str]]] = {}
     for row in rows:
         grid = grids.setdefault((row["scenario"], row["v_walk_kmh"], row["v_drive_kmh"]), {})
-        grid.setdefault(row["agent"], {})[row["failure_cost_s"]] = _seconds(row["total_s"])
-    tables, short = [], _short_labels(row["agent"] for row in rows)
+        grid.setdefault(row["agent"], {})[row["failure_cost_s"]] = f"{row['total_s']:.1f}"
+    tables = []
     for (name, walk, drive), grid in grids.items():
         costs = sorted({cost for cells in grid.values() for cost in cells})
         title = f"{name}: mean total time, s, by failure cost, s; walk {walk:g} km/h, drive {drive:g} km/h"
-        cells = ((short[agent], *(its.get(cost, "") for cost in costs)) for agent, its in grid.items())
+        cells = ((agent, *(its.get(cost, "") for cost in costs)) for agent, its in grid.items())
         tables.append(make_table(title, ("agent", *(f"{cost:g}" for cost in costs)), cells))
     return tables
 
 
-def _short_labels(agents: Iterable[str]) -> dict[str, str]:
-    """Return labels without the folders of files, or whole where two agents would have the same."""
-    short = {agent: re.sub(r":[^()]*[/\\]", ":", agent) for agent in agents}
+def with_short_labels(rows: Sequence[Row]) -> list[Row]:
+    """Return rows whose agents have no folders of files, unless two agents would have the same name."""
+    short = {row["agent"]: re.sub(r":[^()]*[/\\]", ":", row["agent"]) for row in rows}
     times = Counter(short.values())
-    return {agent: label if times[label] == 1 else agent for agent, label in short.items()}
-
-
-def _cost_columns(rows: Sequence[Row]) -> Iterator[Column]:
-    """Yield a column for each term of the costs, but for optional ones that are 0."""
-    for term in COST_TERMS:
-        if not term.optional or any(row[term.field] for row in rows):
-            yield f"{term.name.replace('_', ' ')} s", lambda row, field=term.field: _seconds(row[field])  # type: ignore[misc]
-
-
-def _difference(row: Row, first_agent: str) -> str:
-    if row["agent"] == first_agent:
-        return ""
-    return _interval(row["difference_s"], row["difference_s_ci95"], signed=True)
-
-
-def _interval(mean: float, ends: list[float], *, signed: bool = False) -> str:
-    if ends[0] != ends[0]:
-        return _seconds(mean, signed)
-    return f"{_seconds(mean, signed)} [{_seconds(ends[0], signed)}, {_seconds(ends[1], signed)}]"
-
-
-def _seconds(value: float, signed: bool = False) -> str:
-    return number_text(value, f"{'+' if signed else ''}{'.0f' if abs(value) >= 1000 else '.1f'}")
+    return [row | {"agent": label} if times[label := short[row["agent"]]] == 1 else row for row in rows]
 
 
 class Plan(Command):
@@ -251,19 +188,9 @@ class Plan(Command):
             make_folder(self.out)
             save_picture(draw_searches(traces), self.out / "plan.png")
         save_summary(self.out, self.seed, rows)
-        cells = (
-            (
-                f"{row['failure_cost_s']:g}", f"{row['v_walk_kmh']:g}", f"{row['v_drive_kmh']:g}",
-                f"{row['expected_s']:.1f}", f"{row['total_s']:.1f}", f"{row['driven_m']:.0f}", row["slot"],
-                f"{row['walked_m']:.0f}", str(row["replans"]),
-            )
-            for row in rows
-        )  # fmt: skip
-        headings = (
-            "failure s", "walk km/h", "drive km/h", "expected s", "took s", "driven m", "slot", "walked m", "replans",
-        )  # fmt: skip
         title = f"{self.scenario.title}: plans of {self.agent.label}, seed {self.seed}"
-        console.print(make_table(title, headings, cells))
+        shown = (*SETTING_AXES, "slot", "expected_s", "total_s", "driven_m", "walked_m", "replans")
+        print_rows(console, title, rows, shown)
         console.print(f"Picture and summary are in {self.out}")
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_table
+from parkenv.cli.tables import print_rows
 from parkenv.files.option import option
 from parkenv.studies.dataset.study import DatasetStudy
 
@@ -36,19 +36,8 @@ class Dataset(StudyCommand):
 
     def show(self, console: Console, result: Result) -> None:
         """Print what each data set holds, and how it is loaded."""
-        headings = ("data set", "episodes", "steps", "mean total s", "parked", "step limit")
-        cells = (
-            (
-                row["dataset"],
-                f"{row['episodes']:,}",
-                f"{row['steps']:,}",
-                "{:.1f} [{:.1f}, {:.1f}]".format(row["total_s"], *row["total_s_ci95"]),
-                f"{row['parked_fraction']:.1%}",
-                f"{row['truncated_fraction']:.1%}",
-            )
-            for row in result.rows
-        )
-        console.print(make_table(None, headings, cells))
+        shown = ("dataset", "episodes", "steps", "total_s", "parked_fraction", "truncated_fraction")
+        print_rows(console, "Data sets", result.rows, shown)
         if result.complete:
             name, folder = result.rows[0]["dataset"], result.folder
             console.print(f"MINARI_DATASETS_PATH={folder} minari show {name}", soft_wrap=True)

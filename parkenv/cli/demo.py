@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from parkenv.cli.compare import result_tables
+from parkenv.cli.compare import SHOWN as OF_SEARCHES
 from parkenv.cli.report import make_report
 from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, print_recorded
+from parkenv.cli.tables import make_console, print_recorded, print_rows
 from parkenv.files.option import option
 from parkenv.studies.demo.study import FILM, QUICK
 from parkenv.studies.demo.study import Demo as DemoStudy
@@ -96,8 +96,7 @@ class Demo(StudyCommand):
                 f"{found} Mean absolute error of the map: {surveyed['occupancy_mae']:.2f} "
                 f"(raw counts for that hour: {surveyed['occupancy_mae_expected']:.2f})."
             )
-        for printed in result_tables(result.rows, console.width):
-            console.print(printed)
+        print_rows(console, "Searches", result.rows, OF_SEARCHES)
 
 
 def _record(study: DemoStudy, out: Path, path: Path) -> None:

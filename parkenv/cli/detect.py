@@ -11,7 +11,7 @@ from pydantic_core import PydanticCustomError
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, make_table, save_summary, stages
+from parkenv.cli.tables import make_console, make_table, print_rows, save_summary, stages
 from parkenv.errors import InputError
 from parkenv.files.known_names import RigName
 from parkenv.files.option import Inside, Option, option
@@ -360,8 +360,7 @@ class EvaluateDetector(Command, ExecutionSpec):
         with stages(console, "images") as progress:
             scores = score_on_uiuc(loaded, uiuc, on_image=counted(progress, "Detecting"))
         rows = [score.row for score in scores]
-        cells = ([f"{v:.4f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)
-        console.print(make_table(None, list(rows[0]), cells))
+        print_rows(console, "UIUC", rows, rows[0])
         kind = "model" if isinstance(loaded, CarModel) else "detector"
         save_curves(scores, f"{kind} {self._names[0]}", self.out / "recall_precision.png")
         save_summary(self.out, None, rows)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, make_table, print_recorded, save_summary, stages, writing_into
+from parkenv.cli.tables import make_console, print_recorded, print_rows, save_summary, stages, writing_into
 from parkenv.cli.trust import TrustModel, readable_models
 from parkenv.errors import InputError
 from parkenv.files.option import Inside, option, words_in
@@ -29,6 +29,11 @@ if TYPE_CHECKING:
     from parkenv.studies.trips.driven_search import Trip as DrivenTrip
 
 SHOWN_ROWS = 20
+SHOWN = (
+    "agent", "kind", "way", "parked", "success", "contacts", "planning_ms", "planning_ms_p95", "time_s", "time_s_p95",
+    "direction_changes", "direction_changes_p95", "driven_m", "turned_rad",
+)  # fmt: skip
+"""Columns of a comparison of parking agents that are printed."""
 
 
 class Calibrate(StudyCommand):
@@ -55,16 +60,7 @@ class Calibrate(StudyCommand):
         """Print the distributions and the calibration."""
         from parkenv.world.scenario import KMH
 
-        cells = (
-            (
-                row["what"],
-                str(row["n"]),
-                f"{row['mean']:.2f} [{row['mean_ci95'][0]:.2f}, {row['mean_ci95'][1]:.2f}]",
-                *(f"{row[name]:.2f}" if name in row else "" for name in ("median", "p95")),
-            )
-            for row in result.rows
-        )
-        console.print(make_table(self.study.title, ("what", "n", "mean [95 %]", "median", "p95"), cells))
+        print_rows(console, self.study.title, result.rows, ("what", "n", "mean", "median", "p95"))
         if (made := result.summary["calibrated"]) is not None:
             trips, touched, stuck = (result.summary[name] for name in ("trips", "contacts", "rescues"))
             console.print(
@@ -222,8 +218,8 @@ class Park(Command, ExecutionSpec):
                 found = compare_parking(cases, agents, seeds, self.out, workers=workers, progress=progress)
             names = [case.lot.name for case in cases]
             save_summary(self.out, self.seed, found.table, lots=names, agents=found.labels)
-        _show_parkings(
-            console, f"{', '.join(names)}: {plural(self.episodes, 'episode')} per lot", found.table
+        print_rows(
+            console, f"{', '.join(names)}, {plural(self.episodes, 'episode')} per lot", found.table, SHOWN
         )
         for row in [row for row in found.rows if not row["parked"]][:SHOWN_ROWS]:
             agent = f"{row['agent']}, " if len(found.labels) > 1 else ""
@@ -231,36 +227,3 @@ class Park(Command, ExecutionSpec):
                 f"failed: {agent}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
             )
         console.print(f"Episodes, summary and pictures are in {self.out}")
-
-
-def _show_parkings(console: Console, title: str, table: list[dict[str, Any]]) -> None:
-    headings = (
-        "agent", "slot", "parked", "success [95 %]", "contacts", "plan ms (p95)", "drive s (p95)", "changes (p95)",
-        "driven m", "turned rad",
-    )  # fmt: skip
-    cells = (
-        (
-            row["agent"],
-            f"{row['kind']} {row['way']}".strip(),
-            f"{row['parked']}/{row['episodes']}",
-            f"{row['success']:.1%} [{row['success_ci95'][0]:.1%}, {row['success_ci95'][1]:.1%}]",
-            str(row["contacts"]),
-            _pair(row, "planning_ms", 0),
-            _pair(row, "time_s", 1),
-            _pair(row, "direction_changes", 0),
-            _known(row["driven_m"], 1),
-            _known(row["turned_rad"], 1),
-        )
-        for row in table
-    )
-    console.print(make_table(title, headings, cells))
-
-
-def _pair(row: dict[str, Any], name: str, digits: int) -> str:
-    """Format a median with its 95th percentile; empty for agents without the quantity, e.g. planning time."""
-    median, p95 = (_known(row[key], digits) for key in (name, f"{name}_p95"))
-    return median and f"{median} ({p95})"
-
-
-def _known(value: float, digits: int) -> str:
-    return "" if value != value else f"{value:.{digits}f}"

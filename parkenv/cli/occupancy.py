@@ -9,11 +9,12 @@ from pydantic import Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, make_table, save_summary, stages
+from parkenv.cli.tables import make_console, make_table, print_rows, save_summary, stages
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Date, scenario_spec
 from parkenv.show.plurals import plural
+from parkenv.show.report.tables import OF_FLEETS
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
 from parkenv.studies.fleet.demand_study import PREDICTIONS, DemandStudy
@@ -73,26 +74,14 @@ class Fit(Command):
         if is_counts(self.log):
             with stages(console) as progress:
                 title, summary = fit_counts(Counts.read(self.log, self.timezone), progress)
-            cells = [
-                [f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()]
-                for row in summary["rows"]
-            ]
-            console.print(make_table(title, [key.replace("_", " ") for key in summary["rows"][0]], cells))
+            print_rows(console, title, summary["rows"], summary["rows"][0])
             _print_notes(console, summary)
             drift = summary["level_drift_per_week"]
             console.print(f"Levels drift by {drift:.2f} logits a week. The summary is in {self.out}")
         else:
             with console.status("Fitting rates"):
                 title, summary = fit_log(self.log, self.out, max_gap_s=3600.0 * self.max_gap_h)
-            cells = [
-                [
-                    row["day"], f"{row['hour']:02d}", f"{row['arrival_rate_per_h']:.3f}",
-                    f"{row['departure_rate_per_h']:.3f}", f"{row['occupancy']:.0%}",
-                ]
-                for row in summary["rows"]
-            ]  # fmt: skip
-            headings = ("day", "hour", "arrivals an hour", "departures an hour", "occupied")
-            console.print(make_table(title, headings, cells))
+            print_rows(console, title, summary["rows"], summary["rows"][0], OF_FLEETS)
             level = summary["day_error"]["level"]
             console.print(f"Days differ from the process by a standard deviation of {level:.2f} logits")
             console.print(f"Process, picture and summary are in {self.out}")

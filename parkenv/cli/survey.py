@@ -7,13 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, make_table, print_recorded, save_summary, stages
+from parkenv.cli.tables import make_console, make_table, print_recorded, print_table, save_summary, stages
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import SCENARIO_NAMES, LocaliserName
 from parkenv.files.option import Inside, option
 from parkenv.mapping.photo_options import PhotoOptions
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.plurals import plural
+from parkenv.show.report.tables import survey_tables, table_of
 from parkenv.studies.fields import Detector, OneScenario
 from parkenv.studies.sensing.survey_study import SurveyStudy
 
@@ -81,37 +82,8 @@ class Survey(StudyCommand):
     def show(self, console: Console, result: Result) -> None:
         """Print the errors of a survey."""
         for row in result.rows:
-            error, pose = row["range_abs_error_m"], row["pose_error_m"]
-            rates = (
-                "car_detection_rate",
-                "detection_precision",
-                "slot_accuracy",
-                "slot_accuracy_seen",
-                "unknown_fraction",
-            )
-            figures = [
-                *((name, f"{row[name]:.3f}") for name in rates),
-                ("range_abs_error_m", f"median {error['median']:.3f}, p95 {error['p95']:.3f}"),
-                (
-                    "occupancy_mae",
-                    f"{row['occupancy_mae']:.3f} (counts alone: {row['occupancy_mae_expected']:.3f})",
-                ),
-                ("seconds_per_frame", f"{row['seconds_per_frame']:.4f}"),
-            ]
-            if "range_within_std" in row:
-                one, two = row["range_within_std"]
-                figures.append(("errors within 1, 2 stated deviations", f"{one:.1%}, {two:.1%}"))
-            if pose["odometry"] > 0.0 or row["localise"] != "none":
-                text = (
-                    f"{pose['estimated']:.2f}, at most {pose['max']:.2f} (odometry: {pose['odometry']:.2f})"
-                )
-                figures.append(("pose_error_m", text))
-            console.print(make_table(None, ["figure", "value"], figures))
-            by_weather = (
-                (name, str(r["sessions"]), f"{r['car_detection_rate']:.1%}", f"{r['slot_accuracy']:.1%}")
-                for name, r in row["by_weather"].items()
-            )
-            console.print(make_table(None, ["weather", "sessions", "cars found", "slots right"], by_weather))
+            for table in survey_tables(row, ()):
+                print_table(console, table)
         console.print(*self.study.findings(result.summary))
 
 
@@ -166,9 +138,7 @@ class MapDrive(Command):
                 progress=progress,
             )  # fmt: skip
         save_summary(self.out, None, [row])
-        console.print(
-            make_table(None, ["figure", "value"], ((name, str(value)) for name, value in row.items()))
-        )
+        print_table(console, table_of("", "The drive", [row], facts=True))
         driven_in = row["key"].partition("/")[0]
         if driven_in in SCENARIO_NAMES and driven_in != its.name:
             text = f"The drive was recorded in {driven_in}, and is mapped in {its.name}: see --scenario"

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from threading import Event, Thread
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 from parkenv.files.file_names import is_plain
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
     from rich.table import Table
+
+    from parkenv.show.report.tables import Column
 
 WIDE = 1000
 """Width assumed if output goes to a file or a pipe, characters: no column of a table is cut there."""
@@ -43,8 +47,10 @@ def _escaped(text: str) -> str:
     return "".join(c if c == "\n" or is_plain(c) else ascii(c)[1:-1] for c in text)
 
 
-def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequence[str]] = ()) -> Table:
-    """Make a table of numbers; the first column names the rows."""
+def make_table(
+    title: str | None, headings: Iterable[str], rows: Iterable[Sequence[str]] = (), texts: int = 1
+) -> Table:
+    """Make a table of numbers; the first columns, of texts, name the rows."""
     from rich import box
     from rich.table import Table
 
@@ -52,10 +58,67 @@ def make_table(title: str | None, headings: Iterable[str], rows: Iterable[Sequen
         title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
     )
     for i, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if i else "left", no_wrap=True)
+        table.add_column(heading, justify="right" if i >= texts else "left", no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table
+
+
+def print_rows(
+    console: Console,
+    title: str,
+    rows: Sequence[Mapping[str, Any]],
+    keys: Collection[str],
+    columns: Mapping[str, Column] = MappingProxyType({}),
+) -> None:
+    """Print some columns of results as a page shows them."""
+    from parkenv.show.report.tables import table_of
+
+    kept = [{key: row[key] for key in row if key.removesuffix("_ci95") in keys} for row in rows]
+    print_table(console, table_of("", title, kept, columns=columns))
+
+
+def print_table(console: Console, table: Mapping[str, Any]) -> None:
+    """Print a table of `parkenv.show.report.tables.table_of`.
+
+    What is equal in all rows, and not 0, stands above the table. A narrow terminal gets several tables, each of which
+    begins with the columns that name the rows.
+    """
+    from parkenv.show.report.tables import written
+
+    equal = [
+        f"{column['label']} {written(column, column['value'])} {column.get('unit', '')}".rstrip()
+        for column in table["same"]
+        if column["value"]
+    ]
+    title = f"{table['title']}: {', '.join(equal)}" if equal else table["title"]
+    headings, cells, n_texts = list[str](), list[list[str]](), 0
+    for column, *values in zip(table["columns"], *table["rows"], strict=True):
+        if not any(texts := [written(column, value) for value in values]):
+            continue
+        if not any(isinstance(value, float | int | list) for value in values):
+            n_texts += n_texts == len(cells)
+        interval = "[95 %]" if any(isinstance(value, list) for value in values) else ""
+        words = " ".join(filter(None, (column["label"], column.get("unit"), interval)))
+        room = 60 if table["facts"] else max(10, *map(len, texts))
+        headings.append("\n".join(textwrap.wrap(words, room, break_long_words=False)))
+        cells.append(texts)
+    if table["facts"]:
+        facts = zip(headings, (texts[0] for texts in cells), strict=True)
+        console.print(make_table(title, ("figure", "value"), facts))
+        return
+    widths = [
+        2 + max(map(len, (*heading.split("\n"), *texts)))
+        for heading, texts in zip(headings, cells, strict=True)
+    ]
+    parts = [list(range(n_texts))]
+    for i in range(n_texts, len(widths)):
+        if sum(widths[k] for k in parts[-1]) + widths[i] > console.width and len(parts[-1]) > n_texts:
+            parts.append(list(range(n_texts)))
+        parts[-1].append(i)
+    for number, part in enumerate(parts):
+        made = zip(*(cells[i] for i in part), strict=True)
+        console.print(make_table(None if number else title, [headings[i] for i in part], made, n_texts))
 
 
 @contextmanager

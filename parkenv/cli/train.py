@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 from parkenv.cli.options import Command, Given, field_options, made
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, make_table, stages
+from parkenv.cli.tables import make_console, print_rows, stages
 from parkenv.cli.trust import Trust, require_trust
 from parkenv.errors import InputError
 from parkenv.files.option import Inside, Option, option, words_in
@@ -20,6 +20,12 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from parkenv.studies.runner import Result
+
+SHOWN = (
+    "test_scenario", "kind", "agent", "seed", "episodes", "days", "total_s", "others_s", "search_s", "parked_fraction",
+    "success", "contacts", "time_s",
+)  # fmt: skip
+"""Columns of the tests that are printed."""
 
 
 class Train(StudyCommand):
@@ -71,11 +77,9 @@ class Train(StudyCommand):
         if self.study.training.announcement:
             console.print(self.study.training.announcement)
         if result.complete:
-            console.print(
-                make_table(
-                    *self.study.training.table_of(result.summary["transfer"], result.summary["planners"])
-                )
-            )
+            models, planners = result.summary["transfer"], result.summary["planners"]
+            rows = [*models, *(row | {"test_scenario": row["scenario"]} for row in planners)]
+            print_rows(console, "Tests in held-out worlds", rows, SHOWN)
 
 
 class Publish(Command, ExecutionSpec):

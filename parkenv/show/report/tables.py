@@ -1,4 +1,4 @@
-"""The tables of a report: their columns, labels and number formats."""
+"""Tables of results, for pages and terminals: their columns, labels and number formats."""
 
 from __future__ import annotations
 
@@ -6,7 +6,8 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from parkenv.show.plurals import LEAST_SEARCHES
+from parkenv.show.columns import SETTING_AXES
+from parkenv.show.plurals import LEAST_SEARCHES, number_text
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
 
 Row = Mapping[str, Any]
@@ -35,6 +36,8 @@ class Column(NamedTuple):
     help: str = ""
 
 
+_GIVEN = (*SETTING_AXES, "arrivals_per_hour")
+"""Columns of numbers that somebody chose, which have all their digits."""
 _OPTIONAL = tuple(term.field for term in COST_TERMS if term.optional)
 _MINUS_OWN = "total time, minus that of all cars if nobody knows more than it observes, on the same days"
 _METHODS = (
@@ -299,6 +302,28 @@ def table_of(
 def described(column: Column) -> dict[str, Any]:
     """Return a column for the page's data, without empty entries."""
     return {k: v for k, v in column._asdict().items() if v != "" and v is not False}
+
+
+def written(column: Mapping[str, Any], value: Cell) -> str:
+    """Return a value of a table, or a value and its interval, as text; nothing for what is not known.
+
+    Examples:
+        >>> written(described(column_of("difference_s")), [-1.25, -2.0, 0.04])
+        '-1.2 [-2.0, 0.0]'
+    """
+    if isinstance(value, list):
+        mean, *ends = (written(column, part) for part in value)
+        return f"{mean} [{', '.join(ends)}]" if all(ends) else mean
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, str) or value is None or value != value:
+        return value if isinstance(value, str) else ""
+    if column["key"] in _GIVEN:
+        return f"{value:g}"
+    number = 100.0 * value if column.get("share") else value
+    digits = 0 if isinstance(value, int) or abs(number) >= 1000.0 else column["digits"]
+    text = number_text(number, f"{'+' if column.get('signed') else ''},.{digits}f")
+    return f"{text}%" if column.get("share") else text
 
 
 def _flat(row: Mapping[str, Any], prefix: str = "") -> dict[str, Cell]:

@@ -34,7 +34,6 @@ class FleetTraining(RLTraining):
     """Training of one network that drives all cars of a fleet, or a share of them."""
 
     spec: FleetTrainingSpec
-    heading = "Mean total time, s, of a driver's cars and [of the others], {episodes} held-out days"
     evaluated_by = ("env", "scenario", "fleet", "demand", "evaluation_episodes")
     configs = FLEET_CONFIGS
 
@@ -156,12 +155,6 @@ class FleetTraining(RLTraining):
         ]
         own = {c: transfer[0][c] for c in ("total_s", "total_s_ci95", "search_s")}
         return Tested(self.scenario.name, own, transfer)
-
-    def test_text(self, row: Row) -> str:
-        """See `Training`."""
-        low, high = row["total_s_ci95"]
-        others = "" if row["others_s"] != row["others_s"] else f"; others {row['others_s']:.1f}"
-        return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]{others}"
 
     @property
     def title(self) -> str:

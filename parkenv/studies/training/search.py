@@ -73,7 +73,6 @@ class SearchTraining(RLTraining):
     """Training of a search agent in one scenario or several; the score is the mean total time."""
 
     spec: SearchTrainingSpec | ScanTrainingSpec
-    heading = "Mean total time, s, in held-out worlds"
     most_between = 100_000
     evaluated_by = ("scenario", "held_out", "evaluation_episodes")
     configs: ClassVar[Mapping[str, TrainingConfig]] = SEARCH_CONFIGS
@@ -236,11 +235,6 @@ class SearchTraining(RLTraining):
         """Test a model: return the times of the test's episodes, s, and whether the car parked."""
         agent = LearnedAgent(self.sides[0][0], self.algorithm, model)
         return episode_times(agent.model, places, self.test_seeds)
-
-    def test_text(self, row: Row) -> str:
-        """See `Training`."""
-        low, high = row["total_s_ci95"]
-        return f"{row['total_s']:.1f} [{low:.1f}, {high:.1f}]"
 
     def replays(self, summary: Row, folder: Path) -> Sequence[Replay]:
         """Return the tests of the best model and of the best planners; nothing without a test."""

@@ -37,9 +37,6 @@ _OUTSIDE = {
 }  # fmt: skip
 """Fields of a specification that do not change its trainings, or that `settings` gives in other words."""
 
-Table = tuple[str, list[str], list[list[str]]]
-"""Title, headings and rows."""
-
 
 class Trained(NamedTuple):
     """Trainings that have ended.
@@ -78,10 +75,6 @@ class Training(ABC):
         spec: specification of the training.
     """
 
-    heading: ClassVar[str]
-    """Of the table of tests; `{episodes}` is their number."""
-    table_by: ClassVar[tuple[str, ...]] = ()
-    """Columns of a test beside its name that have a column each in the table of tests."""
     evaluated_by: ClassVar[tuple[str, ...]]
     """Settings that evaluations depend on: curves are comparable if these are equal."""
     command: tuple[str, ...] = ()
@@ -275,24 +268,6 @@ class Training(ABC):
     def across_seeds(self, curves: list[list[Row]]) -> Any:
         """Return the mean of the curves, for the summary."""
         return across_seeds(curves)
-
-    @abstractmethod
-    def test_text(self, row: Row) -> str:
-        """Return a test as text for the table."""
-
-    def table_of(self, transfer: Sequence[Row], planners: Sequence[Row]) -> Table:
-        """Return a table with a column for each test, and a row for each model and planner."""
-        by = self.table_by
-        columns = list(dict.fromkeys((row["test_scenario"], *(row[name] for name in by)) for row in transfer))
-        found: dict[str, dict[tuple[Any, ...], Row]] = {}
-        for row in transfer:
-            key = (row["test_scenario"], *(row[name] for name in by))
-            found.setdefault(f"{self.algorithm}, seed {row['seed']}", {})[key] = row
-        for row in planners:
-            found.setdefault(row["agent"], {})[(row["scenario"], *(row[name] for name in by))] = row
-        rows = [[agent, *(self.test_text(its[column]) for column in columns)] for agent, its in found.items()]
-        heading = self.heading.format(episodes=len(self.test_seeds))
-        return heading, ["", *(" ".join(column) for column in columns)], rows
 
 
 def use_one_thread() -> None:

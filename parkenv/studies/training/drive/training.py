@@ -45,8 +45,6 @@ class DriveTraining(RLTraining):
     """Training of an agent that drives into slots, of every kind on the lots equally often."""
 
     spec: DriveTrainingSpec
-    heading = "Parkings that succeed, contacts, median s of those, in held-out tasks"
-    table_by = ("kind",)
     evaluated_by = ("env", "lot", "evaluation_episodes")
     evaluations = 20
 
@@ -185,11 +183,6 @@ class DriveTraining(RLTraining):
         total = parking_table(parkings)[-1]
         own = {c: total[c] for c in ("success", "success_ci95", "contacts", "time_s")}
         return Tested(",".join(self.tests), own, transfer)
-
-    def test_text(self, row: Row) -> str:
-        """See `Training`."""
-        low, high = row["success_ci95"]
-        return f"{row['success']:.1%} [{low:.1%}, {high:.1%}], {row['contacts']}, {row['time_s']:.1f}"
 
     def across_seeds(self, curves: list[list[Row]]) -> dict[str, list[dict[str, float]]]:
         """See `Training`."""
