@@ -22,6 +22,7 @@ class Map:
     nodes: dict[tuple[float, float], dict[str, str]] = field(default_factory=dict)
     ways: list[tuple[list[tuple[float, float]], dict[str, str]]] = field(default_factory=list)
     areas: list[tuple[list[int], list[int], dict[str, str]]] = field(default_factory=list)
+    turns: list[tuple[dict[str, int], tuple[str, ...], dict[str, str]]] = field(default_factory=list)
 
     def node(self, x, y, **tags):
         self.nodes.setdefault((x, y), {}).update(tags)
@@ -39,6 +40,12 @@ class Map:
     def area(self, outer, inner, **tags):
         """A multipolygon of ways, by their numbers from 1."""
         self.areas.append((outer, inner, {"type": "multipolygon", **tags}))
+        return self
+
+    def turn(self, comes, via, leaves, roles=("from", "via", "to"), **tags):
+        """A restriction of turns from a way to another one, by their numbers from 1, over a point."""
+        refs = {"from": comes, "via": list(self.nodes).index(via) + 1, "to": leaves}
+        self.turns.append((refs, roles, {"type": "restriction", **tags}))
         return self
 
     def places(self):
@@ -66,6 +73,12 @@ class Map:
                 for way in ways
             )
             lines.append(f'<relation id="{i + 1}">{members}{tags(values)}</relation>')
+        for i, (refs, roles, values) in enumerate(self.turns):
+            members = "".join(
+                f'<member type="{"node" if role == "via" else "way"}" ref="{refs[role]}" role="{role}"/>'
+                for role in roles
+            )
+            lines.append(f'<relation id="{i + 1001}">{members}{tags(values)}</relation>')
         return "\n".join([*lines, "</osm>"])
 
     def overpass(self, *, geometry):
@@ -93,6 +106,14 @@ class Map:
                 for ref in refs
             ]
             elements.append({"type": "relation", "id": i + 1, "members": members, "tags": tags})
+        for i, (refs, roles, tags) in enumerate(self.turns):
+            members = [
+                {"type": "node", "ref": refs[role], "role": role} | (position(refs[role]) if geometry else {})
+                if role == "via"
+                else {"type": "way", "ref": refs[role], "role": role}
+                for role in roles
+            ]
+            elements.append({"type": "relation", "id": i + 1001, "members": members, "tags": tags})
         if geometry:
             elements = [e for e in elements if e["type"] != "node" or e["tags"]]
         return json.dumps({"version": 0.6, "generator": "Overpass API", "elements": elements})

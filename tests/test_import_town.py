@@ -519,6 +519,16 @@ def test_real_extracts_become_towns(path):
             assert row["capacity"] >= said, row
             assert row["capacity"] == said or row["capacity_from"] == "drawn"
     assert sum(row["capacity"] for row in town.facilities) == lot.capacity.sum()
+    # Every restriction of turns is kept or listed, and most are kept.
+    import osmium
+
+    ways = osmium.FileProcessor(str(path), osmium.osm.RELATION)
+    named = {f"relation/{r.id}" for r in ways if r.tags.get("type") == "restriction"}
+    out = {one for left in town.draft.left_out if left.reason.startswith("turn") for one in left.ids}
+    (line,) = (line for line in town.draft.found if line.startswith("turn restrictions"))
+    assert int(line.split()[2]) == len(named - out) >= 0.6 * len(named)
+    assert out <= named
+    assert len(lot.turns) >= len(named - out)
 
 
 @pytest.mark.slow

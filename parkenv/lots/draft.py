@@ -15,7 +15,7 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.quality import QualityIssue
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import Facility
-from parkenv.world.lot import Lane, ParkingLot
+from parkenv.world.lot import Lane, ParkingLot, Turn
 from parkenv.world.tariff import Zone
 
 NEAR_ON_GLOBE = 1.0
@@ -110,6 +110,7 @@ class LotDraft:
     zone_rules: Mapping[str, Zone] = field(default_factory=dict)
     goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_goals,)
     entry_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_entries,)
+    turns: tuple[Turn, ...] = ()  # those that cars may not make, or that are the only ones
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> LotDraft:
@@ -128,6 +129,7 @@ class LotDraft:
             zone_rules=lot.zone_rules,
             goal_weights=lot.goal_weights,
             entry_weights=lot.entry_weights,
+            turns=lot.turns,
         )
 
     def lot(self) -> ParkingLot:
@@ -158,6 +160,7 @@ class LotDraft:
             zone_rules=self.zone_rules,
             goal_weights=self.goal_weights,
             entry_weights=self.entry_weights,
+            turns=self.turns,
         )
 
     def searchable(self) -> LotDraft:

@@ -3,13 +3,15 @@
 Every slot has one vertex, the point on the lane before its mouth; lane ends and junctions are further vertices.
 A two-way lane has one directed chain of slot vertices per side, to the right of the centre line: a car passes the
 slots on its right in order, turns round at the ends of the lane, and may cross to the opposite slots. A one-way lane
-has a single chain that serves both sides. All computations are vectorised: a million slots take seconds.
+has a single chain that serves both sides. A junction has one vertex, and one more for each chain whose cars may not
+turn everywhere there (`turns`). All computations are vectorised: a million slots take seconds.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import permutations
 
 import numpy as np
@@ -21,6 +23,7 @@ from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError
+from parkenv.world.turns import Chains, TurnParts, forbidden_after
 
 LANE_OFFSET = 1.5
 """Distance, m, of a slot's vertex from the centre line of a two-way lane, to the right of travel."""
@@ -66,7 +69,7 @@ class DriveGraph:
 
 
 @dataclass(frozen=True, eq=False)
-class _Centrelines:
+class Centrelines:
     """All lanes in one array of points; `station` is the cumulative length along it.
 
     A segment is the part of a lane between two consecutive nodes, a leg is a straight piece between two points.
@@ -83,12 +86,26 @@ class _Centrelines:
     segment_speed: FloatArray  # (n_segments,)
     node_xy: FloatArray  # (n_nodes, 2)
 
+    @cached_property
+    def chains(self) -> Chains:
+        """The two directions of each segment."""
+        n = len(self.segment_oneway)
+        segment = np.arange(n)
+        # The first leg of a segment starts at its start, the last leg ends at its end.
+        begin = self.leg_tangent[np.searchsorted(self.leg_segment, segment, side="left")]
+        end = self.leg_tangent[np.searchsorted(self.leg_segment, segment, side="right") - 1]
+        first, last = (np.stack([self.segment_nodes[:, k], self.segment_nodes[:, 1 - k]], 1) for k in (0, 1))
+        drivable = np.stack([np.ones(n, bool), ~self.segment_oneway], axis=1)
+        leaving = np.stack([begin, -end], axis=1).reshape(-1, 2)
+        return Chains(first.ravel(), last.ravel(), leaving, drivable.ravel(), self.node_xy)
+
     def legs_at(self, station: FloatArray) -> IntArray:
-        """The leg of each station."""
+        """Return the leg of each station."""
         leg = np.searchsorted(self.station[self.leg_start], station, side="right") - 1
         return np.clip(leg, 0, len(self.leg_start) - 1)
 
     def points_at(self, station: FloatArray, leg: IntArray) -> FloatArray:
+        """Return the points at stations on their legs, (n, 2) m."""
         start = self.leg_start[leg]
         return self.xy[start] + (station - self.station[start])[:, None] * self.leg_tangent[leg]
 
@@ -97,7 +114,12 @@ LaneParts = tuple[FloatArray, bool, float]
 """The points of a lane, whether it is one-way, and its speed."""
 
 
-def build_drive_graph(lanes: Sequence[LaneParts], mouth_xy: FloatArray, entry_xy: FloatArray) -> DriveGraph:
+def build_drive_graph(
+    lanes: Sequence[LaneParts],
+    mouth_xy: FloatArray,
+    entry_xy: FloatArray,
+    turns: Sequence[TurnParts] = (),
+) -> DriveGraph:
     """Build the drive graph: assign slots and entries to lanes, and connect vertices by moves.
 
     Args:
@@ -105,12 +127,14 @@ def build_drive_graph(lanes: Sequence[LaneParts], mouth_xy: FloatArray, entry_xy
             Lanes are connected where they share a point.
         mouth_xy: (n_slots, 2) m, middle of the side by which each slot is entered.
         entry_xy: (n_entries, 2) m.
+        turns: those that cars may not make, or that are the only ones.
 
     Raises:
-        GraphError: a slot or an entry out of reach of all lanes, or a junction with more than four lanes out.
+        GraphError: a slot or an entry out of reach of all lanes, a junction with more than four lanes out, or a turn
+            between lanes that there are not, or that leaves no way on.
     """
     lanes, entry_point = _with_entry_points(lanes, entry_xy)
-    lines = _centrelines(lanes)
+    lines = centrelines(lanes)
     n_slots = len(mouth_xy)
 
     station, leg, left = _attach_slots(lines, mouth_xy)
@@ -128,23 +152,24 @@ def build_drive_graph(lanes: Sequence[LaneParts], mouth_xy: FloatArray, entry_xy
     offset = np.where(lines.segment_oneway[segment], 0.0, LANE_OFFSET)
     slot_vertex_xy = lines.points_at(station, leg) + offset[:, None] * right
 
-    edges = _chain_edges(lines, station, tangent, chain, order, n_slots)
-    edges += _crossing_edges(lines, station, tangent, segment, against)
+    along = _chain_edges(lines, station, tangent, chain, order, n_slots)
+    along, node = _turning_edges(lines.chains, turns, along, n_slots)
+    edges = [along, *_crossing_edges(lines, station, tangent, segment, against)]
     source, target, length, bearing, of = (np.concatenate(part) for part in zip(*edges, strict=True))
     neighbors, edge_length, edge_speed = _four_columns(
-        n_slots + len(lines.node_xy),
+        n_slots + len(node),
         n_slots,
         lines.node_xy,
         source,
         target,
         length,
         bearing,
-        lines.segment_speed[of],
+        lines.segment_speed[of // 2],
     )
-    vertex_yaw = np.zeros(n_slots + len(lines.node_xy))
+    vertex_yaw = np.zeros(n_slots + len(node))
     vertex_yaw[:n_slots] = np.arctan2(tangent[:, 1], tangent[:, 0])
     return DriveGraph(
-        vertex_xy=np.concatenate([slot_vertex_xy, lines.node_xy]),
+        vertex_xy=np.concatenate([slot_vertex_xy, lines.node_xy[node]]),
         vertex_yaw=vertex_yaw,
         neighbors=neighbors,
         edge_length=edge_length,
@@ -212,7 +237,8 @@ def component_labels(links: IntArray, n: int) -> IntArray:
     return np.asarray(connected_components(graph, directed=False)[1], dtype=np.int64)
 
 
-def _centrelines(lanes: Sequence[LaneParts]) -> _Centrelines:
+def centrelines(lanes: Sequence[LaneParts]) -> Centrelines:
+    """Cut lanes into segments where they meet."""
     xy = np.concatenate([centre for centre, _, _ in lanes])
     count = np.array([len(centre) for centre, _, _ in lanes])
     oneway, speed = (np.array([lane[k] for lane in lanes]) for k in (1, 2))
@@ -245,7 +271,7 @@ def _centrelines(lanes: Sequence[LaneParts]) -> _Centrelines:
     node_of_point[cut] = node
     node_xy = np.empty((node.max() + 1, 2))
     node_xy[node[::-1]] = xy[cut[::-1]]  # the first of the points within the tolerance counts
-    return _Centrelines(
+    return Centrelines(
         xy=xy,
         station=station,
         leg_start=leg_start,
@@ -259,9 +285,7 @@ def _centrelines(lanes: Sequence[LaneParts]) -> _Centrelines:
     )
 
 
-def _attach_slots(
-    lines: _Centrelines, mouth_xy: FloatArray
-) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
+def _attach_slots(lines: Centrelines, mouth_xy: FloatArray) -> tuple[FloatArray, IntArray, NDArray[np.bool_]]:
     """Station, leg and side (True: left of the lane's direction) of the lane point nearest to each mouth."""
     start = lines.leg_start
     ends = np.stack([lines.xy[start], lines.xy[start + 1]], axis=1)
@@ -291,7 +315,7 @@ def _attach_slots(
 
 
 def _spread(
-    lines: _Centrelines, station: FloatArray, segment: IntArray, chain: IntArray, order: IntArray
+    lines: Centrelines, station: FloatArray, segment: IntArray, chain: IntArray, order: IntArray
 ) -> FloatArray:
     """Move vertices along their lane, as little as possible, until they keep a distance from each other and nodes."""
     if not len(order):
@@ -320,28 +344,19 @@ Edges = tuple[IntArray, IntArray, FloatArray, FloatArray, IntArray]
 
 
 def _chain_edges(
-    lines: _Centrelines,
+    lines: Centrelines,
     station: FloatArray,
     tangent: FloatArray,
     chain: IntArray,
     order: IntArray,
     n_slots: int,
-) -> list[Edges]:
-    """Edges along every chain, node to slots to node: sources, targets, lengths, m, bearings, rad, and segments."""
-    n_segments = len(lines.segment_oneway)
-    drivable = np.ones(2 * n_segments, dtype=bool)
-    drivable[1::2] = ~lines.segment_oneway
-    chains = np.flatnonzero(drivable)
-    segment, against = chains // 2, chains % 2 == 1
-    first_node = np.where(against, lines.segment_nodes[segment, 1], lines.segment_nodes[segment, 0])
-    last_node = np.where(against, lines.segment_nodes[segment, 0], lines.segment_nodes[segment, 1])
-    first_at = np.where(against, lines.segment_stations[segment, 1], lines.segment_stations[segment, 0])
-    last_at = np.where(against, lines.segment_stations[segment, 0], lines.segment_stations[segment, 1])
-    # The first leg of a segment starts at its start, the last leg ends at its end.
-    first_leg = np.searchsorted(lines.leg_segment, segment, side="left")
-    last_leg = np.searchsorted(lines.leg_segment, segment, side="right") - 1
-    leaving = lines.leg_tangent[np.where(against, last_leg, first_leg)]
-    leaving = leaving * np.where(against, -1.0, 1.0)[:, None]
+) -> Edges:
+    """Edges along every chain, node to slots to node: sources, targets, lengths, m, bearings, rad, and chains."""
+    chains = np.flatnonzero(lines.chains.drivable)
+    first_node, last_node, leaving = (values[chains] for values in lines.chains[:3])
+    # Stations grow along even chains.
+    at = lines.segment_stations[chains // 2]
+    first_at, last_at = np.where((chains % 2 == 1)[:, None], at[:, ::-1], at).T
 
     # The stops of all chains: first node, slots in order, last node.
     stop_chain = np.concatenate([chains, chain[order], chains])
@@ -353,19 +368,45 @@ def _chain_edges(
     linked = stop_chain[row][:-1] == stop_chain[row][1:]
     here, there = row[:-1][linked], row[1:][linked]
     direction = stop_direction[here]
-    return [
-        (
-            stop_vertex[here],
-            stop_vertex[there],
-            np.abs(stop_station[there] - stop_station[here]),
-            np.arctan2(direction[:, 1], direction[:, 0]),
-            stop_chain[here] // 2,
+    return (
+        stop_vertex[here],
+        stop_vertex[there],
+        np.abs(stop_station[there] - stop_station[here]),
+        np.arctan2(direction[:, 1], direction[:, 0]),
+        stop_chain[here],
+    )
+
+
+def _turning_edges(
+    chains: Chains, turns: Sequence[TurnParts], edges: Edges, n_slots: int
+) -> tuple[Edges, IntArray]:
+    """Let the cars of chains with turns stop at vertices of their own; return edges, and the node of each vertex."""
+    node = np.arange(len(chains.node_xy))
+    forbidden, wrong = forbidden_after(chains, turns)
+    if wrong:
+        raise GraphError(
+            [GraphProblem("turn", i, reason, tuple(turns[i][0][1].tolist())) for i, reason in wrong.items()]
         )
-    ]
+    if not forbidden:
+        return edges, node
+    source, target, *_, of = edges
+    target = target.copy()
+    leaves, ends = source >= n_slots, target >= n_slots
+    for k, chain in enumerate(forbidden):
+        target[ends & (of == chain)] = n_slots + len(node) + k
+    rows, at = [np.arange(len(source))], [source]
+    for k, (chain, others) in enumerate(forbidden.items()):
+        onward = np.flatnonzero(leaves & (source == n_slots + chains.last[chain]) & ~np.isin(of, others))
+        rows.append(onward)
+        at.append(np.full(len(onward), n_slots + len(node) + k))
+    row = np.concatenate(rows)
+    _, _, length, bearing, _ = edges
+    more = (np.concatenate(at), target[row], length[row], bearing[row], of[row])
+    return more, np.concatenate([node, chains.last[list(forbidden)]])
 
 
 def _crossing_edges(
-    lines: _Centrelines,
+    lines: Centrelines,
     station: FloatArray,
     tangent: FloatArray,
     segment: IntArray,
@@ -390,7 +431,7 @@ def _crossing_edges(
         here, mate, along = here[linked], mate[linked], along[linked]
         # A crossing leads to the left of the direction of travel.
         bearing = np.arctan2(tangent[here, 0], -tangent[here, 1])
-        edges.append((here, mate, np.hypot(2 * LANE_OFFSET, along), bearing, segment[here]))
+        edges.append((here, mate, np.hypot(2 * LANE_OFFSET, along), bearing, 2 * segment[here]))
     return edges
 
 
@@ -415,7 +456,7 @@ def _four_columns(
     order = np.argsort(source, kind="stable")
     source, target, length, bearing = source[order], target[order], length[order], bearing[order]
     degree = np.bincount(source, minlength=n_vertices)
-    crowded = np.flatnonzero(degree > 4)
+    crowded = np.flatnonzero(degree[: n_slots + len(node_xy)] > 4)
     if len(crowded):
         crowded_xy = node_xy[crowded - n_slots].tolist()
         raise GraphError(

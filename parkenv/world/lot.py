@@ -77,6 +77,37 @@ class Lane:
     __hash__ = None  # type: ignore[assignment]
 
 
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """A turn at a junction that cars may not make, or the only one that they may.
+
+    Args:
+        points: (3, 2) float64, m, lot frame: a point on the lane by which cars come, the junction, and a point on the
+            lane by which they leave; the first and the last one are the same where cars turn back.
+        only: whether cars that come by this lane may make this turn alone.
+
+    Raises:
+        InputError: a wrong shape, or a value that is not finite.
+    """
+
+    points: FloatArray
+    only: bool = False
+
+    def __post_init__(self) -> None:
+        points = _frozen(self.points, "points")
+        if points.shape != (3, 2):
+            raise InputError(f"turn points: shape {points.shape}, want (3, 2)")
+        _require_finite("turn points", points)
+        object.__setattr__(self, "points", points)
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Turn):
+            return NotImplemented
+        return self.only == other.only and np.array_equal(self.points, other.points)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ParkingLot:
     """A parking lot: slots, lanes, entries, goals and walls, and the drive graph between slots.
@@ -84,7 +115,8 @@ class ParkingLot:
     Units are metres in a local frame, x east and y north; yaw is counter-clockwise from x, in radians. The drive
     graph is derived from slots, lanes and entries on construction, so two lots with equal features have equal
     graphs. Vertex `i < n_slots` is the stop position on the lane before slot `i`, the planning state of the thesis
-    (T §3.4.1, Fig. 3.6 right); further vertices are junctions and lane ends. `parkenv.lots` reads, writes and
+    (T §3.4.1, Fig. 3.6 right); further vertices are junctions and lane ends, and for each lane whose cars may not turn
+    everywhere another one in the same place. `parkenv.lots` reads, writes and
     generates lots.
 
     Args:
@@ -109,6 +141,7 @@ class ParkingLot:
         zone_rules: rules of zones, by name; empty: zones have none, and prices come from the scenario alone.
         goal_weights: how much demand each goal attracts, (n_goals,) float64 by purpose of the drivers; empty: unknown.
         entry_weights: how much demand comes from each entry, (n_entries,) float64 by purpose; empty: unknown.
+        turns: those that cars may not make at junctions, or that are the only ones.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
@@ -126,8 +159,9 @@ class ParkingLot:
     Raises:
         InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal, a name of a
             facility or zone that the lot does not have.
-        GraphError: slots, entries or facilities out of reach of all lanes, more than four lanes out of one junction, or
-            a counted facility that no entry leads to.
+        GraphError: slots, entries or facilities out of reach of all lanes, more than four lanes out of one junction, a
+            turn between lanes that there are not, or that leaves no way on, or a counted facility that no entry leads
+            to.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -156,6 +190,7 @@ class ParkingLot:
     zone_rules: Mapping[str, Zone] = field(default_factory=dict)
     goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)
     entry_weights: Mapping[str, FloatArray] = field(default_factory=dict)
+    turns: tuple[Turn, ...] = ()
 
     vertex_xy: FloatArray = field(init=False)
     vertex_yaw: FloatArray = field(init=False)
@@ -175,6 +210,7 @@ class ParkingLot:
 
         set_field("slot_ids", tuple(self.slot_ids))
         set_field("lanes", tuple(self.lanes))
+        set_field("turns", tuple(self.turns))
         set_field("facilities", tuple(self.facilities))
         self._set_counted(set_field)
         self._require_names()
@@ -215,7 +251,10 @@ class ParkingLot:
                 raise InputError(f"lot {self.name!r} has no {kind}")
 
         graph = build_drive_graph(
-            [(lane.points, lane.oneway, lane.speed) for lane in self.lanes], self.mouth_xy(), self.entries
+            [(lane.points, lane.oneway, lane.speed) for lane in self.lanes],
+            self.mouth_xy(),
+            self.entries,
+            [(turn.points, turn.only) for turn in self.turns],
         )
         for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "edge_speed", "entry_vertices"):
             values = getattr(graph, name)
@@ -504,4 +543,4 @@ def _same(a: object, b: object) -> bool:
     return a == b
 
 
-__all__ = ["ACTIONS", "MOVES", "PARK", "GraphError", "GraphProblem", "Lane", "Mouth", "ParkingLot"]
+__all__ = ["ACTIONS", "MOVES", "PARK", "GraphError", "GraphProblem", "Lane", "Mouth", "ParkingLot", "Turn"]

@@ -13,7 +13,7 @@ from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.facility import Facility
-from parkenv.world.lot import FARTHEST, Lane, ParkingLot
+from parkenv.world.lot import FARTHEST, Lane, ParkingLot, Turn
 from parkenv.world.tariff import Zone
 
 KINDS = {
@@ -23,6 +23,7 @@ KINDS = {
     "goal": ("Point",),
     "wall": ("LineString", "Polygon"),
     "facility": ("Point",),
+    "turn": ("LineString",),
 }
 """The kinds of features, and the geometry types allowed for each."""
 
@@ -70,6 +71,7 @@ class LotContents:
     entries: list[FloatArray] = field(default_factory=list)
     goals: list[FloatArray] = field(default_factory=list)
     walls: list[FloatArray] = field(default_factory=list)
+    turns: list[Turn] = field(default_factory=list)
     facilities: list[Facility] = field(default_factory=list)
     zone_rules: dict[str, Zone] = field(default_factory=dict)
     # by kind, `goal` or `entry`: the weights by purpose of each
@@ -91,6 +93,7 @@ class LotContents:
             "zone_rules": self.zone_rules,
             "goal_weights": self._weights("goal"),
             "entry_weights": self._weights("entry"),
+            "turns": tuple(self.turns),
         }
 
     def _weights(self, kind: str) -> dict[str, FloatArray]:
@@ -105,18 +108,23 @@ class LotContents:
 
 
 def graph_errors(contents: LotContents) -> list[LotProblem]:
-    """Return errors of the drive graph: slots, entries and facilities without a lane, junctions with too many lanes."""
+    """Return errors of the drive graph: slots, entries, turns and facilities without a lane, crowded junctions."""
     lanes = [(lane.points, lane.oneway, lane.speed) for lane in contents.lanes]
     if not lanes:
         return []
     mouth_xy = contents.slots.mouths()
-    left = {"slot": np.arange(len(mouth_xy)), "entry": np.arange(len(contents.entries))}
     entries = np.array(contents.entries).reshape(-1, 2)
+    turns = [(turn.points, turn.only) for turn in contents.turns]
+    left = {
+        kind: np.arange(len(its)) for kind, its in (("slot", mouth_xy), ("entry", entries), ("turn", turns))
+    }
     errors = []
     while True:
         # Remove faulty features and repeat, so that all faults are found.
         try:
-            build_drive_graph(lanes, mouth_xy[left["slot"]], entries[left["entry"]])
+            build_drive_graph(
+                lanes, mouth_xy[left["slot"]], entries[left["entry"]], [turns[i] for i in left["turn"]]
+            )
         except GraphError as error:
             kind = error.problems[0].kind
             for problem in error.problems:

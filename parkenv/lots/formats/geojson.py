@@ -13,6 +13,8 @@ to metres east and north of the centre of the features; metres without either ar
 | `lane` | LineString | `oneway`, false if absent; `speed`, multiple of the driving speed, 1 if absent |
 | `entry`, `goal` | Point | `weights`, numbers by purpose, none if absent |
 | `wall` | LineString or Polygon | |
+| `turn` | LineString: on the lane before, the junction, on the lane after | `only`: false if absent, cars may not \
+make it; true: they may make no other |
 | `facility` | Point | `name`, `type` (kerb, lot, garage), `zone`; a counted one `capacity`, `gate_s`, `inside_s`, \
 `known` (nothing, sign, live), `delay_s` |
 
@@ -48,7 +50,7 @@ from parkenv.lots.formats.geojson_supply import (
 from parkenv.lots.formats.positions import Positions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.quality import Provenance
-from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, is_building
+from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, Turn, is_building
 
 LOT_VERSION = 1
 
@@ -150,6 +152,8 @@ def _features(lot: ParkingLot) -> Iterator[dict[str, Any]]:
             yield feature("Polygon", [wall.tolist()], kind="wall")
         else:
             yield feature("LineString", wall.tolist(), kind="wall")
+    for turn in lot.turns:
+        yield feature("LineString", turn.points.tolist(), kind="turn", only=turn.only)
 
 
 # ---- reading: all errors are collected, so nothing below raises out of `read_contents` ----
@@ -209,15 +213,15 @@ def read_contents(path: Path) -> LotContents:
 
 
 def _add_feature(contents: LotContents, feature: RawFeature, parts: list[FloatArray]) -> None:
-    """Add a lane, an entry, a goal, or a wall with one part per ring."""
-    if feature.kind == "lane":
+    """Add a lane, a turn, an entry, a goal, or a wall with one part per ring."""
+    if feature.kind in ("lane", "turn"):
+        names = ("oneway", "speed") if feature.kind == "lane" else ("only",)
+        given = {name: value for name in names if (value := feature.properties.get(name)) is not None}
         try:
-            given = {
-                name: value
-                for name in ("oneway", "speed")
-                if (value := feature.properties.get(name)) is not None
-            }
-            contents.lanes.append(Lane(parts[0], **given))
+            if feature.kind == "lane":
+                contents.lanes.append(Lane(parts[0], **given))
+            else:
+                contents.turns.append(Turn(parts[0], **given))
         except InputError as error:
             contents.error(feature.number, str(error))
             return
@@ -282,8 +286,9 @@ def _check_feature(
     kinds_seen.add(kind)
     if shape not in KINDS[kind]:
         raise InputError(f"{kind}: geometry is {shape!r:.40}, want {' or '.join(KINDS[kind])}")
-    if kind == "lane" and not isinstance(properties.get("oneway", False), bool):
-        raise InputError(f"lane: oneway is {properties['oneway']!r:.40}, want true or false")
+    for of, name in (("lane", "oneway"), ("turn", "only")):
+        if kind == of and not isinstance(properties.get(name, False), bool):
+            raise InputError(f"{kind}: {name} is {properties[name]!r:.40}, want true or false")
 
     coordinates = geometry.get("coordinates")
     lines: Any

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +12,7 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.lots.draft import ImportOptions, LotDraft
-from parkenv.lots.osm.draft import draft_of_elements, map_frame
+from parkenv.lots.osm.draft import draft_of_map, map_frame
 from parkenv.lots.osm.elements import OsmElement, place_name, read_map
 from parkenv.lots.osm.spaces import is_space
 from parkenv.world.drive_graph import component_labels
@@ -55,7 +55,7 @@ def import_car_parks(
     for name, part in parts:
         count = sum(map(is_space, part))
         try:
-            draft = draft_of_elements(name, part, options, place.positions.frame)
+            draft = draft_of_map(name, replace(place, elements=part), options, place.positions.frame)
             draft.lot()
         except InputError as error:
             yield CarPark(name, count, None, str(error))

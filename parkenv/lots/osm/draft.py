@@ -50,13 +50,14 @@ from parkenv.lots.osm.buildings import (
     split_walls,
     within,
 )
-from parkenv.lots.osm.elements import OsmElement, place_name, read_map
+from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.kerbs import Junctions, kerb_of, kerb_slots
 from parkenv.lots.osm.outline_draft import outline_draft
 from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
 from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
 from parkenv.lots.osm.rows import ARRANGEMENTS, without_overlaps
 from parkenv.lots.osm.spaces import is_parking_area, is_space, slots_by_rank, split_space, usable_spaces
+from parkenv.lots.osm.turns import turns_of
 from parkenv.world.drive_graph import SLOT_REACH
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
@@ -82,9 +83,7 @@ def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraf
     path = Path(path)
     place = read_map(path)
     with naming(path):
-        draft = draft_of_elements(
-            place_name(path), place.elements, options or ImportOptions(), place.positions.frame
-        )
+        draft = draft_of_map(place_name(path), place, options or ImportOptions(), place.positions.frame)
     found = (
         *([place.positions.found] if place.positions.found else []),
         *draft.found,
@@ -99,18 +98,19 @@ def cut_elements(elements: Sequence[OsmElement]) -> Iterator[str]:
         yield str(LeftOut("cut at the edge of the map", cut))
 
 
-def draft_of_elements(
-    name: str, elements: Sequence[OsmElement], options: ImportOptions, frame: LocalFrame | None = None
+def draft_of_map(
+    name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None = None
 ) -> LotDraft:
-    """Draft a lot from the elements of a map, in a frame or one around its parking; see `osm_draft`.
+    """Draft a lot from a map, in a frame or one around its parking; see `osm_draft`.
 
     Without a road for cars among them, the lanes are inferred from the spaces' outlines; the same holds if guesses are
     allowed and the roads do not reach all spaces or lack an entry.
     """
+    elements = place.elements
     has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
     if has_spaces and not any(_may_be_lane(e) for e in elements):
         return outline_draft(name, elements, [], frame or map_frame(elements), options)
-    importer = _OsmImporter(name, elements, options, frame)
+    importer = _OsmImporter(name, place, options, frame)
     importer.read_spaces()
     importer.fill_outlines()
     importer.line_kerbs()
@@ -168,10 +168,8 @@ class _Group:
 class _OsmImporter:
     """The state of an import: roads, areas, slots, and elements left out."""
 
-    def __init__(
-        self, name: str, elements: Sequence[OsmElement], options: ImportOptions, frame: LocalFrame | None
-    ) -> None:
-        self.name = name
+    def __init__(self, name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None) -> None:
+        self.name, self.place, elements = name, place, place.elements
         self.options = options
         self.left_out: dict[str, list[str]] = {}
         self.notes: list[str] = []
@@ -357,7 +355,9 @@ class _OsmImporter:
         for name in passages:
             self._leave_out("buildings over slots or lanes, which are no walls", name)
 
-        lanes = limit_junctions(network.lanes_of(roads))
+        whole = network.lanes_of(roads)
+        lanes = limit_junctions(whole)
+        turns = turns_of(self.place, self.frame, whole, lanes, away=False)
         draft = LotDraft(
             name=self.name,
             slot_ids=tuple(names),
@@ -370,10 +370,13 @@ class _OsmImporter:
             outlines=tuple(exterior_rings(a.polygon for a in self.outlines)),
             missing=tuple(self._missing(slots, roads, entries, goals)),
             frame=self.frame,
+            turns=turns.kept,
         ).searchable()
         left_out = [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items()]
         return replace(
-            draft, found=tuple(self._found(draft, roads, goal_note)), left_out=(*left_out, *draft.left_out)
+            draft,
+            found=(*self._found(draft, roads, goal_note), *turns.found),
+            left_out=(*left_out, *turns.left_out, *draft.left_out),
         )
 
     def _all_slots(self) -> tuple[list[str], list[str], Slots, NDArray[np.int64]]:

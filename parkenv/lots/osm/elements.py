@@ -8,6 +8,10 @@ GeoJSON of polygons without any such tag holds outlines of parking spaces. XML a
 Extracts are clipped: ways lack the nodes beyond the edge, multipolygons some of their ways. Streets are cut there,
 areas are closed by a straight line between what is left, and what has nothing left is listed.
 
+Turn restrictions are relations. Those for cars at all hours are read, `no_*` and `only_*` from ways over a node to
+ways; others are listed: over a way, at some hours only (`restriction:conditional`), without cars (`except=motorcar`,
+`restriction:hgv`), and those that lack a member or whose ways do not end where they should.
+
 OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
 expand into gigabytes or fetch other files.
 """
@@ -20,7 +24,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -41,6 +45,9 @@ MOST_ELEMENTS = 5_000_000
 """Maximum number of nodes, ways and relations of one file: a city of a million people."""
 MOST_XML_BYTES = 512_000_000
 """Maximum size of OSM XML, unpacked."""
+CAR_KEYS = frozenset(("motorcar", "motor_vehicle", "vehicle"))
+TURN_KEYS = (*(f"restriction:{key}" for key in ("motorcar", "motor_vehicle", "vehicle")), "restriction")
+"""Keys of a restriction of turns that holds for cars, the most specific first."""
 _SAME = 1e-6  # degrees, some 0.1 m: a cut nearer to a node is at the node
 BEYOND = (np.nan, np.nan)  # position of a node that is not in the file
 
@@ -73,6 +80,15 @@ class OsmElement:
         return self if self.is_closed or not rings else replace(self, lines=rings, cut=True)
 
 
+class OsmTurn(NamedTuple):
+    """A turn that cars may not make, or the only one that they may."""
+
+    id: str  # of its relation
+    # (3, 2) degrees, longitude first: on the way by which cars come, the junction, on the way by which they leave
+    line: FloatArray
+    only: bool
+
+
 @dataclass(frozen=True, eq=False)
 class OsmMap:
     """What a file holds."""
@@ -80,6 +96,8 @@ class OsmMap:
     elements: list[OsmElement]  # the tagged nodes, ways and multipolygons, in order
     positions: Positions = field(default_factory=Positions)  # what the positions in the file are
     left_out: tuple[LeftOut, ...] = ()  # those without an outline or a line
+    turns: tuple[OsmTurn, ...] = ()  # those restricted for cars
+    turns_left_out: tuple[LeftOut, ...] = ()  # restrictions of turns that are not read
 
     def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> OsmMap:
         """Cut the map at a box: roads end there; everything else stays whole if half of its corners are inside.
@@ -175,6 +193,10 @@ def _holds_outlines(features: list[Any]) -> bool:
 # ---- common to all formats: references are resolved when everything has been read ----
 
 
+class _NoTurnError(Exception):
+    """Why a restriction of turns is not read."""
+
+
 @dataclass
 class RawWay:
     """A way with references to its nodes, or with its line."""
@@ -186,10 +208,11 @@ class RawWay:
 
 @dataclass
 class RawRelation:
-    """A relation with its member ways: reference, role, and line if it is known."""
+    """A relation with its member ways: reference, role, and line if it is known; and its nodes with the role via."""
 
     tags: dict[str, str]
     members: list[tuple[int, str, FloatArray | None]] = field(default_factory=list)
+    via: list[int] = field(default_factory=list)
 
 
 @dataclass
@@ -254,9 +277,62 @@ class RawElements:
                 "none of its ways has its nodes in the file; export with complete ways (Overpass: "
                 "`out body; >; out skel qt;` or `out geom;`)"
             )
-        areas = [area for i, raw in self.relations.items() if (area := self._area(i, raw)) is not None]
-        left_out = tuple(LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items())
-        return OsmMap(nodes + ways + areas, positions or Positions(), left_out)
+        areas, turns = list[OsmElement](), list[OsmTurn]()
+        no_turns: dict[str, list[str]] = defaultdict(list)
+        for i, raw in self.relations.items():
+            if raw.tags["type"] == "multipolygon":
+                if (area := self._area(i, raw)) is not None:
+                    areas.append(area)
+                continue
+            try:
+                turns += self._turns(f"relation/{i}", raw)
+            except _NoTurnError as reason:
+                no_turns[str(reason)].append(f"relation/{i}")
+        left_out, turns_left_out = (
+            tuple(LeftOut(reason, tuple(ids)) for reason, ids in listed.items())
+            for listed in (self.left_out, no_turns)
+        )
+        return OsmMap(nodes + ways + areas, positions or Positions(), left_out, tuple(turns), turns_left_out)
+
+    def _turns(self, name: str, relation: RawRelation) -> list[OsmTurn]:
+        """Return the turns of a restriction: from each of its ways, to each of them."""
+        tags = relation.tags
+        key = next((key for key in TURN_KEYS if key in tags), None)
+        if key is None:
+            some = any(f"{key}:conditional" in tags for key in TURN_KEYS)
+            raise _NoTurnError("at some hours only" if some else "for other vehicles")
+        if CAR_KEYS.intersection(tags.get("except", "").replace(" ", "").split(";")):
+            raise _NoTurnError("except cars")
+        ways = {role: [m for m in relation.members if m[1] == role] for role in ("from", "via", "to")}
+        if ways["via"]:
+            raise _NoTurnError("over a way")
+        only = tags[key].startswith("only_")
+        if (
+            not re.fullmatch(r"(no|only)_(left_turn|right_turn|straight_on|u_turn|entry|exit)", tags[key])
+            or len(relation.via) != 1
+            or not ways["from"]
+            or not ways["to"]
+            or (only and len(ways["to"]) > 1)
+        ):
+            raise _NoTurnError("damaged")
+        via = np.array(self.positions.get(relation.via[0], BEYOND))
+        comes, leaves = ([self._beside(via, *m) for m in ways[role]] for role in ("from", "to"))
+        return [OsmTurn(name, np.array([a, via, b]), only) for a in comes for b in leaves]
+
+    def _beside(self, via: FloatArray, ref: int, _: str, line: FloatArray | None) -> FloatArray:
+        """Return the position of a way next to the junction at one of its ends, (2,) degrees."""
+        if line is None and ref in self.ways:
+            line = self._line_of(self.ways[ref])
+        if line is None or np.isnan(via).any():
+            raise _NoTurnError("beyond the edge of the map")
+        steps = line[(line != via).any(axis=1)]
+        ends = [np.array_equal(line[k], via) for k in (0, -1)]
+        if sum(ends) != 1 or not len(steps):
+            raise _NoTurnError("damaged")
+        beside: FloatArray = steps[0 if ends[0] else -1]
+        if np.isnan(beside).any():
+            raise _NoTurnError("beyond the edge of the map")
+        return beside
 
     def _line_of(self, way: RawWay) -> FloatArray:
         """Return the positions of a way, (k, 2) degrees, NaN beyond the edge of the map."""
@@ -339,9 +415,11 @@ def _position(name: str, lat: object, lon: object) -> tuple[float, float]:
     return values[1], values[0]
 
 
-def is_area_relation(tags: Mapping[str, str]) -> bool:
-    """Whether a relation is a multipolygon that an import reads."""
-    return tags.get("type") == "multipolygon" and any(key in tags for key in ("amenity", "building"))
+def is_read(tags: Mapping[str, str]) -> bool:
+    """Whether an import reads a relation: an area, or a restriction of turns."""
+    if tags.get("type") == "multipolygon":
+        return any(key in tags for key in ("amenity", "building"))
+    return tags.get("type") == "restriction"
 
 
 # ---- OSM XML ----
@@ -387,9 +465,12 @@ class _XmlReader:
             self._tags[values["k"]] = values["v"]
         elif name == "nd" and self._way is not None:
             self._way[1].refs.append(self._number(name, values, "ref"))
-        elif name == "member" and self._relation is not None and values.get("type") == "way":
-            member = (self._number(name, values, "ref"), values.get("role", ""), None)
-            self._relation.members.append(member)
+        elif name == "member" and self._relation is not None:
+            kind, role = values.get("type"), values.get("role", "")
+            if kind == "way":
+                self._relation.members.append((self._number(name, values, "ref"), role, None))
+            elif kind == "node" and role == "via":
+                self._relation.via.append(self._number(name, values, "ref"))
 
     def end(self, name: str) -> None:
         if name == "node" and self._node is not None:
@@ -402,7 +483,7 @@ class _XmlReader:
             self._relation = None
 
     def close(self) -> None:
-        self.raw.relations = {i: r for i, r in self.raw.relations.items() if is_area_relation(r.tags)}
+        self.raw.relations = {i: r for i, r in self.raw.relations.items() if is_read(r.tags)}
 
     @staticmethod
     def _number(element: str, values: dict[str, str], key: str) -> int:
@@ -477,18 +558,19 @@ def _overpass_map(elements: Iterable[Any]) -> OsmMap:
             if not isinstance(refs, list) or not all(type(ref) is int for ref in refs):
                 refs = []
             raw.add_way(number, RawWay(tags, refs, line))
-        elif is_area_relation(tags):
+        elif is_read(tags):
+            relation = raw.relations[number] = RawRelation(tags)
             listed = element.get("members")
-            members = [
-                (
-                    m["ref"] if type(m.get("ref")) is int else 0,
-                    str(m.get("role", "")),
-                    _geometry(f"{name}: way {m.get('ref')}", m),
-                )
-                for m in (listed if isinstance(listed, list) else ())
-                if isinstance(m, dict) and m.get("type") == "way"
-            ]
-            raw.relations[number] = RawRelation(tags, members)
+            for m in listed if isinstance(listed, list) else ():
+                if not isinstance(m, dict):
+                    continue
+                ref, role = m["ref"] if type(m.get("ref")) is int else 0, str(m.get("role", ""))
+                if m.get("type") == "way":
+                    relation.members.append((ref, role, _geometry(f"{name}: way {ref}", m)))
+                elif m.get("type") == "node" and role == "via":
+                    relation.via.append(ref)
+                    if "lat" in m:
+                        raw.positions.setdefault(ref, _position(f"{name}: node", m["lat"], m.get("lon")))
     return raw.map()
 
 
@@ -577,30 +659,32 @@ def _read_pbf(path: Path) -> OsmMap:
     if not is_there(path):
         raise InputError(f"{path}: No such file or directory")
     raw = RawElements()
-    needed: set[int] = set()
+    needed, junctions = set[int](), set[int]()
     with naming(path):
         try:
             for relation in osmium.FileProcessor(str(path), osmium.osm.RELATION):
                 raw.count_one()
                 tags = dict(relation.tags)
-                if is_area_relation(tags):
+                if is_read(tags):
                     ways = [(m.ref, m.role) for m in relation.members if m.type == "w"]
-                    raw.relations[relation.id] = RawRelation(tags, [(*way, None) for way in ways])
+                    via = [m.ref for m in relation.members if m.type == "n" and m.role == "via"]
+                    raw.relations[relation.id] = RawRelation(tags, [(*way, None) for way in ways], via)
                     needed.update(ref for ref, _ in ways)
+                    junctions.update(via)
             for element in osmium.FileProcessor(str(path), osmium.osm.NODE | osmium.osm.WAY).with_locations():
                 raw.count_one()
-                _add(raw, element, needed)
+                _add(raw, element, needed, junctions)
         except RuntimeError as error:
             raise InputError(f"not an OpenStreetMap extract: {error}") from error
         return raw.map()
 
 
-def _add(raw: RawElements, element: Any, needed: set[int]) -> None:
+def _add(raw: RawElements, element: Any, needed: set[int], junctions: set[int]) -> None:
     wanted = any(key in element.tags for key in KEYS)
     if element.is_node():
-        if wanted:
+        if wanted or element.id in junctions:
             location = element.location
-            raw.add_node(element.id, (location.lon, location.lat), dict(element.tags))
+            raw.add_node(element.id, (location.lon, location.lat), dict(element.tags) if wanted else {})
     elif wanted or element.id in needed:
         line = [(n.location.lon, n.location.lat) if n.location.valid() else BEYOND for n in element.nodes]
         raw.add_way(element.id, RawWay(dict(element.tags), [], np.array(line).reshape(-1, 2)))

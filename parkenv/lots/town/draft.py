@@ -37,6 +37,7 @@ from parkenv.lots.osm.outlines import CORRIDOR
 from parkenv.lots.osm.roads import Rank, off_the_ground, whole_number
 from parkenv.lots.osm.rows import without_overlaps
 from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots_by_rank, split_space
+from parkenv.lots.osm.turns import turns_of
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
 from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of
@@ -411,7 +412,8 @@ class _Town:
         slots = Slots.joined(parts)
         mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
         entries, traffic = self.streets.entries()
-        lanes = self.streets.lanes(mouths, entries if self.beside is not None else None)
+        whole, lanes = self.streets.lanes(mouths, entries if self.beside is not None else None)
+        turns = turns_of(self.place, self.frame, whole, lanes)
         of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
         zone = [rules.zone(row.kind).name for row in self.rows for rules in row.slot_rules]
         slots = replace(
@@ -455,6 +457,7 @@ class _Town:
             zone_rules=zones_of(used),
             goal_weights=weights,
             entry_weights=dict.fromkeys(PURPOSES, traffic),
+            turns=turns.kept,
         ).searchable()
         rows = _table(self.rows, draft)
         listed = [LeftOut(reason, tuple(names)) for reason, names in self.left_out.items() if names]
@@ -463,9 +466,10 @@ class _Town:
             *self.closed_roads,
             *self.streets.unconnected(),
             *listed,
+            *turns.left_out,
             *draft.left_out,
         )
-        found = (*self._found(rows, draft), *cut_elements(self.place.elements))
+        found = (*self._found(rows, draft), *turns.found, *cut_elements(self.place.elements))
         guesses = tuple(_guesses(rows, draft))
         return TownDraft(replace(draft, found=found, left_out=left_out, guesses=guesses), rows)
 

@@ -3,9 +3,8 @@
 Streets are cut at their junctions into pieces. Those from which cars can drive on to every other one are kept: what a
 fence or a missing junction parts from them is left out. Beyond the edge of the map streets go on: where a one-way
 street leaves it or enters it, and where the edge parts streets from the others, a way to the nearest street that
-crosses the edge within 600 m is assumed. Service roads that lead to no parking are dropped. Turn restrictions are not
-applied: a junction is one vertex of the drive graph, whichever arm a car comes from. The speed of a lane is its limit
-over 30 km/h: where 30 is allowed, cars drive at the scenario's speed.
+crosses the edge within 600 m is assumed. Service roads that lead to no parking are dropped. The speed of a lane is its
+limit over 30 km/h: where 30 is allowed, cars drive at the scenario's speed.
 """
 
 from __future__ import annotations
@@ -253,11 +252,14 @@ class Streets:
         """Return the connected part as roads, each a run of pieces of one way."""
         return [replace(self.roads[k], points=points) for k, points in self._runs(self.kept, set())]
 
-    def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> list[Lane]:
+    def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> tuple[list[Lane], list[Lane]]:
         """Return the lanes: the connected part without service roads that lead to none of the mouths, (n, 2) m.
 
         Ways are cut at junctions with more than four ways out, so that `limit_junctions` can split these. With entries,
         (m, 2) m, only the shortest ways between these and the mouths are left, each as long lanes as there can be.
+
+        Returns:
+            The lanes before junctions are split, and with these split.
         """
         kept = self._useful(mouths)
         if entries is not None:
@@ -266,10 +268,9 @@ class Streets:
         back = ~self.oneway[kept]
         ways_out = np.bincount(np.r_[a, b[back]], minlength=len(self.node_xy))
         crowded = set(np.flatnonzero(ways_out > len(MOVES)).tolist())
-        lanes = limit_junctions(
-            [self._lane(self.roads[k], points) for k, points in self._runs(kept, crowded)]
-        )
-        return lanes if entries is None else _joined(lanes, mouths)
+        whole = [self._lane(self.roads[k], points) for k, points in self._runs(kept, crowded)]
+        lanes = limit_junctions(whole)
+        return whole, lanes if entries is None else _joined(lanes, mouths)
 
     @staticmethod
     def _lane(road: Road, points: FloatArray) -> Lane:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -46,16 +46,24 @@ class Street(NamedTuple):
     """A chain of drive graph edges between two junctions: one edge of SUMO.
 
     Attributes:
-        start, end: vertices of the lot.
+        start, end: vertices of the lot, the first of those at their junctions.
         length: m.
         slots: slots along it, and their positions, m from the start.
+        reached: vertex where cars come out of it: which turns they may make there.
+        number: of the streets between the same junctions.
     """
 
     start: int
     end: int
     length: float
     slots: tuple[tuple[int, float], ...]
-    number: int = 0  # of the streets between the same junctions
+    reached: int
+    number: int = 0
+
+    @property
+    def first(self) -> int:
+        """The first vertex on it."""
+        return self.slots[0][0] if self.slots else self.reached
 
     @property
     def name(self) -> str:
@@ -162,9 +170,13 @@ def streets_of(lot: ParkingLot) -> list[Street]:
     Raises:
         InputError: a slot can be reached, or left, in two ways.
     """
-    neighbors = [[int(v) for v in row if v >= 0] for row in lot.neighbors]
-    reached = np.bincount(lot.neighbors[lot.neighbors >= 0], minlength=lot.n_vertices)
-    for slot in range(lot.n_slots):
+    n, neighbors = lot.n_slots, [[int(v) for v in row if v >= 0] for row in lot.neighbors]
+    # All vertices of a junction, one for each set of turns, begin the same streets.
+    first, of = np.unique(lot.vertex_xy[n:], axis=0, return_index=True, return_inverse=True)[1:]
+    junction = np.r_[np.arange(n), n + first[of.ravel()]]
+    ways_in = np.unique([(junction[u], v) for u, row in enumerate(neighbors) for v in row], axis=0)
+    reached = np.bincount(ways_in[:, 1], minlength=n)
+    for slot in range(n):
         if len(neighbors[slot]) != 1 or reached[slot] != 1:
             raise InputError(
                 f"lot {lot.name!r}: slot {slot} is on no one-way lane, which SUMO's parking areas need"
@@ -175,18 +187,21 @@ def streets_of(lot: ParkingLot) -> list[Street]:
         for a, v in enumerate(row)
         if v >= 0
     }
-    streets: list[Street] = []
+    streets: dict[tuple[Any, ...], Street] = {}
     count: dict[tuple[int, int], int] = {}
-    for start in range(lot.n_slots, lot.n_vertices):
-        for first in neighbors[start]:
-            before, at, along, slots = start, first, length[start, first], []
-            while at < lot.n_slots:
+    for start in range(n, lot.n_vertices):
+        for begin in neighbors[start]:
+            before, at, along, slots = start, begin, length[start, begin], []
+            while at < n:
                 slots.append((at, along))
                 before, at = at, neighbors[at][0]
                 along += length[before, at]
-            number = count[start, at] = count.get((start, at), -1) + 1
-            streets.append(Street(start, at, along, tuple(slots), number))
-    return streets
+            ends = int(junction[start]), int(junction[at])
+            key = (*ends, along, tuple(slots), at)
+            if key not in streets:
+                number = count[ends] = count.get(ends, -1) + 1
+                streets[key] = Street(*key, number)
+    return list(streets.values())
 
 
 def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> ParkedDay:
@@ -235,7 +250,7 @@ def run_sumo(fleet: Fleet, folder: Path, step_s: float, end_s: float) -> ParkedD
 def _metres_ahead(fleet: Fleet, street: Street) -> FloatArray:
     """Return the drive from the beginning of a street, through it, to each slot, (n_slots,) m."""
     scenario = fleet.scenario
-    beyond: FloatArray = drive_times(scenario, street.end)[: scenario.lot.n_slots] * scenario.v_drive
+    beyond: FloatArray = drive_times(scenario, street.reached)[: scenario.lot.n_slots] * scenario.v_drive
     metres = street.length + beyond
     for slot, along in street.slots:
         metres[slot] = along
@@ -260,7 +275,8 @@ def _write_network(fleet: Fleet, streets: Sequence[Street], at: Path, folder: Pa
             for s in streets
         ),
     )
-    # All turns of the drive graph, also back at a corner, which netconvert would leave out.
+    # All turns of the drive graph and no other, also back at a corner, which netconvert would leave out.
+    neighbors = fleet.scenario.lot.neighbors
     _write(
         at / "lot.con.xml",
         "connections",
@@ -268,7 +284,7 @@ def _write_network(fleet: Fleet, streets: Sequence[Street], at: Path, folder: Pa
             f'<connection from="{a.name}" to="{b.name}" fromLane="0" toLane="0"/>'
             for a in streets
             for b in streets
-            if a.end == b.start
+            if a.end == b.start and b.first in neighbors[a.reached]
         ),
     )
     files = (

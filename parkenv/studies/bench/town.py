@@ -17,9 +17,9 @@ from parkenv.scenarios.build import make_scenario
 from parkenv.studies.bench.rows import BenchRow, duration, equal, peak_memory_gib
 from parkenv.studies.bench.sumo import streets_of, sumo_rows
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNormalTime, PoissonArrivals
-from parkenv.world.drive_graph import node_labels
+from parkenv.world.drive_graph import NODE_TOLERANCE, node_labels
 from parkenv.world.facility import Facility
-from parkenv.world.lot import Lane, ParkingLot
+from parkenv.world.lot import Lane, ParkingLot, Turn
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import HOUR_S
 from planners.heuristics import POLICIES
@@ -145,8 +145,9 @@ def blocks_of(lot: ParkingLot) -> ParkingLot:
     The two directions of a street share its ends only, so nobody turns round amid a street. Garages are kept, rules
     and prices are not.
     """
+    lanes, turns = _one_way(lot)
 
-    def plain(slots: Slots, lanes: tuple[Lane, ...], facilities: tuple[Facility, ...]) -> ParkingLot:
+    def plain(slots: Slots, facilities: tuple[Facility, ...]) -> ParkingLot:
         slots = dataclasses.replace(slots, zone=slots.zone[:0], facility=slots.facility[:0])
         ids = tuple(map(str, range(len(slots))))
         return ParkingLot(
@@ -157,10 +158,11 @@ def blocks_of(lot: ParkingLot) -> ParkingLot:
             entries=lot.entries,
             goals=lot.goals,
             facilities=facilities,
+            turns=turns,
         )
 
     drawn = Slots.of_lot(lot)[~lot.is_counted]
-    each = plain(drawn, _one_way(lot.lanes), ())
+    each = plain(drawn, ())
     reached = np.isfinite(drive_times(make_scenario(each), each.entry_vertices).min(axis=0))
     kerbs = []
     for street in streets_of(each):
@@ -171,24 +173,40 @@ def blocks_of(lot: ParkingLot) -> ParkingLot:
             kerbs.append(kerb)
     garages = [one for one in lot.facilities if one.is_counted and one.kind == "garage"]
     garages = [dataclasses.replace(garage, zone="", known="sign") for garage in garages]
-    return plain(drawn[:0], each.lanes, (*kerbs, *garages))
+    return plain(drawn[:0], (*kerbs, *garages))
 
 
-def _one_way(lanes: Sequence[Lane]) -> tuple[Lane, ...]:
-    """Return lanes with two one-way ones for the directions of each two-way one."""
-    points = np.concatenate([lane.points for lane in lanes])
+def _one_way(lot: ParkingLot) -> tuple[tuple[Lane, ...], tuple[Turn, ...]]:
+    """Return lanes with two one-way ones for the directions of each two-way one, and the turns between them."""
+    points = np.concatenate([lane.points for lane in lot.lanes])
     label = node_labels(points)
     shared = (np.bincount(label) > 1)[label]
     made, first = list[Lane](), 0
-    for lane in lanes:
+    old = list[FloatArray]()
+    for lane in lot.lanes:
         is_end = shared[first : first + len(lane.points)].copy()
         first += len(lane.points)
         is_end[[0, -1]] = True
         cuts = np.flatnonzero(is_end)
         for begin, end in itertools.pairwise(cuts):
             part = lane.points[begin : end + 1]
+            old += [part] if lane.oneway else [part, part[::-1]]
             made += [Lane(part, oneway=True)] if lane.oneway else [_shifted(part), _shifted(part[::-1])]
-    return tuple(made)
+
+    def beside(at: FloatArray, point: FloatArray, end: int, inner: int) -> FloatArray:
+        """Return the point next to a junction on the lane that leads a way."""
+        ways = np.array([part[inner] - part[end] for part in old])
+        alike = ways @ (point - at) / np.hypot(*ways.T)
+        alike[np.hypot(*(np.array([part[end] for part in old]) - at).T) > NODE_TOLERANCE] = -np.inf
+        chosen: FloatArray = made[int(alike.argmax())].points[inner]
+        return chosen
+
+    turns = [
+        Turn(np.array([beside(at, before, -1, -2), at, beside(at, after, 0, 1)]), turn.only)
+        for turn in lot.turns
+        for before, at, after in (turn.points,)
+    ]
+    return tuple(made), tuple(turns)
 
 
 def _shifted(points: FloatArray) -> Lane:

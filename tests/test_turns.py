@@ -1,0 +1,319 @@
+"""Turns that cars may not make: the ways round them, files, imports, and that nobody ever makes one."""
+
+import itertools
+import json
+from pathlib import Path
+from xml.etree import ElementTree
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.wrappers import TimeLimit
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from made_maps import STREET, Map
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv import make_agent, make_scenario
+from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.errors import InputError
+from parkenv.lots import check_lot, import_lot, import_town, read_lot, write_lot
+from parkenv.studies.bench import sumo
+from parkenv.studies.bench.town import blocks_of
+from parkenv.studies.simulate import adapt_to_agent
+from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
+from parkenv.world.lot import GraphError, Lane, Mouth, ParkingLot, Turn
+from planners.heuristics import POLICIES
+
+AT = (-100.0, 0.0, 100.0)
+ARMS = {"west": (-1, 0), "east": (1, 0), "north": (0, 1), "south": (0, -1)}
+
+
+def turn(comes, leaves, at=(0.0, 0.0), *, only=False):
+    """From one arm of a crossing into another one."""
+    via = np.array(at)
+    return Turn(
+        np.array([via + 50.0 * np.array(ARMS[comes]), via, via + 50.0 * np.array(ARMS[leaves])]), only
+    )
+
+
+def blocks(turns=(), every=None):
+    """Four blocks of 100 m, entered from the west: a kerb slot on the way north from the middle, or one every few m."""
+    places = [(4.0, 50.0, np.pi / 2)]  # x, y, heading of those who drive past it
+    if every is not None:
+        along = np.arange(-100.0 + every / 2, 100.0, every).tolist()
+        places = [(a, y - 4.0 * way, np.arccos(way)) for y in AT for way in (1, -1) for a in along]
+        places += [(x + 4.0 * way, a, way * np.pi / 2) for x in AT for way in (1, -1) for a in along]
+    x, y, yaw = np.array(places).T
+    n = len(x)
+    level = [[(-150.0, 0.0)] * (y == 0.0) + [(x, y) for x in AT] for y in AT]
+    return ParkingLot(
+        "blocks",
+        tuple(map(str, range(n))),
+        slot_xy=np.stack([x, y], axis=1),
+        slot_yaw=yaw,
+        slot_length=np.full(n, 5.0),
+        slot_width=np.full(n, 2.0),
+        slot_mouth=np.full(n, Mouth.LEFT),
+        lanes=tuple(Lane(np.array(points)) for points in (*level, *([(x, y) for y in AT] for x in AT))),
+        entries=np.array([(-150.0, 0.0)]),
+        goals=np.array([(10.0, 50.0)]),
+        turns=tuple(turns),
+    )
+
+
+def metres(lot):
+    return dijkstra(lot.drive_matrix(), indices=lot.entry_vertices[0])[0]
+
+
+BACK = [turn(arm, arm) for arm in ARMS]
+
+
+@pytest.mark.parametrize(
+    ("turns", "wanted"),
+    [
+        ([], 200.0),
+        # Round a block to come from the north, and turn round; straight on and back from the east; right, and back from
+        # the south, or there round a block.
+        ([turn("west", "north")], 400.0),
+        ([turn("west", "south", only=True)], 400.0),
+        ([turn("west", "north"), *BACK, turn("south", "north")], 400.0),
+        (
+            [turn("west", "east", only=True), turn("north", "north"), turn("west", "west", (100.0, 0.0))],
+            400.0,
+        ),
+        ([turn(arm, "north") for arm in ARMS], np.inf),
+        # What is allowed elsewhere does not change.
+        ([turn("east", "north"), turn("south", "west"), turn("south", "north", only=True)], 200.0),
+    ],
+)
+def test_the_shortest_way_goes_round_what_is_forbidden(turns, wanted):
+    assert metres(blocks(turns)) == pytest.approx(wanted)
+
+
+def test_a_lot_without_turns_has_one_vertex_a_junction_and_each_turn_adds_at_most_one():
+    plain = blocks()
+    assert blocks([turn("west", "north"), turn("west", "west")]).n_vertices == plain.n_vertices + 1
+    assert blocks([turn("west", "north"), turn("east", "north")]).n_vertices == plain.n_vertices + 2
+    assert plain == blocks([])
+    assert plain != blocks([turn("west", "north")])
+
+
+@pytest.mark.parametrize(
+    ("points", "message"),
+    [
+        ([(-50, 0), (3, 0), (50, 0)], r"turn 0: has no junction or end of a lane at \(3.0, 0.0\) m"),
+        ([(-50, -50), (0, 0), (50, 0)], "turn 0: has no lane by which cars come from"),
+        ([(-50, 0), (0, 0), (50, 50)], "turn 0: has no lane by which cars leave"),
+        ([(-100, 0), (-150, 0), (-100, 0)], r"turn 0: leaves cars that come to \(-150.0, 0.0\) m no way on"),
+        ([(-50, 0), (0, 0)], r"turn points: shape \(2, 2\), want \(3, 2\)"),
+    ],
+)
+def test_a_turn_that_there_is_not_is_refused(points, message):
+    with pytest.raises(InputError, match=message):
+        blocks([Turn(np.array(points, float))])
+
+
+def made(lot, origins, vertices):
+    """The turns of a drive, as (comes, at, leaves), by names of arms; the steps are those of one car in their order."""
+    n, xy, found = lot.n_slots, lot.vertex_xy, set()
+    steps = [(u, v) for u, v in zip(origins, vertices, strict=True) if u != v]
+    for before, (v, after) in itertools.pairwise(steps):
+        if v >= n and before[1] == v:
+            ways = [xy[u] - xy[v] for u in (before[0], after)]
+            arms = [max(ARMS, key=lambda arm, way=way: float(way @ np.array(ARMS[arm]))) for way in ways]
+            found.add((arms[0], tuple(xy[v].tolist()), arms[1]))
+    return found
+
+
+TURNS = st.builds(
+    turn,
+    st.sampled_from(sorted(ARMS)),
+    st.sampled_from(sorted(ARMS)),
+    st.tuples(st.sampled_from(AT), st.sampled_from(AT)),
+    only=st.booleans(),
+)
+
+
+@settings(max_examples=12, deadline=None)
+@given(turns=st.lists(TURNS, min_size=1, max_size=12), seed=st.integers(0, 99))
+def test_nobody_ever_makes_a_forbidden_turn(turns, seed):
+    """Of all compiled drivers, in a crowded town; turns that the map has not, or that leave no way on, are dropped."""
+    while True:
+        try:
+            lot = blocks(turns, every=40.0)
+            break
+        except GraphError as error:
+            wrong = {problem.index for problem in error.problems}
+            turns = [one for i, one in enumerate(turns) if i not in wrong]
+    assume(turns)
+    demand = Demand(PoissonArrivals(400.0, 8 * 3600, 8.5 * 3600), ExponentialTime(1800.0))
+    drivers = [DriverKind(policy=policy) for policy in POLICIES.values()]
+    fleet = Fleet(make_scenario(lot), demand, background="none", drivers=drivers)
+    fleet.reset(seed)
+    fleet.keep_steps()
+    fleet.run()
+    steps = fleet.take_steps()
+    driven = set()
+    for car in np.unique(steps["car"]).tolist():
+        its = steps[steps["car"] == car]
+        driven |= made(lot, its["origin"].tolist(), its["vertex"].tolist())
+    assert driven
+    for one in turns:
+        comes, at, leaves = one.points
+        arms = [
+            max(ARMS, key=lambda arm, way=way: float((way - at) @ np.array(ARMS[arm])))
+            for way in (comes, leaves)
+        ]
+        at = tuple(at.tolist())
+        those = {last for first, where, last in driven if (first, where) == (arms[0], at)}
+        assert those <= {arms[1]} if one.only else arms[1] not in those
+
+
+@pytest.mark.parametrize("name", ["mdp", "belief"])
+def test_agents_drive_round_it_too(name):
+    scenario = make_scenario(blocks([turn("west", "north"), turn("south", "north")], every=40.0))
+    agent = make_agent(name, scenario.public())
+    env = adapt_to_agent(TimeLimit(gym.make("parkenv/Search-v2", scenario=scenario), 200), agent)
+    for seed in range(5):
+        observation, _ = env.reset(seed=seed)
+        memory, over, path = None, False, [int(observation["vertex"])]
+        while not over:
+            action, memory = agent.predict(observation, memory)
+            observation, _, *ends, _ = env.step(action)
+            over = any(ends)
+            path.append(int(observation["vertex"]))
+        driven = made(scenario.lot, path[:-1], path[1:])
+        assert not driven & {("west", (0.0, 0.0), "north"), ("south", (0.0, 0.0), "north")}
+
+
+def test_turns_come_back_from_a_file_and_faults_are_named(tmp_path):
+    lot = blocks([turn("west", "north"), turn("north", "south", only=True), turn("east", "east")])
+    path = tmp_path / "blocks.geojson"
+    write_lot(lot, path)
+    again = read_lot(path)
+    assert again == lot
+    np.testing.assert_array_equal(again.neighbors, lot.neighbors)
+    document = json.loads(path.read_text())
+    first = next(i for i, f in enumerate(document["features"]) if f["properties"]["kind"] == "turn")
+
+    def told(**changes):
+        broken = json.loads(path.read_text())
+        feature = broken["features"][first]
+        feature["properties"] |= {k: v for k, v in changes.items() if k == "only"}
+        feature["geometry"] |= {k: v for k, v in changes.items() if k != "only"}
+        other = tmp_path / "broken.geojson"
+        other.write_text(json.dumps(broken))
+        with pytest.raises(InputError) as caught:
+            read_lot(other)
+        (problem,) = check_lot(other)
+        assert problem.feature == first
+        assert str(caught.value) == f"{other}: feature {first}: {problem.message}"
+        return problem.message
+
+    assert told(only="yes") == "turn: only is 'yes', want true or false"
+    assert told(type="Point", coordinates=[0, 0]) == "turn: geometry is 'Point', want LineString"
+    assert "shape (2, 2), want (3, 2)" in told(coordinates=[[0, 0], [1, 0]])
+    assert "has no junction" in told(coordinates=[[0, 0], [1, 0], [2, 0]])
+
+
+def test_sumo_gets_the_turns_that_are_left(monkeypatch):
+    plain, lot = (
+        blocks(every=20.0),
+        blocks([turn("west", "north"), turn("north", "east", only=True)], every=20.0),
+    )
+    assert connections(plain, monkeypatch) - connections(lot, monkeypatch) == {
+        ("west", "north"), ("north", "south"), ("north", "west"), ("north", "north"),
+    }  # fmt: skip
+
+
+def connections(lot, monkeypatch):
+    """The turns at the middle that SUMO gets, by names of arms."""
+    district = blocks_of(lot)
+    demand = Demand(PoissonArrivals(60.0, 8 * 3600, 9 * 3600), ExponentialTime(3600.0))
+    kind = DriverKind(policy=POLICIES["greedy-drive"])
+    fleet = Fleet(make_scenario(district), demand, background="none", drivers=[kind], leave_full_lot=False)
+    fleet.reset(0)
+    files = {}
+
+    def run(command):
+        for option, path in itertools.pairwise(map(str, command)):
+            if option in ("-n", "-e", "-x") and Path(path).exists():
+                files[Path(path).name] = ElementTree.parse(path).getroot()
+        if "--stop-output" in map(str, command):
+            Path(str(command[list(map(str, command)).index("--stop-output") + 1])).write_text("<stops/>")
+        return ""
+
+    monkeypatch.setattr(sumo, "_run", run)
+    sumo.run_sumo(fleet, Path("/nowhere"), 1.0, 7200.0)
+    nodes = {node.get("id"): (float(node.get("x")), float(node.get("y"))) for node in files["lot.nod.xml"]}
+    assert len(set(nodes.values())) == len(nodes)
+    ends = {edge.get("id"): (edge.get("from"), edge.get("to")) for edge in files["lot.edg.xml"]}
+
+    def arm(node):
+        return max(ARMS, key=lambda name: float(np.array(nodes[node]) @ np.array(ARMS[name])))
+
+    return {
+        (arm(ends[a][0]), arm(ends[b][1]))
+        for a, b in ((one.get("from"), one.get("to")) for one in files["lot.con.xml"])
+        if nodes[ends[a][1]] == (0.0, 0.0)
+    }
+
+
+# ---- imports ----
+
+
+def crossing(**relation):
+    """Two streets that cross, a way for each arm, kerbs beside all, and a restriction from the west to the north."""
+    place = Map()
+    for x, y in ARMS.values():
+        place.way([(200 * x, 200 * y), (100 * x, 100 * y), (0, 0)], STREET, **{"parking:both": "lane"})
+    place.way([(-200, 200), (0, 200), (200, 200)], STREET)
+    place.way([(200, 200), (200, 0), (200, -200)], STREET)
+    place.way([(200, -200), (0, -200), (-200, -200)], STREET)
+    place.way([(-200, -200), (-200, 0), (-200, 200)], STREET)
+    if relation:
+        place.turn(1, (0, 0), 3, **relation)
+    place.way([(200, 0), (400, 0)], STREET)
+    return place.node(10, 10, entrance="main")
+
+
+def imported(place, tmp_path, form):
+    path = tmp_path / ("map.osm" if form == "xml" else "map.json")
+    path.write_text(place.xml() if form == "xml" else place.overpass(geometry=form == "geom"))
+    draft = import_lot(path)
+    return draft, [line for line in draft.found if line.startswith("turn restrictions")]
+
+
+@pytest.mark.parametrize("form", ["xml", "json", "geom"])
+def test_a_restriction_of_the_map_is_a_turn_of_the_lot(tmp_path, form):
+    draft, (line,) = imported(crossing(restriction="no_left_turn"), tmp_path, form)
+    assert line == "turn restrictions: 1 kept"
+    (one,) = draft.turns
+    assert not one.only
+    np.testing.assert_allclose(one.points - one.points[1], [(-100, 0), (0, 0), (0, 100)], atol=0.05)
+    plain, nothing = imported(crossing(), tmp_path, form)
+    assert nothing == []
+    assert draft.lot().n_vertices == plain.lot().n_vertices + 1
+
+
+@pytest.mark.parametrize(
+    ("tags", "wanted"),
+    [
+        ({"restriction": "only_straight_on"}, "1 kept"),
+        ({"restriction": "no_entry"}, "1 kept"),
+        ({"restriction:motorcar": "no_left_turn", "except": "bicycle; psv"}, "1 kept"),
+        ({"restriction": "no_left_turn", "except": "psv; motorcar"}, "except cars: 1"),
+        ({"restriction:conditional": "no_left_turn @ (Mo-Fr 07:00-09:00)"}, "at some hours only: 1"),
+        ({"restriction:hgv": "no_left_turn"}, "for other vehicles: 1"),
+        ({"restriction": "no_flying"}, "damaged: 1"),
+        ({"restriction": "no_left_turn", "roles": ("from", "to")}, "damaged: 1"),
+        ({"restriction": "no_left_turn", "roles": ("from", "via", "via", "to")}, "damaged: 1"),
+        ({"restriction": "no_left_turn", "roles": ("via", "to")}, "damaged: 1"),
+    ],
+)
+def test_what_is_not_for_all_cars_at_all_hours_is_counted(tmp_path, tags, wanted):
+    path = tmp_path / "map.osm"
+    path.write_text(crossing(**tags).xml())
+    (line,) = (line for line in import_town(path).draft.found if line.startswith("turn restrictions"))
+    assert wanted in line
