@@ -17,6 +17,7 @@ from parkenv.files.known_names import RigName
 from parkenv.files.option import Inside, Option, option
 from parkenv.files.spec_file import Axis, DetectorName, Several
 from parkenv.show.plurals import plural
+from parkenv.show.report.tables import Column
 from parkenv.studies.fields import CaptureDistance, ScenarioItem, Seed
 from parkenv.studies.results import Row
 from parkenv.studies.sensing.detector_study import DetectorStudy
@@ -314,11 +315,8 @@ class EvaluateDetector(Command, ExecutionSpec):
                 drawn()
             advance = counted(progress, "Detecting", len(taken) * len(detectors))
             rows = score_on_drives(detectors, taken, self.false_positives, advance)
-        cells = [
-            (row["part"], str(row["cars"]), *("" if row[n] is None else f"{row[n]:.1%}" for n in detectors))
-            for row in rows
-        ]
-        console.print(make_table(None, ["part", "cars", *detectors], cells))
+        columns = {name: Column(name, name, share=True) for name in detectors}
+        print_rows(console, "Cars found", rows, rows[0], columns)
         save_summary(self.out, None, rows)
         console.print(
             f"Recall on {plural(len(taken), 'picture')} at {self.false_positives:g} false positives in a picture. "
@@ -336,16 +334,13 @@ class EvaluateDetector(Command, ExecutionSpec):
         with stages(console, "crops") as progress:
             advance = counted(progress, "Detecting", len(crops.positives) + len(crops.negatives))
             rows = recall_on_crops(loaded, crops, on_image=advance)
-        cells = [
-            (
-                f"{r['false_positives']:.0%}",
-                f"{r['recall']:.1%} ± {100 * r['interval']:.1f}",
-                str(r["cars"]),
-                str(r["others"]),
-            )
-            for r in rows
+        columns = {
+            key: Column(key, key.replace("_", " "), share=True) for key in ("false_positives", "recall")
+        }
+        shown = [
+            r | {"recall_ci95": [r["recall"] - r["interval"], r["recall"] + r["interval"]]} for r in rows
         ]
-        console.print(make_table(None, ["false positives", "cars found", "cars", "others"], cells))
+        print_rows(console, "Cars found in crops", shown, (*columns, "cars", "others"), columns)
         save_summary(self.out, None, rows)
         console.print(f"Written: {self.out / 'summary.json'}")
 

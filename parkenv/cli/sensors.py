@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, get_args
 
 from pydantic import AfterValidator, Field
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, make_table, stages
+from parkenv.cli.tables import make_console, print_rows, stages
 from parkenv.files.known_names import WEATHERS, RigName, WeatherName
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import scenario_spec
+from parkenv.show.report.tables import Column
 from parkenv.studies.fields import PRICES, TRAFFIC, Detector, OneScenario, Scenarios, Seed, with_traffic
 from parkenv.studies.study import ExecutionSpec, counted
 
+UP_TO = Column("up_to", "slots up to", "m")
 _OBSERVATIONS = ("--sensor-model", "--view-range", *PRICES)
 
 
@@ -117,17 +120,7 @@ class FitSensorModel(Command, ExecutionSpec):
             )
         model = counts.fitted()
         model.to_file(self.out)
-        cells = (
-            (
-                f"{band.up_to:g} m",
-                "right" if band.beside else "elsewhere",
-                str(in_band.sum()),
-                f"{band.seen_rate:.0%}",
-                f"{band.hit_rate:.3f}",
-                f"{band.false_alarm_rate:.3f}",
-            )
-            for band, in_band in zip(model.bands, counts.counts.reshape(-1, 2, 3), strict=True)
-        )
-        headings = ["slots up to", "side", "slots in range", "observed", "hit rate", "false-alarm rate"]
-        console.print(make_table(f"Observations of slots, rig {rig}", headings, cells))
+        in_range = counts.counts.reshape(-1, 2, 3).sum(axis=(1, 2)).tolist()
+        rows = [{**asdict(band), "slots_in_range": n} for band, n in zip(model.bands, in_range, strict=True)]
+        print_rows(console, f"Observations of slots, rig {rig}", rows, rows[0], {"up_to": UP_TO})
         console.print(f"Written: {self.out}")

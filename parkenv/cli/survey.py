@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, make_table, print_recorded, print_table, save_summary, stages
+from parkenv.cli.tables import make_console, print_recorded, print_rows, print_table, save_summary, stages
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import SCENARIO_NAMES, LocaliserName
 from parkenv.files.option import Inside, option
@@ -206,12 +206,8 @@ class Map(Command):
             if slot in (None, name)
         ]
         console = make_console()
-        cells = (
-            (str(r["slot"]), f"{r['p_occupied']:.2f}", f"{r['low']:.2f}-{r['high']:.2f}", str(r["sessions"]))
-            for r in sorted(rows, key=lambda r: float(str(r["p_occupied"])))[:MOST_ROWS]
-        )
-        title = f"{its.name}, {when}, {plural(len(log.time), 'session')}"
-        console.print(make_table(title, ["slot", "P(taken)", f"{self.confidence:.0%}", "seen in"], cells))
+        free = sorted(rows, key=lambda row: float(str(row["p_occupied"])))[:MOST_ROWS]
+        print_rows(console, f"{its.name}, {when}, {plural(len(log.time), 'session')}", free, rows[0])
         if len(rows) > MOST_ROWS:
             console.print(f"The {MOST_ROWS} most likely free of {len(rows)}; --out writes all.")
         if self.out is not None:
