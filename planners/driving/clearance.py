@@ -14,6 +14,7 @@ from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import VehicleParameters
 
 CELL_M = 0.1  # cell of the distance field, m
+_BEYOND_M = 3.0  # distance, m, by which a car may reach beyond the window
 DISCS = 4  # number of discs in a row that cover the footprint
 
 _SAMPLE_M = 0.5 * CELL_M
@@ -51,8 +52,8 @@ def clearance(
     center = (outlines * used[..., None]).sum(axis=1) / n_corners[:, None]
     away = np.hypot(*np.moveaxis(outlines - center[:, None], -1, 0))
     circle = np.column_stack([center, np.where(used, away, 0.0).max(axis=1, initial=0.0)])
-    near = (circle[:, :2] + circle[:, 2:] > low - 1.0).all(axis=1) & (
-        circle[:, :2] - circle[:, 2:] < high + 1.0
+    near = (circle[:, :2] + circle[:, 2:] > low - _BEYOND_M).all(axis=1) & (
+        circle[:, :2] - circle[:, 2:] < high + _BEYOND_M
     ).all(axis=1)
     outlines, n_corners, circle = outlines[near], n_corners[near], circle[near]
     columns, rows = np.ceil((high - low) / CELL_M).astype(int).tolist()
@@ -128,10 +129,12 @@ def is_collision_free(space: Clearance, x: float, y: float, yaw: float, margin: 
         if row < 0 or column < 0 or row >= rows or column >= columns:
             return False
         away = space.field[row, column]
+        # What lies beyond the field is not in it.
+        edge = CELL_M * min(row, column, rows - 1 - row, columns - 1 - column)
         # The discs at either end reach beyond the footprint before they reach its sides.
         if away + _UNSURE < (half_width if 0 < i < DISCS - 1 else min(half_width, 0.5 * pitch)):
             return False
-        if away - _UNSURE < radius:
+        if min(away, edge) - _UNSURE < radius:
             clear = False
     if clear:
         return True

@@ -23,15 +23,19 @@ from planners.driving.clearance import CELL_M, Clearance, clearance, room_at
 from planners.driving.grid_distances import GRID_CELLS, grid_distances
 from planners.driving.path_shortening import shorten_path
 from planners.driving.reeds_shepp import PIECES, Words, distance_between, words_buffer
-from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot
+from planners.driving.reeds_shepp_shots import DriveCosts, arc_is_free, cheapest_shot, free_length
 
 WINDOW_M = 9.0
 """Margin, m, around start and target within which the car may drive."""
 
 _STEERINGS = np.array([0.0, 0.5, -0.5, 1.0, -1.0])
 _MOST_NODES = 60_000
-_SHORT_MOVE_M = 0.4
-_NARROW_M, _NARROW_CELL_M, _NARROW_YAW_CELLS = 2.0, 0.05, 360
+_TABLE, _SPREAD = (
+    1 << 17,
+    0x9E3779B1,
+)  # size of the hash table of cells, and a factor that spreads them over it
+_TIGHT_CELL_M, _TIGHT_YAW_CELLS = 0.02, 720
+_SHORTEST_M, _LONGEST_M = 0.02, 1.5  # of moves that end where the car would touch something
 
 
 @dataclass(frozen=True)
@@ -43,7 +47,8 @@ class SearchSettings:
         steer_m: cost of turning the wheel from straight to its stop, m, at each change of curvature.
         reserve: fraction by which planned turning circles exceed the smallest one, which leaves room for corrections.
         attempts: pairs, tried in order, of the clearance to obstacles, m (less where start or target are closer), and
-            the length of a search move, m. Cells are half as wide as a move is long.
+            the length of a search move, m. Cells are half as wide as a move is long. Moves of length 0 go on until
+            the car would touch something, which leads out of the tightest slots.
         greed: weight of the heuristic, at least 1.
         most_expansions: number of expanded nodes after which an attempt fails.
         patience: after the first path, the search expands further nodes, this fraction of those so far.
@@ -59,8 +64,9 @@ class SearchSettings:
         (0.20, 0.5),
         (0.10, 0.5),
         (0.05, 0.5),
-        (0.05, 0.25),
-        (0.02, 0.25),
+        (0.05, 0.0),
+        (0.02, 0.0),
+        (0.01, 0.0),
     )
     greed: float = 1.3
     most_expansions: int = 20_000
@@ -78,10 +84,11 @@ class SearchSettings:
             if not (math.isfinite(value) and value >= least):
                 raise InputError(f"search {name} is {value!r}, want at least {least:g}")
         if not self.attempts or any(
-            margin < 0.0 or not 0.05 <= move <= 2.0 for margin, move in self.attempts
+            margin < 0.0 or not (move == 0.0 or 0.05 <= move <= 2.0) for margin, move in self.attempts
         ):
             raise InputError(
-                f"search attempts are {self.attempts!r}, want pairs of a margin, 0 m or more, and a move, 0.05 to 2 m"
+                f"search attempts are {self.attempts!r}, want pairs of a margin, 0 m or more, and a move, 0 or "
+                "0.05 to 2 m"
             )
         if self.most_expansions < 1:
             raise InputError(f"search most_expansions is {self.most_expansions}, want at least 1")
@@ -167,14 +174,12 @@ def _search(
     patience: float,
 ) -> tuple[FloatArray, FloatArray, int]:
     """Run hybrid A*; return lengths, m, and curvatures, 1/m, of the arcs from start to end, and the expansions."""
-    cell, yaw_cells = 0.5 * move, round(36.0 / move)
-    rows = int(space.field.shape[0] * CELL_M / cell) + 1
-    columns = int(space.field.shape[1] * CELL_M / cell) + 1
-    # Best node per cell and direction of arrival. In a tight slot short moves shift the car sideways by millimetres, so
-    # cells are small there; else each move would end in the cell where it started.
-    n_wide = rows * columns * yaw_cells
-    narrow = int(2.0 * _NARROW_M / _NARROW_CELL_M) if move < _SHORT_MOVE_M else 0
-    node_of = np.full((n_wide + narrow * narrow * _NARROW_YAW_CELLS, 2), -1, np.int32)
+    # Best node per cell and direction of arrival, in a hash table. In a tight slot moves shift the car sideways by
+    # millimetres, so cells are small there; else each move would end in the cell where it started.
+    tight = move == 0.0
+    cell, yaw_cells = (_TIGHT_CELL_M, _TIGHT_YAW_CELLS) if tight else (0.5 * move, round(36.0 / move))
+    rows, columns = space.field.shape[0] * CELL_M / cell + 1.0, space.field.shape[1] * CELL_M / cell + 1.0
+    node_of, cell_of = np.full(_TABLE, -1, np.int32), np.empty(_MOST_NODES, np.int64)
     pose, cost = np.empty((_MOST_NODES, 3)), np.empty(_MOST_NODES)
     parent = np.empty(_MOST_NODES, np.int32)
     way, steering = np.empty(_MOST_NODES), np.empty(_MOST_NODES)
@@ -198,7 +203,7 @@ def _search(
         closed[node] = True
         opened += 1
         x, y, yaw = pose[node]
-        if opened <= 64 or opened % 4 == 0:
+        if tight or opened <= 64 or opened % 4 == 0:
             below = best - cost[node]
             word, more = cheapest_shot(space, x, y, yaw, end, costs, way[node], steering[node], below, words)
             if word >= 0:
@@ -210,7 +215,11 @@ def _search(
         for direction in (1.0, -1.0):
             for share in _STEERINGS:
                 curvature, length = share / radius, direction * move
-                g = cost[node] + move + costs.steer_m * abs(share - steering[node])
+                if tight:
+                    length = free_length(space, x, y, yaw, curvature, direction * _LONGEST_M, costs.margin)
+                    if abs(length) < _SHORTEST_M:
+                        continue
+                g = cost[node] + abs(length) + costs.steer_m * abs(share - steering[node])
                 if way[node] * direction < 0.0:
                     g += costs.change_m
                 nx, ny, nyaw = move_along(x, y, yaw, curvature, length)
@@ -220,21 +229,15 @@ def _search(
                     continue
                 if r < 0 or c < 0 or r >= left.shape[0] or c >= left.shape[1]:
                     continue
-                turns_left = nyaw / (2.0 * math.pi)
-                near_row = math.floor((ny - start[1] + _NARROW_M) / _NARROW_CELL_M)
-                near_column = math.floor((nx - start[0] + _NARROW_M) / _NARROW_CELL_M)
-                if 0 <= near_row < narrow and 0 <= near_column < narrow:
-                    place = (near_row * narrow + near_column) * _NARROW_YAW_CELLS
-                    place += n_wide + math.floor(turns_left * _NARROW_YAW_CELLS) % _NARROW_YAW_CELLS
-                else:
-                    place = (row * columns + column) * yaw_cells + math.floor(
-                        turns_left * yaw_cells
-                    ) % yaw_cells
-                heading = 0 if direction > 0.0 else 1
-                old = node_of[place, heading]
+                yaw_cell = math.floor(nyaw / (2.0 * math.pi) * yaw_cells) % yaw_cells
+                key = ((row * int(columns) + column) * yaw_cells + yaw_cell) * 2 + (direction > 0.0)
+                place = (key * _SPREAD) % _TABLE
+                while node_of[place] >= 0 and cell_of[node_of[place]] != key:
+                    place = (place + 1) % _TABLE
+                old = node_of[place]
                 if old >= 0 and (closed[old] or cost[old] <= g):
                     continue
-                if not arc_is_free(space, x, y, yaw, curvature, length, costs.margin):
+                if not (tight or arc_is_free(space, x, y, yaw, curvature, length, costs.margin)):
                     continue
                 cs, sn = math.cos(nyaw), math.sin(nyaw)
                 dx, dy = end[0] - nx, end[1] - ny
@@ -244,7 +247,7 @@ def _search(
                     h = max(h, left[r, c])
                 if g + h >= best:
                     continue
-                node_of[place, heading] = n
+                node_of[place], cell_of[n] = n, key
                 pose[n, 0], pose[n, 1], pose[n, 2] = nx, ny, nyaw
                 cost[n], parent[n], way[n], steering[n] = g, node, length, share
                 if old >= 0:

@@ -32,6 +32,7 @@ class TrackingSettings:
         firmness: gain, 1/m; an offset from the path decays over about 2/firmness metres.
         blend_m: distance over which the steering changes between two arcs, m.
         control_s: control period, s.
+        stops: stop wherever the curvature changes and turn the wheels at rest: slow, but exact.
 
     Raises:
         InputError: a value that is not a finite number above 0.
@@ -43,6 +44,7 @@ class TrackingSettings:
     firmness: float = 1.3
     blend_m: float = 0.6
     control_s: float = 0.1
+    stops: bool = False
 
     def __post_init__(self) -> None:
         for name in ("speed", "reverse_speed", "acceleration", "firmness", "blend_m", "control_s"):
@@ -52,10 +54,13 @@ class TrackingSettings:
 
 
 _CRAWL = 0.1  # m/s, lowest commanded speed before the end of the path
-_ARRIVED = 0.01  # m
+_ARRIVED, _EXACTLY = (
+    0.01,
+    0.001,
+)  # m, from the end of a segment; the second where the car stops to turn its wheels
 _BRAKE_FROM = 0.85  # of the acceleration
 _LAG = 0.8  # steps
-_CLOSE = 0.06  # m
+_CLOSE, _CLOSER = 0.06, 0.005  # m, likewise, of where the car may stand
 _AIMED = 0.02  # rad, of the wheels, before the car sets off
 _STANDS = 0.01  # m/s
 _RATE_SHARE = 0.8  # share of the steering rate available to the path; the rest is for corrections
@@ -116,7 +121,8 @@ class PathTracker:
             self.offset = math.cos(yaw) * dy - math.sin(yaw) * dx
             self.askew = math.remainder(float(pose[2]) - yaw, 2.0 * math.pi)
             left = float(segment.station[-1]) - station
-            if not (left < _CLOSE and abs(speed) < _STANDS and self._set_off):
+            close = _CLOSER if self._settings.stops else _CLOSE
+            if not (left < close and abs(speed) < _STANDS and self._set_off):
                 return self._drive(segment, station, left, speed, steering)
             if self._segment + 1 == len(self._segments):
                 self.done = True
@@ -140,13 +146,14 @@ class PathTracker:
         bend = float(np.interp(station + 1.5 * reach, segment.station, segment.curvature))
         if not self._set_off:
             wheels = math.atan(bend * vehicle.wheelbase)
-            if abs(speed) >= _STANDS or abs(steering - wheels) > _AIMED:
+            aimed = _EXACTLY if settings.stops else _AIMED
+            if abs(speed) >= _STANDS or abs(steering - wheels) > aimed:
                 return self._pedal(0.0, speed), self._turn(wheels)
             self._set_off = True
         w = settings.firmness
         bend -= w * w * self.offset + 2.0 * w * segment.direction * self.askew
         turn = self._turn(math.atan(bend * vehicle.wheelbase))
-        if left < _ARRIVED:
+        if left < (_EXACTLY if settings.stops else _ARRIVED):
             return self._pedal(0.0, speed), turn
         # Brake to stop at the end of the segment; braking takes most of a step to build up.
         braking = 0.5 * speed * speed / max(left - _LAG * reach, 1e-3)
@@ -185,7 +192,7 @@ def _segments(vehicle: VehicleParameters, path: CarPath, settings: TrackingSetti
     """
     kept = np.abs(path.length) > 1e-9
     length, curvature = path.length[kept], path.curvature[kept]
-    cuts = np.flatnonzero(np.diff(np.sign(length))) + 1
+    cuts = np.arange(1, len(length)) if settings.stops else np.flatnonzero(np.diff(np.sign(length))) + 1
     start = tuple(path.start.tolist())
     segments = []
     for arcs in np.split(np.arange(len(length)), cuts):

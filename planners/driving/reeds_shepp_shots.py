@@ -11,7 +11,13 @@ from parkenv.driving.vehicle import move_along
 from planners.driving.clearance import Clearance, is_collision_free
 from planners.driving.reeds_shepp import Words, word_cost, words_between
 
-CHECK_M = 0.15  # maximum distance, m, between checked poses
+CHECK_M, FINE_M = 0.15, 0.015  # maximum distance, m, between checked poses, and that without any clearance
+
+
+@compiled(error_model="numpy")
+def _check_every(margin: float) -> float:
+    """Return the distance between checked poses, m: corners that pass each other in between overlap by less than it."""
+    return CHECK_M if margin >= 0.1 else max(1.5 * margin, FINE_M)
 
 
 @compiled(error_model="numpy")
@@ -19,12 +25,33 @@ def arc_is_free(
     space: Clearance, x: float, y: float, yaw: float, curvature: float, way: float, margin: float
 ) -> bool:
     """Return whether the car, grown by `margin` m, is collision-free along an arc of `way` m."""
-    n = max(1, math.ceil(abs(way) / CHECK_M))
+    n = max(1, math.ceil(abs(way) / _check_every(margin)))
     for i in range(1, n + 1):
         px, py, pyaw = move_along(x, y, yaw, curvature, way * i / n)
         if not is_collision_free(space, px, py, pyaw, margin):
             return False
     return True
+
+
+@compiled(error_model="numpy")
+def free_length(
+    space: Clearance, x: float, y: float, yaw: float, curvature: float, most: float, margin: float
+) -> float:
+    """Return how far, m, up to `most`, the car, grown by `margin` m, may drive along an arc; both negative backward."""
+    n = math.ceil(abs(most) / _check_every(margin))
+    for i in range(1, n + 1):
+        px, py, pyaw = move_along(x, y, yaw, curvature, most * i / n)
+        if not is_collision_free(space, px, py, pyaw, margin):
+            free, blocked = most * (i - 1) / n, most * i / n
+            for _ in range(5):
+                middle = 0.5 * (free + blocked)
+                px, py, pyaw = move_along(x, y, yaw, curvature, middle)
+                if is_collision_free(space, px, py, pyaw, margin):
+                    free = middle
+                else:
+                    blocked = middle
+            return free
+    return most
 
 
 class DriveCosts(NamedTuple):
