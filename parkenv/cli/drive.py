@@ -17,9 +17,9 @@ from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.show.plurals import plural
 from parkenv.studies.fields import Scenarios, Seed
-from parkenv.studies.study import ExecutionSpec
 from parkenv.studies.trips.calibration_study import CalibrationStudy, DrivenTrips
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
+from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy
 from planners.names import PARKING_PLANNER
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
     from parkenv.studies.trips.driven_search import Trip as DrivenTrip
 
-SHOWN_ROWS = 20
+SHOWN_ROWS, SHOWN_SCENES = 20, 60
 SHOWN = (
     "agent", "kind", "way", "parked", "success", "contacts", "planning_ms", "planning_ms_p95", "time_s", "time_s_p95",
     "direction_changes", "direction_changes_p95", "driven_m", "turned_rad",
@@ -144,18 +144,25 @@ def _all_or(text: str) -> object:
     return None if text in ("all", "both") else words_in(text)
 
 
-class Park(Command, ExecutionSpec):
-    """Writes pictures of one successful episode per kind of slot and orientation, and an animation of one.
+class Park(StudyCommand):
+    """On lots it writes pictures of one successful episode per kind of slot and orientation, and an animation of one.
 
     Failures are also drawn, if any; with several agents, into one folder per agent.
+
+    With --cases or --levels every scene is planned, driven within the car's limits, and judged by its footprints, 2 cm
+    apart, against the exact obstacles: no contact, and an end within 0.05 m and 0.01 rad of the target. It writes
+    manoeuvres.csv, trajectories.csv (the middle of the rear axle every 0.05 s) and pictures of all scenes.
     """
 
     examples = """
         parkenv park --episodes 250 --scenario campus,street,jam
         parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors
         parkenv park --lot parking_map.yml --way back-in
+        parkenv park --cases tpcap --vehicle tpcap --out results/tpcap
+        parkenv park --levels parallel-extreme,oblique-complex --episodes 10
         """
 
+    study: ManoeuvreStudy = ManoeuvreStudy()
     agents: Axis[str] = option(
         (PARKING_PLANNER,),
         "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
@@ -163,8 +170,6 @@ class Park(Command, ExecutionSpec):
         takes="NAME[,...]",
     )
     scenarios: Annotated[Scenarios, Inside(only=())] = (scenario_spec("campus"), scenario_spec("street"))
-    episodes: int = option(100, "Episodes per lot.", short="-n", ge=1, le=1_000_000)
-    seed: Seed = 0
     kinds: Axis[Literal["perpendicular", "oblique", "parallel"]] | None = option(
         None,
         "Slots: perpendicular, oblique, parallel.",
@@ -201,25 +206,40 @@ class Park(Command, ExecutionSpec):
 
     def run(self) -> None:
         """See `Command`."""
+        if self.study.cases is not None or self.study.levels is not None:
+            self.run_study()
+        else:
+            self._park_on_lots()
+
+    def show(self, console: Console, result: Result) -> None:
+        """Print a row for each scene, those that failed first."""
+        rows = sorted(result.rows, key=lambda row: row["driven"])
+        shown = [name for name in rows[0] if name != "planned"] if rows else ()
+        print_rows(console, plural(len(rows), "scene"), rows[:SHOWN_SCENES], shown)
+        console.print(*self.study.findings(result.summary), soft_wrap=True)
+
+    def _park_on_lots(self) -> None:
         from parkenv.driving.parking_task import WAYS
+        from parkenv.driving.vehicle import VehicleParameters
         from parkenv.scenarios.build import build
         from parkenv.studies.trips.parking_comparison import compare_parking
         from parkenv.studies.trips.parking_runs import ParkingCase
 
+        study, vehicle = self.study, self.study.vehicle or VehicleParameters()
         cases = [
-            ParkingCase(build(spec).lot, self.kinds, self.ways or WAYS, self.occupied, self.slack)
+            ParkingCase(build(spec).lot, self.kinds, self.ways or WAYS, self.occupied, self.slack, vehicle)
             for spec in self.scenarios
         ]
         agents = readable_models(self.agents) if self.trust_model else self.agents
-        seeds = range(self.seed, self.seed + self.episodes)
+        seeds = range(study.seed, study.seed + study.episodes)
         console = make_console()
         with writing_into(self.out):
-            with stages(console, "episodes") as progress, self.workers() as workers:
+            with stages(console, "episodes") as progress, study.workers() as workers:
                 found = compare_parking(cases, agents, seeds, self.out, workers=workers, progress=progress)
             names = [case.lot.name for case in cases]
-            save_summary(self.out, self.seed, found.table, lots=names, agents=found.labels)
+            save_summary(self.out, study.seed, found.table, lots=names, agents=found.labels)
         print_rows(
-            console, f"{', '.join(names)}, {plural(self.episodes, 'episode')} per lot", found.table, SHOWN
+            console, f"{', '.join(names)}, {plural(study.episodes, 'episode')} per lot", found.table, SHOWN
         )
         for row in [row for row in found.rows if not row["parked"]][:SHOWN_ROWS]:
             agent = f"{row['agent']}, " if len(found.labels) > 1 else ""

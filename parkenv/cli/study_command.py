@@ -143,6 +143,7 @@ COMMANDS = {
     "calibrate": "drive:Calibrate",
     "verify": "checks:Verify",
     "train": "train:Train",
+    "park": "drive:Park",
     "dataset": "dataset:Dataset",
 }
 """The command of each kind of study."""
@@ -153,7 +154,7 @@ class Run(RunCommand, ExecutionSpec):
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
     command: compare (the default), commute, fleet, demand, benchmark, survey, detectors, demo, calibrate, verify,
-    train or dataset.
+    train, park (scenes) or dataset.
     """
 
     examples = """

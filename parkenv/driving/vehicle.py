@@ -127,6 +127,21 @@ class VehicleParameters:
         return _shifted(pose, -self.middle)
 
 
+TPCAP = VehicleParameters(
+    length=4.689, width=1.942, wheelbase=2.8, rear_overhang=0.929, max_steering=0.75, steering_rate=0.5,
+    max_speed=2.5, max_reverse_speed=2.5, max_acceleration=1.0, max_braking=1.0,
+)  # fmt: skip
+VEHICLES = {
+    "golf": VehicleParameters(),
+    "tpcap": TPCAP,
+    "parkbench": dataclasses.replace(
+        TPCAP, length=4.95, width=2.0, wheelbase=3.0, rear_overhang=1.025, max_steering=math.radians(32.0)
+    ),
+}
+"""Cars by name: the default; that of the Trajectory Planning Competition for Automated Parking (2022); and that of the
+paper on ParkBench (2026, appendix B), without its cut corners and with the speeds and rates of the second."""
+
+
 def placed(points: FloatArray, pose: FloatArray) -> FloatArray:
     """Transform points of one body, (k, 2) m, or of each, (..., k, 2) m, to poses, (..., 3); returns (..., k, 2) m."""
     pose = np.asarray(pose, dtype=np.float64)

@@ -26,6 +26,12 @@ MapName = Literal["empty", "right", "wrong"]
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
 """What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
+SCENE_LEVELS = tuple(
+    f"{kind}-{level}"
+    for level in ("normal", "complex", "extreme")
+    for kind in ("perpendicular", "oblique", "parallel")
+)
+"""Levels of drawn scenes with a kind of slot each, the easiest first; see `parkenv.driving.levels`."""
 MAX_CARS = 1_000_000
 """Maximum number of cars of a world."""
 BackendName = Literal["loky", "ray", "dask"]

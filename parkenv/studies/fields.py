@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, Field, ValidationInfo
+from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
 from parkenv.errors import InputError
@@ -134,6 +134,25 @@ OneAgent = Annotated[
 ]
 """The one agent of a file."""
 Seed = Annotated[int, Field(ge=0, lt=2**31, description="First seed; episode i uses seed + i."), Option()]
+
+
+def _vehicle(value: object, info: ValidationInfo) -> object:
+    """Return the car of a name, a file or a table."""
+    if value is None:
+        return None
+    from parkenv.driving.scene_files import vehicle_of
+
+    return vehicle_of(value, (info.context or {}).get("folder", "."))
+
+
+Vehicle = Annotated[
+    Any,
+    BeforeValidator(_vehicle),
+    WithJsonSchema({"anyOf": [{"type": "string"}, {"type": "object"}, {"type": "null"}]}),
+    Field(description="The car: golf, tpcap, parkbench, a file (.toml, .json), or a table."),
+    Option(takes="NAME|FILE", parse=str, default="golf, or that of a scene"),
+]
+"""A `VehicleParameters`, or None for the default."""
 
 
 def listed(value: object) -> object:

@@ -50,7 +50,7 @@ def free_length(
                     free = middle
                 else:
                     blocked = middle
-            return free
+            return float(free)
     return most
 
 

@@ -90,7 +90,7 @@ class DriveRenderer:
             self._ground = cv2.resize(fine, _SIZE, interpolation=cv2.INTER_AREA)
         image = self._ground.copy()
         layers = [
-            *_trail(state),
+            *trail(task.vehicle, np.array(state.trail)),
             *movers(state.movers, outlines),
             *steered_car(task.vehicle, state.vehicle),
         ]
@@ -134,9 +134,13 @@ def _panes(poses: FloatArray, size: FloatArray) -> list[Layer]:
     return [Marks(poses, pane, "glass", size) for pane in (WINDSCREEN, REAR_WINDOW)]
 
 
-def _trail(state: DriveState) -> list[Layer]:
-    """Return the path of the car's centre, and its outline at the start and at changes of direction."""
-    vehicle, poses = state.task.vehicle, np.array(state.trail)
+def trail(vehicle: VehicleParameters, poses: FloatArray) -> list[Layer]:
+    """Return the path of the car's centre, and its outline at the start and at changes of direction.
+
+    Args:
+        vehicle: the car.
+        poses: (n, 3), of its rear axle.
+    """
     step = np.diff(poses[:, :2], axis=0)
     forward = (step * np.stack([np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])], axis=1)).sum(axis=1)
     moving = np.flatnonzero(np.abs(forward) > 1e-6)

@@ -66,7 +66,7 @@ def compare_parking(
     for case in cases:
         case.environment().close()
     labels = _labels(agents)
-    parking_agents = {label: make_parking_agent(name) for label, name in labels.items()}
+    parking_agents = {label: make_parking_agent(name, cases[0].vehicle) for label, name in labels.items()}
     parkings: dict[str, list[Parking]] = {label: [] for label in labels}
     for label, name in labels.items():
         doing = "Parking" if len(labels) == 1 else label

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import binomtest
 
 from parkenv.driving.drive_state import DriveState
-from parkenv.driving.vehicle import STEERING, YAW
+from parkenv.driving.vehicle import STEERING, YAW, VehicleParameters
 from parkenv.envs.drive import DriveEnv
 from parkenv.files.csv_tables import write_csv
 from parkenv.studies.simulate import FrameRecorder, Observer, Step, simulate
@@ -36,6 +36,7 @@ class ParkingCase:
     ways: tuple[str, ...] = ("nose-in", "back-in")  # orientations in perpendicular and oblique slots
     occupancy: float = 0.85  # fraction of the other slots that are occupied
     slack: float = 0.0  # distance around the slot kept clear of parked cars, m
+    vehicle: VehicleParameters = field(default_factory=VehicleParameters)
 
     def environment(self, render_mode: str | None = None) -> gym.Env[Any, Any]:
         """Make `parkenv/Drive-v1` with the obstacle map."""
@@ -46,6 +47,7 @@ class ParkingCase:
             ways=self.ways,
             occupancy=self.occupancy,
             slack=self.slack,
+            vehicle=self.vehicle,
             obstacle_map=True,
             render_mode=render_mode,
             disable_env_checker=True,
@@ -158,7 +160,7 @@ def park_all(
 
 
 def _park_some(case: ParkingCase, seeds: Sequence[int], name: str) -> list[Parking]:
-    env, agent = case.environment(), make_parking_agent(name)
+    env, agent = case.environment(), make_parking_agent(name, case.vehicle)
     return [park_once(env, agent, seed) for seed in seeds]
 
 

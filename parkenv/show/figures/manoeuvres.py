@@ -1,0 +1,94 @@
+"""Pictures and films of manoeuvres in scenes, from above."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import shapely
+
+from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.driving.scene import Scene
+from parkenv.driving.vehicle import STATE_SIZE
+from parkenv.show.colors import FREE, PALETTE, mixed_color
+from parkenv.show.figures.parkings import save_sheet
+from parkenv.show.figures.picture_files import save_film
+from parkenv.show.frames.drive import LARGEST_SCALE, steered_car, trail
+from parkenv.show.frames.lot import HEIGHT, HUD, WIDTH, strip, write_line
+from parkenv.show.painters.opencv import MapView, paint
+from parkenv.show.scene import Areas, Layer, Lines
+
+FPS, SPEED_UP, COLORS = 10, 4, 64
+"""Frames per second of a film, how much faster than real it is, and its colours."""
+_SIZE = (WIDTH, HEIGHT - HUD)
+_MARGIN = 2.5  # m, around what is driven
+_LINE = 0.16  # m, obstacles that are lines
+_STILL = 5  # times that a film shows its last frame
+
+Shown = tuple[Scene, Mapping[str, Any], str]
+"""A scene, its lines of `trajectories.csv`, and what is said of it."""
+
+
+def save_manoeuvres(shown: Sequence[Shown], path: Path) -> None:
+    """Write a PNG of manoeuvres, two a row."""
+    save_sheet(
+        [_frame(scene, _states(scene, driven), f"{scene.name}: {says}") for scene, driven, says in shown],
+        path,
+    )
+
+
+def save_manoeuvre_film(scene: Scene, driven: Mapping[str, Any], path: Path) -> None:
+    """Write a film of a manoeuvre as GIF, `SPEED_UP` times as fast as it was."""
+    states, time = _states(scene, driven), np.array(driven["time_s"])
+    ends = np.searchsorted(time, np.arange(0.0, time[-1] + SPEED_UP / FPS, SPEED_UP / FPS)).clip(1, len(time))
+    frames = [
+        _frame(scene, states[:end], f"{scene.name}: {time[end - 1]:.1f} s", states) for end in ends.tolist()
+    ]
+    save_film([*frames, *[frames[-1]] * _STILL], path, fps=FPS, colors=COLORS)
+
+
+def _states(scene: Scene, driven: Mapping[str, Any]) -> FloatArray:
+    """Return the states of a trajectory, (n, 6), in the scene's coordinates."""
+    columns = [driven[name] for name in ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad")]
+    states = np.zeros((len(columns[0]), STATE_SIZE))
+    states[:, :5] = np.column_stack(columns)
+    states[:, :2] -= scene.origin
+    return states
+
+
+def _frame(scene: Scene, states: FloatArray, text: str, whole: FloatArray | None = None) -> Image:
+    """Render what was driven in a scene so far, (480, 640, 3) uint8 RGB; the view fits `whole`."""
+    whole = states if whole is None else whole
+    poses = np.concatenate([whole[:: max(1, len(whole) // 200), :3], scene.target[None]])
+    corners = scene.vehicle.corners(poses).reshape(-1, 2)
+    view = MapView.fit(
+        np.array([corners.min(axis=0) - _MARGIN, corners.max(axis=0) + _MARGIN]), _SIZE, LARGEST_SCALE
+    )
+    fine = np.full((_SIZE[1] * 2, _SIZE[0] * 2, 3), PALETTE["floor"], dtype=np.uint8)
+    paint(fine, MapView(view.turn, 2 * view.scale, 2 * view.shift, 2), _ground(scene))
+    image = cv2.resize(fine, _SIZE, interpolation=cv2.INTER_AREA)
+    paint(image, view, [*trail(scene.vehicle, states[:, :3]), *steered_car(scene.vehicle, states[-1])])
+    line = strip()
+    write_line(line, (text,))
+    return np.vstack([image, line])
+
+
+def _ground(scene: Scene) -> list[Layer]:
+    """Return the target and, darkest of all, the obstacles."""
+    goal = scene.vehicle.corners(scene.target)
+    solid = [s for s in scene.shapes if s.geom_type == "Polygon"]
+    lines = [shapely.get_coordinates(s) for s in scene.shapes if s.geom_type != "Polygon"]
+    return [
+        Areas([[goal]], mixed_color("floor", FREE, 0.6)),
+        Lines([np.vstack([goal, goal[:1]])], "white", 0.1),
+        Areas([[shapely.get_coordinates(shape)] for shape in solid], "ink"),
+        Lines(
+            [np.repeat(line, 2, axis=0) if len(line) == 1 else line for line in lines],
+            "ink",
+            _LINE,
+            (3.0, np.inf),
+        ),
+    ]

@@ -1,0 +1,271 @@
+"""Scenes of manoeuvres, planned and driven, and judged by their footprints."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections import Counter
+from collections.abc import Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self
+
+from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
+from pydantic_core import PydanticCustomError
+
+from parkenv.errors import InputError, nearest
+from parkenv.files.csv_tables import NUMBER_OR_NOTHING, TEXT, WHOLE, YES_OR_NO
+from parkenv.files.known_names import SCENE_LEVELS
+from parkenv.files.option import option, words_in
+from parkenv.files.spec_file import Axis
+from parkenv.studies.fields import Figures, Seed, Vehicle
+from parkenv.studies.results import CsvTable, LongTable, Results, Row
+from parkenv.studies.study import Cell, Study
+from parkenv.version import __version__
+
+if TYPE_CHECKING:
+    from parkenv.driving.scene import Scene
+    from parkenv.studies.runner import Result
+    from parkenv.studies.workers import Task
+    from planners.driving.manoeuvre import Manoeuvre
+
+MANOEUVRES = CsvTable(
+    "manoeuvres.csv",
+    ("case",),
+    (
+        "planned", "driven", "contact", "clearance_m", "error_m", "error_rad", "time_s", "length_m",
+        "direction_changes", "planning_s",
+    ),
+    {"case": TEXT, "direction_changes": WHOLE, **dict.fromkeys(("planned", "driven", "contact"), YES_OR_NO)},
+    other=NUMBER_OR_NOTHING,
+    lists=None,
+)  # fmt: skip
+TRAJECTORIES = LongTable(
+    "trajectories.csv",
+    ("case",),
+    ("time_s",),
+    ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad"),
+    {"case": TEXT},
+)
+SHEET = 12
+"""Greatest number of scenes on a picture."""
+
+
+def _there(value: object, info: ValidationInfo) -> object:
+    folder = (info.context or {}).get("folder", Path())
+    return (Path(folder) / Path(value).expanduser()).absolute() if isinstance(value, str | Path) else value
+
+
+def _levels(text: str) -> object:
+    return SCENE_LEVELS if text == "all" else words_in(text)
+
+
+class _Scenes(NamedTuple):
+    """Scenes by name."""
+
+    source: str
+
+    @property
+    def columns(self) -> Row:
+        """Nothing but their names identifies them."""
+        return {}
+
+
+class ManoeuvreStudy(Study):
+    """Scenes of manoeuvres, each planned, driven with the vehicle's limits and rates, and judged by its footprints."""
+
+    table: ClassVar = MANOEUVRES
+    all_tables: ClassVar = (MANOEUVRES, TRAJECTORIES)
+    block: ClassVar = 4
+    doing: ClassVar = "Parking"
+    unit: ClassVar = "scenes"
+    goes_on: ClassVar = "unfinished"
+    heading: ClassVar = "Manoeuvres"
+
+    kind: Literal["park"] = "park"
+    cases: Annotated[Path | None, BeforeValidator(_there)] = option(
+        None,
+        "A scene, or a folder of scenes: TPCAP's CSV, ParkBench's JSON, or our own (.toml, .json, .geojson).",
+        takes="DIR|FILE",
+        default="none",
+        panel="Scenes",
+    )
+    levels: Axis[str] | None = option(
+        None,
+        "Levels of scenes to draw: perpendicular, oblique or parallel, and normal, complex or extreme, such as "
+        "parallel-extreme.",
+        takes="NAME[,...]|all",
+        default="none",
+        panel="Scenes",
+        parse=_levels,
+    )
+    episodes: int = option(100, "Episodes per lot, or scenes per level.", short="-n", ge=1, le=1_000_000)
+    vehicle: Vehicle = None
+    seed: Seed = Field(0, description="First seed; episode or scene i uses seed + i.")
+    figures: Figures = True
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        if self.cases is not None and self.levels is not None:
+            raise PydanticCustomError("whole", "cases and levels exclude each other: want one of them")
+        for level in self.levels or ():
+            if level not in SCENE_LEVELS:
+                raise PydanticCustomError(
+                    "whole",
+                    "levels is {given}; {near}",
+                    {"given": repr(level), "near": nearest(level, SCENE_LEVELS)},
+                )
+        return self
+
+    @cached_property
+    def sources(self) -> dict[str, Path | tuple[str, int]]:
+        """The file of each scene, or its level and seed, by name."""
+        from parkenv.driving.scene_files import scene_files
+
+        if self.cases is not None:
+            return {file.stem: file for file in scene_files(self.cases)}
+        seeds = range(self.seed, self.seed + self.episodes)
+        return {f"{level}-{seed}": (level, seed) for level in self.levels or () for seed in seeds}
+
+    def scene(self, name: str) -> Scene:
+        """Return a scene by its name.
+
+        Raises:
+            InputError: its file is no valid scene.
+        """
+        from parkenv.driving.levels import level_scene
+        from parkenv.driving.scene_files import read_scene
+
+        source = self.sources[name]
+        return (
+            read_scene(source, self.vehicle)
+            if isinstance(source, Path)
+            else level_scene(*source, self.vehicle)
+        )
+
+    def check(self) -> None:
+        """See `Study`: all files are read."""
+        if not self.sources:
+            raise InputError("park: want cases or levels")
+        if self.cases is not None:
+            for name in self.sources:
+                self.scene(name)
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        return {"version": __version__, **self.tables()}
+
+    def cells(self) -> list[Cell]:
+        """See `Study`."""
+        return [Cell(_Scenes(str(self.cases or self.levels)), list(self.sources))]
+
+    def run(self, work: _Scenes, items: Sequence[str]) -> list[Row]:
+        """See `Study`."""
+        from planners.driving.manoeuvre import park
+
+        del work
+        _warm()
+        return [manoeuvre_row(name, park(self.scene(name))) for name in items]
+
+    def keep(self, work: _Scenes, rows: Sequence[Row], results: Results) -> None:
+        """See `Study`: what was driven."""
+        del work
+        results.add([{"case": row["case"], **row["states"]} for row in rows], TRAJECTORIES)
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        import numpy as np
+
+        rows = [row for cell in self.cells() for row in results.of(self, cell)]
+        rows = [{name: row[name] for name in ("case", *MANOEUVRES.columns)} for row in rows]
+        planning = [1e3 * row["planning_s"] for row in rows] or [np.nan]
+        return {
+            "scenes": len(rows),
+            "planned": sum(row["planned"] for row in rows),
+            "driven": sum(row["driven"] for row in rows),
+            "contacts": sum(row["contact"] for row in rows),
+            "planning_ms": float(np.median(planning)),
+            "planning_ms_p95": float(np.quantile(planning, 0.95)),
+            "planning_ms_max": float(np.max(planning)),
+            "vehicles": self._vehicles([row["case"] for row in rows]),
+            "rows": rows,
+        }
+
+    def _vehicles(self, names: Sequence[str]) -> list[Row]:
+        """Return each car with the number of its scenes."""
+        cars = Counter(self.scene(name).vehicle for name in names)
+        return [{"scenes": count, **dataclasses.asdict(car)} for car, count in cars.items()]
+
+    @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`."""
+        return [
+            f"{summary['driven']} of {summary['scenes']} scenes were driven to their target without a contact, within "
+            f"5 cm and 0.01 rad. Planning took {summary['planning_ms']:.0f} ms (median), "
+            f"{summary['planning_ms_p95']:.0f} ms (95 %), at most {summary['planning_ms_max']:.0f} ms."
+        ]
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: pictures of all scenes, those that failed first, and a film of the longest manoeuvre."""
+        from parkenv.show.figures.manoeuvres import save_manoeuvre_film, save_manoeuvres
+
+        rows = sorted(result.rows, key=lambda row: row["driven"])
+        driven = result.results.rows(TRAJECTORIES)
+        shown = [(self.scene(row["case"]), driven[row["case"],], _says(row)) for row in rows[: 5 * SHEET]]
+        tasks: list[Task[object]] = [
+            partial(save_manoeuvres, shown[i : i + SHEET], result.folder / f"manoeuvres_{i // SHEET + 1}.png")
+            for i in range(0, len(shown), SHEET)
+        ]
+        parked = [row for row in rows if row["driven"]]
+        if parked:
+            row = max(parked, key=lambda row: row["direction_changes"])
+            tasks.append(
+                partial(
+                    save_manoeuvre_film,
+                    self.scene(row["case"]),
+                    driven[row["case"],],
+                    result.folder / "manoeuvre.gif",
+                )
+            )
+        return tasks
+
+
+def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
+    """Return the row of a manoeuvre, with `states`, the lines of its trajectory in the frame of its file."""
+    from parkenv.driving.vehicle import PHYSICS_S, SPEED, STEERING, YAW, X, Y
+
+    x, y = made.scene.origin.tolist()
+    columns = {
+        "x_m": (X, x),
+        "y_m": (Y, y),
+        "yaw_rad": (YAW, 0.0),
+        "speed_mps": (SPEED, 0.0),
+        "steering_rad": (STEERING, 0.0),
+    }
+    states = {key: (made.states[:, k].round(7) + offset).tolist() for key, (k, offset) in columns.items()}
+    return {
+        "case": name,
+        "planned": made.path is not None,
+        **made.judged()._asdict(),
+        "time_s": made.time_s,
+        "length_m": made.length_m,
+        "direction_changes": made.direction_changes,
+        "planning_s": made.planning_s,
+        "states": {"time_s": [round(PHYSICS_S * i, 2) for i in range(len(made.states))], **states},
+    }
+
+
+def _says(row: Row) -> str:
+    if row["driven"]:
+        n = row["direction_changes"]
+        return f"{row['time_s']:.1f} s, {n} change{'' if n == 1 else 's'}, {100 * row['clearance_m']:.0f} cm clear"
+    return "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
+
+
+@functools.cache
+def _warm() -> None:
+    """Plan and drive once, so that the times of the others do not include loading compiled code."""
+    from parkenv.driving.levels import level_scene
+    from planners.driving.manoeuvre import park
+
+    park(level_scene(SCENE_LEVELS[-1], 0))

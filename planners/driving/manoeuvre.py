@@ -1,0 +1,180 @@
+"""Manoeuvres: plan a path in a scene, and drive it with the vehicle's limits and rates."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, Scene
+from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
+from planners.driving.car_path import CarPath
+from planners.driving.clearance import clearance, room_at
+from planners.driving.hybrid_astar import WINDOW_M, SearchSettings, plan_path
+from planners.driving.path_tracking import PathTracker, TrackingSettings
+
+SEARCH = SearchSettings(
+    greed=2.0,
+    patience=0.3,
+    most_expansions=8_000,
+    attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.05, 0.5), (0.05, 0.0), (0.02, 0.0), (0.01, 0.0)),
+)
+"""Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
+
+EXACT = TrackingSettings(
+    speed=0.8, reverse_speed=0.8, acceleration=0.6, firmness=2.5, control_s=PHYSICS_S, stops=True
+)
+"""Settings of the tracking where a fluent drive would touch something."""
+AIM_M, AIM_RAD = 0.03, 0.004
+"""Largest distance, m, and angle, rad, of the pose aimed at from the target, within what a scene tolerates."""
+_ROOMY_M = 0.1  # room at the target, m, from which on the car aims at it exactly
+_CLOSE_M = 0.015  # clearance, m, below which a fluent drive is compared with an exact one
+_LONGEST_S = 600.0
+
+
+@dataclass(frozen=True, eq=False)
+class Manoeuvre:
+    """A planned and driven manoeuvre.
+
+    Attributes:
+        scene: the scene.
+        path: the path that was driven; None if none was found.
+        states: (n, 6) states of the vehicle every `PHYSICS_S` from the start on; see `parkenv.driving.vehicle`.
+        planning_s: wall time of planning, s.
+    """
+
+    scene: Scene
+    path: CarPath | None
+    states: FloatArray
+    planning_s: float
+
+    @property
+    def time_s(self) -> float:
+        """Time from the start until the car stands for good, s."""
+        return PHYSICS_S * (len(self.states) - 1)
+
+    @property
+    def length_m(self) -> float:
+        """Distance driven, m."""
+        return float(np.hypot(*np.diff(self.states[:, :2], axis=0).T).sum())
+
+    @property
+    def direction_changes(self) -> int:
+        """Number of changes between forward and backward."""
+        sign = np.sign(self.states[self.states[:, SPEED] != 0.0, SPEED])
+        return int((sign[1:] != sign[:-1]).sum())
+
+    def judged(self) -> Judgement:
+        """Judge what was driven by its footprints alone."""
+        check = self.scene.check(self.states[:, :3])
+        away, turned = self.scene.error(self.states[-1])
+        arrived = away <= POSITION_TOLERANCE_M and turned <= ANGLE_TOLERANCE_RAD
+        stands = self.states[-1, SPEED] == 0.0
+        return Judgement(
+            bool(arrived and stands and not check.contact), check.contact, check.clearance, away, turned
+        )
+
+
+class Judgement(NamedTuple):
+    """Whether a manoeuvre ended at its target without a contact; clearance, m, and errors at the end, m and rad."""
+
+    driven: bool
+    contact: bool
+    clearance_m: float
+    error_m: float
+    error_rad: float
+
+
+def park(scene: Scene, search: SearchSettings = SEARCH) -> Manoeuvre:
+    """Plan a path from a scene's start to its target, and drive it.
+
+    The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
+    and stops to turn its wheels. The planner knows the vehicle's model, so it finds that out before it drives.
+    """
+    began = time.perf_counter()
+    path = plan_in_scene(scene, search)
+    planning_s = time.perf_counter() - began
+    start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
+    if path is None:
+        return Manoeuvre(scene, None, start[None], planning_s)
+    made = Manoeuvre(scene, path, drive(scene.vehicle, path, start, tracking_of(scene.vehicle)), planning_s)
+    driven = made.judged()
+    if driven.driven and driven.clearance_m >= _CLOSE_M:
+        return made
+    states = drive(scene.vehicle, path, start, tracking_of(scene.vehicle, EXACT))
+    exact = Manoeuvre(scene, path, states, planning_s)
+    return max(made, exact, key=lambda each: (each.judged().driven, each.judged().clearance_m))
+
+
+def plan_in_scene(scene: Scene, search: SearchSettings = SEARCH) -> CarPath | None:
+    """Plan a path from a scene's start to its target; None if none was found."""
+    obstacles = scene.obstacles
+    return plan_path(scene.vehicle, obstacles.corners, obstacles.n_corners, scene.start, aim(scene), search)
+
+
+def aim(scene: Scene) -> FloatArray:
+    """Return the pose to park at, (3,): the target, or where it is narrow a pose nearby with the most room."""
+    reach = np.full(2, WINDOW_M)
+    space = clearance(
+        scene.vehicle,
+        scene.obstacles.corners,
+        scene.obstacles.n_corners,
+        scene.target[:2] - reach,
+        scene.target[:2] + reach,
+    )
+    x, y, yaw = scene.target.tolist()
+    best, most = scene.target, room_at(space, x, y, yaw, _ROOMY_M)
+    if most >= 0.99 * _ROOMY_M:
+        return best
+    steps = np.linspace(-1.0, 1.0, 5)
+    for turn in (0.0, -AIM_RAD, AIM_RAD):
+        for along in AIM_M * steps:
+            for across in AIM_M * steps:
+                if math.hypot(along, across) > AIM_M:
+                    continue
+                cosine, sine = math.cos(yaw), math.sin(yaw)
+                pose = (x + along * cosine - across * sine, y + along * sine + across * cosine, yaw + turn)
+                room = room_at(space, *pose, _ROOMY_M)
+                if room > most + 1e-4:
+                    best, most = np.array(pose), room
+    return best
+
+
+def tracking_of(vehicle: VehicleParameters, settings: TrackingSettings | None = None) -> TrackingSettings:
+    """Return settings of path tracking within the limits of a vehicle."""
+    settings = settings or TrackingSettings()
+    return dataclasses.replace(
+        settings,
+        speed=min(settings.speed, vehicle.max_speed),
+        reverse_speed=min(settings.reverse_speed, vehicle.max_reverse_speed),
+        # Feedback needs the rest.
+        acceleration=min(settings.acceleration, 0.7 * min(vehicle.max_acceleration, vehicle.max_braking)),
+    )
+
+
+def drive(
+    vehicle: VehicleParameters, path: CarPath, start: FloatArray, tracking: TrackingSettings
+) -> FloatArray:
+    """Track a path from a state, (6,), to a stop at its end; return the states, (n, 6), every `PHYSICS_S`."""
+    tracker, state = PathTracker(vehicle, path, tracking), start.copy()
+    states = [state.copy()]
+    while len(states) < _LONGEST_S / PHYSICS_S:
+        command = tracker.command(state[:3], float(state[SPEED]), float(state[STEERING]))
+        if tracker.done:
+            break
+        for _ in range(round(tracking.control_s / PHYSICS_S)):
+            advance(state, *command, vehicle.limits)
+            states.append(state.copy())
+    while state[SPEED] != 0.0:
+        # The last millimetres a second.
+        brake = min(1.01 * abs(state[SPEED]) / (vehicle.max_braking * PHYSICS_S), 1.0)
+        advance(
+            state, -math.copysign(brake, state[SPEED]), state[STEERING] / vehicle.max_steering, vehicle.limits
+        )
+        states.append(state.copy())
+    return np.array(states)

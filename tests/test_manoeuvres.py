@@ -1,0 +1,276 @@
+"""Scenes of manoeuvres: files of all formats, the check of footprints, levels, and what is planned and driven."""
+
+import csv
+import dataclasses
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import shapely
+from command_line import parkenv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from parkenv.driving.levels import level_scene, levels
+from parkenv.driving.scene import MAX_POINTS, Contour, Scene
+from parkenv.driving.scene_files import read_scene, read_scenes
+from parkenv.driving.vehicle import SPEED, STEERING, TPCAP, VEHICLES, VehicleParameters, move_along
+from parkenv.errors import InputError
+from parkenv.files.known_names import SCENE_LEVELS
+from planners.driving.manoeuvre import park
+
+PUBLIC = Path(__file__).parents[2] / "shared" / "data" / "manoeuvres"
+# A parallel slot along x below a lane, between two blocks: 0.5 m longer than TPCAP's car.
+GAP = TPCAP.length + 0.5
+START, TARGET = (1.0, 3.0, 0.0), (TPCAP.rear_overhang + 0.25, 0.0, 0.0)
+BLOCKS = [
+    [[-6.0, -1.2], [0.0, -1.2], [0.0, 1.1], [-6.0, 1.1]],
+    [[GAP, -1.2], [GAP + 6.0, -1.2], [GAP + 6.0, 1.1], [GAP, 1.1]],
+]
+KERB = [[-6.0, -1.3], [GAP + 6.0, -1.3]]
+
+
+def tpcap_text(start, target, blocks):
+    numbers = [*start, *target, len(blocks), *map(len, blocks), *np.array(blocks).ravel()]
+    return ",".join(map(repr, map(float, numbers)))
+
+
+def parkbench_content(
+    lines, origin=(0.0, 0.0), frame=(0.0, 0.0), start=(1.0, 3.0, 0.0), target=(0.0, 0.0, 0.0)
+):
+    request = {
+        "m_startPosture": {"m_pose": list(start)},
+        "m_targetArea": {"m_targetPosture": {"m_pose": list(target)}},
+        "m_origin": list(origin),
+    }
+    nodes = [{"nfmPolygonObjectNodes": [{"m_x": x, "m_y": y} for x, y in line]} for line in lines]
+    return {
+        "Frames": {
+            "0": {
+                "PlanningRequest": request,
+                "m_nfmOrigin": list(frame),
+                "NfmAggregatedPolygonObjects": nodes,
+            }
+        }
+    }
+
+
+def own_text(**changes):
+    fields = {"start": list(START), "target": list(TARGET), "vehicle": "tpcap"} | changes
+    lines = [f"{name} = {json.dumps(value)}" for name, value in fields.items()]
+    lines += [f"[[obstacles]]\npolygon = {json.dumps(block)}" for block in BLOCKS]
+    return "\n".join([*lines, f"[[obstacles]]\nline = {json.dumps(KERB)}"])
+
+
+def geojson_content():
+    def feature(kind, shape, at, **more):
+        return {
+            "type": "Feature",
+            "properties": {"kind": kind} | more,
+            "geometry": {"type": shape, "coordinates": at},
+        }
+
+    features = [feature(k, "Point", p[:2], yaw=p[2]) for k, p in (("start", START), ("target", TARGET))]
+    features += [feature("obstacle", "Polygon", [[*block, block[0]]]) for block in BLOCKS]
+    features.append(feature("obstacle", "LineString", KERB))
+    return {"type": "FeatureCollection", "vehicle": "tpcap", "features": features}
+
+
+def test_every_format_says_the_same_scene_wherever_it_lies(tmp_path):
+    far = np.array([4.0e9, -2.5e8])
+    moved = [(*(np.array(pose[:2]) + far), pose[2]) for pose in (START, TARGET)]
+    (tmp_path / "a1.csv").write_text(tpcap_text(START, TARGET, BLOCKS))
+    (tmp_path / "a2.csv").write_text(tpcap_text(*moved, np.array(BLOCKS) + far).replace(",", "\n"))
+    (tmp_path / "a3.toml").write_text(own_text())
+    (tmp_path / "a10.geojson").write_text(json.dumps(geojson_content()))
+    scenes = read_scenes(tmp_path)
+    assert [scene.name for scene in scenes] == ["a1", "a2", "a3", "a10"]
+    for scene in scenes:
+        assert scene.vehicle == TPCAP
+        np.testing.assert_allclose(
+            scene.start[:2] + scene.origin - (far if scene.name == "a2" else 0.0), START[:2], atol=1e-6
+        )
+        np.testing.assert_allclose(scene.target - scene.start, np.subtract(TARGET, START), atol=1e-6)
+        assert len(scene.contours) == (2 if scene.name in ("a1", "a2") else 3)
+        assert scene.check(scene.target[None]).clearance == pytest.approx(min(0.25, 1.1 - 0.971), abs=0.13)
+
+
+def test_parkbench_is_read_in_the_frame_of_its_obstacles_without_what_lies_below_the_target(tmp_path):
+    car = VEHICLES["parkbench"]
+    stop = [[-0.8, -1.5], [-0.8, 1.5]]  # across the parked car, and beyond its sides
+    wall = [[8.0, -3.0], [8.0, 3.0]]
+    file = tmp_path / "scene.json"
+    file.write_text(
+        json.dumps(parkbench_content([stop, wall], (5.0, 1.0), (4.0, 1.0), target=(-1.0, 0.0, 0.0)))
+    )
+    scene = read_scene(file)
+    assert scene.vehicle == car
+    np.testing.assert_allclose(scene.start[:2] + scene.origin, [2.0, 3.0])
+    np.testing.assert_allclose(scene.target[:2] + scene.origin, [0.0, 0.0])
+    left = shapely.union_all(scene.shapes)
+    assert not left.intersects(shapely.Polygon(car.corners(scene.target)))
+    # Either end of the wheel stop is still there, 0.4 to 0.5 m long, and the wall whole.
+    ends = left.length - 6.0
+    assert 0.8 <= ends <= 1.0
+    assert read_scene(file, TPCAP).vehicle == TPCAP
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.floats(-3.1, 3.1), st.floats(-0.3, 0.3), st.floats(-1.5, 1.5))
+def test_footprints_between_two_poses_lie_on_the_arc_between_them(yaw, curvature, way):
+    """A point that the car reaches between two poses is touched; the distance to one beside it is exact."""
+    along = [np.array(move_along(0.0, 0.0, yaw, curvature, way * i / 100)) for i in range(101)]
+    corner = TPCAP.corners(along[50])[1]  # the front right
+    ahead = np.array([math.cos(along[50][2]), math.sin(along[50][2])])
+    right = np.array([ahead[1], -ahead[0]])
+    for point, touched in ((corner - 0.005 * (ahead + right), True), (corner + 0.1 * right, False)):
+        contour = Contour(point[None], closed=False)
+        scene = Scene("point", TPCAP, np.array([50.0, 0.0, 0.0]), np.array([60.0, 0.0, 0.0]), (contour,))
+        found = scene.check(np.array([along[0], along[-1]]))
+        away = min(shapely.Polygon(TPCAP.corners(pose)).distance(shapely.Point(point)) for pose in along)
+        assert found.contact == touched or away < 1e-3
+        assert found.clearance == pytest.approx(away, abs=0.005)
+
+
+def test_the_tightest_slot_is_left_and_entered_within_all_limits(tmp_path):
+    (tmp_path / "slot.toml").write_text(own_text())
+    scene = read_scene(tmp_path / "slot.toml")
+    made = park(scene)
+    judged = made.judged()
+    assert judged.driven, judged
+    assert judged.clearance_m > 0.001
+    states, limits = made.states, scene.vehicle
+    assert np.abs(np.diff(states[:, STEERING])).max() <= limits.steering_rate * 0.05 + 1e-9
+    assert np.abs(states[:, STEERING]).max() <= limits.max_steering
+    assert np.abs(np.diff(states[:, SPEED])).max() <= limits.max_acceleration * 0.05 + 1e-9
+    assert states[-1, SPEED] == 0.0
+
+
+@pytest.mark.parametrize("level", SCENE_LEVELS)
+def test_a_level_is_a_car_and_its_margin(level):
+    kind, _, how = level.partition("-")
+    low, high = getattr(levels(TPCAP)[how], "along" if kind == "parallel" else "across")
+    for seed in range(4):
+        scene, again = (level_scene(level, seed, TPCAP) for _ in range(2))
+        np.testing.assert_array_equal(scene.start, again.start)
+        car = shapely.Polygon(TPCAP.corners(scene.target))
+        beside = sorted(car.distance(shape) for shape in scene.shapes if shape.geom_type == "Polygon")
+        assert low - 1e-6 <= beside[0] + beside[1] <= high + 1e-6
+
+
+def test_scenes_are_planned_driven_and_judged(tmp_path):
+    out = tmp_path / "out"
+    (tmp_path / "scenes").mkdir()
+    (tmp_path / "scenes" / "slot.csv").write_text(
+        tpcap_text((3e6, 3.0, 0.0), (3e6 + 9.0, 0.0, 0.0), [np.add(BLOCKS[0], [3e6, 0.0])])
+    )
+    done = parkenv(
+        "park",
+        "--cases",
+        str(tmp_path / "scenes"),
+        "--out",
+        str(out),
+        "--jobs",
+        "1",
+        "--report",
+        cwd=tmp_path,
+    )
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((out / "summary.json").read_text())
+    (row,) = summary["rows"]
+    assert (row["case"], row["planned"], row["driven"], row["contact"]) == ("slot", True, True, False)
+    assert summary["vehicles"] == [{"scenes": 1, **dataclasses.asdict(TPCAP)}]
+    lines = list(csv.DictReader((out / "trajectories.csv").open()))
+    poses = np.array([[float(line[name]) for name in ("x_m", "y_m", "yaw_rad")] for line in lines])
+    assert float(lines[-1]["time_s"]) == pytest.approx(row["time_s"])
+    assert math.dist(poses[-1, :2], (3e6 + 9.0, 0.0)) == pytest.approx(row["error_m"], abs=1e-5)
+    blocks = shapely.polygons(np.add(BLOCKS[0], [3e6, 0.0]))
+    assert shapely.polygons(TPCAP.corners(poses)).tolist()[0].distance(blocks) >= row["clearance_m"] - 1e-6
+    for name in ("manoeuvres_1.png", "manoeuvre.gif", "report.html"):
+        assert (out / name).stat().st_size > 1000
+
+
+def test_levels_are_drawn_for_a_car_in_a_file_and_a_run_says_it_again(tmp_path):
+    (tmp_path / "van.toml").write_text("length = 4.9\nwheelbase = 2.9\n")
+    words = ("--levels", "oblique-normal", "-n", "2", "--vehicle", "van.toml", "--no-figures", "--jobs", "1")
+    done = parkenv("park", *words, "--out", "out", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["driven"] == 2
+    assert summary["vehicles"] == [
+        {"scenes": 2, **dataclasses.asdict(VehicleParameters(length=4.9, wheelbase=2.9))}
+    ]
+    again = parkenv("run", "out/experiment.json", "--out", "again", cwd=tmp_path)
+    assert again.returncode == 0, again.stderr
+    first, second = (tmp_path / f / "trajectories.csv" for f in ("out", "again"))
+    assert first.read_bytes() == second.read_bytes()
+
+
+CROSSED = [[0.0, 5.0], [2.0, 7.0], [2.0, 5.0], [0.0, 7.0]]
+BAD = {
+    "crossing.csv": (tpcap_text(START, TARGET, [CROSSED]), "not a simple polygon"),
+    "inside.csv": (tpcap_text(START, TARGET, [[[0, -1], [3, -1], [3, 1], [0, 1]]]), "target is"),
+    "touching.csv": (tpcap_text(START, TARGET, [[[0, 2], [3, 2], [3, 4], [0, 4]]]), "start is"),
+    "nan.csv": (tpcap_text((math.nan, 0.0, 0.0), TARGET, BLOCKS), "not finite"),
+    "short.csv": ("0,0,0,9,0,0,2,4,4,1,1", "want start and target"),
+    "many.csv": ("0,0,0,9,0,0,1,1000000," + "1.0," * 2_000_000, "want at most"),
+    "prose.csv": ("a scene,of words", "is no scene"),
+    "other.json": ('{"Frames": {"0": {}}}', "no scene of ParkBench"),
+    "nan.json": (json.dumps(parkbench_content([[[math.nan, 1.0], [2.0, 2.0]]])), "not JSON"),
+    "open.toml": ("start = [0.0, 0.0, 0.0]", "target is missing"),
+    "short.toml": (own_text(start=[0.0, 1.0]), "start"),
+    "car.toml": (own_text(vehicle="tank"), "vehicle is 'tank'"),
+    "truck.toml": (
+        own_text(vehicle={"length": 5.0}).replace('{"length": 5.0}', "{lenght = 5.0}"),
+        "'lenght'",
+    ),
+    "hole.geojson": ('{"features": [{"geometry": {"type": "Point", "coordinates": [1, 2]}}]}', "features.0"),
+    "empty": (None, "is not there"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
+    text, said = BAD[name]
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    done = parkenv("park", "--cases", name, "--out", "out", cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert name in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--levels", "parallel-extrem"), "parallel-extreme"),
+        (("--levels", "all", "--cases", "."), "exclude each other"),
+        (("--levels", "all", "--vehicle", "tank"), "tank"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, said, tmp_path):
+    done = parkenv("park", *options, "--out", "out", cwd=tmp_path)
+    assert done.returncode == 2
+    assert said in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_of_too_many_points_or_without_bounds_is_refused():
+    line = Contour(
+        np.column_stack([np.arange(MAX_POINTS + 1.0), np.full(MAX_POINTS + 1, 50.0)]), closed=False
+    )
+    with pytest.raises(InputError, match="points, want at most"):
+        Scene("long", TPCAP, np.array(START), np.array(TARGET), (line,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("source", ["tpcap", "parkbench"])
+def test_all_public_scenes_are_driven(source):
+    if not (PUBLIC / source).exists():
+        pytest.skip(f"the scenes of {source} are not in shared/data")
+    for scene in read_scenes(PUBLIC / source):
+        assert park(scene).judged().driven, scene.name
