@@ -15,7 +15,7 @@ from gymnasium import spaces
 from gymnasium.error import DependencyNotInstalled, ResetNeeded
 from numpy.typing import NDArray
 
-from parkenv.errors import InputError, needs_extra, require_whole
+from parkenv.errors import InputError, needs_extra, require_number, require_one_of, require_whole
 
 try:
     from pettingzoo import AECEnv, ParallelEnv
@@ -64,14 +64,11 @@ class _CarsAsAgents:
         knows: str = "own",
         **changes: Any,
     ) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
+        require_one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         if demand is None:
-            if isinstance(cars, bool) or not isinstance(cars, (int, np.integer)) or not 1 <= cars <= MAX_CARS:
-                raise InputError(f"cars is {cars!r}, want a whole number from 1 to {MAX_CARS:,}")
+            require_whole("cars", cars, least=1, most=MAX_CARS)
             demand = Demand(Headways(int(cars)))
-        if isinstance(max_cycles, bool) or not isinstance(max_cycles, (int, np.integer)) or max_cycles < 1:
-            raise InputError(f"max_cycles is {max_cycles!r}, want a whole number of at least 1")
+        require_whole("max_cycles", max_cycles, least=1)
         require_changes((type(self), LotEnv), changes, *self._fleet_options)
         options = {name: value for name, value in changes.items() if name in self._fleet_options}
         fields = {name: value for name, value in changes.items() if name not in options}
@@ -338,8 +335,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
     def __init__(
         self, scenario: ScenarioSource = "mini", cars: int = 5, tick_s: float = 1.0, **options: Any
     ) -> None:
-        if not tick_s > 0.0:
-            raise InputError(f"tick_s is {tick_s!r}, want a finite number above 0")
+        require_number("tick_s", tick_s, above=0.0)
         super().__init__(scenario, cars, tick_s=tick_s, **options)
         self.tick_s = float(tick_s)
         self._observations: dict[str, dict[str, Any]] = {}

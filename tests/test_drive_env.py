@@ -417,7 +417,7 @@ def test_frames_are_drawn_and_show_that_the_car_moves(lot):
         ({"slack": float("nan")}, "slack is nan"),
         ({"distance": (5.0, 90.0)}, "distance is "),
         ({"starts": "sky"}, "starts is 'sky'"),
-        ({"reward": "kind"}, "reward is 'kind', want sparse or dense"),
+        ({"reward": "kind"}, "reward is 'kind', want one of sparse, dense"),
         ({"contact_cost": -1.0}, "contact_cost is -1.0"),
         ({"laser": 3}, "laser is 3"),
         ({"traffic": 3}, "traffic is a int, want a Traffic"),

@@ -175,7 +175,7 @@ def test_frames_show_the_camera_beside_the_lot():
         ({"rig": 3}, "rig is a int"),
         ({"weather": "snow"}, "weather is 'snow'"),
         ({"captures": 0}, "captures is 0, want a whole number of at least 1"),
-        ({"every": float("nan")}, "every is nan m"),
+        ({"every": float("nan")}, "every is nan, want a finite number above 0"),
         ({"observation": "scans"}, "observation is 'scans', want one of full, scan"),
         ({"observation": "scan", "rig": "stereo"}, 'observation is "scan", want a rig with a laser'),
         ({"traffic": 5}, "traffic is a int, want a Traffic"),

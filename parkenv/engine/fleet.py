@@ -63,7 +63,7 @@ from parkenv.engine.records import (
     most_observed_in,
 )
 from parkenv.engine.spaces import action_number, space_of
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_one_of, require_whole
 from parkenv.files.known_names import KNOWLEDGE
 from parkenv.scenarios.build import ScenarioSource, make_scenario
 from parkenv.world.demand import CarPlans, Demand, TownDemand
@@ -106,16 +106,13 @@ class DriverKind:
     shares: bool = False
 
     def __post_init__(self) -> None:
-        good = isinstance(self.weight, (int, float, np.number)) and math.isfinite(self.weight)
-        if not good or self.weight < 0.0:
-            raise InputError(f"DriverKind.weight is {self.weight!r}, want a finite number of at least 0")
+        require_number("DriverKind.weight", self.weight, least=0.0)
         if self.policy is not None and not isinstance(self.policy, CompiledPolicy):
             raise InputError(
                 f"DriverKind.policy is {self.policy!r:.60}, want a CompiledPolicy, such as POLICIES['greedy-drive'], "
                 "or None"
             )
-        if self.knows not in KNOWLEDGE:
-            raise InputError(f"DriverKind.knows is {self.knows!r}, want one of {', '.join(KNOWLEDGE)}")
+        require_one_of("DriverKind.knows", self.knows, KNOWLEDGE)
 
 
 class StepOutcome(NamedTuple):
@@ -306,11 +303,9 @@ class Fleet:
             raise InputError(f"drivers is {self.drivers!r:.60}, want at least one DriverKind")
         if not sum(kind.weight for kind in self.drivers) > 0.0:
             raise InputError("drivers: all weights are 0, want one above 0")
-        if isinstance(max_steps, bool) or not isinstance(max_steps, (int, np.integer)) or max_steps < 1:
-            raise InputError(f"max_steps is {max_steps!r}, want a whole number of at least 1")
+        require_whole("max_steps", max_steps, least=1)
         for name, value in times.items():
-            if not isinstance(value, (int, float, np.number)) or not 0.0 <= value < math.inf:
-                raise InputError(f"{name} is {value!r}, want a finite number of at least 0")
+            require_number(name, value, least=0.0)
         return background
 
     def _weighted(self, name: str, weights: tuple[float, ...], n: int) -> range:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.threads import in_threads
 from parkenv.engine.state import SearchState
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number, require_one_of, require_whole
 from parkenv.world.lot_scene import LotScenes, slot_lot
 from parkenv.world.scenario import Scenario
 from sim_sensors.camera.weather import PRESETS, Weather
@@ -59,8 +59,7 @@ def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int
         made, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
     if width is None:
         return made
-    if isinstance(width, bool) or not isinstance(width, (int, np.integer)) or width < 64:
-        raise InputError(f"picture_width is {width!r} px, want a whole number of at least 64")
+    require_whole("picture_width", width, least=64)
     return made.resized(int(width))
 
 
@@ -89,12 +88,9 @@ class SensorSampler:
         captures: int,
         every: float,
     ) -> None:
-        if weather is not None and weather not in PRESETS:
-            raise InputError(f"weather is {weather!r}, want None or one of {', '.join(PRESETS)}")
-        if isinstance(captures, bool) or not isinstance(captures, (int, np.integer)) or captures < 1:
-            raise InputError(f"captures is {captures!r}, want a whole number of at least 1")
-        if not (isinstance(every, (int, float)) and math.isfinite(every) and every > 0.0):
-            raise InputError(f"every is {every!r} m, want a finite distance above 0")
+        require_one_of("weather", weather, (None, *PRESETS))
+        require_whole("captures", captures, least=1)
+        require_number("every", every, above=0.0)
         self.rig = make_rig(rig, scenario)
         self.captures = int(captures)
         self._lot, self._scenario = scenario.lot, scenario

@@ -29,7 +29,7 @@ from parkenv.envs.drive_observation import (
     obstacle_map,
     scan_plane,
 )
-from parkenv.errors import InputError, reset_options
+from parkenv.errors import InputError, require_number, require_one_of, reset_options
 from parkenv.lots import load_lot
 from parkenv.world.lot import ParkingLot
 from parkenv.world.traffic import Traffic
@@ -181,14 +181,9 @@ length and width over the car's |
         obstacle_map: bool = False,
         traffic: Traffic | None = None,
     ) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
-        if reward not in ("sparse", "dense"):
-            raise InputError(f"reward is {reward!r}, want sparse or dense")
-        if not (
-            isinstance(contact_cost, int | float) and math.isfinite(contact_cost) and contact_cost >= 0.0
-        ):
-            raise InputError(f"contact_cost is {contact_cost!r}, want seconds of 0 or more")
+        require_one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
+        require_one_of("reward", reward, ("sparse", "dense"))
+        require_number("contact_cost", contact_cost, least=0.0)
         if not isinstance(laser, bool | LaserScanner):
             raise InputError(f"laser is {laser!r:.40}, want True, False or a LaserScanner")
         if not isinstance(traffic, Traffic | None):

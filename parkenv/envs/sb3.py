@@ -12,7 +12,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.scenarios.build import ScenarioSources
 
 
@@ -40,8 +40,7 @@ class BatchVecEnv(VecEnv):  # type: ignore[misc]
     def __init__(self, batch: VectorEnv[Any, Any, Any], reward_scale: float = 1.0) -> None:
         if batch.metadata["autoreset_mode"] is not AutoresetMode.SAME_STEP:
             raise InputError(f"autoreset_mode is {batch.metadata['autoreset_mode']}, want SAME_STEP")
-        if not (np.isfinite(reward_scale) and reward_scale > 0.0):
-            raise InputError(f"reward_scale is {reward_scale}, want a number above 0")
+        require_number("reward_scale", reward_scale, above=0.0)
         super().__init__(batch.num_envs, batch.single_observation_space, batch.single_action_space)
         self.batch: Any = batch
         self.reward_scale = reward_scale

@@ -228,8 +228,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise InputError(f"render_mode is {render_mode!r}, want one of {self.metadata['render_modes']}")
+        require_one_of("render_mode", render_mode, (None, *self.metadata["render_modes"]))
         require_one_of("observation", observation, OBSERVATIONS)
         require_changes((type(self),), changes)
         if k is not None and observation != "local":

@@ -31,7 +31,7 @@ from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout
 from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import TWINS
-from parkenv.errors import InputError, require_number, require_whole, reset_options
+from parkenv.errors import InputError, require_number, require_one_of, require_whole, reset_options
 from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios, require_changes
 from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
@@ -149,11 +149,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
-        _require_count("num_envs", num_envs, MAX_ENVS)
+        require_whole("num_envs", num_envs, least=1, most=MAX_ENVS)
         if max_episode_steps is not None:
-            _require_count("max_episode_steps", max_episode_steps, 2**31 - 1)
-        if render_mode not in (None, "rgb_array"):
-            raise InputError(f"render_mode is {render_mode!r}, want rgb_array or None")
+            require_whole("max_episode_steps", max_episode_steps, least=1, most=2**31 - 1)
+        require_one_of("render_mode", render_mode, (None, "rgb_array"))
         try:
             mode = AutoresetMode(autoreset_mode)
         except ValueError:
@@ -210,7 +209,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
 
     @n_places.setter
     def n_places(self, n: int) -> None:
-        _require_count("n_places", n, len(self.scenarios))
+        require_whole("n_places", n, least=1, most=len(self.scenarios))
         self._searches.records["n_places"] = n
 
     @property
@@ -484,8 +483,3 @@ def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int
 
         return lambda tables, n: ScansObserver(tables, n, SCANS if k is None else k)
     raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}, scan")
-
-
-def _require_count(name: str, value: Any, most: int) -> None:
-    if isinstance(value, bool) or not isinstance(value, (int, np.integer)) or not 1 <= value <= most:
-        raise InputError(f"{name} is {value!r}, want a whole number from 1 to {most:,}")

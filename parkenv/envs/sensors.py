@@ -14,7 +14,7 @@ from parkenv.engine.sensor_sampler import SensorSampler, make_rig
 from parkenv.engine.spaces import LATEST
 from parkenv.engine.state import SearchState
 from parkenv.envs.search import SearchEnv
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 from parkenv.scenarios.build import ScenarioSource, make_scenario, require_changes
 from sim_sensors.rig import SensorRig, TimedCapture
 
@@ -143,8 +143,7 @@ road users |
         reward_scale: float = 1.0,
         **changes: Any,
     ) -> None:
-        if observation not in OBSERVATIONS:
-            raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")
+        require_one_of("observation", observation, OBSERVATIONS)
         require_changes((type(self),), changes)
         super().__init__(make_scenario(scenario, **changes), render_mode, reward_scale=reward_scale)
         sensors = make_rig(rig, self.scenario, picture_width)

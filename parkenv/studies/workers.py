@@ -25,7 +25,7 @@ from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky import process_executor, reusable_executor
 from joblib.externals.loky.backend import resource_tracker
 
-from parkenv.errors import InputError, needs_extra
+from parkenv.errors import InputError, needs_extra, require_one_of
 from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
@@ -63,8 +63,7 @@ class Workers:
     """
 
     def __init__(self, jobs: int | None = 1, backend: str = "loky", address: str | None = None) -> None:
-        if backend not in BACKENDS:
-            raise InputError(f"backend is {backend!r}, want one of {', '.join(BACKENDS)}")
+        require_one_of("backend", backend, BACKENDS)
         if address is not None and backend == "loky":
             raise InputError("address requires the backend ray or dask; loky works on this machine alone")
         if jobs is not None and jobs < 1:

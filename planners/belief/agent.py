@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.errors import InputError
+from parkenv.errors import require_number
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.day_error import nearness
 from parkenv.world.scenario import SearchProblem
@@ -129,10 +129,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
-        if not (budget_ms > 0.0 and math.isfinite(budget_ms)):
-            raise InputError(f"budget_ms is {budget_ms}, want a finite number above 0")
-        if not (explore >= 0.0 and math.isfinite(explore)):
-            raise InputError(f"explore is {explore}, want finite seconds of at least 0")
+        require_number("budget_ms", budget_ms, above=0.0)
+        require_number("explore", explore, least=0.0)
         self._explore = explore
         self._day = day
         self._nearness = nearness(self.problem.walk_s)

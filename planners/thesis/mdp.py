@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_number
 from parkenv.world.lot import ACTIONS, MOVES, PARK
 from parkenv.world.scenario import SearchProblem
 
@@ -101,9 +101,8 @@ class ParkingMDP:
             raise InputError("p_free must lie in [0, 1]")
         if not (np.isfinite(arrival_cost_s).all() and (move_s[neighbors >= 0] >= 0.0).all()):
             raise InputError("arrival_cost_s must be finite and move_s not negative")
-        for name, least in (("failure_s", 0.0), ("wait_s", 0.0)):
-            if not least <= getattr(self, name) < np.inf:
-                raise InputError(f"{name} is {getattr(self, name)}, want a finite number, at least {least:g}")
+        for name in ("failure_s", "wait_s"):
+            require_number(name, getattr(self, name), least=0.0)
         if not 0.0 < self.gamma <= 1.0:
             raise InputError(f"gamma is {self.gamma}, want a number in (0, 1]")
         object.__setattr__(self, "park_reward", arrival_cost_s.max() - arrival_cost_s)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
-from parkenv.errors import InputError
+from parkenv.errors import InputError, require_one_of
 from parkenv.files.archives import tar_members
 from parkenv.files.images import decode_image, images_in, natural_order, read_image
 from parkenv.files.limited_reading import read_text
@@ -75,8 +75,7 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
     Raises:
         InputError: an unknown set, missing files, or a line that is not `n: (i,j) ...` or `n: (i,j,w) ...`.
     """
-    if test_set not in UIUC_TESTS:
-        raise InputError(f"test set is {test_set!r}, want one of {', '.join(UIUC_TESTS)}")
+    require_one_of("test set", test_set, UIUC_TESTS)
     images, truth = (folder / name for name in UIUC_TESTS[test_set])
     if not truth.is_file():
         raise InputError(f"{truth}: no such file; want the folder as UIUC publishes it")

@@ -14,7 +14,7 @@ from parkenv.engine import kernel as kernel
 from parkenv.engine.sensor_sampler import Station
 from parkenv.envs.perception import OnboardPerception
 from parkenv.envs.search import SearchEnv
-from parkenv.errors import InputError
+from parkenv.errors import require_whole
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
 from parkenv.studies.trips.executor import Leg, MotionExecutor, ParkingAttempt
@@ -201,8 +201,7 @@ class DrivenSearch:
         Raises:
             InputError: the seed is not an integer of at least 0.
         """
-        if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-            raise InputError(f"seed is {seed!r}, want a whole number of at least 0")
+        require_whole("seed", seed)
         env, driver = self.env, self.driver
         driver.on_control = on_control
         result = simulate(self._limited, self._agent, int(seed), observers)
