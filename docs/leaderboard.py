@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from parkenv.cli.compare import with_short_labels
 from parkenv.show.plurals import interval_text
 from parkenv.studies.benchmark.page import DESIGNS, entries_of, neighbours, ranking, result_files
 from parkenv.studies.benchmark.result_file import check_result
@@ -19,7 +20,8 @@ def tables():
         "| | agent | score, % | mean time, s | behind the best, s | ms a decision | submitted by | code | commit |",
         "|---|---|---|---|---|---|---|---|---|",
     ]
-    for place, row in enumerate(ranking(suite, entries), 1):
+    rows = ranking(suite, entries)
+    for place, row in enumerate(rows, 1):
         score, low, high = (f"{100 * value:.1f}" for value in (row["score"], *row["score_ci95"]))
         code = f"[code]({row['code']})" if row["code"].startswith("http") else row["code"]
         lines.append(
@@ -33,7 +35,10 @@ def tables():
     for row in neighbours(suite, entries):
         cells = [f"{row[f'searches.{d}']:,.0f}" for d in DESIGNS if f"searches.{d}" in row]
         pairs.append(f"| {row['agents']} | {interval(row, 'behind_s', '+')} | " + " | ".join(cells) + " |")
-    return {"ranking": "\n".join(lines), "pairs": "\n".join(pairs)}
+    made = {"ranking": "\n".join(lines), "pairs": "\n".join(pairs)}
+    for row, brief in zip(rows, with_short_labels(rows), strict=True):
+        made = {name: table.replace(row["agent"], brief["agent"]) for name, table in made.items()}
+    return made
 
 
 def interval(row, name, sign=""):

@@ -23,6 +23,8 @@ from parkenv.studies.statistics import columns_of
 from parkenv.version import __version__
 from planners.names import AGENTS
 
+ADDRESSES = ("http", "examples/", "docs/leaderboard/")
+"""What the address of an agent's code begins with: elsewhere, or a path in the repository of parkenv."""
 PAIRS = 5
 """Pairs of neighbours whose precision is shown."""
 DESIGNS = ("independent", "paired", "paired, controls", "stratified", "stratified, controls")
@@ -30,7 +32,7 @@ DESIGNS = ("independent", "paired", "paired, controls", "stratified", "stratifie
 _WIDE = float(ndtri(0.975))
 _WHO = (
     Column("by", "submitted by"),
-    Column("code", "code", help="Address of the agent's code; parkenv if it comes with it"),
+    Column("code", "code", help="Address of the agent's code, or path in parkenv's repository"),
     Column("commit", "commit", help="Of parkenv"),
     Column("date", "date"),
 )
@@ -78,7 +80,7 @@ def entries_of(results: Sequence[Row]) -> tuple[Suite, list[Entry]]:
     suite, entries = Suite.named(names[0]), []
     for result in results:
         for agent, tasks in result["episodes"].items():
-            if agent.partition("(")[0] not in AGENTS and not result["code"].startswith("http"):
+            if agent.partition("(")[0] not in AGENTS and not result["code"].startswith(ADDRESSES):
                 raise InputError(f"code is {result['code']!r}, want the address of the code of {agent}")
             times = {task: np.array(its["total_s"]) for task, its in tasks.items()}
             entries.append(Entry(agent, result, times))

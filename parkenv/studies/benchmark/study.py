@@ -32,7 +32,8 @@ class Benchmark(CaseStudy):
     by: str = option("", "Who submits the result.", default="nobody", max_length=200)
     code: str = option(
         "",
-        "Address of the agents' code, with its commit; needed on a leaderboard unless they come with parkenv.",
+        "Address of the agents' code, with its commit, or path in parkenv's repository; needed on a leaderboard unless "
+        "they come with parkenv.",
         takes="URL",
         default="parkenv's own",
         max_length=200,
