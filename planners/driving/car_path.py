@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 
@@ -39,6 +40,12 @@ class CarPath:
     def turned_rad(self) -> float:
         """Total absolute change of heading, rad: a measure of smoothness."""
         return float(np.abs(self.length * self.curvature).sum())
+
+    def reversed(self, start: FloatArray) -> CarPath:
+        """Return the path driven the other way, from its end, `start`, (3,)."""
+        return dataclasses.replace(
+            self, start=start, length=-self.length[::-1], curvature=self.curvature[::-1]
+        )
 
     def sampled(self, step: float = 0.05) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Sample the path: poses, (n, 3), and curvature, (n,) 1/m, and direction, (n,) ±1, of the arc ending there."""

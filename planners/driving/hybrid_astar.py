@@ -101,6 +101,7 @@ def plan_path(
     start: FloatArray,
     target: FloatArray,
     settings: SearchSettings | None = None,
+    window_m: float = WINDOW_M,
 ) -> CarPath | None:
     """Plan a collision-free path from one pose to another.
 
@@ -111,13 +112,14 @@ def plan_path(
         start: (3,) x, y in m and yaw in rad of the rear axle.
         target: (3,) likewise.
         settings: of the search.
+        window_m: margin around start and target within which the car may drive.
 
     Returns:
         The path, or None if none was found.
     """
     settings = settings or SearchSettings()
     ends = np.stack([start[:2], target[:2]])
-    low, high = ends.min(axis=0) - WINDOW_M, ends.max(axis=0) + WINDOW_M
+    low, high = ends.min(axis=0) - window_m, ends.max(axis=0) + window_m
     space = clearance(vehicle, outlines, n_corners, low, high)
     widest = max(margin for margin, _ in settings.attempts)
     ends_room = min(room_at(space, *map(float, pose), widest + 0.01) for pose in (start, target)) - 0.01

@@ -14,18 +14,22 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, Scene
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
 from planners.driving.car_path import CarPath
-from planners.driving.clearance import clearance, room_at
+from planners.driving.clearance import Clearance, clearance, room_at
 from planners.driving.hybrid_astar import WINDOW_M, SearchSettings, plan_path
 from planners.driving.path_tracking import PathTracker, TrackingSettings
+from planners.driving.reeds_shepp_shots import free_length
 
 SEARCH = SearchSettings(
     greed=2.0,
     patience=0.3,
     most_expansions=8_000,
-    attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.05, 0.5), (0.05, 0.0), (0.02, 0.0), (0.01, 0.0)),
+    attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.05, 0.5)),
 )
 """Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
-
+TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.05, 0.0), (0.02, 0.0), (0.01, 0.0)))
+"""Settings of the search out of the tightest slots."""
+WIDE_M = 25.0
+"""Margin, m, around start and target of the search for ways around."""
 EXACT = TrackingSettings(
     speed=0.8, reverse_speed=0.8, acceleration=0.6, firmness=2.5, control_s=PHYSICS_S, stops=True
 )
@@ -35,6 +39,7 @@ AIM_M, AIM_RAD = 0.03, 0.004
 _ROOMY_M = 0.1  # room at the target, m, from which on the car aims at it exactly
 _CLOSE_M = 0.015  # clearance, m, below which a fluent drive is compared with an exact one
 _LONGEST_S = 600.0
+_WAY_M, _WAY_CLEAR_M = 2.0, 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +95,14 @@ class Judgement(NamedTuple):
     error_rad: float
 
 
-def park(scene: Scene, search: SearchSettings = SEARCH) -> Manoeuvre:
+def park(scene: Scene) -> Manoeuvre:
     """Plan a path from a scene's start to its target, and drive it.
 
     The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
     and stops to turn its wheels. The planner knows the vehicle's model, so it finds that out before it drives.
     """
     began = time.perf_counter()
-    path = plan_in_scene(scene, search)
+    path = plan_in_scene(scene)
     planning_s = time.perf_counter() - began
     start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
     if path is None:
@@ -111,22 +116,42 @@ def park(scene: Scene, search: SearchSettings = SEARCH) -> Manoeuvre:
     return max(made, exact, key=lambda each: (each.judged().driven, each.judged().clearance_m))
 
 
-def plan_in_scene(scene: Scene, search: SearchSettings = SEARCH) -> CarPath | None:
-    """Plan a path from a scene's start to its target; None if none was found."""
-    obstacles = scene.obstacles
-    return plan_path(scene.vehicle, obstacles.corners, obstacles.n_corners, scene.start, aim(scene), search)
+def plan_in_scene(scene: Scene) -> CarPath | None:
+    """Plan a path from a scene's start to its target; None if none was found.
+
+    A search is short that begins where the car has the least room, so that end comes first.
+    """
+    start, end = scene.start, aim(scene)
+    forward = _free_way(scene, end) <= _free_way(scene, start)
+    for settings, from_tighter, window_m in (
+        (SEARCH, True, WINDOW_M), (SEARCH, True, WIDE_M), (TIGHT, True, WINDOW_M), (SEARCH, False, WINDOW_M),
+        (TIGHT, False, WINDOW_M),
+    ):  # fmt: skip
+        obstacles = scene.obstacles.corners, scene.obstacles.n_corners
+        # The search begins at the last pose.
+        ends = (start, end) if from_tighter == forward else (end, start)
+        path = plan_path(scene.vehicle, *obstacles, *ends, settings, window_m)
+        if path is not None:
+            return path if ends[0] is start else path.reversed(start)
+    return None
+
+
+def _free_way(scene: Scene, pose: FloatArray) -> float:
+    """Return how far, m, the car may drive from a pose, all ways together."""
+    space = _space_around(scene, pose)
+    bends = np.array([-1.0, 0.0, 1.0]) / scene.vehicle.turning_radius
+    ways = [(bend, way) for bend in bends.tolist() for way in (-_WAY_M, _WAY_M)]
+    return float(sum(abs(free_length(space, *pose.tolist(), *way, _WAY_CLEAR_M)) for way in ways))
+
+
+def _space_around(scene: Scene, pose: FloatArray) -> Clearance:
+    low, high = pose[:2] - WINDOW_M, pose[:2] + WINDOW_M
+    return clearance(scene.vehicle, scene.obstacles.corners, scene.obstacles.n_corners, low, high)
 
 
 def aim(scene: Scene) -> FloatArray:
     """Return the pose to park at, (3,): the target, or where it is narrow a pose nearby with the most room."""
-    reach = np.full(2, WINDOW_M)
-    space = clearance(
-        scene.vehicle,
-        scene.obstacles.corners,
-        scene.obstacles.n_corners,
-        scene.target[:2] - reach,
-        scene.target[:2] + reach,
-    )
+    space = _space_around(scene, scene.target)
     x, y, yaw = scene.target.tolist()
     best, most = scene.target, room_at(space, x, y, yaw, _ROOMY_M)
     if most >= 0.99 * _ROOMY_M:
