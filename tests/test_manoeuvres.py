@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import json
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -274,3 +275,28 @@ def test_all_public_scenes_are_driven(source):
         pytest.skip(f"the scenes of {source} are not in shared/data")
     for scene in read_scenes(PUBLIC / source):
         assert park(scene).judged().driven, scene.name
+
+
+def test_a_drive_is_shortened_until_the_deadline_and_within_the_limits():
+    pytest.importorskip("casadi")
+    from planners.driving.time_optimal import shorten
+
+    made = park(level_scene("perpendicular-normal", 0, TPCAP))
+    shorter = shorten(made, 20.0)
+    judged, states = shorter.judged(), shorter.states
+    assert judged.driven
+    assert judged.clearance_m >= 0.015
+    assert shorter.time_s < 0.8 * made.time_s
+    assert np.abs(np.diff(states[:, STEERING])).max() <= TPCAP.steering_rate * 0.05 + 1e-9
+    assert np.abs(np.diff(states[:, SPEED])).max() <= TPCAP.max_acceleration * 0.05 + 1e-9
+    assert shorten(made, 0.0) is made
+
+
+def test_shortening_names_the_extra_that_it_lacks(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    done = parkenv(
+        "park", "--levels", "oblique-normal", "-n", "1", "--shorten", "1", "--out", "out", cwd=tmp_path
+    )
+    assert done.returncode == 2
+    assert "parkenv[optimal]" in done.stderr
+    assert not (tmp_path / "out").exists()

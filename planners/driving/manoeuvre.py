@@ -26,7 +26,9 @@ SEARCH = SearchSettings(
     attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.05, 0.5)),
 )
 """Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
-TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.05, 0.0), (0.02, 0.0), (0.01, 0.0)))
+TIGHT = dataclasses.replace(
+    SEARCH, most_expansions=6_000, attempts=((0.05, 0.0), (0.02, 0.0), (0.01, 0.0), (0.004, 0.0))
+)
 """Settings of the search out of the tightest slots."""
 WIDE_M = 25.0
 """Margin, m, around start and target of the search for ways around."""

@@ -101,6 +101,15 @@ class ManoeuvreStudy(Study):
     )
     episodes: int = option(100, "Episodes per lot, or scenes per level.", short="-n", ge=1, le=1_000_000)
     vehicle: Vehicle = None
+    shorten_s: float = option(
+        0.0,
+        "Wall time, s, to shorten each drive of a scene by optimal control (extra optimal).",
+        name="--shorten",
+        takes="S",
+        panel="Scenes",
+        ge=0.0,
+        le=3_600.0,
+    )
     seed: Seed = Field(0, description="First seed; episode or scene i uses seed + i.")
     figures: Figures = True
 
@@ -147,6 +156,10 @@ class ManoeuvreStudy(Study):
         """See `Study`: all files are read."""
         if not self.sources:
             raise InputError("park: want cases or levels")
+        if self.shorten_s > 0.0:
+            from planners.driving.time_optimal import require_casadi
+
+            require_casadi()
         if self.cases is not None:
             for name in self.sources:
                 self.scene(name)
@@ -162,10 +175,14 @@ class ManoeuvreStudy(Study):
     def run(self, work: _Scenes, items: Sequence[str]) -> list[Row]:
         """See `Study`."""
         from planners.driving.manoeuvre import park
+        from planners.driving.time_optimal import shorten
 
         del work
         _warm()
-        return [manoeuvre_row(name, park(self.scene(name))) for name in items]
+        made = {name: park(self.scene(name)) for name in items}
+        if self.shorten_s > 0.0:
+            made = {name: shorten(each, self.shorten_s) for name, each in made.items()}
+        return [manoeuvre_row(name, each) for name, each in made.items()]
 
     def keep(self, work: _Scenes, rows: Sequence[Row], results: Results) -> None:
         """See `Study`: what was driven."""
