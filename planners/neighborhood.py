@@ -59,7 +59,7 @@ class Neighborhood:
         views["slot"], views["rate"], views["hit"], views["false_alarm"] = slots, *rates
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         neighbors, starts = neighbors.copy(), starts.copy()
-        table, own_rate = RoadTable.over(neighbors, problem.move_cost_s[vertices]), np.zeros(n_slots)
+        table, own_rate = RoadTable(neighbors, problem.move_cost_s[vertices]), np.zeros(n_slots)
         own = slots == np.repeat(np.arange(len(vertices)), np.diff(starts))
         own_rate[slots[own]] = rates.seen[own]
         cost_s = problem.finite_cost_s[vertices[:n_slots]]

@@ -382,11 +382,13 @@ CAR = _with_costs(
         # Sums of the search, complete when it has ended.
         *_SUMS,
         # Its SEARCH record, 0 unless searching. For compiled policies: the target slot, or -1; how many of the moves to
-        # it are left; until when the search is expected to last, walk and price included, s since its beginning.
+        # it are left; until when the search is expected to last, walk and price included, s since its beginning;
+        # whether the target, not observed yet, was the best at the last decision.
         ("search", ADDRESS),
         ("target", np.int64),
         ("n_moves", np.int64),
         ("expected_s", np.float64),
+        ("settled", np.bool_),
     ],
     costs=COST_FIELDS[0],
 )

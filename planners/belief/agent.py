@@ -39,6 +39,7 @@ WORTH_PASSING_S = 1.0
 If the forecast is right, stopping for a smaller gain costs next to nothing; if it is wrong, the slot that was passed
 may have been the last one for a long time.
 """
+ROWS = 40  # of the table of drives of a part that are computed at each decision on the way there: some 3 ms
 STALE_S = 60.0  # s without a newly observed slot after which the search moves on to another part of the lot
 PREVIEW_S = 60.0  # s, horizon of the plan preview
 
@@ -186,6 +187,8 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.past.append(belief.observations)
         known = self._update(belief, vertex, memory)
         if memory.entry not in (-1, vertex):
+            if belief.time > 0.0:  # The first decision has enough to do.
+                memory.near.table.prepare(ROWS)
             return self._routes.move_toward(vertex, memory.entry)
         if memory.entry == vertex:
             memory.entry, memory.news_at = -1, memory.time

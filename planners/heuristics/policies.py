@@ -31,6 +31,7 @@ from planners.heuristics.rules import (
     choose_route,
     heuristic_tables,
     keeps_target,
+    still_leads,
     tables_at,
 )
 from planners.heuristics.streets import choose_place, street_tables, streets_at, takes_slot
@@ -46,12 +47,19 @@ def decide_by_rule(address: int, number: int) -> int:
     tables = tables_at(data, 0)
     moves = uint8_array(search.moves, (tables.n_vertices,))
     state = UNOBSERVED if target == NO_SLOT else recent_state(search, target)
-    if not keeps_target(tables.heuristic, target, state):
+    if keeps_target(tables.heuristic, target, state):
+        car.settled = False
+    elif not (
+        car.settled
+        and state == UNOBSERVED
+        and still_leads(data, car.place, car.search, search.vertex, target, moves, car.n_moves)
+    ):
         car.target, car.n_moves = choose_route(
             data, car.place, car.search, search.vertex, target, moves, car.n_moves
         )
         if car.target == NO_SLOT:
             return LEAVE
+        car.settled = tables.heuristic == GREEDY_TOTAL and recent_state(search, car.target) == UNOBSERVED
     if car.n_moves == 0:
         return PARK
     car.n_moves -= 1
