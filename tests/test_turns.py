@@ -18,6 +18,7 @@ from parkenv import make_agent, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.lots import check_lot, import_lot, import_town, read_lot, write_lot
+from parkenv.mapping.route import survey_route
 from parkenv.studies.bench import sumo
 from parkenv.studies.bench.town import blocks_of
 from parkenv.studies.simulate import adapt_to_agent
@@ -172,7 +173,16 @@ def test_nobody_ever_makes_a_forbidden_turn(turns, seed):
 
 @pytest.mark.parametrize("name", ["mdp", "belief"])
 def test_agents_drive_round_it_too(name):
-    scenario = make_scenario(blocks([turn("west", "north"), turn("south", "north")], every=40.0))
+    at = (-100.0, 0.0)
+    forbidden = {("west", at, "north"), ("west", at, "east")}
+    turns = [turn(comes, leaves, at) for comes, _, leaves in forbidden]
+    assert driven_by(name, blocks(every=40.0)) & forbidden
+    assert not driven_by(name, blocks(turns, every=40.0)) & forbidden
+
+
+def driven_by(name, lot):
+    """The turns that an agent makes in five searches."""
+    scenario, driven = make_scenario(lot), set()
     agent = make_agent(name, scenario.public())
     env = adapt_to_agent(TimeLimit(gym.make("parkenv/Search-v2", scenario=scenario), 200), agent)
     for seed in range(5):
@@ -183,8 +193,8 @@ def test_agents_drive_round_it_too(name):
             observation, _, *ends, _ = env.step(action)
             over = any(ends)
             path.append(int(observation["vertex"]))
-        driven = made(scenario.lot, path[:-1], path[1:])
-        assert not driven & {("west", (0.0, 0.0), "north"), ("south", (0.0, 0.0), "north")}
+        driven |= made(scenario.lot, path[:-1], path[1:])
+    return driven
 
 
 def test_turns_come_back_from_a_file_and_faults_are_named(tmp_path):
@@ -276,6 +286,32 @@ def crossing(**relation):
         place.turn(1, (0, 0), 3, **relation)
     place.way([(200, 0), (400, 0)], STREET)
     return place.node(10, 10, entrance="main")
+
+
+def test_a_junction_is_blocked_for_all_who_come_to_it():
+    ends = []
+    for turns in ([], BACK):  # nobody turns back
+        demand = Demand(PoissonArrivals(1200, 8 * 3600, 8.25 * 3600), ExponentialTime(600.0))
+        drivers = [DriverKind(policy=POLICIES["first-free"])]
+        scenario = make_scenario(blocks(turns, every=20.0))
+        fleet = Fleet(scenario, demand, drivers=drivers, manoeuvre_s=30.0, background="none")
+        fleet.reset(1)
+        fleet.run()
+        ends.append(fleet.cars["ended_at"])
+        assert (fleet.cars["queued_s"] > 0.0).sum() > 100
+    np.testing.assert_array_equal(*ends)
+
+
+LEFT = [turn(*arms) for arms in itertools.pairwise(["west", "north", "east", "south", "west"])]
+
+
+@pytest.mark.parametrize("turns", [LEFT[:1], LEFT, [turn("west", "north", only=True)]])
+def test_a_survey_passes_every_slot_once_without_them(turns):
+    plain, lot = survey_route(blocks(every=20.0)), blocks(turns, every=20.0)
+    route = survey_route(lot)
+    assert (lot.neighbors[route.vertices[:-1]] == route.vertices[1:, None]).any(axis=1).all()
+    assert sorted(route.vertices[route.vertices < lot.n_slots]) == list(range(lot.n_slots))
+    assert route.length == pytest.approx(plain.length)
 
 
 def imported(place, tmp_path, form):

@@ -148,10 +148,10 @@ class Fleet(AgentStudyCommand):
 
 
 def _show_places(console: Console, what: str, rows: Sequence[Row]) -> None:
-    """Print what happens on a day to the cars of each purpose, in each zone, or in the blocks with the most cars."""
+    """Print what happens on a day to the cars of each purpose, in each zone or block, or in those with the most."""
     title = f"{what}s, a day".capitalize()
     if (count := len({row[what] for row in rows})) > MOST_SHOWN:
-        title = f"The {MOST_SHOWN} blocks with the most cars, of {count}, a day"
+        title = f"The {MOST_SHOWN} {what}s with the most cars, of {count}, a day"
         rows = sorted(rows, key=lambda row: -row["parked_a_day"])
         names = list(dict.fromkeys(row[what] for row in rows))[:MOST_SHOWN]
         rows = [row for row in rows if row[what] in names]

@@ -582,17 +582,20 @@ def clear_lanes(fleet: Any) -> None:
 @inlined
 def block_lane(fleet: Any, vertex: int, until: float, number: int) -> None:
     """Block a vertex for other cars until a time, s, if cars block lanes."""
-    if fleet.manoeuvre_s > 0.0 and until > float64s(fleet.blocked_until)[vertex]:
-        float64s(fleet.blocked_until)[vertex] = until
-        int64s(fleet.blocked_by)[vertex] = number
+    if fleet.manoeuvre_s > 0.0:
+        at = int64s(fleet.junction_of_vertex)[vertex]
+        if until > float64s(fleet.blocked_until)[at]:
+            float64s(fleet.blocked_until)[at] = until
+            int64s(fleet.blocked_by)[at] = number
 
 
 @inlined
 def blocked_until(fleet: Any, car: Any, number: int) -> float:
     """Return until when another car blocks the vertex that a car has driven to; in the past if none does."""
-    if fleet.manoeuvre_s == 0.0 or car.stands or int64s(fleet.blocked_by)[car.vertex] == number:
+    if fleet.manoeuvre_s == 0.0 or car.stands:
         return -np.inf
-    return float(float64s(fleet.blocked_until)[car.vertex])
+    at = int64s(fleet.junction_of_vertex)[car.vertex]
+    return -np.inf if int64s(fleet.blocked_by)[at] == number else float(float64s(fleet.blocked_until)[at])
 
 
 @inlined

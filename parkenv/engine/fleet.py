@@ -278,6 +278,7 @@ class Fleet:
             "live_map": np.zeros(lot.n_slots, LIVE_SLOT),
             "blocked_until": np.zeros(lot.n_vertices),
             "blocked_by": np.zeros(lot.n_vertices, np.int64),
+            "junction_of_vertex": lot.junction_of_vertex,
             "by_cost": np.argsort(cost_s, axis=1, kind="stable").astype(np.int64),
             "counted": _counted(lot),
         }

@@ -53,7 +53,8 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
         InputError: a required lane cannot be reached from the entry, or the entry cannot be reached from it.
     """
     passes = _passes(lot)
-    needed = [p for p in passes if len(p.stops) > 2]
+    # A section begins at each vertex of its junction from which cars may take it.
+    needed = list({p.stops[1:]: p for p in reversed(passes) if len(p.stops) > 2}.values())[::-1]
     if not both_sides:
         needed += [_Pass(p.stops[::-1], p.length, True) for p in needed if _left_slots(lot, p)]
     start = int(lot.entry_vertices[entry])
@@ -63,8 +64,19 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
         if not ways.has_edge(a, b) or ways.edges[a, b]["length"] > p.length:
             ways.add_edge(a, b, length=p.length, stops=p.stops)
     drive: nx.MultiDiGraph[Any] = nx.MultiDiGraph()
-    for p in needed:
-        drive.add_edge(p.stops[0], p.stops[-1], stops=p.stops)
+    junction = lot.junction_of_vertex
+    for number, p in enumerate(needed):
+        begin = p.stops[0]
+        if p.against:
+            begins = np.flatnonzero(junction == junction[begin]).tolist()
+        else:
+            begins = [q.stops[0] for q in passes if q.stops[1:] == p.stops[1:]]
+        if len(begins) > 1:
+            begin = -1 - number  # a node before all of them
+            for vertex in begins:
+                ways.add_edge(vertex, begin, length=0.0, stops=(vertex,))
+            ways.add_edge(begin, p.stops[-1], length=p.length, stops=p.stops)
+        drive.add_edge(begin, p.stops[-1], stops=p.stops)
     try:
         _join(drive, ways, start)
         _balance(drive, ways)

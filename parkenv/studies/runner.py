@@ -13,7 +13,7 @@ import time
 import warnings
 import weakref
 from collections.abc import Collection, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -167,8 +167,10 @@ def run(
         )
         if continues and (path / SPEC_FILE).exists():
             machines = {name: getattr(study, name) for name in ExecutionSpec.model_fields}
-            if type(study).read(path / SPEC_FILE).changed(**machines) == study:
-                results.command = results.recorded_command() or results.command
+            # A file that is damaged, or another study's, is written anew.
+            with suppress(InputError):
+                if type(study).read(path / SPEC_FILE).changed(**machines) == study:
+                    results.command = results.recorded_command() or results.command
         study.prepare(results, continues=continues)
         results.begin(settings)
         study.write(path / SPEC_FILE)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import InputError, nearest, require_number
 from parkenv.files.file_names import is_plain
 from parkenv.world.drive_graph import NODE_TOLERANCE, GraphError, GraphProblem, build_drive_graph
@@ -422,6 +422,16 @@ class ParkingLot:
     def n_vertices(self) -> int:
         """Number of vertices of the drive graph: one per slot, then junctions and lane ends."""
         return len(self.vertex_xy)
+
+    @property
+    def junction_of_vertex(self) -> IntArray:
+        """(n_vertices,) int64, the first vertex in the same place.
+
+        That is the vertex itself, but at junctions that have one more for each lane whose cars may not turn everywhere.
+        """
+        n = self.n_slots
+        _, first, of = np.unique(self.vertex_xy[n:], axis=0, return_index=True, return_inverse=True)
+        return np.concatenate([np.arange(n), n + first[of.ravel()]])
 
     @property
     def is_town(self) -> bool:

@@ -171,9 +171,8 @@ def streets_of(lot: ParkingLot) -> list[Street]:
         InputError: a slot can be reached, or left, in two ways.
     """
     n, neighbors = lot.n_slots, [[int(v) for v in row if v >= 0] for row in lot.neighbors]
-    # All vertices of a junction, one for each set of turns, begin the same streets.
-    first, of = np.unique(lot.vertex_xy[n:], axis=0, return_index=True, return_inverse=True)[1:]
-    junction = np.r_[np.arange(n), n + first[of.ravel()]]
+    # All vertices of a junction begin the same streets.
+    junction = lot.junction_of_vertex
     ways_in = np.unique([(junction[u], v) for u, row in enumerate(neighbors) for v in row], axis=0)
     reached = np.bincount(ways_in[:, 1], minlength=n)
     for slot in range(n):
