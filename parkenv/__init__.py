@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result, open_run
     from parkenv.studies.simulate import simulate
     from parkenv.studies.verbs import compare, fleet, survey, train
-    from parkenv.world.lot import Lane, Mouth, ParkingLot
+    from parkenv.world.lot import Lane, Mouth, ParkingLot, Turn
     from parkenv.world.occupancy.arrival_window import ArrivalWindow
     from parkenv.world.occupancy.log import OccupancyLog
     from parkenv.world.occupancy.process import OccupancyProcess
@@ -56,6 +56,7 @@ _EXPORTS = {
     "SensorBand": "parkenv.world.sensor_model",
     "SensorModel": "parkenv.world.sensor_model",
     "Traffic": "parkenv.world.traffic",
+    "Turn": "parkenv.world.lot",
     "compare": "parkenv.studies.verbs",
     "fleet": "parkenv.studies.verbs",
     "import_lot": "parkenv.lots",
@@ -85,6 +86,7 @@ __all__ = [
     "SensorBand",
     "SensorModel",
     "Traffic",
+    "Turn",
     "compare",
     "fleet",
     "import_lot",

@@ -106,7 +106,10 @@ def test_a_lot_without_turns_has_one_vertex_a_junction_and_each_turn_adds_at_mos
         ([(-50, 0), (3, 0), (50, 0)], r"turn 0: has no junction or end of a lane at \(3.0, 0.0\) m"),
         ([(-50, -50), (0, 0), (50, 0)], "turn 0: has no lane by which cars come from"),
         ([(-50, 0), (0, 0), (50, 50)], "turn 0: has no lane by which cars leave"),
-        ([(-100, 0), (-150, 0), (-100, 0)], r"turn 0: leaves cars that come to \(-150.0, 0.0\) m no way on"),
+        (
+            [(-100, 0), (-150, 0), (-100, 0)],
+            r"turn 0: prohibits the last turn that cars may make at \(-150.0, 0.0\) m",
+        ),
         ([(-50, 0), (0, 0)], r"turn points: shape \(2, 2\), want \(3, 2\)"),
     ],
 )

@@ -92,12 +92,13 @@ def print_table(console: Console, table: Mapping[str, Any]) -> None:
         if column["value"]
     ]
     title = f"{table['title']}: {', '.join(equal)}" if equal else table["title"]
-    headings, cells, n_texts = list[str](), list[list[str]](), 0
+    headings, cells, n_names = list[str](), list[list[str]](), 0
     for column, *values in zip(table["columns"], *table["rows"], strict=True):
         if not any(texts := [written(column, value) for value in values]):
             continue
-        if not any(isinstance(value, float | int | list) for value in values):
-            n_texts += n_texts == len(cells)
+        has_numbers = any(isinstance(value, float | int | list) for value in values)
+        if not has_numbers and n_names == len(cells):
+            n_names += 1  # the columns before the first with numbers name the rows
         interval = "[95 %]" if any(isinstance(value, list) for value in values) else ""
         words = " ".join(filter(None, (column["label"], column.get("unit"), interval)))
         room = 60 if table["facts"] else max(10, *map(len, texts))
@@ -111,14 +112,14 @@ def print_table(console: Console, table: Mapping[str, Any]) -> None:
         2 + max(map(len, (*heading.split("\n"), *texts)))
         for heading, texts in zip(headings, cells, strict=True)
     ]
-    parts = [list(range(n_texts))]
-    for i in range(n_texts, len(widths)):
-        if sum(widths[k] for k in parts[-1]) + widths[i] > console.width and len(parts[-1]) > n_texts:
-            parts.append(list(range(n_texts)))
+    parts = [list(range(n_names))]
+    for i in range(n_names, len(widths)):
+        if sum(widths[k] for k in parts[-1]) + widths[i] > console.width and len(parts[-1]) > n_names:
+            parts.append(list(range(n_names)))
         parts[-1].append(i)
     for number, part in enumerate(parts):
         made = zip(*(cells[i] for i in part), strict=True)
-        console.print(make_table(None if number else title, [headings[i] for i in part], made, n_texts))
+        console.print(make_table(None if number else title, [headings[i] for i in part], made, n_names))
 
 
 @contextmanager

@@ -79,12 +79,12 @@ class Lane:
 
 @dataclass(frozen=True, eq=False)
 class Turn:
-    """A turn at a junction that cars may not make, or the only one that they may.
+    """A turn restriction: a turn at a junction that is prohibited, or mandatory.
 
     Args:
         points: (3, 2) float64, m, lot frame: a point on the lane by which cars come, the junction, and a point on the
             lane by which they leave; the first and the last one are the same where cars turn back.
-        only: whether cars that come by this lane may make this turn alone.
+        only: whether the turn is mandatory: all others from its lane are prohibited.
 
     Raises:
         InputError: a wrong shape, or a value that is not finite.
@@ -97,6 +97,8 @@ class Turn:
         points = _frozen(self.points, "points")
         if points.shape != (3, 2):
             raise InputError(f"turn points: shape {points.shape}, want (3, 2)")
+        if not isinstance(self.only, bool):
+            raise InputError(f"turn only is {self.only!r}, want True or False")
         _require_finite("turn points", points)
         object.__setattr__(self, "points", points)
 

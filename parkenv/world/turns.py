@@ -1,8 +1,8 @@
-"""Turns that cars may not make at a junction, as chains of the drive graph.
+"""Turn restrictions at junctions, in the drive graph.
 
-The chain by which a car comes decides where it may drive on. So the graph has one more vertex for each chain whose cars
-may not turn everywhere: they stop there, in the same place as the others, and its edges are the turns that are left.
-Whoever drives on the graph keeps to them without knowing of turns.
+Which turns a car may make depends on the chain by which it reaches the junction. So a junction has one more vertex for
+each chain with a restriction, in the same place: the chain ends there, and the edges of that vertex are the permitted
+turns. All who drive on the graph keep to the restrictions, with no code of their own.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class Chains(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """What cars may not do that come by a chain: drive on by some others."""
+    """The chains that cars may not take after one."""
 
     chain: int
     forbidden: IntArray
@@ -100,7 +100,7 @@ def forbidden_after(chains: Chains, turns: Sequence[TurnParts]) -> tuple[dict[in
             continue
         together = np.union1d(forbidden.get(rule.chain, rule.forbidden), rule.forbidden)
         if len(together) == len(chains.onward(rule.chain)):
-            wrong[number] = f"leaves cars that come to {_place(turns[number][0][1])} no way on"
+            wrong[number] = f"prohibits the last turn that cars may make at {_place(turns[number][0][1])}"
         else:
             forbidden[rule.chain] = together
     return forbidden, wrong
