@@ -82,7 +82,7 @@ def test_only_streets_that_cars_need_are_left_and_no_way_is_longer(tmp_path):
     doors = np.array([streets.points(piece).mean(axis=0) + 3.0 for piece in (1, 6, 10, 13)])
     facilities = tuple(Facility(f"P{k}", capacity=9, xy=tuple(xy)) for k, xy in enumerate(doors.tolist()))
     drives = []
-    for lanes in (streets.lanes(doors), streets.lanes(doors, entries)):
+    for _, lanes in (streets.lanes(doors), streets.lanes(doors, entries)):
         drawn = Slots.joined([NO_SLOTS]).columns()
         lot = ParkingLot(
             "doors", (), **drawn, lanes=tuple(lanes), entries=entries, goals=doors[:1], facilities=facilities

@@ -27,8 +27,8 @@ from parkenv.world.demand import (
     NoArrivals,
     PoissonArrivals,
     TownDemand,
-    rest_of_stay,
 )
+from parkenv.world.durations import rest_of_stay
 from parkenv.world.occupancy.process import Arrival, ArrivalDay
 from parkenv.world.tariff import Price, Zone
 from planners.heuristics.policies import POLICIES

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import warnings
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -140,10 +139,6 @@ class Check(Command):
             )
 
 
-METRES_PER_DEGREE = 111_195.0
-"""Of latitude."""
-
-
 def _points(texts: Sequence[str]) -> tuple[tuple[float, float], ...]:
     """Return the points of an option; `auto` stands for none."""
     numbers = (numbers_in(text, 2) for text in texts if text != AUTO)
@@ -265,10 +260,13 @@ class Import(Command):
     def box(self) -> tuple[tuple[float, float], tuple[float, float]] | None:
         """Two corners of what is imported; None for all of the map."""
         if self.around is not None:
+            from parkenv.lots.local_frame import LocalFrame
+
             lat, lon, metres = self.around
-            up = metres / METRES_PER_DEGREE
-            right = up / max(math.cos(math.radians(lat)), 1e-6)
-            return (lat - up, lon - right), (lat + up, lon + right)
+            (west, south), (east, north) = (
+                LocalFrame(lon, lat).to_lonlat([[-metres] * 2, [metres] * 2]).tolist()
+            )
+            return (south, west), (north, east)
         if self.bounds is None:
             return None
         south, west, north, east = self.bounds
@@ -298,7 +296,7 @@ class Import(Command):
         from parkenv.lots import import_lot, import_town, write_lot
         from parkenv.lots.formats.geojson import check_lot_output
         from parkenv.lots.quality import Provenance
-        from parkenv.lots.town.draft import TABLE
+        from parkenv.lots.town.facilities import TABLE
 
         check_lot_output(self.out)
         table = self.out.with_suffix(".csv")

@@ -854,5 +854,12 @@ def drive_times(problem: SearchProblem, vertex: int | NDArray[np.int64]) -> NDAr
 
     It is infinite where there is no way.
     """
-    metres = dijkstra(problem.lot.drive_matrix(timed=True), indices=np.asarray(vertex))
-    return np.asarray(metres[..., : problem.lot.n_slots] / problem.v_drive)
+    return drive_metres(problem.lot, vertex, timed=True) / problem.v_drive
+
+
+def drive_metres(
+    lot: ParkingLot, vertex: int | NDArray[np.int64], *, timed: bool = False
+) -> NDArray[np.float64]:
+    """Return the shortest drive from a vertex, or several, to each slot, (..., n_slots) m; see `drive_matrix`."""
+    metres = dijkstra(lot.drive_matrix(timed), indices=np.asarray(vertex))
+    return np.asarray(metres[..., : lot.n_slots])

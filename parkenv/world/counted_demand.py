@@ -8,7 +8,8 @@ import numpy as np
 from scipy.optimize import nnls
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.world.demand import LogNormalTime, hours_between, parked_share, staying_share
+from parkenv.world.arrivals import hours_between
+from parkenv.world.durations import LogNormalTime, parked_share, staying_share
 
 STAYS_H = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 9.0, 14.0, 24.0)
 """Mean stays that are tried, h."""

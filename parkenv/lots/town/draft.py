@@ -37,22 +37,20 @@ from parkenv.lots.osm.outlines import CORRIDOR
 from parkenv.lots.osm.roads import Rank, off_the_ground, whole_number
 from parkenv.lots.osm.rows import without_overlaps
 from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots_by_rank, split_space
-from parkenv.lots.osm.turns import turns_of
+from parkenv.lots.osm.turns import Turns, turns_of
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
 from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of
-from parkenv.lots.town.kerbs import CLASS_RULE, STRIPS, FacilityRow, kerb_sides, strip_side
+from parkenv.lots.town.facilities import FacilityRow, facilities_of, table_of
+from parkenv.lots.town.kerbs import CLASS_RULE, STRIPS, kerb_sides, strip_side
 from parkenv.lots.town.listed import ListedCarPark, matched, read_listed
 from parkenv.lots.town.streets import read_streets
 from parkenv.lots.town.zones import PRICE, Rules, rules_of, zones_of
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
-from parkenv.world.facility import FACILITY_REACH, Facility
+from parkenv.world.facility import FACILITY_REACH
 from parkenv.world.lot import Lane
 from parkenv.world.tariff import PUBLIC
 
-GATE_S = 10.0  # s that the barrier of a garage takes for a car
-INSIDE_S = {"garage": (30.0, 120.0), "lot": (10.0, 30.0)}
-"""Seconds from the entry of a counted facility to a space, when it is empty and when it is full."""
 ENTRANCE_WITHIN = 20.0  # m, of a garage's outline from its `amenity=parking_entrance`
 SAME_GARAGE = 60.0  # m, between entrances that are of one garage, and from its outline
 SAME_CAR_PARK = 22.0  # m, between drawn spaces outside any car park that belong together
@@ -62,12 +60,6 @@ PAID: dict[str, Any] = {"per_hour": PRICE, "assumed": True}
 """Rules of car parks of a list whose tags name no price: all at the same one, so that none draws drivers by it."""
 CLOSED = ("no", "military", "forestry", "agricultural")
 """Values of `access` of parking that no car in town may use."""
-
-
-TABLE = ("name", "kind", "capacity", "capacity_from", "rule", "zone", "slots", "tagged", "element")
-"""Columns of the table of facilities: `capacity_from` is tag, drawn, list or rule, `rule` which one; `slots` of the
-capacity are drawn, the others counted; `tagged` is what the tags say; `element` is the way or node, of a kerb with its
-side."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -413,7 +405,8 @@ class _Town:
         mouths = np.concatenate([slots.mouths(), *([row.xy] for row in self.rows if row.xy is not None)])
         entries, traffic = self.streets.entries()
         whole, lanes = self.streets.lanes(mouths, entries if self.beside is not None else None)
-        turns = turns_of(self.place, self.frame, whole, lanes)
+        # Of some car parks alone, the shortest ways are left, and none around what is forbidden.
+        turns = turns_of(self.place, self.frame, whole, lanes) if self.beside is None else Turns((), (), ())
         of = np.repeat(np.arange(len(self.rows)), [len(part) for part in parts])
         zone = [rules.zone(row.kind).name for row in self.rows for rules in row.slot_rules]
         slots = replace(
@@ -431,7 +424,7 @@ class _Town:
         index = np.flatnonzero(near)
         slots, ids = slots[index], [ids[i] for i in index.tolist()]
         filled = set(slots.facility.tolist())
-        facilities = [f for row in self.rows for f in _facilities(row, filled)]
+        facilities = [f for row in self.rows for f in facilities_of(row, filled)]
         used = [
             (row.kind, rules)
             for row in self.rows
@@ -459,7 +452,7 @@ class _Town:
             entry_weights=dict.fromkeys(PURPOSES, traffic),
             turns=turns.kept,
         ).searchable()
-        rows = _table(self.rows, draft)
+        rows = table_of(self.rows, draft)
         listed = [LeftOut(reason, tuple(names)) for reason, names in self.left_out.items() if names]
         left_out = (
             *self.place.left_out,
@@ -498,41 +491,6 @@ class _Town:
         yield f"zones: {', '.join(draft.zone_rules)}"
         yield from (f"of the list: {line}" for line in self.listed)
         yield f"frame: {self.frame}"
-
-
-def _facilities(row: FacilityRow, filled: set[str]) -> Iterator[Facility]:
-    """Yield the facilities of a row of the table: one for drawn slots, one for each counted part."""
-    if len(row.slots) and row.name in filled:
-        yield Facility(row.name, row.kind, row.rules.zone(row.kind).name)
-    for name, capacity, rules in row.counted if row.xy is not None else ():
-        yield Facility(
-            name,
-            row.kind,
-            rules.zone(row.kind).name,
-            capacity,
-            row.xy,
-            GATE_S if row.kind == "garage" else 0.0,
-            INSIDE_S.get(row.kind, INSIDE_S["lot"]),
-            "sign" if row.kind == "garage" else "nothing",
-        )
-
-
-def _table(rows: Sequence[FacilityRow], draft: LotDraft) -> list[dict[str, Any]]:
-    """Return the table of facilities, those of the draft."""
-    names, count = np.unique(draft.slots.facility, return_counts=True)
-    slots = dict(zip(names.tolist(), count.tolist(), strict=True))
-    counted = {facility.name: facility.capacity for facility in draft.facilities}
-    table = []
-    for row in rows:
-        places = slots.get(row.name, 0) + sum(counted.get(name, 0) for name, _, _ in row.counted)
-        if places:
-            more = {
-                "capacity": places,
-                "zone": row.rules.zone(row.kind).name,
-                "slots": slots.get(row.name, 0),
-            }
-            table.append({name: more[name] if name in more else getattr(row, name) for name in TABLE})
-    return table
 
 
 def _guesses(rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:

@@ -11,18 +11,18 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.osm.buildings import Area
 from parkenv.lots.osm.kerbs import SHORTEST_KERB_SLOT, Junctions, Kerb, free_intervals, kerb_of, kerb_slots
 from parkenv.lots.osm.roads import Rank, Road, whole_number
 from parkenv.lots.osm.rows import ARRANGEMENTS, Side
-from parkenv.lots.town.zones import RESERVED, Rules, kerb_rules, rules_of
+from parkenv.lots.town.facilities import FacilityRow
+from parkenv.lots.town.zones import RESERVED, kerb_rules, rules_of
 from parkenv.world.drive_graph import linestrings
 
 PLACES_PER_METRE = {
@@ -46,25 +46,6 @@ CLASS_RULE = "class of street"
 HOUSES_WITHIN = 40.0  # m; where no building is this near, an untagged street has no places
 STATION = 20.0  # m, between the points of a street at which buildings are looked for
 STRIP_REACH = 20.0  # largest distance, m, of a drawn kerb from its street
-
-
-@dataclass(eq=False)
-class FacilityRow:
-    """A facility: its line in the table, its rules, and what makes it."""
-
-    name: str
-    kind: str
-    rules: Rules
-    capacity_from: str  # `tag`, `drawn`, `rule` or `list`
-    rule: str  # which rule
-    element: str  # of the map; of a kerb with its side
-    tagged: int | None = None  # number of places that the tags say
-    slots: Slots = NO_SLOTS  # drawn ones
-    slot_rules: list[Rules] = field(default_factory=list)
-    counted: list[tuple[str, int, Rules]] = field(
-        default_factory=list
-    )  # name, places, rules of counted parts
-    xy: tuple[float, float] | None = None
 
 
 def capacity_by_class(free_m: float, kind: str) -> float:

@@ -18,8 +18,9 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.results import Row
+from parkenv.world.arrivals import hours_between
 from parkenv.world.counted_demand import STAYS_H, follow_counts
-from parkenv.world.demand import hours_between, weights_of_all
+from parkenv.world.demand import weights_of_all
 from parkenv.world.week import DAY_HOURS, HOUR_S
 
 PATIENCE_S = 3600.0

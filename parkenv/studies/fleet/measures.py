@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.engine.fleet import Fleet
+from parkenv.engine.fleet import Fleet, drive_metres
 from parkenv.studies.fleet.blocks import has_zones, paid
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.setting import BY_HOUR
@@ -37,9 +36,7 @@ class Roads:
     def __init__(self, problem: SearchProblem) -> None:
         lot = problem.lot
         entries = np.unique(lot.entry_vertices)
-        metres, timed = (
-            dijkstra(lot.drive_matrix(timed), indices=entries)[:, : lot.n_slots] for timed in (False, True)
-        )
+        metres, timed = (drive_metres(lot, entries, timed=timed) for timed in (False, True))
         self._entries, self._metres, self._drive_s = entries, metres, timed / problem.v_drive
         self._problem, self._cost_s = problem, problem.walk_s + lot.slot_parking_cost_s
         self.first_slot_m = float(timed.min(axis=1).mean())
