@@ -7,6 +7,7 @@ import math
 import sys
 from pathlib import Path
 
+import gymnasium as gym
 import numpy as np
 import pytest
 import shapely
@@ -21,6 +22,7 @@ from parkenv.driving.vehicle import SPEED, STEERING, TPCAP, VEHICLES, VehiclePar
 from parkenv.errors import InputError
 from parkenv.files.known_names import SCENE_LEVELS
 from planners.driving.manoeuvre import park
+from planners.driving.parking_agents import make_parking_agent
 
 PUBLIC = Path(__file__).parents[2] / "shared" / "data" / "manoeuvres"
 # A parallel slot along x below a lane, between two blocks: 0.5 m longer than TPCAP's car.
@@ -300,3 +302,12 @@ def test_shortening_names_the_extra_that_it_lacks(tmp_path, monkeypatch):
     assert done.returncode == 2
     assert "parkenv[optimal]" in done.stderr
     assert not (tmp_path / "out").exists()
+
+
+def test_an_environment_takes_a_car_by_name_and_an_agent_of_another_car_is_refused():
+    env = gym.make("parkenv/Drive-v1", lot="mini", vehicle="tpcap", obstacle_map=True)
+    assert env.unwrapped.vehicle == TPCAP
+    observation, _ = env.reset(seed=0)
+    with pytest.raises(InputError, match="vehicle with length"):
+        make_parking_agent("planner").predict(observation)
+    assert np.isfinite(make_parking_agent("planner", TPCAP).predict(observation)[0]).all()

@@ -18,6 +18,7 @@ from parkenv.compiled.keyed_random import world_key
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind
 from parkenv.driving.drive_state import DriveState
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask, ParkingTasks
+from parkenv.driving.scene_files import vehicle_of
 from parkenv.driving.vehicle import PHYSICS_S, VehicleParameters, advance, placed
 from parkenv.driving.yielding_traffic import YieldingTraffic
 from parkenv.envs.drive_goals import goal_error, goal_errors, goal_of
@@ -125,8 +126,9 @@ length and width over the car's |
 
     ## Arguments
     - `lot`: a `ParkingLot`, the name of a packaged lot (campus, jam, street, mini), or a lot file.
-    - `kinds`, `ways`, `slot`, `occupancy`, `slack`, `distance`, `starts`, `vehicle`: see `ParkingTasks`. A curriculum
+    - `kinds`, `ways`, `slot`, `occupancy`, `slack`, `distance`, `starts`: see `ParkingTasks`. A curriculum
       starts with `starts="way-out"`, a small `distance` and a large `slack`.
+    - `vehicle`: `VehicleParameters`, the name of a car (golf, tpcap, parkbench), or a file (.toml, .json).
     - `reward`: `sparse` or `dense`. `contact_cost`: s.
     - `laser`: True for the thesis's scanner (1081 beams over 270°), or a `LaserScanner`.
     - `obstacle_map`: whether the observation has `cars`, `lines` and `vehicle`.
@@ -174,7 +176,7 @@ length and width over the car's |
         slack: float = 0.0,
         distance: tuple[float, float] = (4.0, 14.0),
         starts: str = "lane",
-        vehicle: VehicleParameters | None = None,
+        vehicle: VehicleParameters | str | None = None,
         reward: str = "sparse",
         contact_cost: float = CONTACT_COST,
         laser: bool | LaserScanner = False,
@@ -189,7 +191,7 @@ length and width over the car's |
         if not isinstance(traffic, Traffic | None):
             raise InputError(f"traffic is a {type(traffic).__name__}, want a Traffic")
         self.render_mode = render_mode
-        self.vehicle = vehicle or VehicleParameters()
+        self.vehicle = VehicleParameters() if vehicle is None else vehicle_of(vehicle)
         self.tasks = ParkingTasks(
             lot if isinstance(lot, ParkingLot) else load_lot(lot),
             self.vehicle,

@@ -109,11 +109,11 @@ def park(scene: Scene) -> Manoeuvre:
     start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
     if path is None:
         return Manoeuvre(scene, None, start[None], planning_s)
-    made = Manoeuvre(scene, path, drive(scene.vehicle, path, start, tracking_of(scene.vehicle)), planning_s)
+    made = Manoeuvre(scene, path, drive(scene.vehicle, path, start, TrackingSettings()), planning_s)
     driven = made.judged()
     if driven.driven and driven.clearance_m >= _CLOSE_M:
         return made
-    states = drive(scene.vehicle, path, start, tracking_of(scene.vehicle, EXACT))
+    states = drive(scene.vehicle, path, start, EXACT)
     exact = Manoeuvre(scene, path, states, planning_s)
     return max(made, exact, key=lambda each: (each.judged().driven, each.judged().clearance_m))
 
@@ -170,18 +170,6 @@ def aim(scene: Scene) -> FloatArray:
                 if room > most + 1e-4:
                     best, most = np.array(pose), room
     return best
-
-
-def tracking_of(vehicle: VehicleParameters, settings: TrackingSettings | None = None) -> TrackingSettings:
-    """Return settings of path tracking within the limits of a vehicle."""
-    settings = settings or TrackingSettings()
-    return dataclasses.replace(
-        settings,
-        speed=min(settings.speed, vehicle.max_speed),
-        reverse_speed=min(settings.reverse_speed, vehicle.max_reverse_speed),
-        # Feedback needs the rest.
-        acceleration=min(settings.acceleration, 0.7 * min(vehicle.max_acceleration, vehicle.max_braking)),
-    )
 
 
 def drive(

@@ -7,8 +7,10 @@ the lateral offset, but it is also stable in reverse, where feedback control of 
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 
@@ -52,6 +54,15 @@ class TrackingSettings:
             if not (math.isfinite(value) and value > 0.0):
                 raise InputError(f"tracking {name} is {value!r}, want above 0")
 
+    def within(self, vehicle: VehicleParameters) -> Self:
+        """Return the same within the limits of a vehicle, with some acceleration left for feedback."""
+        return dataclasses.replace(
+            self,
+            speed=min(self.speed, vehicle.max_speed),
+            reverse_speed=min(self.reverse_speed, vehicle.max_reverse_speed),
+            acceleration=min(self.acceleration, 0.7 * min(vehicle.max_acceleration, vehicle.max_braking)),
+        )
+
 
 _CRAWL = 0.1  # m/s, lowest commanded speed before the end of the path
 _ARRIVED, _EXACTLY = (
@@ -90,7 +101,7 @@ class PathTracker:
         if path.vehicle is not None:
             path.vehicle.require_same(vehicle.numbers, "path")
         self._vehicle = vehicle
-        self._settings = settings = settings or TrackingSettings()
+        self._settings = settings = (settings or TrackingSettings()).within(vehicle)
         self._segments = _segments(vehicle, path, settings)
         self._segment = 0
         self._at = 0

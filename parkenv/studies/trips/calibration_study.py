@@ -15,7 +15,7 @@ from parkenv.files.option import option
 from parkenv.files.spec_file import Spec
 from parkenv.scenarios.spec import Speed, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, require_rig
+from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
@@ -70,6 +70,7 @@ class DrivenTrips(Spec):
         panel="Costs and speeds",
         default="the scenario's, 10",
     )
+    vehicle: Vehicle = None
     rig: Rig = None
     detector: Detector = None
 
@@ -109,7 +110,9 @@ class DrivenTrips(Spec):
         from parkenv.studies.trips.driven_search import DrivenSearch
 
         scenario, rig = (self.built, self.rig) if slots == OBSERVED else (blind_scenario(self.built), None)
-        return DrivenSearch(scenario, self.agent, style=self.style, rig=rig, detector=self.detector)
+        return DrivenSearch(
+            scenario, self.agent, style=self.style, rig=rig, detector=self.detector, vehicle=self.vehicle
+        )
 
 
 class CalibrationStudy(DrivenTrips, Study):
@@ -138,7 +141,8 @@ class CalibrationStudy(DrivenTrips, Study):
         from parkenv.studies.fingerprints import search_settings
 
         driving = {"agent": self.agent.label, "style": dataclasses.asdict(self.style)}
-        return search_settings(self, "rig") | driving
+        car = {"vehicle": dataclasses.asdict(self.vehicle)} if self.vehicle else {}
+        return search_settings(self, "rig") | driving | car
 
     def cells(self) -> list[Cell]:
         """See `Study`."""
