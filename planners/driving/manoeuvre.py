@@ -41,7 +41,11 @@ AIM_M, AIM_RAD = 0.03, 0.004
 _ROOMY_M = 0.1  # room at the target, m, from which on the car aims at it exactly
 _CLOSE_M = 0.015  # clearance, m, below which a fluent drive is compared with an exact one
 _LONGEST_S = 600.0
-_WAY_M, _WAY_CLEAR_M = 2.0, 0.02
+_WAY_M, _WAY_CLEAR_M, _TIGHT_WAY_M = (
+    2.0,
+    0.02,
+    3.2,
+)  # of six ways, their clearance, and their sum in a tight slot, m
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,9 +128,12 @@ def plan_in_scene(scene: Scene) -> CarPath | None:
     A search is short that begins where the car has the least room, so that end comes first.
     """
     start, end = scene.start, aim(scene)
-    forward = _free_way(scene, end) <= _free_way(scene, start)
+    ways = _free_way(scene, start), _free_way(scene, end)
+    forward = ways[1] <= ways[0]
+    # What does not lead out of a tight slot is soon over; ways around take longer.
+    second = [(TIGHT, True, WINDOW_M), (SEARCH, True, WIDE_M)]
     for settings, from_tighter, window_m in (
-        (SEARCH, True, WINDOW_M), (SEARCH, True, WIDE_M), (TIGHT, True, WINDOW_M), (SEARCH, False, WINDOW_M),
+        (SEARCH, True, WINDOW_M), *(second if min(ways) < _TIGHT_WAY_M else second[::-1]), (SEARCH, False, WINDOW_M),
         (TIGHT, False, WINDOW_M),
     ):  # fmt: skip
         obstacles = scene.obstacles.corners, scene.obstacles.n_corners
