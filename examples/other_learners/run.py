@@ -1,19 +1,26 @@
-"""Train other people's learners, unmodified, each in a clean environment of its own, and print a line for each.
+"""Train other people's learners, unmodified, each in a clean environment of its own, and print a table.
 
 `python examples/other_learners/run.py` trains all of them on campus; `run.py rl-zoo3 torchrl --scenario mini
---decisions 20480` some of them elsewhere. Environments are kept in `--folder`, and made anew with `--fresh`. PPO of
-CleanRL is one file: it is fetched from its repository, or `--cleanrl` names it.
+--decisions 20480` some of them elsewhere. Then each searches in the same worlds, which had no say, as `first-free`.
+Environments are kept in `--folder`, and made anew with `--fresh`. PPO of CleanRL is one file: it is fetched from its
+repository, or `--cleanrl` names it. The exit code is the number of learners that failed.
 """
 
 import argparse
+import json
 import os
-import re
-import statistics
 import subprocess
 import sys
 import time
 from pathlib import Path
 from urllib.request import urlretrieve
+
+import numpy as np
+from held_out import WORLDS, make
+
+import parkenv
+from parkenv.show.plurals import interval_text
+from parkenv.studies.statistics import mean_interval
 
 HERE = Path(__file__).resolve().parent
 PROJECT = HERE.parents[1]
@@ -22,67 +29,68 @@ PACKAGES = {
     "rl-zoo3": ["rl_zoo3"],
     "cleanrl": ["tyro", "tensorboard"],
     "torchrl": ["torchrl"],
+    "rllib": ["ray[rllib]"],
+    "tianshou": ["tianshou"],
 }
 """What each learner needs beside parkenv and PyTorch."""
 
 
 def make_environment(name, folder, fresh):
-    """Make a virtual environment with this project and a learner, and return its folder of commands."""
-    commands = folder / name / "bin"
-    if fresh or not (commands / "parkenv").exists():
+    """Make a virtual environment with this project and a learner, and return its Python."""
+    python = folder / name / "bin" / "python"
+    if fresh or not python.exists():
         subprocess.run([sys.executable, "-m", "venv", "--clear", str(folder / name)], check=True)
         for packages in (["torch<=2.13.0"], [f"{PROJECT}[rl]"], PACKAGES[name]):
-            subprocess.run([str(commands / "pip"), "install", "-q", *packages], check=True)
-    return commands
+            subprocess.run([str(python), "-m", "pip", "install", "-q", *packages], check=True)
+    return python
 
 
-def run(*command, folder, **variables):
-    """Run a command with one thread in a folder and return what it prints."""
-    environment = os.environ | {"OMP_NUM_THREADS": "1"} | variables
+def train(name, python, folder, scenario, decisions, *files):
+    """Train a learner with one thread, and return what `held_out.tell` says of it, and the seconds that it took."""
+    begun = time.perf_counter()
+    script = HERE / f"with_{name.replace('-', '_')}.py"
     done = subprocess.run(
-        [str(part) for part in command],
+        [str(part) for part in (python, script, scenario, decisions, *files)],
         cwd=folder,
-        env=environment,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
         text=True,
         capture_output=True,
         check=False,
     )
+    (folder / f"{name}.log").write_text(done.stdout + done.stderr)
     if done.returncode:
-        raise RuntimeError(done.stderr.strip().splitlines()[-1] if done.stderr.strip() else "no message")
-    return done.stdout
+        raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
+    told = [line for line in done.stdout.splitlines() if line.startswith('{"library"')]
+    return json.loads(told[-1]) | {"seconds": time.perf_counter() - begun}
 
 
-def train_with_zoo(commands, folder, scenario, decisions):
-    """Train with rl-zoo3 and compare its best model in worlds that had no say."""
-    options = [f"scenario:'{scenario}'", "observation:'local'", "reward_scale:0.01", "max_episode_steps:500"]
-    run(
-        commands / "python", "-m", "rl_zoo3.train", "--algo", "ppo", "--env", "parkenv/Search-v2",
-        "--gym-packages", "parkenv", "--conf-file", HERE / "ppo.yml", "--env-kwargs", *options, "-n", decisions,
-        "--eval-freq", max(decisions // 10, 1), "--eval-episodes", "100", "--n-eval-envs", "10", "--seed", "0",
-        "--num-threads", "1", "--device", "cpu", "-f", "zoo", folder=folder,
-    )  # fmt: skip
-    newest = max(folder.glob("zoo/ppo/*/best_model.zip"), key=lambda path: path.stat().st_mtime)
-    newest.with_suffix(".safetensors").unlink(missing_ok=True)
-    said = run(
-        commands / "parkenv", "compare", "--scenario", scenario, "--agents", f"first-free,ppo:{newest}",
-        "--trust-model", "--episodes", "500", "--seed", "1000000", "--out", "compared", "--overwrite",
-        folder=folder, COLUMNS="200",
-    )  # fmt: skip
-    return next(line.strip() for line in said.splitlines() if "ppo" in line and "[" in line)
+def first_free(scenario):
+    """Return the total times, s, of `first-free` in the same worlds."""
+    env, agent = (
+        make(scenario, observation="full", flat=False),
+        parkenv.make_agent("first-free", parkenv.make_scenario(scenario)),
+    )
+    return np.array([parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in WORLDS])
 
 
-def train_with_cleanrl(commands, folder, scenario, decisions, file):
-    """Train with CleanRL's file, and return the mean of the last episodes."""
-    log = folder / "episodes.txt"
-    log.unlink(missing_ok=True)
-    run(
-        commands / "python", file, "--env-id", f"logged_ids:logged/{scenario}-v2", "--total-timesteps", decisions,
-        "--num-envs", "32", "--num-steps", "64", "--gamma", "0.999", "--learning-rate", "1e-3", "--no-cuda",
-        folder=folder, EPISODES=str(log), PYTHONPATH=str(HERE),
-    )  # fmt: skip
-    totals = [float(line) for line in log.read_text().split()]
-    first, last = statistics.mean(totals[:200]), statistics.mean(totals[-200:])
-    return f"{last:.1f} s (mean of the last 200 training episodes; the first 200: {first:.1f} s)"
+def table(rows, beside):
+    """Return the lines of a table of what the learners have learned."""
+    yield f"{len(WORLDS)} searches; first-free: {interval_text(*parted(beside), '.1f')} s"
+    yield "| learner | version | decisions | s | processor s | mean total, s | minus first-free, s |"
+    yield "|---|---|---:|---:|---:|---|---|"
+    for row in rows:
+        totals = np.array(row["totals"])
+        yield (
+            f"| {row['library']} | {row['version']} | {row['decisions']:,} | {row['seconds']:.0f} | "
+            f"{row['cpu_s']:.0f} | {interval_text(*parted(totals), '.1f')} | "
+            f"{interval_text(*parted(totals - beside), '+.1f')} |"
+        )
+
+
+def parted(sample):
+    """Return the mean of a sample and the ends of its interval."""
+    mean, *ends = mean_interval(sample)
+    return mean, ends
 
 
 def main():
@@ -94,41 +102,30 @@ def main():
         "names", nargs="*", choices=[*PACKAGES, []], help="learners; all of them if none is named"
     )
     parser.add_argument("--scenario", default="campus", help="a packaged car park")
-    parser.add_argument("--decisions", type=int, default=300_000)
+    parser.add_argument("--decisions", type=int, default=150_000)
     parser.add_argument(
-        "--folder", type=Path, default=Path("learners"), help="of the environments and results"
+        "--folder", type=Path, default=Path("learners"), help="of the environments and outputs"
     )
     parser.add_argument("--fresh", action="store_true", help="make the environments anew")
     parser.add_argument("--cleanrl", type=Path, help="CleanRL's ppo.py; fetched if not given")
     given = parser.parse_args()
     given.folder.mkdir(parents=True, exist_ok=True)
-    folder, wrong = given.folder.resolve(), 0
+    folder, rows, failed = given.folder.resolve(), [], 0
     for name in given.names or PACKAGES:
+        files = []
         try:
-            commands = make_environment(name, folder, given.fresh)
-            begun = time.perf_counter()
-            settings = commands, folder, given.scenario, given.decisions
-            if name == "rl-zoo3":
-                result = train_with_zoo(*settings)
-            elif name == "cleanrl":
-                file = given.cleanrl.resolve() if given.cleanrl else folder / "ppo.py"
-                if not file.exists():
-                    urlretrieve(CLEANRL, file)
-                result = train_with_cleanrl(*settings, file)
-            else:
-                said = run(
-                    commands / "python",
-                    HERE / f"with_{name}.py",
-                    given.scenario,
-                    given.decisions,
-                    folder=folder,
-                )
-                result = re.findall(r".* decisions .* s", said)[-1].strip()
-            print(f"{name:9} {time.perf_counter() - begun:5.0f} s  {result}", flush=True)
+            python = make_environment(name, folder, given.fresh)
+            if name == "cleanrl":
+                files = [given.cleanrl.resolve() if given.cleanrl else folder / "ppo.py"]
+                if not files[0].exists():
+                    urlretrieve(CLEANRL, files[0])
+            rows.append(train(name, python, folder, given.scenario, given.decisions, *files))
+            print(f"{name}: {rows[-1]['seconds']:.0f} s", flush=True)
         except (OSError, RuntimeError, subprocess.CalledProcessError) as error:
-            wrong += 1
-            print(f"{name:9}          failed: {error}", flush=True)
-    sys.exit(wrong)
+            failed += 1
+            print(f"{name} failed: {error}", flush=True)
+    print("\n".join(table(rows, first_free(given.scenario))))
+    sys.exit(failed)
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 import sys
 
 import torch
+from held_out import OPTIONS, tell
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.distributions import Categorical
@@ -12,20 +13,14 @@ from torchrl.modules import ProbabilisticActor, ValueOperator
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-import parkenv  # noqa: F401 - registers the environments
-
 SCENARIO, DECISIONS = sys.argv[1], int(sys.argv[2])
 BATCH, EPOCHS, MINIBATCH = 2048, 4, 512
 
 torch.manual_seed(0)
 torch.set_num_threads(1)
 env = TransformedEnv(
-    GymEnv(
-        "parkenv/Search-v2", scenario=SCENARIO, observation="local", flat=True, reward_scale=0.01,
-        max_episode_steps=500, categorical_action_encoding=True,
-    ),
-    RewardSum(),
-)  # fmt: skip
+    GymEnv("parkenv/Search-v2", scenario=SCENARIO, categorical_action_encoding=True, **OPTIONS), RewardSum()
+)
 env.set_seed(0)
 size = env.observation_spec["observation"].shape[-1]
 
@@ -35,8 +30,9 @@ def network(outputs):
     return nn.Sequential(nn.Linear(size, 64), nn.Tanh(), nn.Linear(64, 64), nn.Tanh(), nn.Linear(64, outputs))
 
 
+logits = network(5)
 actor = ProbabilisticActor(
-    TensorDictModule(network(5), ["observation"], ["logits"]),
+    TensorDictModule(logits, ["observation"], ["logits"]),
     in_keys=["logits"],
     spec=env.action_spec,
     distribution_class=Categorical,
@@ -61,3 +57,10 @@ for number, batch in enumerate(batches, 1):
     returns = batch["next", "episode_reward"].squeeze(-1)[ends]
     print(f"{number * BATCH:9,} decisions {-100.0 * returns.mean().item():7.1f} s", flush=True)
 batches.shutdown()
+
+tell(
+    "torchrl",
+    DECISIONS,
+    lambda observation: int(Categorical(logits=logits(torch.as_tensor(observation))).sample()),
+    SCENARIO,
+)

@@ -23,7 +23,7 @@ REAL_PLACES = ("place-01", "place-09", "place-17")
 def missing_peers() -> str:
     """Return why `PEERS` cannot be measured here; empty if they can."""
     if find_spec(LIBRARY) is None:
-        return needs_extra("pomdp-py", "pomdp")
+        return needs_extra("POUCT", "pomdp")
     if not ADAPTERS.exists():
         return f"their adapters, {ADAPTERS}, are not in the working directory"
     return ""
