@@ -49,6 +49,7 @@ if TYPE_CHECKING:
     from parkenv.forecast.counts import Counts
     from parkenv.forecast.day_forecast import DayForecast
     from parkenv.world.occupancy.counted import CountedOccupancy
+    from parkenv.world.occupancy.log import OccupancyLog
 
 LOT_KMH, TOWN_KMH = 10.0, 20.0
 """Default driving speeds: in a car park (the thesis's), and in a town, whose junctions are part of the mean."""
@@ -230,14 +231,13 @@ def _lot(spec: LotSpec) -> ParkingLot:
 def _occupancy(spec: OccupancySpec, lot: ParkingLot, goal: int) -> OccupancyModel:
     if spec.log is not None:
         from parkenv.forecast.counts import is_counts
-        from parkenv.world.occupancy.log import OccupancyLog
         from parkenv.world.occupancy.recorded import RecordedOccupancy, read_mapping, same_slots
 
         if is_counts(spec.log[0]):
             raise InputError(
                 f"{spec.log[0]}: has counts of car parks, want --car-park with it, or a table `counts`"
             )
-        log = OccupancyLog.read_all(spec.log)
+        log = _log(tuple(spec.log), tuple(map(_changed, spec.log)))
         mapped = None
         if spec.mapping == SAME_SLOTS:
             mapped = same_slots(lot.slot_ids, log)
@@ -282,8 +282,7 @@ def _own_world(text: str, lot: ParkingLot, goal: int) -> OccupancyModel:
 def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: int) -> CountedOccupancy:
     from parkenv.world.occupancy.counted import CountedOccupancy
 
-    changed = spec.file.stat().st_mtime_ns if spec.file.exists() else 0
-    counts, forecast = _forecast_counts(spec.file, changed, spec.timezone, first, past)
+    counts, forecast = _forecast_counts(spec.file, _changed(spec.file), spec.timezone, first, past)
     if spec.car_park not in counts.car_parks:
         counts.chosen([spec.car_park])  # says which names there are
     row, days = counts.car_parks.index(spec.car_park), slice(forecast.first, None)
@@ -298,10 +297,23 @@ def _counted(spec: CountsSpec, first: date, past: bool, lot: ParkingLot, goal: i
     )
 
 
+def _changed(file: Path) -> int:
+    """Return when a file was changed: another key of a cache."""
+    return file.stat().st_mtime_ns if file.exists() else 0
+
+
+@lru_cache(maxsize=2)
+def _log(files: tuple[Path, ...], changed: tuple[int, ...]) -> OccupancyLog:  # noqa: ARG001
+    """Read a log once for all scenarios that replay it: they share the models that are fitted to its days."""
+    from parkenv.world.occupancy.log import OccupancyLog
+
+    return OccupancyLog.read_all(files)
+
+
 @lru_cache(maxsize=2)
 def _forecast_counts(
     file: Path,
-    changed: int,  # noqa: ARG001 - when the file was changed: another key of the cache
+    changed: int,  # noqa: ARG001
     timezone: str,
     first: date,
     past: bool,

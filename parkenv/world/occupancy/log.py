@@ -6,12 +6,12 @@ was not observed on a day has no record of that day.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import date, datetime
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, Literal, NamedTuple, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -79,6 +79,9 @@ class _Periods(NamedTuple):
     seen: FloatArray
 
 
+_Model = TypeVar("_Model")
+
+
 @dataclass(frozen=True, eq=False)
 class OccupancyLog:
     """Observations of the slots of a lot over several days.
@@ -108,6 +111,7 @@ class OccupancyLog:
     # Record r = day * n_slots + slot: observations first[r] to first[r + 1]. Each state holds from from_s on.
     first: IntArray = field(init=False, repr=False)
     from_s: FloatArray = field(init=False, repr=False)
+    _models: dict[tuple[Any, ...], Any] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         slot, day = np.asarray(self.slot, np.int64), np.asarray(self.day, np.int64)
@@ -208,6 +212,14 @@ class OccupancyLog:
         for path in paths[1:]:
             log = log._with(cls.read(path))
         return log
+
+    def fitted(self, what: str, days: IntArray, fit: Callable[[IntArray], _Model]) -> _Model:
+        """Return a model of some of the days: fitted once, however many scenarios replay the log."""
+        key = (what, *days.tolist())
+        if key not in self._models:
+            self._models[key] = fit(days)
+        model: _Model = self._models[key]
+        return model
 
     def _with(self, other: Self) -> Self:
         odd = set(self.slot_ids) ^ set(other.slot_ids)

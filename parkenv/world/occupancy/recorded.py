@@ -20,7 +20,7 @@ from parkenv.compiled.memory import address_of, float64s, int64s, uint8s
 from parkenv.errors import InputError, require_one_of
 from parkenv.files.known_names import FORECAST_FROM, ForecastFrom
 from parkenv.files.limited_reading import csv_rows
-from parkenv.forecast.slot_days import MAX_DAYS, FittedSlotDays, fit_slot_days
+from parkenv.forecast.slot_days import MAX_DAYS, fit_slot_days
 from parkenv.world.occupancy.arrival_window import DAY_NAMES, ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS, DayError
 from parkenv.world.occupancy.fit import fit_hourly_decay_rates
@@ -240,7 +240,6 @@ class RecordedOccupancy(OccupancyModel):
     forecast_from: ForecastFrom = "others"
     _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
     _forecasts: dict[int, ReplayForecast] = field(init=False, repr=False, default_factory=dict)
-    _fitted: dict[tuple[int, ...], FittedSlotDays] = field(init=False, repr=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         walk = np.array(self.walk_m, float)
@@ -392,14 +391,12 @@ class RecordedOccupancy(OccupancyModel):
 
     def _forecast_day(self, day: int, mapped: MappedLog) -> ReplayForecast:
         log, known = self.log, mapped.known
-        rates = self._decay_rates(known)
+        rates = log.fitted("decay rates", known, self._decay_rates)
         days_away = np.abs(log.dates(known).number - log.dates([day]).number)
         nearest = np.sort(known[np.argsort(days_away, kind="stable")[:MAX_DAYS]])
-        key = tuple(nearest.tolist())
-        if key not in self._fitted:
-            self._fitted[key] = fit_slot_days(log.slot_days(nearest))
+        fitted = log.fitted("slot days", nearest, lambda days: fit_slot_days(log.slot_days(days)))
         replayed, which = np.unique(mapped.replayed, return_inverse=True)
-        found = self._fitted[key].forecast(log.dates(replayed))
+        found = fitted.forecast(log.dates(replayed))
         share = np.bincount(which) / which.size
         level = np.sqrt(np.einsum("j,pjk,k->p", share, found.level_covariance, share))
         p = np.clip(found.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
