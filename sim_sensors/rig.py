@@ -165,6 +165,19 @@ class SensorRig:
             lasers=(("laser", LaserScanner(), Mount(z=0.5)),),
         )
 
+    def mirrored(self) -> SensorRig:
+        """Return the rig for a car that keeps to the left: what was on its right is on its left."""
+        names = {"right": "left", "left": "right"}
+
+        def there(name: str, mount: Mount) -> tuple[str, Mount]:
+            return names.get(name, name), replace(mount, y=-mount.y, yaw=-mount.yaw)
+
+        mirrored = {
+            kind: tuple((there(n, m)[0], sensor, there(n, m)[1]) for n, sensor, m in getattr(self, kind))
+            for kind in ("cameras", "stereo_cameras", "lasers")
+        }
+        return replace(self, **mirrored)
+
     def resized(self, width: int) -> SensorRig:
         """Return the rig with pictures of another width, px: smaller ones are drawn and looked at faster.
 

@@ -203,6 +203,7 @@ class Import(Command):
         parse=lambda text: tuple(numbers_in(text, 3)),
     )
     disabled: bool = option(False, "Also import spaces for disabled drivers.")
+    left_hand: bool = option(False, "Traffic keeps to the left; no map says so.")
     split: bool = option(
         False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
     )
@@ -236,11 +237,11 @@ class Import(Command):
             raise PydanticCustomError("whole", "--split and --town: want one of them")
         if self.around is not None and self.bounds is not None:
             raise PydanticCustomError("whole", "--bounds and --around: want one of them")
-        if self.split and (points or self.box or self.picture):
+        if self.split and (points or self.box or self.picture or self.left_hand):
             raise PydanticCustomError(
                 "whole",
                 "--split finds entries, goals and places itself, want no --entry, --goal, --bounds, --around, "
-                "--picture",
+                "--picture, --left-hand",
             )
         if (self.car_parks is not None and not self.town) or (self.listed_only and self.car_parks is None):
             raise PydanticCustomError("whole", "--car-parks wants --town, --listed-only wants --car-parks")
@@ -314,6 +315,7 @@ class Import(Command):
                 untagged_kerbs=self.untagged_kerbs,
             )  # fmt: skip
         draft = town.draft if town is not None else import_lot(self.place, self._options)
+        draft = draft.in_left_hand_traffic() if self.left_hand else draft
         for line in draft.found:
             console.print(line)
         for guess in draft.guesses:

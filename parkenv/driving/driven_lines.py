@@ -91,7 +91,9 @@ class DrivenLines:
         for lane in lot.lanes:
             for points in (lane.points,) if lane.oneway else (lane.points, lane.points[::-1]):
                 self._centers.append(points)
-                self.lines.append(DrivenLine(_offset_line(points, 0.0 if lane.oneway else KEPT_RIGHT_M)))
+                self.lines.append(
+                    DrivenLine(_offset_line(points, 0.0 if lane.oneway else lot.side * KEPT_RIGHT_M))
+                )
         self._aside = np.array([abs(LANE_OFFSET - KEPT_RIGHT_M) * (not lane.oneway) for lane in lot.lanes])
         self._aside = np.repeat(self._aside, [1 if lane.oneway else 2 for lane in lot.lanes])
         self._middles = np.array([shapely.LineString(points) for points in self._centers])

@@ -298,7 +298,7 @@ class ParkingTasks:
             station = np.clip(at - direction * rng.uniform(*self.distance), 0.0, line.length)
             ahead = direction * _tangent(line, station)
             right = np.array([ahead[1], -ahead[0]])
-            aside = (0.0 if oneway else LANE_OFFSET) + rng.uniform(-_ASIDE, _ASIDE)
+            aside = (0.0 if oneway else lot.side * LANE_OFFSET) + rng.uniform(-_ASIDE, _ASIDE)
             xy = shapely.get_coordinates(line.interpolate(station))[0] + aside * right
             yaw = math.atan2(ahead[1], ahead[0]) + rng.uniform(-_ASKEW, _ASKEW)
             pose = self.vehicle.at_rear_axle(np.array([*xy, yaw]))

@@ -57,6 +57,7 @@ def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int
         raise InputError(f"rig is {rig!r}, want a SensorRig or one of {', '.join(RIG_NAMES)}")
     else:
         made, width = SensorRig.named(rig), PICTURE_WIDTH if picture_width is None else picture_width
+        made = made.mirrored() if scenario.lot.left_hand else made
     if width is None:
         return made
     require_whole("picture_width", width, least=64)

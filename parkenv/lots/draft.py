@@ -15,7 +15,7 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.quality import QualityIssue
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import Facility
-from parkenv.world.lot import Lane, ParkingLot, Turn
+from parkenv.world.lot import Lane, Mouth, ParkingLot, Turn
 from parkenv.world.tariff import Zone
 
 NEAR_ON_GLOBE = 1.0
@@ -111,6 +111,7 @@ class LotDraft:
     goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_goals,)
     entry_weights: Mapping[str, FloatArray] = field(default_factory=dict)  # by purpose, (n_entries,)
     turns: tuple[Turn, ...] = ()  # those that cars may not make, or that are the only ones
+    left_hand: bool = False  # whether cars keep to the left
 
     @classmethod
     def of_lot(cls, lot: ParkingLot) -> LotDraft:
@@ -130,6 +131,7 @@ class LotDraft:
             goal_weights=lot.goal_weights,
             entry_weights=lot.entry_weights,
             turns=lot.turns,
+            left_hand=lot.left_hand,
         )
 
     def lot(self) -> ParkingLot:
@@ -161,6 +163,7 @@ class LotDraft:
             goal_weights=self.goal_weights,
             entry_weights=self.entry_weights,
             turns=self.turns,
+            left_hand=self.left_hand,
         )
 
     def searchable(self) -> LotDraft:
@@ -184,6 +187,22 @@ class LotDraft:
             return self
         ids = tuple(self.slot_ids[i] for i in np.flatnonzero(lost))
         return self._without(lost, LeftOut("slots that cannot be reached from an entry", ids))
+
+    def in_left_hand_traffic(self) -> LotDraft:
+        """Return the draft where cars keep to the left, and those parked along a lane head the way of its traffic.
+
+        An incomplete draft keeps its slots.
+        """
+        draft = replace(self, left_hand=True)
+        try:
+            lot = draft._lot()
+        except InputError:
+            return draft
+        slots, along = self.slots, np.cos(self.slots.yaw - lot.vertex_yaw[: len(self.slots)])
+        turned = (slots.mouth != Mouth.REAR) & (along < 0.0)
+        # Heading the other way, its left side is the right one.
+        mouth = np.where(turned, Mouth.LEFT + Mouth.RIGHT - slots.mouth, slots.mouth).astype(np.int8)
+        return replace(draft, slots=replace(slots, yaw=slots.yaw + np.pi * turned, mouth=mouth))
 
     def _without(self, lost: BoolArray, left_out: LeftOut) -> LotDraft:
         """Return the draft without slots, (n_slots,) bool, and facilities that are left out or have no slots then."""

@@ -129,11 +129,11 @@ def _straight_on(lot: ParkingLot, vertex: int) -> tuple[int | None, float]:
 
 
 def _left_slots(lot: ParkingLot, way: _Pass) -> int:
-    """Return the number of slots on the left of a section."""
+    """Return the number of slots on the far side of a section, where no camera looks."""
     slots = np.array(way.stops[1:-1], dtype=np.int64)
     yaw = lot.vertex_yaw[slots]
     away = lot.slot_xy[slots] - lot.vertex_xy[slots]
-    return int((np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0] > 0.0).sum())
+    return int((lot.side * (np.cos(yaw) * away[:, 1] - np.sin(yaw) * away[:, 0]) > 0.0).sum())
 
 
 def _join(drive: nx.MultiDiGraph[Any], ways: nx.DiGraph[Any], start: int) -> None:

@@ -130,6 +130,7 @@ class Survey:
         self.scenario = scenario
         self.settings = settings or SurveySettings()
         rig = SensorRig.named(self.settings.rig)
+        rig = rig.mirrored() if scenario.lot.left_hand else rig
         if self.settings.picture_width is not None:
             rig = rig.resized(self.settings.picture_width)
         noise = self.settings.pose_noise

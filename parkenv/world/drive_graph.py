@@ -119,6 +119,7 @@ def build_drive_graph(
     mouth_xy: FloatArray,
     entry_xy: FloatArray,
     turns: Sequence[TurnParts] = (),
+    side: int = 1,
 ) -> DriveGraph:
     """Build the drive graph: assign slots and entries to lanes, and connect vertices by moves.
 
@@ -128,6 +129,7 @@ def build_drive_graph(
         mouth_xy: (n_slots, 2) m, middle of the side by which each slot is entered.
         entry_xy: (n_entries, 2) m.
         turns: those that cars may not make, or that are the only ones.
+        side: 1 where cars keep to the right, -1 where they keep to the left and all of this is its mirror image.
 
     Raises:
         GraphError: a slot or an entry out of reach of all lanes, a junction with more than four lanes out, or a turn
@@ -141,7 +143,7 @@ def build_drive_graph(
     segment = lines.leg_segment[leg]
     # Chain 2k runs along segment k and serves its right side, 2k+1 runs against it and serves the left;
     # a one-way segment has the first only.
-    against = left & ~lines.segment_oneway[segment]
+    against = (left == (side > 0)) & ~lines.segment_oneway[segment]
     chain = 2 * segment + against
     order = np.lexsort((station * np.where(against, -1.0, 1.0), chain))
     station = _spread(lines, station, segment, chain, order)
@@ -149,12 +151,12 @@ def build_drive_graph(
     leg = lines.legs_at(station)
     tangent = lines.leg_tangent[leg] * np.where(against, -1.0, 1.0)[:, None]
     right = np.stack([tangent[:, 1], -tangent[:, 0]], axis=1)
-    offset = np.where(lines.segment_oneway[segment], 0.0, LANE_OFFSET)
+    offset = np.where(lines.segment_oneway[segment], 0.0, side * LANE_OFFSET)
     slot_vertex_xy = lines.points_at(station, leg) + offset[:, None] * right
 
     along = _chain_edges(lines, station, tangent, chain, order, n_slots)
     along, node = _turning_edges(lines.chains, turns, along, n_slots)
-    edges = [along, *_crossing_edges(lines, station, tangent, segment, against)]
+    edges = [along, *_crossing_edges(lines, station, side * tangent, segment, against)]
     source, target, length, bearing, of = (np.concatenate(part) for part in zip(*edges, strict=True))
     neighbors, edge_length, edge_speed = _four_columns(
         n_slots + len(node),

@@ -43,7 +43,7 @@ class Lane:
 
     Args:
         points: (k, 2) float64, m, lot frame, k ≥ 2. Lanes are connected where they share a point.
-        oneway: whether cars may drive only in the order of the points; otherwise they keep to the right.
+        oneway: whether cars may drive only in the order of the points; otherwise they keep to their side.
         speed: how fast cars drive there, as a multiple of the scenario's driving speed.
 
     Raises:
@@ -144,6 +144,7 @@ class ParkingLot:
         goal_weights: how much demand each goal attracts, (n_goals,) float64 by purpose of the drivers; empty: unknown.
         entry_weights: how much demand comes from each entry, (n_entries,) float64 by purpose; empty: unknown.
         turns: those that cars may not make at junctions, or that are the only ones.
+        left_hand: whether cars keep to the left of two-way lanes, not to the right.
 
     Attributes:
         vertex_xy: (n_vertices, 2) float64, m.
@@ -193,6 +194,7 @@ class ParkingLot:
     goal_weights: Mapping[str, FloatArray] = field(default_factory=dict)
     entry_weights: Mapping[str, FloatArray] = field(default_factory=dict)
     turns: tuple[Turn, ...] = ()
+    left_hand: bool = False
 
     vertex_xy: FloatArray = field(init=False)
     vertex_yaw: FloatArray = field(init=False)
@@ -257,6 +259,7 @@ class ParkingLot:
             self.mouth_xy(),
             self.entries,
             [(turn.points, turn.only) for turn in self.turns],
+            self.side,
         )
         for name in ("vertex_xy", "vertex_yaw", "neighbors", "edge_length", "edge_speed", "entry_vertices"):
             values = getattr(graph, name)
@@ -439,6 +442,11 @@ class ParkingLot:
     def is_town(self) -> bool:
         """Whether there are kerbs, car parks or garages, so that a car drives some way before it can park."""
         return bool(self.facilities)
+
+    @property
+    def side(self) -> int:
+        """1 where cars keep to the right, -1 where to the left: the sign of what lies on the driver's kerb side."""
+        return -1 if self.left_hand else 1
 
     @property
     def is_counted(self) -> NDArray[np.bool_]:

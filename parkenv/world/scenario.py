@@ -301,15 +301,15 @@ class SearchProblem:
     def sight_lines(self) -> tuple[FloatArray, NDArray[np.bool_]]:
         """Distance, m, of each of `slots_in_view`, and whether it is beside the car.
 
-        Distances are between vertices, like the view range. A slot is beside a car at a slot's vertex if it lies to the
-        right, within 45° of the perpendicular.
+        Distances are between vertices, like the view range. A slot is beside a car at a slot's vertex if it lies on its
+        kerb side, within 45° of the perpendicular.
         """
         starts, slots = self.slots_in_view
         viewer = np.repeat(np.arange(self.lot.n_vertices), np.diff(starts))
         away = self.lot.vertex_xy[slots] - self.lot.vertex_xy[viewer]
         to_slot = self.lot.slot_xy[slots] - self.lot.vertex_xy[viewer]
         angle = np.arctan2(to_slot[:, 1], to_slot[:, 0]) - self.lot.vertex_yaw[viewer]
-        beside = (np.sin(angle) <= -math.sqrt(0.5)) & (viewer < self.lot.n_slots)
+        beside = (self.lot.side * np.sin(angle) <= -math.sqrt(0.5)) & (viewer < self.lot.n_slots)
         return _read_only(np.hypot(away[:, 0], away[:, 1])), _read_only(beside)
 
     @cached_property

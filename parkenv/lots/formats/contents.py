@@ -72,6 +72,7 @@ class LotContents:
     goals: list[FloatArray] = field(default_factory=list)
     walls: list[FloatArray] = field(default_factory=list)
     turns: list[Turn] = field(default_factory=list)
+    left_hand: bool = False
     facilities: list[Facility] = field(default_factory=list)
     zone_rules: dict[str, Zone] = field(default_factory=dict)
     # by kind, `goal` or `entry`: the weights by purpose of each
@@ -94,6 +95,7 @@ class LotContents:
             "goal_weights": self._weights("goal"),
             "entry_weights": self._weights("entry"),
             "turns": tuple(self.turns),
+            "left_hand": self.left_hand,
         }
 
     def _weights(self, kind: str) -> dict[str, FloatArray]:

@@ -18,7 +18,8 @@ make it; true: they may make no other |
 | `facility` | Point | `name`, `type` (kerb, lot, garage), `zone`; a counted one `capacity`, `gate_s`, `inside_s`, \
 `known` (nothing, sign, live), `delay_s` |
 
-The member `zones` has the rules of zones by name (`parkenv.lots.formats.geojson_supply`).
+The member `traffic` is `left` where cars keep to the left; `zones` has the rules of zones by name
+(`parkenv.lots.formats.geojson_supply`).
 
 A file made by an import may have the member `import`: its source, what was guessed, and what may be wrong with it.
 """
@@ -74,6 +75,8 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
         "parkenv": {"format": "lot", "version": LOT_VERSION},
         "frame": "local",
     }
+    if lot.left_hand:
+        head["traffic"] = "left"
     if provenance is not None:
         head["import"] = provenance.document()
     if lot.zone_rules:
@@ -167,6 +170,7 @@ def read_contents(path: Path) -> LotContents:
         contents.name = _check_head(document, path.stem)
         system = Positions(True) if "frame" in document else Positions.of(document, path)
         contents.found = system.found
+        contents.left_hand = _keeps_left(document)
         contents.zone_rules = read_zones(document.get("zones", {}))
     except InputError as error:
         contents.error(None, str(error))
@@ -269,6 +273,13 @@ def _check_head(document: Any, stem: str) -> str:
     if document.get("frame", "local") != "local":
         raise InputError(f"frame is {document['frame']!r:.40}, want 'local', or no frame for lon/lat")
     return name
+
+
+def _keeps_left(document: dict[str, Any]) -> bool:
+    traffic = document.get("traffic", "right")
+    if traffic not in ("left", "right"):
+        raise InputError(f"traffic is {traffic!r:.40}, want 'left' or 'right'")
+    return bool(traffic == "left")
 
 
 def _check_feature(

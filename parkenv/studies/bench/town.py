@@ -191,7 +191,11 @@ def _one_way(lot: ParkingLot) -> tuple[tuple[Lane, ...], tuple[Turn, ...]]:
         for begin, end in itertools.pairwise(cuts):
             part = lane.points[begin : end + 1]
             old += [part] if lane.oneway else [part, part[::-1]]
-            made += [Lane(part, oneway=True)] if lane.oneway else [_shifted(part), _shifted(part[::-1])]
+            made += (
+                [Lane(part, oneway=True)]
+                if lane.oneway
+                else [_shifted(part, lot.side), _shifted(part[::-1], lot.side)]
+            )
 
     def beside(at: FloatArray, point: FloatArray, end: int, inner: int) -> FloatArray:
         """Return the point next to a junction on the lane that leads a way."""
@@ -209,11 +213,11 @@ def _one_way(lot: ParkingLot) -> tuple[tuple[Lane, ...], tuple[Turn, ...]]:
     return tuple(made), tuple(turns)
 
 
-def _shifted(points: FloatArray) -> Lane:
-    """Return the lane to the right of a line, with the same ends."""
+def _shifted(points: FloatArray, side: int) -> Lane:
+    """Return the lane on the kerb side of a line, with the same ends."""
     step = np.diff(points, axis=0)
     length = np.hypot(*step.T)[:, None]
-    right = np.stack([step[:, 1], -step[:, 0]], axis=1) / length * SHIFT
+    right = np.stack([step[:, 1], -step[:, 0]], axis=1) / length * (side * SHIFT)
     margin = np.minimum(1.0, length / 4.0) * step / length
     beside = np.concatenate([points[:-1] + margin + right, points[1:] - margin + right], axis=1).reshape(
         -1, 2
