@@ -25,7 +25,8 @@ from planners.driving.manoeuvre import Manoeuvre
 _SPEED, _ACCELERATION, _INTERVAL_S = 1.5, 0.7, 0.25  # m/s, m/s², s, of the first reference
 _LEAST_KNOTS = 6  # of a phase, from one change of direction to the next
 _REACH_M = 1.5  # greatest growth of a box around the car, m, to each side
-_CLEAR_M = (0.03, 0.06, 0.1)  # distance of the boxes from obstacles, m, tried in order
+# Distance of the boxes from obstacles, m, and at most as a share of what the given drive has, tried in order.
+_CLEAR = ((0.03, 0.4), (0.06, 0.7), (0.1, 0.95))
 _SHARE = 0.92  # of the limits; the rest is for feedback
 _WHEELS = 0.975  # likewise, of the steering angle
 _GAIN = 1.2  # 1/m and 1/s
@@ -55,11 +56,12 @@ def shorten(made: Manoeuvre, deadline_s: float) -> Manoeuvre:
     until = time.perf_counter() + deadline_s
     if made.path is None or not made.judged().driven:
         return made
-    best, least_m = made, min(made.judged().clearance_m, _LEAST_CLEAR_M)
-    for clear_m in _CLEAR_M:
+    room_m = made.judged().clearance_m
+    best, least_m = made, min(room_m, _LEAST_CLEAR_M)
+    for clear_m, share in _CLEAR:
         reference = _first(made)
         while (left := until - time.perf_counter()) > 0.0:
-            found = _solve(made.scene, reference, min(clear_m, 0.4 * made.judged().clearance_m), left)
+            found = _solve(made.scene, reference, min(clear_m, share * room_m), left)
             if found is None:
                 break
             driven = dataclasses.replace(made, states=follow(made.scene.vehicle, found, made.states[0]))
