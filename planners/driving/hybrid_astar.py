@@ -34,7 +34,7 @@ _TABLE, _SPREAD = (
     1 << 17,
     0x9E3779B1,
 )  # size of the hash table of cells, and a factor that spreads them over it
-_TIGHT_CELL_M, _TIGHT_YAW_CELLS = 0.02, 720
+_TIGHT_CELL_M, _TIGHT_YAW_CELLS, _FINE_BELOW_M = 0.02, 720, 0.01  # halved where a move has less clearance
 _SHORTEST_M, _LONGEST_M = 0.02, 1.5  # of moves that end where the car would touch something
 
 
@@ -180,6 +180,8 @@ def _search(
     # millimetres, so cells are small there; else each move would end in the cell where it started.
     tight = move == 0.0
     cell, yaw_cells = (_TIGHT_CELL_M, _TIGHT_YAW_CELLS) if tight else (0.5 * move, round(36.0 / move))
+    if tight and costs.margin < _FINE_BELOW_M:
+        cell, yaw_cells = 0.5 * cell, 2 * yaw_cells
     rows, columns = space.field.shape[0] * CELL_M / cell + 1.0, space.field.shape[1] * CELL_M / cell + 1.0
     node_of, cell_of = np.full(_TABLE, -1, np.int32), np.empty(_MOST_NODES, np.int64)
     pose, cost = np.empty((_MOST_NODES, 3)), np.empty(_MOST_NODES)

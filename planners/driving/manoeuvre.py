@@ -26,10 +26,10 @@ SEARCH = SearchSettings(
     attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.05, 0.5)),
 )
 """Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
-TIGHT = dataclasses.replace(
-    SEARCH, most_expansions=6_000, attempts=((0.05, 0.0), (0.02, 0.0), (0.01, 0.0), (0.004, 0.0))
-)
+TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.05, 0.0), (0.02, 0.0), (0.01, 0.0)))
 """Settings of the search out of the tightest slots."""
+FINEST = dataclasses.replace(SEARCH, most_expansions=12_000, attempts=((0.008, 0.0), (0.004, 0.0)))
+"""Settings of the last search, out of slots hardly longer than the car."""
 WIDE_M = 25.0
 """Margin, m, around start and target of the search for ways around."""
 EXACT = TrackingSettings(
@@ -134,7 +134,7 @@ def plan_in_scene(scene: Scene) -> CarPath | None:
     second = [(TIGHT, True, WINDOW_M), (SEARCH, True, WIDE_M)]
     for settings, from_tighter, window_m in (
         (SEARCH, True, WINDOW_M), *(second if min(ways) < _TIGHT_WAY_M else second[::-1]), (SEARCH, False, WINDOW_M),
-        (TIGHT, False, WINDOW_M),
+        (TIGHT, False, WINDOW_M), (FINEST, True, WINDOW_M),
     ):  # fmt: skip
         obstacles = scene.obstacles.corners, scene.obstacles.n_corners
         # The search begins at the last pose.
