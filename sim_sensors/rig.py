@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -167,16 +167,12 @@ class SensorRig:
 
     def mirrored(self) -> SensorRig:
         """Return the rig for a car that keeps to the left: what was on its right is on its left."""
-        names = {"right": "left", "left": "right"}
 
-        def there(name: str, mount: Mount) -> tuple[str, Mount]:
-            return names.get(name, name), replace(mount, y=-mount.y, yaw=-mount.yaw)
+        def across(sensors: Any) -> Any:
+            other = {"right": "left", "left": "right"}
+            return tuple((other.get(n, n), s, replace(m, y=-m.y, yaw=-m.yaw)) for n, s, m in sensors)
 
-        mirrored = {
-            kind: tuple((there(n, m)[0], sensor, there(n, m)[1]) for n, sensor, m in getattr(self, kind))
-            for kind in ("cameras", "stereo_cameras", "lasers")
-        }
-        return replace(self, **mirrored)
+        return SensorRig(across(self.cameras), across(self.stereo_cameras), across(self.lasers))
 
     def resized(self, width: int) -> SensorRig:
         """Return the rig with pictures of another width, px: smaller ones are drawn and looked at faster.

@@ -21,6 +21,12 @@ from parkenv.world.tariff import Zone
 NEAR_ON_GLOBE = 1.0
 """Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""
 
+_SHARED = (
+    "name", "slot_ids", "lanes", "entries", "goals", "walls", "facilities", "zone_rules", "goal_weights",
+    "entry_weights", "turns", "left_hand",
+)  # fmt: skip
+"""Fields that a draft and its lot have in common."""
+
 
 @dataclass(frozen=True)
 class ImportOptions:
@@ -117,21 +123,10 @@ class LotDraft:
     def of_lot(cls, lot: ParkingLot) -> LotDraft:
         """Return the draft of a complete lot."""
         return cls(
-            name=lot.name,
-            slot_ids=lot.slot_ids,
+            **{name: getattr(lot, name) for name in _SHARED},
             slots=Slots.of_lot(lot),
             slot_source=("the lot file",) * lot.n_slots,
-            lanes=lot.lanes,
-            entries=lot.entries,
-            goals=lot.goals,
-            walls=lot.walls,
             found=(f"slots: {lot.n_slots}, lanes: {len(lot.lanes)}, of a lot file",),
-            facilities=lot.facilities,
-            zone_rules=lot.zone_rules,
-            goal_weights=lot.goal_weights,
-            entry_weights=lot.entry_weights,
-            turns=lot.turns,
-            left_hand=lot.left_hand,
         )
 
     def lot(self) -> ParkingLot:
@@ -150,21 +145,7 @@ class LotDraft:
     def _lot(self) -> ParkingLot:
         if self.missing:
             raise InputError("; ".join(self.missing))
-        return ParkingLot(
-            name=self.name,
-            slot_ids=self.slot_ids,
-            **self.slots.columns(),
-            lanes=self.lanes,
-            entries=self.entries,
-            goals=self.goals,
-            walls=self.walls,
-            facilities=self.facilities,
-            zone_rules=self.zone_rules,
-            goal_weights=self.goal_weights,
-            entry_weights=self.entry_weights,
-            turns=self.turns,
-            left_hand=self.left_hand,
-        )
+        return ParkingLot(**{name: getattr(self, name) for name in _SHARED}, **self.slots.columns())
 
     def searchable(self) -> LotDraft:
         """Return the draft without slots and facilities that no entry leads to; they are listed in `left_out`.

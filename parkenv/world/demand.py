@@ -49,22 +49,10 @@ from parkenv.world.recorded_demand import recorded_demand
 from parkenv.world.week import HOUR_S
 
 __all__ = [
-    "Arrivals",
-    "CarPlans",
-    "ConstantTime",
-    "Demand",
-    "Duration",
-    "EmpiricalTime",
-    "ExponentialTime",
-    "FollowingArrivals",
-    "Headways",
-    "ListedArrivals",
-    "LogNormalTime",
-    "NoArrivals",
-    "PoissonArrivals",
-    "TownDemand",
+    "Arrivals", "CarPlans", "ConstantTime", "Demand", "Duration", "EmpiricalTime", "ExponentialTime",
+    "FollowingArrivals", "Headways", "ListedArrivals", "LogNormalTime", "NoArrivals", "PoissonArrivals", "TownDemand",
     "weights_of_all",
-]
+]  # fmt: skip
 
 MAX_CLASSES = 60
 """Maximum number of classes of drivers."""

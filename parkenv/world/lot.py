@@ -37,8 +37,20 @@ class Mouth(IntEnum):
     RIGHT = 2  # kerbside slots to the left of their lane
 
 
+class _ByValue:
+    """What equals another one of its class if all fields do, arrays among them."""
+
+    def __eq__(self, other: object) -> bool:
+        if type(other) is not type(self):
+            return NotImplemented
+        names = [f.name for f in fields(self)]  # type: ignore[arg-type]
+        return all(_same(getattr(self, name), getattr(other, name)) for name in names)
+
+    __hash__ = None  # type: ignore[assignment]
+
+
 @dataclass(frozen=True, eq=False)
-class Lane:
+class Lane(_ByValue):
     """A drivable centre line.
 
     Args:
@@ -67,18 +79,9 @@ class Lane:
             raise InputError(f"lane points[{short[0]}] and [{short[0] + 1}] are equal, want different points")
         object.__setattr__(self, "points", points)
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Lane):
-            return NotImplemented
-        return (self.oneway, self.speed) == (other.oneway, other.speed) and np.array_equal(
-            self.points, other.points
-        )
-
-    __hash__ = None  # type: ignore[assignment]
-
 
 @dataclass(frozen=True, eq=False)
-class Turn:
+class Turn(_ByValue):
     """A turn restriction: a turn at a junction that is prohibited, or mandatory.
 
     Args:
@@ -102,16 +105,9 @@ class Turn:
         _require_finite("turn points", points)
         object.__setattr__(self, "points", points)
 
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, Turn):
-            return NotImplemented
-        return self.only == other.only and np.array_equal(self.points, other.points)
-
-    __hash__ = None  # type: ignore[assignment]
-
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ParkingLot:
+class ParkingLot(_ByValue):
     """A parking lot: slots, lanes, entries, goals and walls, and the drive graph between slots.
 
     Units are metres in a local frame, x east and y north; yaw is counter-clockwise from x, in radians. The drive
@@ -407,13 +403,6 @@ class ParkingLot:
             if name in seen:
                 raise InputError(f"lot {self.name!r}: slot id {name!r} appears twice")
             seen.add(name)
-
-    def __eq__(self, other: object) -> bool:
-        if not isinstance(other, ParkingLot):
-            return NotImplemented
-        return all(_same(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
-
-    __hash__ = None  # type: ignore[assignment]
 
     def __repr__(self) -> str:
         return f"ParkingLot({self.name!r}, {self.n_slots} slots, {self.n_vertices} vertices)"

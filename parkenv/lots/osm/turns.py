@@ -15,7 +15,7 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmMap
 from parkenv.world.drive_graph import NODE_TOLERANCE, centrelines
 from parkenv.world.lot import Lane, Turn
-from parkenv.world.turns import Chains, Rule, connected, forbidden_after, rules_of
+from parkenv.world.turns import Chains, Rule, connected, rules_of
 
 NO_LANE, SPLIT, CUTS = (
     "on streets that are no lanes",
@@ -97,21 +97,18 @@ def _reasons(lanes: Sequence[Lane], turns: Sequence[Turn], split: Sequence[bool]
         SPLIT if its else "" if isinstance(rule, Rule) else NO_LANE
         for its, rule in zip(split, rules, strict=True)
     ]
-    left = [i for i, reason in enumerate(why) if not reason]
-    kept = _without_cuts(chains, [rule for i in left if isinstance(rule := rules[i], Rule)])
-    for i, fits in zip(left, kept.tolist(), strict=True):
+    left = [(i, rule) for i, rule in enumerate(rules) if isinstance(rule, Rule) and not why[i]]
+    kept = _without_cuts(chains, [rule for _, rule in left])
+    for (i, _), fits in zip(left, kept.tolist(), strict=True):
         why[i] = "" if fits else CUTS
-    left = [i for i, reason in enumerate(why) if not reason]
-    for k in forbidden_after(chains, [(turns[i].points, turns[i].only) for i in left])[1]:
-        why[left[k]] = CUTS
     return why
 
 
 def _without_cuts(chains: Chains, rules: Sequence[Rule]) -> BoolArray:
     """Return which rules leave each chain connected with the others, (n,) bool: those that do not are tried last."""
-    whole = connected(chains, [])
-    kept = np.ones(len(rules), bool)
-    node = chains.last[[rule.chain for rule in rules]] if rules else np.zeros(0, np.int64)
+    whole, of = connected(chains, []), np.array([rule.chain for rule in rules], np.int64)
+    node, inside = chains.last[of], whole[of]
+    kept = inside.copy()
 
     def lost() -> BoolArray:
         return whole & ~connected(chains, [rule for rule, its in zip(rules, kept, strict=True) if its])
@@ -119,7 +116,7 @@ def _without_cuts(chains: Chains, rules: Sequence[Rule]) -> BoolArray:
     while (cut := np.flatnonzero(lost())).size:
         touching = kept & np.isin(node, [chains.first[cut], chains.last[cut]])
         kept &= ~(touching if touching.any() else kept)
-    for i in np.flatnonzero(~kept).tolist():
+    for i in np.flatnonzero(inside & ~kept).tolist():
         kept[i] = True
         kept[i] = not lost().any()
     return kept
