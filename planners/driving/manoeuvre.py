@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -105,25 +106,28 @@ def park(scene: Scene) -> Manoeuvre:
     """Plan a path from a scene's start to its target, and drive it.
 
     The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
-    and stops to turn its wheels. The planner knows the vehicle's model, so it finds that out before it drives.
+    and stops to turn its wheels, or on another path. The planner knows the vehicle's model, so it finds that out first.
     """
-    began = time.perf_counter()
-    path = plan_in_scene(scene)
-    planning_s = time.perf_counter() - began
     start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
-    if path is None:
+    paths, planning_s, tried = paths_in_scene(scene), 0.0, list[tuple[Judgement, Manoeuvre]]()
+    while not any(judged.driven for judged, _ in tried):
+        began = time.perf_counter()
+        path = next(paths, None)
+        planning_s += time.perf_counter() - began
+        if path is None:
+            break
+        for tracking in (TrackingSettings(), EXACT):
+            made = Manoeuvre(scene, path, drive(scene.vehicle, path, start, tracking), planning_s)
+            tried.append((made.judged(), made))
+            if tried[-1][0].driven and tried[-1][0].clearance_m >= _CLOSE_M:
+                return made
+    if not tried:
         return Manoeuvre(scene, None, start[None], planning_s)
-    made = Manoeuvre(scene, path, drive(scene.vehicle, path, start, TrackingSettings()), planning_s)
-    driven = made.judged()
-    if driven.driven and driven.clearance_m >= _CLOSE_M:
-        return made
-    states = drive(scene.vehicle, path, start, EXACT)
-    exact = Manoeuvre(scene, path, states, planning_s)
-    return max(made, exact, key=lambda each: (each.judged().driven, each.judged().clearance_m))
+    return max(tried, key=lambda each: (each[0].driven, each[0].clearance_m))[1]
 
 
-def plan_in_scene(scene: Scene) -> CarPath | None:
-    """Plan a path from a scene's start to its target; None if none was found.
+def paths_in_scene(scene: Scene) -> Iterator[CarPath]:
+    """Yield paths from a scene's start to its target, of one search after the other.
 
     A search is short that begins where the car has the least room, so that end comes first.
     """
@@ -141,8 +145,7 @@ def plan_in_scene(scene: Scene) -> CarPath | None:
         ends = (start, end) if from_tighter == forward else (end, start)
         path = plan_path(scene.vehicle, *obstacles, *ends, settings, window_m)
         if path is not None:
-            return path if ends[0] is start else path.reversed(start)
-    return None
+            yield path if ends[0] is start else path.reversed(start)
 
 
 def _free_way(scene: Scene, pose: FloatArray) -> float:
