@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, Field, Strict, ValidationInfo
+from pydantic import Field, Strict
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.scene import MAX_POINTS, Contour, Scene, outlines_without
 from parkenv.driving.vehicle import VEHICLES, VehicleParameters
 from parkenv.errors import InputError, naming, nearest
 from parkenv.files.limited_reading import is_there, parse_json, read_text, read_toml
-from parkenv.files.spec_file import OrText, Several, Spec, read_tables
+from parkenv.files.spec_file import Several, Spec, read_tables
 
 SCENE_SUFFIXES = (".csv", ".json", ".toml", ".geojson")
 """Suffixes of the files that are read in a folder of scenes."""
@@ -54,11 +54,6 @@ def vehicle_of(given: object, folder: str | Path = ".") -> VehicleParameters:
     return VehicleParameters(**given)
 
 
-def _vehicle(value: object, info: ValidationInfo) -> VehicleParameters | None:
-    return None if value is None else vehicle_of(value, (info.context or {}).get("folder", "."))
-
-
-_Vehicle = Annotated[VehicleParameters | None, BeforeValidator(_vehicle), OrText()]
 _Point = Annotated[tuple[float, float], Strict(False)]
 _Bounds = Annotated[tuple[float, float, float, float], Strict(False)]
 _Pose = Annotated[
@@ -78,7 +73,7 @@ class SceneSpec(Spec):
 
     start: _Pose
     target: _Pose
-    vehicle: _Vehicle = Field(None, description="The car: a name, a file, or a table.")
+    vehicle: Any = Field(None, description="The car: a name, a file, or a table.")
     bounds: _Bounds | None = Field(
         None, description="Least x and y and greatest x and y that the car may reach, m."
     )
@@ -218,8 +213,8 @@ def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | No
             raise InputError(f"obstacles.{i} is {each.tables()!r:.60}, want a polygon or a line")
         points = np.array(each.polygon or each.line)
         contours.append(Contour(_opened(points)) if each.polygon else Contour(points, closed=False))
-    car = vehicle or spec.vehicle or VehicleParameters()
-    return _made(path.stem, car, spec.start, spec.target, contours, spec.bounds)
+    given = VehicleParameters() if spec.vehicle is None else vehicle_of(spec.vehicle, path.parent)
+    return _made(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
 
 
 def _of_geojson(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -8,12 +8,11 @@ from collections import Counter
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
-from pydantic import BeforeValidator, Field, ValidationInfo, model_validator
-from pydantic_core import PydanticCustomError
+from pydantic import BeforeValidator, Field, ValidationInfo
 
-from parkenv.errors import InputError, nearest
+from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NOTHING, TEXT, WHOLE, YES_OR_NO
 from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option, words_in
@@ -113,19 +112,6 @@ class ManoeuvreStudy(Study):
     seed: Seed = Field(0, description="First seed; episode or scene i uses seed + i.")
     figures: Figures = True
 
-    @model_validator(mode="after")
-    def _known(self) -> Self:
-        if self.cases is not None and self.levels is not None:
-            raise PydanticCustomError("whole", "cases and levels exclude each other: want one of them")
-        for level in self.levels or ():
-            if level not in SCENE_LEVELS:
-                raise PydanticCustomError(
-                    "whole",
-                    "levels is {given}; {near}",
-                    {"given": repr(level), "near": nearest(level, SCENE_LEVELS)},
-                )
-        return self
-
     @cached_property
     def sources(self) -> dict[str, Path | tuple[str, int]]:
         """The file of each scene, or its level and seed, by name."""
@@ -146,23 +132,20 @@ class ManoeuvreStudy(Study):
         from parkenv.driving.scene_files import read_scene
 
         source = self.sources[name]
-        return (
-            read_scene(source, self.vehicle)
-            if isinstance(source, Path)
-            else level_scene(*source, self.vehicle)
-        )
+        if isinstance(source, Path):
+            return read_scene(source, self.vehicle)
+        return level_scene(*source, self.vehicle)
 
     def check(self) -> None:
-        """See `Study`: all files are read."""
-        if not self.sources:
-            raise InputError("park: want cases or levels")
+        """See `Study`: all files are read, and a scene of each level is drawn."""
+        if (self.cases is None) == (self.levels is None):
+            raise InputError("cases and levels exclude each other: want one of them")
         if self.shorten_s > 0.0:
             from planners.driving.time_optimal import require_casadi
 
             require_casadi()
-        if self.cases is not None:
-            for name in self.sources:
-                self.scene(name)
+        for name in self.sources if self.cases else (f"{level}-{self.seed}" for level in self.levels or ()):
+            self.scene(name)
 
     def settings(self) -> Row:
         """See `Study`."""
@@ -233,33 +216,19 @@ class ManoeuvreStudy(Study):
             partial(save_manoeuvres, shown[i : i + SHEET], result.folder / f"manoeuvres_{i // SHEET + 1}.png")
             for i in range(0, len(shown), SHEET)
         ]
-        parked = [row for row in rows if row["driven"]]
-        if parked:
-            row = max(parked, key=lambda row: row["direction_changes"])
-            tasks.append(
-                partial(
-                    save_manoeuvre_film,
-                    self.scene(row["case"]),
-                    driven[row["case"],],
-                    result.folder / "manoeuvre.gif",
-                )
-            )
+        if parked := [row for row in rows if row["driven"]]:
+            case = max(parked, key=lambda row: row["direction_changes"])["case"]
+            filmed = self.scene(case), driven[case,]
+            tasks.append(partial(save_manoeuvre_film, *filmed, result.folder / "manoeuvre.gif"))
         return tasks
 
 
 def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
     """Return the row of a manoeuvre, with `states`, the lines of its trajectory in the frame of its file."""
-    from parkenv.driving.vehicle import PHYSICS_S, SPEED, STEERING, YAW, X, Y
+    from parkenv.driving.vehicle import PHYSICS_S
 
-    x, y = made.scene.origin.tolist()
-    columns = {
-        "x_m": (X, x),
-        "y_m": (Y, y),
-        "yaw_rad": (YAW, 0.0),
-        "speed_mps": (SPEED, 0.0),
-        "steering_rad": (STEERING, 0.0),
-    }
-    states = {key: (made.states[:, k].round(7) + offset).tolist() for key, (k, offset) in columns.items()}
+    lines = made.states[:, : len(TRAJECTORIES.columns)].round(7)
+    lines[:, :2] += made.scene.origin
     return {
         "case": name,
         "planned": made.path is not None,
@@ -268,7 +237,10 @@ def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
         "length_m": made.length_m,
         "direction_changes": made.direction_changes,
         "planning_s": made.planning_s,
-        "states": {"time_s": [round(PHYSICS_S * i, 2) for i in range(len(made.states))], **states},
+        "states": {
+            "time_s": [round(PHYSICS_S * i, 2) for i in range(len(lines))],
+            **dict(zip(TRAJECTORIES.columns, lines.T.tolist(), strict=True)),
+        },
     }
 
 
