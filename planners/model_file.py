@@ -45,7 +45,7 @@ SEARCH_OBSERVATIONS = {
     SCANS_OBSERVATION: ("scan", FIXED_OF_SCANS, NUMBERS_PER_SCAN),
 }
 """What a search model may observe: key of the vector, its fixed numbers, and those for each of k slots or scans."""
-COMMANDS = {"search": "parkenv compare", "drive": "parkenv park"}
+COMMANDS = {"search": "parkenv compare", "drive": "parkenv park", "scenes": "parkenv park --levels"}
 """Commands that run the models of each task."""
 _MAX_BYTES = 500_000_000
 _MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
@@ -123,7 +123,7 @@ class ModelCard(Spec):
 
     format: Literal["parkenv-model-2"] = "parkenv-model-2"
     algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo", "sac", "tqc"]
-    task: Literal["search", "drive"]
+    task: Literal["search", "drive", "scenes"]
     observation: str = Field(description="Version of the observation's layout.")
     k: int = Field(ge=0, le=1_000, description="Slots, or scans, in the observation; 0 for driving.")
     policy: Literal["MultiInputPolicy", "MultiInputLstmPolicy"]
@@ -259,8 +259,10 @@ def observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
             return "search", version, (shape[0] - fixed) // each
     if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
         return "drive", import_module("planners.driving.policy_interface").INTERFACE, 0
+    if isinstance(space, spaces.Dict) and "moves" in space.spaces:
+        return "scenes", import_module("planners.driving.learned_moves").INTERFACE, 0
     raise InputError(
-        "the model observes neither `local` or `scan` (to search) nor `achieved_goal` (to drive)"
+        "the model observes neither `local` or `scan` (to search), `achieved_goal` (to drive) nor `moves` (in scenes)"
     )
 
 
@@ -272,7 +274,7 @@ def load_model(
     Args:
         algorithm: algorithm that it was trained with.
         path: the model file.
-        task: `search` or `drive`.
+        task: `search`, `drive` or `scenes`.
         observations: versions of the layouts that the environment can give.
 
     Raises:
@@ -315,6 +317,9 @@ def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
         key, fixed, each = SEARCH_OBSERVATIONS[card.observation]
         wanted = {key: (fixed + each * card.k,), "action_mask": (len(ACTIONS),)}
         act: int | tuple[int, ...] = len(ACTIONS)
+    elif card.task == "scenes":
+        moves = import_module("planners.driving.learned_moves")
+        wanted, act = {"moves": (moves.OBSERVATION_SIZE,), "action_mask": (moves.MOVES,)}, moves.MOVES
     else:
         size = import_module("planners.driving.policy_interface").OBSERVATION_SIZE
         wanted, act = {"observation": (size,), "achieved_goal": (7,), "desired_goal": (7,)}, (2,)

@@ -8,11 +8,13 @@ from parkenv.studies.training import configs
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.drive.training import DriveTraining
 from parkenv.studies.training.fleet import FleetTraining
+from parkenv.studies.training.scenes import ScenesTraining
 from parkenv.studies.training.search import ScanTraining, SearchTraining
 from parkenv.studies.training.spec import (
     DriveTrainingSpec,
     FleetTrainingSpec,
     ScanTrainingSpec,
+    ScenesTrainingSpec,
     SearchTrainingSpec,
 )
 from parkenv.studies.training.training import use_one_thread
@@ -40,6 +42,9 @@ def make_small(patch):
         _change(patch, configs.FLEET_CONFIGS, name, 8, {"n_steps": 32, "batch_size": 256})
     for name in configs.DRIVE_CONFIGS:
         _change(patch, configs.DRIVE_CONFIGS, name, 16, DRIVE[name] | NETWORK)
+    for name in configs.SCENES_CONFIGS:
+        _change(patch, configs.SCENES_CONFIGS, name, 8, {"n_steps": 16, "batch_size": 64} | NETWORK)
+    patch.setattr("parkenv.studies.training.scenes.DRAWN", 8)
     patch.setattr(configs, "MIN_UPDATES", 0)
     # An untrained agent drives in circles.
     patch.setattr("parkenv.studies.training.search.MAX_STEPS", 60)
@@ -78,6 +83,14 @@ def drive_training(algorithm, steps, every, lots, episodes=6):
     training = DriveTraining(spec)
     training.lots = lots
     return training
+
+
+def scenes_training(steps, every, levels, episodes=2):
+    return ScenesTraining(
+        ScenesTrainingSpec(
+            steps=steps, evaluate_every=every, levels=levels, evaluation_episodes=episodes, agents=()
+        )
+    )
 
 
 def stop_training(training, folder, monkeypatch):

@@ -201,7 +201,7 @@ def test_levels_are_drawn_for_a_car_in_a_file_and_a_run_says_it_again(tmp_path):
     done = parkenv("park", *words, "--out", "out", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["driven"] == 2
+    assert [row["driven"] for row in summary["agents"]] == [2]
     assert summary["vehicles"] == [
         {"scenes": 2, **dataclasses.asdict(VehicleParameters(length=4.9, wheelbase=2.9))}
     ]
@@ -253,6 +253,7 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
         (("--levels", "parallel-extrem"), "parallel-extreme"),
         (("--levels", "all", "--cases", "."), "exclude each other"),
         (("--levels", "all", "--vehicle", "tank"), "tank"),
+        (("--levels", "all", "--agents", "magic"), "magic"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, said, tmp_path):

@@ -6,6 +6,7 @@ from small_trainings import (
     fleet_training,
     make_small,
     scan_training,
+    scenes_training,
     search_training,
     stop_training,
 )
@@ -31,6 +32,7 @@ TRAININGS = {
     "scans": lambda: scan_training(384, 6),
     "fleet": lambda: fleet_training(MixedFleet(PLACES[0], DEMAND), 768, 256),
     "drive, ppo": lambda: drive_training("ppo", 2_000, 600, (packaged_lot("mini"),)),
+    "scenes": lambda: scenes_training(512, 128, ("parallel-complex", "oblique-normal")),
     "drive, sac": lambda: drive_training("sac", 1_000, 300, (packaged_lot("mini"),)),
 }
 

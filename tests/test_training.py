@@ -44,6 +44,7 @@ from parkenv.studies.training.spec import (
     FleetTrainingSpec,
     NetworkTrainingSpec,
     ScanTrainingSpec,
+    ScenesTrainingSpec,
     SearchTrainingSpec,
     TrainingSpec,
 )
@@ -566,6 +567,7 @@ def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
         ({"observation": "scan", "k": 3}, ScanTrainingSpec),
         ({"env": "fleet", "arrivals_per_hour": 120}, FleetTrainingSpec),
         ({"env": "drive", "algorithm": "sac", "agents": ["planner"]}, DriveTrainingSpec),
+        ({"env": "scenes", "levels": ["parallel-extreme"]}, ScenesTrainingSpec),
     ],
 )
 def test_a_file_chooses_the_kind_of_training_and_its_copy_is_the_same(tables, kind, tmp_path):
@@ -618,6 +620,7 @@ OF_FLEET, OF_DRIVES, OF_SCANS = {"env": "fleet"}, {"env": "drive"}, {"observatio
         (OF_DRIVES | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, sac, tqc with env drive"),
         (OF_DRIVES | {"held_out": 0.2}, "held_out requires env search or algorithm network, not"),
         (OF_DRIVES | {"agents": ["mdp"]}, "agents has 'mdp', want planner or none with env drive"),
+        ({"env": "scenes", "levels": ["parallel-tight"]}, "levels is 'parallel-tight'"),
         (OF_DRIVES | {"k": 3}, "k requires env search or observation scan or env fleet, not env drive"),
     ],
 )  # fmt: skip

@@ -20,7 +20,6 @@ from parkenv.studies.fields import Scenarios, Seed
 from parkenv.studies.trips.calibration_study import CalibrationStudy, DrivenTrips
 from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
 from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy
-from planners.names import PARKING_PLANNER
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -29,6 +28,11 @@ if TYPE_CHECKING:
     from parkenv.studies.trips.driven_search import Trip as DrivenTrip
 
 SHOWN_ROWS, SHOWN_SCENES = 20, 60
+SHOWN_LEVELS = (
+    "agent", "level", "scenes", "driven", "success", "success_ci95", "contacts", "time_s", "length_m",
+    "direction_changes", "planning_ms", "planning_ms_p95",
+)  # fmt: skip
+"""Columns of a comparison in drawn scenes that are printed."""
 SHOWN = (
     "agent", "kind", "way", "parked", "success", "contacts", "planning_ms", "planning_ms_p95", "time_s", "time_s_p95",
     "direction_changes", "direction_changes_p95", "driven_m", "turned_rad",
@@ -163,12 +167,6 @@ class Park(StudyCommand):
         """
 
     study: ManoeuvreStudy = ManoeuvreStudy()
-    agents: Axis[str] = option(
-        (PARKING_PLANNER,),
-        "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
-        "`parkenv train --env drive`.",
-        takes="NAME[,...]",
-    )
     scenarios: Annotated[Scenarios, Inside(only=())] = (scenario_spec("campus"), scenario_spec("street"))
     kinds: Axis[Literal["perpendicular", "oblique", "parallel"]] | None = option(
         None,
@@ -212,7 +210,10 @@ class Park(StudyCommand):
             self._park_on_lots()
 
     def show(self, console: Console, result: Result) -> None:
-        """Print a row for each scene, those that failed first."""
+        """Print a row for each level, or of files a row for each scene, those that failed first."""
+        if self.study.levels is not None:
+            levels = result.summary["levels"]
+            print_rows(console, "Levels", levels, SHOWN_LEVELS)
         rows = sorted(result.rows, key=lambda row: row["driven"])
         shown = [name for name in rows[0] if name != "planned"] if rows else ()
         print_rows(console, plural(len(rows), "scene"), rows[:SHOWN_SCENES], shown)
@@ -230,7 +231,7 @@ class Park(StudyCommand):
             ParkingCase(build(spec).lot, self.kinds, self.ways or WAYS, self.occupied, self.slack, vehicle)
             for spec in self.scenarios
         ]
-        agents = readable_models(self.agents) if self.trust_model else self.agents
+        agents = readable_models(study.agents) if self.trust_model else study.agents
         seeds = range(study.seed, study.seed + study.episodes)
         console = make_console()
         with writing_into(self.out):

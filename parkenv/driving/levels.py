@@ -1,8 +1,8 @@
 """Levels of scenes, drawn from a seed: a slot as long or wide as the car and a margin, an aisle, and clutter beyond it.
 
 After Jiang, Li, Zhang, Shen, Yin and Wang, "HOPE: a reinforcement learning-based hybrid policy path planner for diverse
-parking scenarios" (2024): its margins, widths of aisles and amounts of clutter. Oblique slots, and extreme ones across
-the aisle, are ours.
+parking scenarios" (2024): its margins, widths of aisles and amounts of clutter. Ours are oblique slots, extreme ones
+across the aisle, and the level `moving`: normal, with pedestrians and cars that come through the aisle.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import shapely
 from shapely.affinity import rotate, translate
 from shapely.geometry.base import BaseGeometry
 
+from parkenv.driving.crossings import CAR, Crossing
 from parkenv.driving.scene import Contour, Scene
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError, nearest
@@ -29,6 +30,7 @@ class Level:
     across: tuple[float, float]  # of the slot's width over the car's, the other slots
     aisle: tuple[float, float]  # width before parallel slots, and before the others
     clutter: int  # number of obstacles beyond the aisle, where there is no wall
+    crossings: int = 0  # number of pedestrians and cars in the aisle
 
 
 def levels(vehicle: VehicleParameters) -> dict[str, Level]:
@@ -38,10 +40,12 @@ def levels(vehicle: VehicleParameters) -> dict[str, Level]:
         "normal": Level((quarter, quarter + 0.5), (0.85, 1.2), (4.5, 7.0), 3),
         "complex": Level((0.9, quarter), (0.4, 0.85), (4.0, 6.0), 5),
         "extreme": Level((0.6, 0.9), (0.3, 0.4), (3.5, 6.0), 8),
+        "moving": Level((quarter, quarter + 0.5), (0.85, 1.2), (4.5, 7.0), 3, crossings=3),
     }
 
 
 _HALF_M = 16.0  # half the length of the row of slots, m
+_FAR_M = 14.0  # from the slot to where road users start and end, m
 _NEIGHBOURS, _TAKEN = 3, 0.7  # further places on either side, and the chance that a car stands there
 _TRIES = 1_000
 
@@ -118,6 +122,7 @@ def _drawn(
             if box.bounds[1] > aisle and not any(box.intersects(shape) for shape in solids):
                 solids.append(box)
     contours += [Contour(shapely.get_coordinates(shape)[:-1]) for shape in solids]
+    crossings = [_crossing(aisle, rng) for _ in range(level.crossings)]
     x, y = rng.uniform(-7.5, 7.5), rng.uniform(1.0, aisle - 1.0)
     yaw = float(np.clip(rng.normal(0.0, math.pi / 6), -math.pi / 2, math.pi / 2))
     turned = 0.0
@@ -132,9 +137,22 @@ def _drawn(
     if shapely.Polygon(vehicle.corners(start)).intersects(own):
         return None
     try:
-        return Scene(name, vehicle, start, target, tuple(contours))
+        return Scene(name, vehicle, start, target, tuple(contours), crossings=tuple(crossings))
     except InputError:
         return None
+
+
+def _crossing(aisle: float, rng: np.random.Generator) -> Crossing:
+    """Draw a pedestrian or a car that comes through the aisle from either end, a pedestrian askew."""
+    side = rng.choice([-1.0, 1.0])
+    if rng.random() < 0.5:
+        low, high = sorted((0.5 * CAR.width + 0.3, aisle - 0.5 * CAR.width - 0.3))
+        y = rng.uniform(max(low, 0.5 * aisle), max(high, 0.5 * aisle))
+        ends, speed, kind = np.array([y, y]), rng.uniform(1.5, 2.5), "car"
+    else:
+        ends, speed, kind = rng.uniform(0.5, aisle - 0.5, 2), rng.uniform(0.9, 1.6), "pedestrian"
+    start, end = ((float(x), float(y)) for x, y in zip((side * _FAR_M, -side * _FAR_M), ends, strict=True))
+    return Crossing(kind, (start, end), float(speed), float(rng.uniform(0.0, 6.0)))
 
 
 def _moved_to(shape: BaseGeometry, own: BaseGeometry, gap: float, side: float) -> BaseGeometry:

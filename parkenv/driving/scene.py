@@ -15,6 +15,7 @@ from shapely.geometry.base import BaseGeometry
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import ObstacleKind, Obstacles
+from parkenv.driving.crossings import Crossing
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 
@@ -48,6 +49,7 @@ class Scene:
         contours: the obstacles; polygons need not be convex.
         bounds: least x and y and greatest x and y, m, that the footprint may reach; None for no limits.
         origin: (2,) m, of the scene's coordinates in those of its file.
+        crossings: road users that cross it.
 
     Raises:
         InputError: values that are not finite, too many points, a polygon that crosses itself, or a contact at the
@@ -61,6 +63,7 @@ class Scene:
     contours: tuple[Contour, ...]
     bounds: tuple[float, float, float, float] | None = None
     origin: FloatArray = field(default_factory=lambda: np.zeros(2))
+    crossings: tuple[Crossing, ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("start", "target"):

@@ -9,12 +9,13 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field, Strict
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.driving.crossings import Crossing
 from parkenv.driving.scene import MAX_POINTS, Contour, Scene, outlines_without
 from parkenv.driving.vehicle import VEHICLES, VehicleParameters
 from parkenv.errors import InputError, naming, nearest
@@ -68,6 +69,15 @@ class ObstacleSpec(Spec):
     line: Several[_Point] | None = Field(None, min_length=2, description="Points of a line, such as a kerb.")
 
 
+class CrossingSpec(Spec):
+    """A road user that crosses a scene on a straight line; it waits for a car in its way."""
+
+    kind: Literal["pedestrian", "car"]
+    way: Annotated[Several[_Point], Field(min_length=2, max_length=2, description="Start and end, m.")]
+    speed_mps: float = Field(1.3, description="Its speed, m/s.")
+    begins_s: float = Field(0.0, description="When it sets off, s.")
+
+
 class SceneSpec(Spec):
     """A scene in a file of our own."""
 
@@ -78,6 +88,7 @@ class SceneSpec(Spec):
         None, description="Least x and y and greatest x and y that the car may reach, m."
     )
     obstacles: Several[ObstacleSpec] = Field((), description="What the car must not touch.")
+    crossings: Several[CrossingSpec] = Field((), description="Road users.")
 
 
 def scene_files(path: str | Path) -> list[Path]:
@@ -214,7 +225,12 @@ def _own(content: Mapping[str, Any], path: Path, vehicle: VehicleParameters | No
         points = np.array(each.polygon or each.line)
         contours.append(Contour(_opened(points)) if each.polygon else Contour(points, closed=False))
     given = VehicleParameters() if spec.vehicle is None else vehicle_of(spec.vehicle, path.parent)
-    return _made(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
+    made = _made(path.stem, vehicle or given, spec.start, spec.target, contours, spec.bounds)
+    crossings = []
+    for user in spec.crossings:
+        start, end = (tuple((np.array(point) - made.origin).tolist()) for point in user.way)
+        crossings.append(Crossing(user.kind, (start, end), user.speed_mps, user.begins_s))
+    return dataclasses.replace(made, crossings=tuple(crossings))
 
 
 def _of_geojson(content: Mapping[str, Any]) -> dict[str, Any]:

@@ -28,7 +28,7 @@ KnowledgeName = Literal["own", "shared", "reserve", "full"]
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
 SCENE_LEVELS = tuple(
     f"{kind}-{level}"
-    for level in ("normal", "complex", "extreme")
+    for level in ("normal", "complex", "extreme", "moving")
     for kind in ("perpendicular", "oblique", "parallel")
 )
 """Levels of drawn scenes with a kind of slot each, the easiest first; see `parkenv.driving.levels`."""

@@ -5,12 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BeforeValidator, Field, ValidationInfo, WithJsonSchema
+from pydantic import AfterValidator, BeforeValidator, Field, ValidationInfo, WithJsonSchema
 from pydantic_core import PydanticCustomError
 
-from parkenv.errors import InputError
+from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import (
     SCENARIO_NAMES,
+    SCENE_LEVELS,
     RigName,
 )
 from parkenv.files.limited_reading import is_there
@@ -75,6 +76,26 @@ _LOT_ALONE = (
     "Instead of a scenario: a week as in busy real car parks on this lot. A packaged lot, GeoJSON, or a Dragon Lake "
     "map (.yml)."
 )
+
+
+def levels_in(text: str) -> object:
+    """Return the levels that an option names."""
+    return SCENE_LEVELS if text == "all" else words_in(text)
+
+
+def _known_levels(levels: tuple[str, ...]) -> tuple[str, ...]:
+    for level in levels:
+        if level not in SCENE_LEVELS:
+            raise PydanticCustomError(
+                "whole",
+                "levels is {given}; {near}",
+                {"given": repr(level), "near": nearest(level, SCENE_LEVELS)},
+            )
+    return levels
+
+
+SceneLevels = Annotated[Axis[str], AfterValidator(_known_levels)]
+"""Names of levels of drawn scenes; see `parkenv.driving.levels`."""
 PRICES = ("--price", "--value-of-time", "--stay-min")
 """Options of what parking costs, which only matters where slots are chosen."""
 TRAFFIC = ("--cars", "--pedestrians")

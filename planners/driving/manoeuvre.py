@@ -5,14 +5,16 @@ from __future__ import annotations
 import dataclasses
 import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, Scene
+from parkenv.driving.crossings import CrossingTraffic, caused_contact
+from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
+from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, FootprintCheck, Scene
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
 from planners.driving.car_path import CarPath
 from planners.driving.clearance import Clearance, clearance, room_at
@@ -47,6 +49,7 @@ _WAY_M, _WAY_CLEAR_M, _TIGHT_WAY_M = (
     0.02,
     3.2,
 )  # of six ways, their clearance, and their sum in a tight slot, m
+_BRAKING = 2.0  # m/s², for road users
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +61,14 @@ class Manoeuvre:
         path: the path that was driven; None if none was found.
         states: (n, 6) states of the vehicle every `PHYSICS_S` from the start on; see `parkenv.driving.vehicle`.
         planning_s: wall time of planning, s.
+        others: (n, m, 3) poses of the scene's road users at the same times.
     """
 
     scene: Scene
     path: CarPath | None
     states: FloatArray
     planning_s: float
+    others: FloatArray | None = None
 
     @property
     def time_s(self) -> float:
@@ -82,8 +87,13 @@ class Manoeuvre:
         return int((sign[1:] != sign[:-1]).sum())
 
     def judged(self) -> Judgement:
-        """Judge what was driven by its footprints alone."""
+        """Judge what was driven by its footprints alone; the clearance is that to what stands."""
         check = self.scene.check(self.states[:, :3])
+        crossings = self.scene.crossings
+        if self.others is not None and caused_contact(
+            self.scene.vehicle, self.states[:, :3], crossings, self.others
+        ):
+            check = FootprintCheck(True, 0.0)
         away, turned = self.scene.error(self.states[-1])
         arrived = away <= POSITION_TOLERANCE_M and turned <= ANGLE_TOLERANCE_RAD
         stands = self.states[-1, SPEED] == 0.0
@@ -102,14 +112,17 @@ class Judgement(NamedTuple):
     error_rad: float
 
 
-def park(scene: Scene) -> Manoeuvre:
+def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None) -> Manoeuvre:
     """Plan a path from a scene's start to its target, and drive it.
 
     The car is driven fluently; where that would touch something or end too far from the target, it is driven anew
     and stops to turn its wheels, or on another path. The planner knows the vehicle's model, so it finds that out first.
+
+    Args:
+        scene: the scene.
+        plan: yields paths; `paths_in_scene` if None.
     """
-    start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
-    paths, planning_s, tried = paths_in_scene(scene), 0.0, list[tuple[Judgement, Manoeuvre]]()
+    paths, planning_s, tried = (plan or paths_in_scene)(scene), 0.0, list[tuple[Judgement, Manoeuvre]]()
     while not any(judged.driven for judged, _ in tried):
         began = time.perf_counter()
         path = next(paths, None)
@@ -117,11 +130,13 @@ def park(scene: Scene) -> Manoeuvre:
         if path is None:
             break
         for tracking in (TrackingSettings(), EXACT):
-            made = Manoeuvre(scene, path, drive(scene.vehicle, path, start, tracking), planning_s)
+            states, others = drive(scene, path, tracking)
+            made = Manoeuvre(scene, path, states, planning_s, others)
             tried.append((made.judged(), made))
             if tried[-1][0].driven and tried[-1][0].clearance_m >= _CLOSE_M:
                 return made
     if not tried:
+        start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
         return Manoeuvre(scene, None, start[None], planning_s)
     return max(tried, key=lambda each: (each[0].driven, each[0].clearance_m))[1]
 
@@ -182,24 +197,45 @@ def aim(scene: Scene) -> FloatArray:
     return best
 
 
-def drive(
-    vehicle: VehicleParameters, path: CarPath, start: FloatArray, tracking: TrackingSettings
-) -> FloatArray:
-    """Track a path from a state, (6,), to a stop at its end; return the states, (n, 6), every `PHYSICS_S`."""
-    tracker, state = PathTracker(vehicle, path, tracking), start.copy()
-    states = [state.copy()]
+def drive(scene: Scene, path: CarPath, tracking: TrackingSettings) -> tuple[FloatArray, FloatArray | None]:
+    """Track a path from a standstill to a stop at its end, and wait for road users in the way.
+
+    Returns:
+        The states, (n, 6), every `PHYSICS_S`, and the poses of the scene's road users, (n, m, 3); None without any.
+    """
+    vehicle = scene.vehicle
+    tracker = PathTracker(vehicle, path, tracking)
+    traffic = CrossingTraffic(scene.crossings) if scene.crossings else None
+    state = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
+    states, others = [state.copy()], [] if traffic is None else [traffic.poses]
+
+    def move(pedal: float, wheels: float) -> None:
+        if traffic is not None:
+            traffic.advance(PHYSICS_S, vehicle.corners(state[:3]), stands=state[SPEED] == 0.0)
+            others.append(traffic.poses)
+        advance(state, pedal, wheels, vehicle.limits)
+        states.append(state.copy())
+
     while len(states) < _LONGEST_S / PHYSICS_S:
-        command = tracker.command(state[:3], float(state[SPEED]), float(state[STEERING]))
+        pedal, wheels = tracker.command(state[:3], float(state[SPEED]), float(state[STEERING]))
         if tracker.done:
             break
+        if traffic is not None and _has_to_wait(vehicle, tracker, traffic, float(state[SPEED])):
+            slower = min(_BRAKING, abs(state[SPEED]) / tracking.control_s) / vehicle.max_braking
+            pedal = -math.copysign(min(slower, 1.0), state[SPEED]) if state[SPEED] else 0.0
         for _ in range(round(tracking.control_s / PHYSICS_S)):
-            advance(state, *command, vehicle.limits)
-            states.append(state.copy())
+            move(pedal, wheels)
     while state[SPEED] != 0.0:
         # The last millimetres a second.
         brake = min(1.01 * abs(state[SPEED]) / (vehicle.max_braking * PHYSICS_S), 1.0)
-        advance(
-            state, -math.copysign(brake, state[SPEED]), state[STEERING] / vehicle.max_steering, vehicle.limits
-        )
-        states.append(state.copy())
-    return np.array(states)
+        move(-math.copysign(brake, state[SPEED]), state[STEERING] / vehicle.max_steering)
+    return np.array(states), np.array(others) if others else None
+
+
+def _has_to_wait(
+    vehicle: VehicleParameters, tracker: PathTracker, traffic: CrossingTraffic, speed: float
+) -> bool:
+    """Return whether a road user is in the way, now or soon."""
+    ahead = tracker.poses_ahead(PREDICTION_TIMES_S * max(abs(speed), START_SPEED))
+    own = vehicle.at_middle(ahead)
+    return bool(np.isfinite(encounter_times(vehicle, own, traffic.outlines, traffic.velocity)).any())

@@ -42,6 +42,17 @@ class Outlines(NamedTuple):
     circle: FloatArray  # (n, 3) float64, m: centre x, y and radius of a circle around each obstacle
 
     @classmethod
+    def of(cls, corners: FloatArray, n_corners: IntArray, circle: FloatArray) -> Outlines:
+        """Convert convex outlines, (n, k_max, 2) m, with circles around them, (n, 3) m; lines have two corners."""
+        around = np.concatenate([corners, np.roll(corners, -1, axis=1)], axis=2)
+        last = np.maximum(n_corners, 2) - 1
+        around[np.arange(len(corners)), last, 2:] = corners[:, 0]
+        # A line has one edge.
+        count = np.where(n_corners > 2, n_corners, 1)
+        edges = around[np.arange(corners.shape[1]) < count[:, None]]
+        return cls(edges, np.concatenate([[0], np.cumsum(count)]).astype(np.int64), circle)
+
+    @classmethod
     def of_map(cls, cars: Float32Array, lines: Float32Array) -> Outlines:
         """Convert `cars`, (n, 24, 2) m, and `lines`, (m, 2, 2) m, from an observation with the obstacle map."""
         cars = cars[cars[:, 0, 0] < _NOWHERE].astype(np.float64)
@@ -128,12 +139,24 @@ def encode_observation(
     seen[0], seen[1], seen[2] = state[SPEED] / 2.0, state[STEERING] / 0.6, state[ACCELERATION] / 3.0
     for k in range(5):
         seen[3 + k] = about[k]
+    free_distances(middle, state[YAW], outlines, body, seen[8:])
+
+
+@compiled(error_model="numpy")
+def free_distances(
+    middle: FloatArray,
+    yaw: float,
+    outlines: tuple[FloatArray, IntArray, FloatArray],
+    body: FloatArray,
+    seen: Float32Array,
+) -> None:
+    """Fill `seen`, (`BEAMS`,), with 1 / (1 + free distance in m) for each beam; arguments as above."""
     edges, first, circle = outlines
     # Compare edges by inverse distance, 1/m: beams parallel to an edge then need no special case.
     near = np.full(BEAMS, 1.0 / (FARTHEST_M + 3.0))
     ahead, aside = np.empty(BEAMS), np.empty(BEAMS)
     for b in range(BEAMS):
-        ahead[b], aside[b] = math.cos(state[YAW] + _CIRCLE * b), math.sin(state[YAW] + _CIRCLE * b)
+        ahead[b], aside[b] = math.cos(yaw + _CIRCLE * b), math.sin(yaw + _CIRCLE * b)
     for i in range(len(circle)):
         dx, dy = circle[i, 0] - middle[0], circle[i, 1] - middle[1]
         reach = circle[i, 2] + FARTHEST_M + 3.0
@@ -151,4 +174,4 @@ def encode_observation(
                 if left * twice >= 0.0 and right * twice >= 0.0:
                     near[b] = max(near[b], (left + right) / twice)
     for b in range(BEAMS):
-        seen[8 + b] = 1.0 / (1.0 + min(max(1.0 / near[b] - body[b], 0.0), FARTHEST_M))
+        seen[b] = 1.0 / (1.0 + min(max(1.0 / near[b] - body[b], 0.0), FARTHEST_M))

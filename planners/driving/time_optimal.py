@@ -50,11 +50,13 @@ class Reference(NamedTuple):
 def shorten(made: Manoeuvre, deadline_s: float) -> Manoeuvre:
     """Return the shortest drive found until a deadline, s: one that touches nothing and arrives, or the given one.
 
+    A drive among road users stays as it is: it has waited for them.
+
     Raises:
         InputError: CasADi is not installed.
     """
     until = time.perf_counter() + deadline_s
-    if made.path is None or not made.judged().driven:
+    if made.path is None or made.others is not None or not made.judged().driven:
         return made
     room_m = made.judged().clearance_m
     best, least_m = made, min(room_m, _LEAST_CLEAR_M)

@@ -12,7 +12,7 @@ import shapely
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.driving.scene import Scene
-from parkenv.driving.vehicle import STATE_SIZE
+from parkenv.driving.vehicle import STATE_SIZE, placed
 from parkenv.show.colors import FREE, PALETTE, mixed_color
 from parkenv.show.figures.parkings import save_sheet
 from parkenv.show.figures.picture_files import save_film
@@ -40,12 +40,27 @@ def save_manoeuvres(shown: Sequence[Shown], path: Path) -> None:
     )
 
 
-def save_manoeuvre_film(scene: Scene, driven: Mapping[str, Any], path: Path) -> None:
-    """Write a film of a manoeuvre as GIF, `SPEED_UP` times as fast as it was."""
+def save_manoeuvre_film(
+    scene: Scene, driven: Mapping[str, Any], others: Mapping[str, Any], path: Path
+) -> None:
+    """Write a film of a manoeuvre as GIF, `SPEED_UP` times as fast as it was.
+
+    Args:
+        scene: the scene.
+        driven: its lines of `trajectories.csv`.
+        others: its lines of `road_users.csv`; empty without any.
+        path: the file to write.
+    """
     states, time = _states(scene, driven), np.array(driven["time_s"])
     ends = np.searchsorted(time, np.arange(0.0, time[-1] + SPEED_UP / FPS, SPEED_UP / FPS)).clip(1, len(time))
+    users = np.zeros((len(time), 0, 3))
+    if others:
+        users = np.column_stack([others[name] for name in ("x_m", "y_m", "yaw_rad")])
+        users[:, :2] -= scene.origin
+        users = users.reshape(len(time), -1, 3)
     frames = [
-        _frame(scene, states[:end], f"{scene.name}: {time[end - 1]:.1f} s", states) for end in ends.tolist()
+        _frame(scene, states[:end], f"{scene.name}: {time[end - 1]:.1f} s", states, users[end - 1])
+        for end in ends.tolist()
     ]
     save_film([*frames, *[frames[-1]] * _STILL], path, fps=FPS, colors=COLORS)
 
@@ -59,8 +74,10 @@ def _states(scene: Scene, driven: Mapping[str, Any]) -> FloatArray:
     return states
 
 
-def _frame(scene: Scene, states: FloatArray, text: str, whole: FloatArray | None = None) -> Image:
-    """Render what was driven in a scene so far, (480, 640, 3) uint8 RGB; the view fits `whole`."""
+def _frame(
+    scene: Scene, states: FloatArray, text: str, whole: FloatArray | None = None, users: Sequence[Any] = ()
+) -> Image:
+    """Render what was driven in a scene so far, (480, 640, 3) uint8 RGB, and `users`; the view fits `whole`."""
     whole = states if whole is None else whole
     poses = np.concatenate([whole[:: max(1, len(whole) // 200), :3], scene.target[None]])
     corners = scene.vehicle.corners(poses).reshape(-1, 2)
@@ -70,7 +87,9 @@ def _frame(scene: Scene, states: FloatArray, text: str, whole: FloatArray | None
     fine = np.full((_SIZE[1] * 2, _SIZE[0] * 2, 3), PALETTE["floor"], dtype=np.uint8)
     paint(fine, MapView(view.turn, 2 * view.scale, 2 * view.shift, 2), _ground(scene))
     image = cv2.resize(fine, _SIZE, interpolation=cv2.INTER_AREA)
-    paint(image, view, [*trail(scene.vehicle, states[:, :3]), *steered_car(scene.vehicle, states[-1])])
+    others = [placed(user.outline, pose) for user, pose in zip(scene.crossings, users, strict=False)]
+    car = [*trail(scene.vehicle, states[:, :3]), *steered_car(scene.vehicle, states[-1])]
+    paint(image, view, [*car, Areas([[outline] for outline in others], "mover")])
     line = strip()
     write_line(line, (text,))
     return np.vstack([image, line])

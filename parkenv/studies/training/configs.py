@@ -91,6 +91,12 @@ FLEET_CONFIGS = dict.fromkeys(_WITH_MASKS, TrainingConfig(32, "MultiInputPolicy"
 """Config of each algorithm for a fleet; their networks are compiled for the other cars."""
 
 
+# Paths are short: two to fifteen moves.
+_IN_SCENES = {**_ON_POLICY, "n_steps": 32, "gamma": 0.99}
+SCENES_CONFIGS = {"maskable-ppo": TrainingConfig(256, "MultiInputPolicy", _IN_SCENES, 0.05, steps=500_000)}
+"""Config of each algorithm for planning in scenes."""
+
+
 WAY_IN = "way-in"  # start on the planned path into the slot
 
 

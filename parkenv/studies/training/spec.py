@@ -13,7 +13,7 @@ from pydantic_core import PydanticCustomError
 
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import WHOLE
-from parkenv.files.known_names import KnowledgeName
+from parkenv.files.known_names import SCENE_LEVELS, KnowledgeName
 from parkenv.files.limited_reading import read_json
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.files.spec_file import Several, Spec
@@ -28,7 +28,9 @@ from parkenv.studies.fields import (
     Patience,
     ScenarioList,
     Scenarios,
+    SceneLevels,
     Seed,
+    levels_in,
 )
 from parkenv.studies.results import PAGE, SUMMARY, CsvTable, Row, without_nan
 from parkenv.studies.study import Cell, Stage, Study
@@ -132,7 +134,7 @@ class TrainingSpec(Study):
     unit: ClassVar = ""
 
     kind: Literal["train"] = "train"
-    env: Literal["search", "fleet", "drive"] = "search"
+    env: Literal["search", "fleet", "drive", "scenes"] = "search"
     algorithm: str
     scenarios: TrainedOn | None = None
     trainings: int = option(5, "How many, one for each seed.", ge=1, le=10_000)
@@ -382,15 +384,15 @@ class SearchTrainingSpec(PlacesTrainingSpec):
 
     env: Literal["search"] = option(
         "search",
-        "Learn to search (parkenv/Search-v2), to search as all cars of a fleet, or to drive into slots "
-        "(parkenv/Drive-v1).",
-        takes="search|fleet|drive",
+        "Learn to search (parkenv/Search-v2), to search as all cars of a fleet, to drive into slots "
+        "(parkenv/Drive-v1), or to plan manoeuvres in drawn scenes.",
+        takes="search|fleet|drive|scenes",
         default="search",
     )
     algorithm: Literal["ppo", "maskable-ppo", "recurrent-ppo", "dqn"] = option(
         "maskable-ppo",
         "To search: dqn, ppo, maskable-ppo, recurrent-ppo, network. In a fleet: ppo, maskable-ppo. To "
-        "drive: sac, tqc, ppo.",
+        "drive: sac, tqc, ppo. In scenes: maskable-ppo.",
         argument=True,
         default="maskable-ppo; to drive, ppo",
     )
@@ -555,7 +557,9 @@ class FleetTrainingSpec(TrainingSpec):
 def _planner(value: AgentSpec) -> AgentSpec:
     if value.label != PARKING_PLANNER:
         raise PydanticCustomError(
-            "whole", "agents has {name}, want planner or none with env drive", {"name": repr(value.label)}
+            "whole",
+            "agents has {name}, want planner or none with env drive or scenes",
+            {"name": repr(value.label)},
         )
     return value
 
@@ -586,7 +590,38 @@ class DriveTrainingSpec(TestedTrainingSpec):
     tensorboard: TensorBoard = False
 
 
-RLTrainingSpec = SearchTrainingSpec | ScanTrainingSpec | FleetTrainingSpec | DriveTrainingSpec
+class ScenesTrainingSpec(TrainingSpec):
+    """Training to plan manoeuvres in drawn scenes."""
+
+    chosen_by: ClassVar[str] = "env scenes"
+    trained_by: ClassVar[str] = "scenes:ScenesTraining"
+
+    env: Literal["scenes"] = "scenes"
+    algorithm: Literal["maskable-ppo"] = "maskable-ppo"
+    levels: SceneLevels = option(
+        tuple(level for level in SCENE_LEVELS if not level.endswith("moving")),
+        "Levels of the drawn scenes, as in parkenv park (scenes).",
+        takes="NAME[,...]|all",
+        panel="Learning",
+        default="all but moving",
+        parse=levels_in,
+    )
+    steps: Steps = 500_000
+    evaluate_every: EvaluateEvery | None = Field(None, description="A tenth of the steps if absent.")
+    evaluation_episodes: Episodes = Field(
+        32, description="Scenes of an evaluation, of each level; the test in the end has twice as many."
+    )
+    agents: Several[Annotated[AgentItem, AfterValidator(_planner)]] = Field(
+        (AgentSpec(name=PARKING_PLANNER),),
+        max_length=1,
+        description="Drawn for comparison: planner, or none.",
+    )
+    tensorboard: TensorBoard = False
+
+
+RLTrainingSpec = (
+    SearchTrainingSpec | ScanTrainingSpec | FleetTrainingSpec | DriveTrainingSpec | ScenesTrainingSpec
+)
 """The kinds of training with stable-baselines3."""
 AnyTrainingSpec = RLTrainingSpec | NetworkTrainingSpec
 """The kinds of training."""
@@ -610,6 +645,8 @@ def kind_of(tables: Mapping[str, Any]) -> type[AnyTrainingSpec]:
         return FleetTrainingSpec
     if env == "drive":
         return DriveTrainingSpec
+    if env == "scenes":
+        return ScenesTrainingSpec
     if tables.get("algorithm") == "network":
         return NetworkTrainingSpec
     return ScanTrainingSpec if tables.get("observation") == "scan" else SearchTrainingSpec

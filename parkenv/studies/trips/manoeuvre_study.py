@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
@@ -15,12 +15,13 @@ from pydantic import BeforeValidator, Field, ValidationInfo
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NOTHING, TEXT, WHOLE, YES_OR_NO
 from parkenv.files.known_names import SCENE_LEVELS
-from parkenv.files.option import option, words_in
+from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
-from parkenv.studies.fields import Figures, Seed, Vehicle
+from parkenv.studies.fields import Figures, SceneLevels, Seed, Vehicle, levels_in
 from parkenv.studies.results import CsvTable, LongTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.version import __version__
+from planners.names import PARKING_PLANNER
 
 if TYPE_CHECKING:
     from parkenv.driving.scene import Scene
@@ -30,21 +31,29 @@ if TYPE_CHECKING:
 
 MANOEUVRES = CsvTable(
     "manoeuvres.csv",
-    ("case",),
+    ("agent", "case"),
     (
         "planned", "driven", "contact", "clearance_m", "error_m", "error_rad", "time_s", "length_m",
         "direction_changes", "planning_s",
     ),
-    {"case": TEXT, "direction_changes": WHOLE, **dict.fromkeys(("planned", "driven", "contact"), YES_OR_NO)},
+    dict.fromkeys(("planned", "driven", "contact"), YES_OR_NO)
+    | {"agent": TEXT, "case": TEXT, "direction_changes": WHOLE},
     other=NUMBER_OR_NOTHING,
     lists=None,
 )  # fmt: skip
 TRAJECTORIES = LongTable(
     "trajectories.csv",
-    ("case",),
+    ("agent", "case"),
     ("time_s",),
     ("x_m", "y_m", "yaw_rad", "speed_mps", "steering_rad"),
-    {"case": TEXT},
+    {"agent": TEXT, "case": TEXT},
+)
+ROAD_USERS = LongTable(
+    "road_users.csv",
+    ("agent", "case"),
+    ("time_s", "user"),
+    ("x_m", "y_m", "yaw_rad"),
+    {"agent": TEXT, "case": TEXT, "user": WHOLE},
 )
 SHEET = 12
 """Greatest number of scenes on a picture."""
@@ -55,26 +64,22 @@ def _there(value: object, info: ValidationInfo) -> object:
     return (Path(folder) / Path(value).expanduser()).absolute() if isinstance(value, str | Path) else value
 
 
-def _levels(text: str) -> object:
-    return SCENE_LEVELS if text == "all" else words_in(text)
-
-
 class _Scenes(NamedTuple):
-    """Scenes by name."""
+    """An agent in the scenes."""
 
-    source: str
+    agent: str
 
     @property
     def columns(self) -> Row:
-        """Nothing but their names identifies them."""
-        return {}
+        """The agent."""
+        return {"agent": self.agent}
 
 
 class ManoeuvreStudy(Study):
     """Scenes of manoeuvres, each planned, driven with the vehicle's limits and rates, and judged by its footprints."""
 
     table: ClassVar = MANOEUVRES
-    all_tables: ClassVar = (MANOEUVRES, TRAJECTORIES)
+    all_tables: ClassVar = (MANOEUVRES, TRAJECTORIES, ROAD_USERS)
     block: ClassVar = 4
     doing: ClassVar = "Parking"
     unit: ClassVar = "scenes"
@@ -89,14 +94,21 @@ class ManoeuvreStudy(Study):
         default="none",
         panel="Scenes",
     )
-    levels: Axis[str] | None = option(
+    levels: SceneLevels | None = option(
         None,
         "Levels of scenes to draw: perpendicular, oblique or parallel, and normal, complex or extreme, such as "
         "parallel-extreme.",
         takes="NAME[,...]|all",
         default="none",
         panel="Scenes",
-        parse=_levels,
+        parse=levels_in,
+    )
+    agents: Axis[str] = option(
+        (PARKING_PLANNER,),
+        "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of `parkenv train --env "
+        "drive`; in scenes, learned, the network that comes with the package, hybrid, the same where the planner plans "
+        "what the network cannot, and maskable-ppo:FILE or hybrid:FILE for a model of `parkenv train --env scenes`.",
+        takes="NAME[,...]",
     )
     episodes: int = option(100, "Episodes per lot, or scenes per level.", short="-n", ge=1, le=1_000_000)
     vehicle: Vehicle = None
@@ -138,8 +150,12 @@ class ManoeuvreStudy(Study):
 
     def check(self) -> None:
         """See `Study`: all files are read, and a scene of each level is drawn."""
+        from planners.driving.parking_agents import manoeuvre_planner
+
         if (self.cases is None) == (self.levels is None):
             raise InputError("cases and levels exclude each other: want one of them")
+        for agent in self.agents:
+            manoeuvre_planner(agent)
         if self.shorten_s > 0.0:
             from planners.driving.time_optimal import require_casadi
 
@@ -153,41 +169,40 @@ class ManoeuvreStudy(Study):
 
     def cells(self) -> list[Cell]:
         """See `Study`."""
-        return [Cell(_Scenes(str(self.cases or self.levels)), list(self.sources))]
+        return [Cell(_Scenes(agent), list(self.sources)) for agent in self.agents]
 
     def run(self, work: _Scenes, items: Sequence[str]) -> list[Row]:
         """See `Study`."""
         from planners.driving.manoeuvre import park
+        from planners.driving.parking_agents import manoeuvre_planner
         from planners.driving.time_optimal import shorten
 
-        del work
-        _warm()
-        made = {name: park(self.scene(name)) for name in items}
+        _warm(work.agent)
+        plan = manoeuvre_planner(work.agent)
+        made = {name: park(self.scene(name), plan) for name in items}
         if self.shorten_s > 0.0:
             made = {name: shorten(each, self.shorten_s) for name, each in made.items()}
-        return [manoeuvre_row(name, each) for name, each in made.items()]
+        return [work.columns | manoeuvre_row(name, each) for name, each in made.items()]
 
     def keep(self, work: _Scenes, rows: Sequence[Row], results: Results) -> None:
         """See `Study`: what was driven."""
-        del work
-        results.add([{"case": row["case"], **row["states"]} for row in rows], TRAJECTORIES)
+        for table, name in ((TRAJECTORIES, "states"), (ROAD_USERS, "others")):
+            results.add(
+                [work.columns | {"case": row["case"], **row[name]} for row in rows if row[name]], table
+            )
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        import numpy as np
-
         rows = [row for cell in self.cells() for row in results.of(self, cell)]
-        rows = [{name: row[name] for name in ("case", *MANOEUVRES.columns)} for row in rows]
-        planning = [1e3 * row["planning_s"] for row in rows] or [np.nan]
+        names = (*MANOEUVRES.keys, *MANOEUVRES.columns)
+        rows = [{name: row[name] for name in names} for row in rows]
+        levels = {
+            name: "cases" if isinstance(source, Path) else source[0] for name, source in self.sources.items()
+        }
         return {
-            "scenes": len(rows),
-            "planned": sum(row["planned"] for row in rows),
-            "driven": sum(row["driven"] for row in rows),
-            "contacts": sum(row["contact"] for row in rows),
-            "planning_ms": float(np.median(planning)),
-            "planning_ms_p95": float(np.quantile(planning, 0.95)),
-            "planning_ms_max": float(np.max(planning)),
-            "vehicles": self._vehicles([row["case"] for row in rows]),
+            "levels": level_table(rows, levels.__getitem__),
+            "agents": level_table(rows, lambda _: "all"),
+            "vehicles": self._vehicles(list(dict.fromkeys(row["case"] for row in rows))),
             "rows": rows,
         }
 
@@ -200,9 +215,10 @@ class ManoeuvreStudy(Study):
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`."""
         return [
-            f"{summary['driven']} of {summary['scenes']} scenes were driven to their target without a contact, within "
-            f"5 cm and 0.01 rad. Planning took {summary['planning_ms']:.0f} ms (median), "
-            f"{summary['planning_ms_p95']:.0f} ms (95 %), at most {summary['planning_ms_max']:.0f} ms."
+            f"{row['agent']}: {row['driven']} of {row['scenes']} scenes were driven to their target without a contact, "
+            f"within 5 cm and 0.01 rad. Planning took {row['planning_ms']:.0f} ms (median), "
+            f"{row['planning_ms_p95']:.0f} ms (95 %), at most {row['planning_ms_max']:.0f} ms."
+            for row in summary["agents"]
         ]
 
     def outputs(self, result: Result) -> list[Task[object]]:
@@ -211,24 +227,49 @@ class ManoeuvreStudy(Study):
 
         rows = sorted(result.rows, key=lambda row: row["driven"])
         driven = result.results.rows(TRAJECTORIES)
-        shown = [(self.scene(row["case"]), driven[row["case"],], _says(row)) for row in rows[: 5 * SHEET]]
+        shown = [
+            (self.scene(row["case"]), driven[MANOEUVRES.key(row)], self._says(row))
+            for row in rows[: 5 * SHEET]
+        ]
         tasks: list[Task[object]] = [
             partial(save_manoeuvres, shown[i : i + SHEET], result.folder / f"manoeuvres_{i // SHEET + 1}.png")
             for i in range(0, len(shown), SHEET)
         ]
         if parked := [row for row in rows if row["driven"]]:
-            case = max(parked, key=lambda row: row["direction_changes"])["case"]
-            filmed = self.scene(case), driven[case,]
-            tasks.append(partial(save_manoeuvre_film, *filmed, result.folder / "manoeuvre.gif"))
+            scenes = {row["case"]: self.scene(row["case"]) for row in parked}
+            # Where others move, if anywhere.
+            row = max(parked, key=lambda row: (len(scenes[row["case"]].crossings), row["direction_changes"]))
+            others = result.results.rows(ROAD_USERS).get(MANOEUVRES.key(row), {})
+            what = scenes[row["case"]], driven[MANOEUVRES.key(row)], others
+            tasks.append(partial(save_manoeuvre_film, *what, result.folder / "manoeuvre.gif"))
         return tasks
+
+    def _says(self, row: Row) -> str:
+        agent = f"{row['agent']}, " if len(self.agents) > 1 else ""
+        if row["driven"]:
+            n = row["direction_changes"]
+            times = f"{row['time_s']:.1f} s, {n} change{'' if n == 1 else 's'}"
+            return f"{agent}{times}, {100 * row['clearance_m']:.0f} cm clear"
+        return agent + (
+            "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
+        )
 
 
 def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
-    """Return the row of a manoeuvre, with `states`, the lines of its trajectory in the frame of its file."""
+    """Return the row of a manoeuvre, with `states` and `others`, the lines of its trajectory and of road users.
+
+    They are in the frame of its file.
+    """
     from parkenv.driving.vehicle import PHYSICS_S
 
     lines = made.states[:, : len(TRAJECTORIES.columns)].round(7)
     lines[:, :2] += made.scene.origin
+    time, others = [round(PHYSICS_S * i, 2) for i in range(len(lines))], Row()
+    if made.others is not None:
+        users, n = made.others.round(7).reshape(-1, 3), made.others.shape[1]
+        users[:, :2] += made.scene.origin
+        others = {"time_s": [at for at in time for _ in range(n)], "user": list(range(n)) * len(time)}
+        others |= dict(zip(ROAD_USERS.columns, users.T.tolist(), strict=True))
     return {
         "case": name,
         "planned": made.path is not None,
@@ -237,24 +278,52 @@ def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
         "length_m": made.length_m,
         "direction_changes": made.direction_changes,
         "planning_s": made.planning_s,
-        "states": {
-            "time_s": [round(PHYSICS_S * i, 2) for i in range(len(lines))],
-            **dict(zip(TRAJECTORIES.columns, lines.T.tolist(), strict=True)),
-        },
+        "states": {"time_s": time, **dict(zip(TRAJECTORIES.columns, lines.T.tolist(), strict=True))},
+        "others": others,
     }
 
 
-def _says(row: Row) -> str:
-    if row["driven"]:
-        n = row["direction_changes"]
-        return f"{row['time_s']:.1f} s, {n} change{'' if n == 1 else 's'}, {100 * row['clearance_m']:.0f} cm clear"
-    return "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
+def level_table(rows: Sequence[Row], level: Callable[[str], str]) -> list[Row]:
+    """Summarise manoeuvres: a row for each agent and each of its levels.
+
+    Args:
+        rows: of `MANOEUVRES`.
+        level: level of a case.
+
+    Returns:
+        agent, level, scenes, planned, driven, success (fraction that was driven) and its 95 % interval (Wilson),
+        contacts; median time_s, length_m and direction_changes of those that were driven; planning_ms (median),
+        planning_ms_p95, planning_ms_max.
+    """
+    import numpy as np
+    from scipy.stats import binomtest
+
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["agent"], level(row["case"])), []).append(row)
+    table = list[Row]()
+    for (agent, name), its in groups.items():
+        driven, planning = [row for row in its if row["driven"]], [1e3 * row["planning_s"] for row in its]
+        interval = binomtest(len(driven), len(its)).proportion_ci(0.95, "wilson")
+        medians = {
+            key: float(np.median([row[key] for row in driven])) if driven else np.nan
+            for key in ("time_s", "length_m", "direction_changes")
+        }
+        table.append({
+            "agent": agent, "level": name, "scenes": len(its), "planned": sum(row["planned"] for row in its),
+            "driven": len(driven), "success": len(driven) / len(its),
+            "success_ci95": [float(interval.low), float(interval.high)],
+            "contacts": sum(row["contact"] for row in its), **medians, "planning_ms": float(np.median(planning)),
+            "planning_ms_p95": float(np.quantile(planning, 0.95)), "planning_ms_max": max(planning),
+        })  # fmt: skip
+    return table
 
 
 @functools.cache
-def _warm() -> None:
+def _warm(agent: str) -> None:
     """Plan and drive once, so that the times of the others do not include loading compiled code."""
     from parkenv.driving.levels import level_scene
     from planners.driving.manoeuvre import park
+    from planners.driving.parking_agents import manoeuvre_planner
 
-    park(level_scene(SCENE_LEVELS[-1], 0))
+    park(level_scene(SCENE_LEVELS[-1], 0), manoeuvre_planner(agent))

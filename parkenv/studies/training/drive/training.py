@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+from abc import abstractmethod
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ from parkenv.studies.training.drive.env import (
     slot_groups,
 )
 from parkenv.studies.training.learning import RLTraining
-from parkenv.studies.training.spec import DriveTrainingSpec
+from parkenv.studies.training.spec import DriveTrainingSpec, ScenesTrainingSpec
 from parkenv.studies.training.training import Tested
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, parking_table
 from parkenv.studies.workers import Workers
@@ -41,12 +42,89 @@ from planners.names import PARKING_PLANNER
 _MOST_DECISIONS = round(60.0 / DECISION_S)  # a minute, as in the environment
 
 
-class DriveTraining(RLTraining):
+class Outcome(NamedTuple):
+    """Held-out tasks of one kind: (n,) bool, which succeeded; (n,) what is told of them; and `more` of the training."""
+
+    parked: NDArray[np.bool_]
+    value: NDArray[np.float64]
+    more: tuple[float, ...] = ()
+
+
+class ParkingTraining(RLTraining):
+    """Training whose score is the success rate over kinds of slots."""
+
+    spec: DriveTrainingSpec | ScenesTrainingSpec
+    value: ClassVar[str] = "time_s"
+    """What the mean over successes is told of, which breaks ties: less is better."""
+    more: ClassVar[tuple[str, ...]] = ()
+    """Further results for each kind."""
+
+    @property
+    @abstractmethod
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of slots."""
+
+    @abstractmethod
+    def outcomes(self, policy: Any, env: VecEnv) -> dict[str, Outcome]:
+        """Run a policy in the held-out tasks of each kind of slot."""
+
+    @property
+    def compared(self) -> tuple[AgentSpec, ...]:
+        """See `Training`: the planner, or none."""
+        return self.spec.agents
+
+    @property
+    def measures(self) -> tuple[str, ...]:
+        """See `Training`."""
+        return tuple(f"{kind}_success" for kind in self.kinds)
+
+    @property
+    def metrics(self) -> tuple[str, ...]:
+        """Success rate and mean `value` over the kinds; then those of each kind, see `evaluate`."""
+        of_kind = ("success", "low", "high", self.value, *self.more)
+        return ("success", self.value, *(f"{kind}_{name}" for kind in self.kinds for name in of_kind))
+
+    def evaluate(self, policy: Any, env: VecEnv) -> Row:
+        """Evaluate a policy on the held-out tasks.
+
+        Returns:
+            Per kind: success rate with 95 % interval (Wilson), mean `value` of successes (NaN for none), and `more`.
+            `success` and `value` are also means over the kinds.
+        """
+        row: Row = {}
+        for kind, (parked, value, more) in self.outcomes(policy, env).items():
+            interval = binomtest(int(parked.sum()), len(parked)).proportion_ci(0.95, "wilson")
+            mean = float(value[parked].mean()) if parked.any() else np.nan
+            found = (float(parked.mean()), float(interval.low), float(interval.high), mean, *more)
+            names = ("success", "low", "high", self.value, *self.more)
+            row |= {f"{kind}_{name}": value for name, value in zip(names, found, strict=True)}
+        means = {
+            name: float(np.mean([row[f"{kind}_{name}"] for kind in self.kinds]))
+            for name in ("success", self.value)
+        }
+        return means | row
+
+    def score(self, row: Row) -> tuple[float, ...]:
+        """Return the success rate, then minus the mean value to break ties."""
+        value = row[self.value]
+        return (row["success"], -value if value == value else -np.inf)
+
+    def across_seeds(self, curves: list[list[Row]]) -> dict[str, list[dict[str, float]]]:
+        """See `Training`."""
+        return {kind: across_seeds(curves, f"{kind}_success") for kind in self.kinds}
+
+    def save_curves(self, *drawn: Any) -> None:
+        """See `Training`."""
+        save_success_curves(*drawn)
+
+
+class DriveTraining(ParkingTraining):
     """Training of an agent that drives into slots, of every kind on the lots equally often."""
 
     spec: DriveTrainingSpec
     evaluated_by = ("env", "lot", "evaluation_episodes")
     evaluations = 20
+    more = ("contacts", "level")
 
     @property
     def config(self) -> DriveTrainingConfig:
@@ -63,16 +141,6 @@ class DriveTraining(RLTraining):
         """See `Training`: one on each lot."""
         lots = [build(scenario).lot for scenario in self.spec.test_on or self.scenarios]
         return {lot.name: lot for lot in lots}
-
-    @property
-    def compared(self) -> tuple[AgentSpec, ...]:
-        """See `Training`: the planner, or none."""
-        return self.spec.agents
-
-    @property
-    def measures(self) -> tuple[str, ...]:
-        """See `Training`."""
-        return tuple(f"{kind}_success" for kind in self.kinds)
 
     def check(self) -> None:
         """See `Training`."""
@@ -95,45 +163,18 @@ class DriveTraining(RLTraining):
         """The kinds of slots on the lots."""
         return tuple(dict.fromkeys(group.kind for group in self.groups))
 
-    @property
-    def metrics(self) -> tuple[str, ...]:
-        """Success rate and mean time, s, over the kinds; then the metrics of each kind, see `evaluate`."""
-        of_kind = ("success", "low", "high", "contacts", "time_s", "level")
-        return ("success", "time_s", *(f"{kind}_{name}" for kind in self.kinds for name in of_kind))
-
     def make_env(self) -> BatchVecEnv:
         """Make a batch of drives, at the first level of the curriculum."""
         return BatchVecEnv(DriveTrainingEnv(self.config.n_envs, self.groups, self.config))
 
-    def evaluate(self, policy: Any, env: VecEnv) -> Row:
-        """Evaluate a policy on the held-out tasks.
-
-        Returns:
-            Per kind: success rate with 95 % interval (Wilson), fraction of contacts (including leaving the area), mean
-            time of successes, s (NaN for none), and curriculum level. `success` and `time_s` are means over
-            the kinds.
-        """
-        row: Row = {}
+    def outcomes(self, policy: Any, env: VecEnv) -> dict[str, Outcome]:
+        """See `ParkingTraining`; contacts include leaving the area, the level is that of the curriculum."""
+        levels, found = env.get_attr("levels")[0], dict[str, Outcome]()
         for kind in self.kinds:
             status, time = evaluate_parking(policy, self._tasks[kind])
-            parked = status == PARKED
-            interval = binomtest(int(parked.sum()), len(parked)).proportion_ci(0.95, "wilson")
-            row |= {
-                f"{kind}_success": float(parked.mean()),
-                f"{kind}_low": float(interval.low),
-                f"{kind}_high": float(interval.high),
-                f"{kind}_contacts": float((status >= CONTACT).mean()),
-                f"{kind}_time_s": float(time[parked].mean()) if parked.any() else np.nan,
-                f"{kind}_level": float(env.get_attr("levels")[0][kind]),
-            }
-        success, time_s = (
-            float(np.mean([row[f"{kind}_{name}"] for kind in self.kinds])) for name in ("success", "time_s")
-        )
-        return {"success": success, "time_s": time_s, **row}
-
-    def score(self, row: Row) -> tuple[float, ...]:
-        """Return the success rate, then minus the mean time to break ties."""
-        return (row["success"], -row["time_s"] if row["time_s"] == row["time_s"] else -np.inf)
+            more = float((status >= CONTACT).mean()), float(levels[kind])
+            found[kind] = Outcome(status == PARKED, time, more)
+        return found
 
     def arguments(self) -> dict[str, Any]:
         """Return the constructor's arguments: goal features and, for sparse rewards, hindsight experience replay."""
@@ -184,19 +225,11 @@ class DriveTraining(RLTraining):
         own = {c: total[c] for c in ("success", "success_ci95", "contacts", "time_s")}
         return Tested(",".join(self.tests), own, transfer)
 
-    def across_seeds(self, curves: list[list[Row]]) -> dict[str, list[dict[str, float]]]:
-        """See `Training`."""
-        return {kind: across_seeds(curves, f"{kind}_success") for kind in self.kinds}
-
     @property
     def title(self) -> str:
         """See `Training`."""
         lots = " and ".join(lot.name for lot in self.lots)
         return f"{lots}: {self.evaluation_episodes} parkings of each kind in held-out tasks"
-
-    def save_curves(self, *drawn: Any) -> None:
-        """See `Training`."""
-        save_success_curves(*drawn)
 
 
 def evaluate_parking(
