@@ -12,12 +12,13 @@ from planners.driving.clearance import Clearance, is_collision_free
 from planners.driving.reeds_shepp import Words, word_cost, words_between
 
 CHECK_M, FINE_M = 0.15, 0.015  # maximum distance, m, between checked poses, and that without any clearance
+ROOMY_M = 0.045  # clearance, m, from which on the first one is enough
 
 
 @compiled(error_model="numpy")
 def _check_every(margin: float) -> float:
-    """Return the distance between checked poses, m: corners that pass each other in between overlap by less than it."""
-    return CHECK_M if margin >= 0.1 else max(1.5 * margin, FINE_M)
+    """Return the distance between checked poses, m: corners that pass each other in between overlap little."""
+    return CHECK_M if margin >= ROOMY_M else max(1.5 * margin, FINE_M)
 
 
 @compiled(error_model="numpy")
