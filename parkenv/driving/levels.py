@@ -38,7 +38,7 @@ def levels(vehicle: VehicleParameters) -> dict[str, Level]:
     quarter = 0.25 * vehicle.length
     return {
         "normal": Level((quarter, quarter + 0.5), (0.85, 1.2), (4.5, 7.0), 3),
-        "complex": Level((0.9, quarter), (0.4, 0.85), (4.0, 6.0), 5),
+        "complex": Level((min(0.9, quarter), quarter), (0.4, 0.85), (4.0, 6.0), 5),
         "extreme": Level((0.6, 0.9), (0.3, 0.4), (3.5, 6.0), 8),
         "moving": Level((quarter, quarter + 0.5), (0.85, 1.2), (4.5, 7.0), 3, crossings=3),
     }

@@ -305,7 +305,7 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
         for part, old, new in _parts(name, was, its):
             if old != new:
                 raise InputError(
-                    f"--resume: {part:.80} was {old!r:.200} in {folder}, now it is {new!r:.200}; "
+                    f"--resume: {part:.300} was {old!r:.200} in {folder}, now it is {new!r:.200}; "
                     "use the same settings, or another folder"
                 )
     return both

@@ -235,7 +235,7 @@ def _search(
                     continue
                 yaw_cell = math.floor(nyaw / (2.0 * math.pi) * yaw_cells) % yaw_cells
                 key = ((row * int(columns) + column) * yaw_cells + yaw_cell) * 2 + (direction > 0.0)
-                place = (key * _SPREAD) % _TABLE
+                place = ((key * _SPREAD) >> 16) % _TABLE  # low bits of a product depend on low bits alone
                 while node_of[place] >= 0 and cell_of[node_of[place]] != key:
                     place = (place + 1) % _TABLE
                 old = node_of[place]

@@ -18,6 +18,7 @@ from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option
 from parkenv.files.spec_file import Axis
 from parkenv.studies.fields import Figures, SceneLevels, Seed, Vehicle, levels_in
+from parkenv.studies.fingerprints import fingerprints
 from parkenv.studies.results import CsvTable, LongTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.version import __version__
@@ -165,7 +166,13 @@ class ManoeuvreStudy(Study):
 
     def settings(self) -> Row:
         """See `Study`."""
-        return {"version": __version__, **self.tables()}
+        return {"version": __version__, **self.tables(), "files": fingerprints(self.files())}
+
+    def files(self) -> list[Path]:
+        """See `Spec`: the scenes instead of their folder, and trained models."""
+        scenes = [source for source in self.sources.values() if isinstance(source, Path)]
+        models = [Path(agent.partition(":")[2]) for agent in self.agents if ":" in agent]
+        return [file for file in super().files() if file != self.cases] + scenes + models
 
     def cells(self) -> list[Cell]:
         """See `Study`."""
