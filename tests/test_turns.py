@@ -22,7 +22,7 @@ from parkenv.mapping.route import survey_route
 from parkenv.studies.bench import sumo
 from parkenv.studies.bench.town import blocks_of
 from parkenv.studies.simulate import adapt_to_agent
-from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
+from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.lot import GraphError, Lane, Mouth, ParkingLot, Turn
 from planners.heuristics import POLICIES
 
@@ -139,7 +139,7 @@ TURNS = st.builds(
 )
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(turns=st.lists(TURNS, min_size=1, max_size=12), seed=st.integers(0, 99))
 def test_nobody_ever_makes_a_forbidden_turn(turns, seed):
     """Of all compiled drivers, in a crowded town; turns that the map has not, or that leave no way on, are dropped."""
@@ -151,7 +151,9 @@ def test_nobody_ever_makes_a_forbidden_turn(turns, seed):
             wrong = {problem.index for problem in error.problems}
             turns = [one for i, one in enumerate(turns) if i not in wrong]
     assume(turns)
-    demand = Demand(PoissonArrivals(400.0, 8 * 3600, 8.5 * 3600), ExponentialTime(1800.0))
+    demand = Demand(
+        PoissonArrivals(200.0, 8 * 3600, 8.5 * 3600), ExponentialTime(1800.0), ConstantTime(300.0)
+    )
     drivers = [DriverKind(policy=policy) for policy in POLICIES.values()]
     fleet = Fleet(make_scenario(lot), demand, background="none", drivers=drivers)
     fleet.reset(seed)
