@@ -26,10 +26,10 @@ SEARCH = SearchSettings(
     greed=2.0,
     patience=0.3,
     most_expansions=8_000,
-    attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.05, 0.5)),
+    attempts=((0.2, 1.0), (0.1, 1.0), (0.1, 0.5), (0.04, 0.5)),
 )
 """Settings of the search in scenes: long moves first, and a path soon rather than the shortest."""
-TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.05, 0.0), (0.02, 0.0), (0.01, 0.0)))
+TIGHT = dataclasses.replace(SEARCH, most_expansions=6_000, attempts=((0.04, 0.0), (0.02, 0.0), (0.01, 0.0)))
 """Settings of the search out of the tightest slots."""
 FINEST = dataclasses.replace(SEARCH, most_expansions=12_000, attempts=((0.008, 0.0), (0.004, 0.0)))
 """Settings of the last search, out of slots hardly longer than the car."""
@@ -42,7 +42,10 @@ EXACT = TrackingSettings(
 AIM_M, AIM_RAD = 0.03, 0.004
 """Largest distance, m, and angle, rad, of the pose aimed at from the target, within what a scene tolerates."""
 _ROOMY_M = 0.1  # room at the target, m, from which on the car aims at it exactly
-_CLOSE_M = 0.015  # clearance, m, below which a fluent drive is compared with an exact one
+_CLOSE_M, _SURE = (
+    0.015,
+    0.8,
+)  # clearance, m, and share of the tolerance, from which on a fluent drive is enough
 _LONGEST_S = 600.0
 _WAY_M, _WAY_CLEAR_M, _TIGHT_WAY_M = (
     2.0,
@@ -111,6 +114,12 @@ class Judgement(NamedTuple):
     error_m: float
     error_rad: float
 
+    @property
+    def merit(self) -> tuple[bool, bool, float]:
+        """Whether it was driven, and exactly enough, and the clearance up to the one that is enough."""
+        far = max(self.error_m / POSITION_TOLERANCE_M, self.error_rad / ANGLE_TOLERANCE_RAD)
+        return self.driven, self.driven and far <= _SURE, min(self.clearance_m, _CLOSE_M)
+
 
 def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None) -> Manoeuvre:
     """Plan a path from a scene's start to its target, and drive it.
@@ -133,12 +142,12 @@ def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None)
             states, others = drive(scene, path, tracking)
             made = Manoeuvre(scene, path, states, planning_s, others)
             tried.append((made.judged(), made))
-            if tried[-1][0].driven and tried[-1][0].clearance_m >= _CLOSE_M:
+            if tried[-1][0].merit == (True, True, _CLOSE_M):
                 return made
     if not tried:
         start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
         return Manoeuvre(scene, None, start[None], planning_s)
-    return max(tried, key=lambda each: (each[0].driven, each[0].clearance_m))[1]
+    return max(tried, key=lambda each: each[0].merit)[1]
 
 
 def paths_in_scene(scene: Scene) -> Iterator[CarPath]:
