@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from parkenv.studies.statistics import mean_interval
+from parkenv.show.plurals import interval_text
 
 HERE = Path(__file__).resolve().parent
 TWINS = {
@@ -31,6 +31,8 @@ TWINS = {
 }
 """Titles of what is trained, by memory and observation."""
 BESIDE = ("reactive", "occupancy")
+SMOOTHED = 15
+"""Updates over which curves are means."""
 
 
 def train(memory, observation, options):
@@ -51,7 +53,7 @@ def read(folder, kind):
 
 
 def table(tests):
-    """Return lines of a table: means of each seed, mean of all, and the difference to the belief by seed and world."""
+    """Return lines of a table: means of each seed, mean of all, and the difference to the belief in the same worlds."""
     times = {}
     for key, rows in tests.items():
         seeds = sorted({row["seed"] for row in rows})
@@ -64,10 +66,38 @@ def table(tests):
         if key in times:
             mine = times[key]
             each = ", ".join(f"{mean:.1f}" for mean in mine.mean(axis=1))
-            mean, low, high = mean_interval((mine - times[BESIDE]).mean(axis=0))
-            difference = "" if key == BESIDE else f"{mean:+.1f} [{low:+.1f}, {high:+.1f}]"
+            difference = "" if key == BESIDE else interval_text(*difference_of(mine, times[BESIDE]), "+.1f")
             lines.append(f"| {title} | {each} | {mine.mean():.1f} | {difference} |")
     return lines
+
+
+def difference_of(mine, theirs):
+    """Return the mean difference of times, (seeds, worlds) s in the same worlds, and the ends of its 95 % interval.
+
+    The bootstrap draws seeds, of either side, and worlds: other trainings would differ as much as other days.
+    """
+    rng, means = np.random.default_rng(0), []
+    for _ in range(2000):
+        rows = [rng.integers(0, len(times), len(times)) for times in (mine, theirs)]
+        worlds = rng.integers(0, mine.shape[1], mine.shape[1])
+        means.append(mine[rows[0]][:, worlds].mean() - theirs[rows[1]][:, worlds].mean())
+    return mine.mean() - theirs.mean(), np.percentile(means, [2.5, 97.5])
+
+
+def write(curves, path):
+    """Write the means of each seed's curve over `SMOOTHED` updates."""
+    with path.open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(["memory", "observation", "seed", "decisions", "total_s"])
+        for key in TWINS:
+            for seed in sorted({row["seed"] for row in curves[key]}):
+                mine = [row for row in curves[key] if row["seed"] == seed]
+                for first in range(0, len(mine), SMOOTHED):
+                    part = mine[first : first + SMOOTHED]
+                    mean = np.average(
+                        [float(r["total_s"]) for r in part], weights=[int(r["searches"]) for r in part]
+                    )
+                    rows.writerow([*key, seed, part[-1]["decisions"], f"{mean:.1f}"])
 
 
 def draw(curves, path):
@@ -89,8 +119,8 @@ def draw(curves, path):
                 raw = np.interp(
                     grid, [int(r["decisions"]) for r in mine], [float(r["total_s"]) for r in mine]
                 )
-                padded = np.pad(raw, 2, mode="edge")
-                lines.append(np.convolve(padded, np.ones(5) / 5.0, mode="valid"))
+                padded = np.pad(raw, SMOOTHED // 2, mode="edge")
+                lines.append(np.convolve(padded, np.ones(SMOOTHED) / SMOOTHED, mode="valid"))
             color = f"C{list(TWINS).index(key)}"
             grid = grid / 1e3
             ax.plot(grid, np.mean(lines, axis=0), color=color, label=TWINS[key])
@@ -106,7 +136,7 @@ def draw(curves, path):
 
 
 def main():
-    """Train what is wanted; write `twins.png`, and print the table."""
+    """Train what is wanted; write `curves.csv` and `twins.png`, and print the table."""
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -121,7 +151,9 @@ def main():
     if not given.draw:
         with ThreadPoolExecutor(given.jobs) as pool:
             list(pool.map(lambda key: train(*key, options), TWINS))
-    draw(read(given.out, "curve"), given.out / "twins.png")
+    curves = read(given.out, "curve")
+    write(curves, given.out / "curves.csv")
+    draw(curves, given.out / "twins.png")
     print("\n".join(table(read(given.out, "test"))))
 
 
