@@ -105,7 +105,7 @@ def test_every_format_says_the_same_scene_wherever_it_lies(tmp_path):
 
 
 def test_parkbench_is_read_in_the_frame_of_its_obstacles_without_what_lies_below_the_target(tmp_path):
-    car = VEHICLES["parkbench"]
+    car = TPCAP
     stop = [[-0.8, -1.5], [-0.8, 1.5]]  # across the parked car, and beyond its sides
     wall = [[8.0, -3.0], [8.0, 3.0]]
     file = tmp_path / "scene.json"
@@ -121,7 +121,7 @@ def test_parkbench_is_read_in_the_frame_of_its_obstacles_without_what_lies_below
     # Either end of the wheel stop is still there, 0.4 to 0.5 m long, and the wall whole.
     ends = left.length - 6.0
     assert 0.8 <= ends <= 1.0
-    assert read_scene(file, TPCAP).vehicle == TPCAP
+    assert read_scene(file, VEHICLES["parkbench"]).vehicle == VEHICLES["parkbench"]
 
 
 @settings(max_examples=15, deadline=None)

@@ -17,7 +17,7 @@ from pydantic import Field, Strict
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.crossings import Crossing
 from parkenv.driving.scene import MAX_POINTS, Contour, Scene, outlines_without
-from parkenv.driving.vehicle import VEHICLES, VehicleParameters
+from parkenv.driving.vehicle import TPCAP, VEHICLES, VehicleParameters
 from parkenv.errors import InputError, naming, nearest
 from parkenv.files.limited_reading import is_there, parse_json, read_text, read_toml
 from parkenv.files.spec_file import Several, Spec, read_tables
@@ -182,7 +182,7 @@ def _tpcap(text: str, name: str, vehicle: VehicleParameters | None) -> Scene:
         )
     corners = np.split(values[7 + n :].reshape(-1, 2), np.cumsum(counts)[:-1]) if n else []
     contours = [Contour(_opened(points)) for points in corners]
-    return _made(name, vehicle or VEHICLES["tpcap"], values[:3].tolist(), values[3:6].tolist(), contours)
+    return _made(name, vehicle or TPCAP, values[:3].tolist(), values[3:6].tolist(), contours)
 
 
 def _parkbench(content: Mapping[str, Any], name: str, vehicle: VehicleParameters | None) -> Scene:
@@ -210,7 +210,7 @@ def _parkbench(content: Mapping[str, Any], name: str, vehicle: VehicleParameters
         if isinstance(error, InputError):
             raise
         raise InputError(f"is no scene of ParkBench: {type(error).__name__} {error}") from error
-    car = vehicle or VEHICLES["parkbench"]
+    car = vehicle or TPCAP  # the file names no car
     # The benchmark drops obstacle points in the footprint of the parked car, such as wheel stops.
     contours = outlines_without(lines, goal, car, PARKBENCH_STEP_M)
     return _made(name, car, start.tolist(), goal.tolist(), contours)
