@@ -40,13 +40,15 @@ MOVES = 2 * WAYS
 """Number of actions: forward and backward, with every steering; until the car would touch something, or short."""
 OBSERVATION_SIZE = 13 + WAYS + BEAMS
 MOST_MOVES = 40
-"""Greatest number of moves before the curve."""
-DETOUR_M = 10.0
+"""Greatest number of moves before the curve in training."""
+PLANNED_MOVES = 120
+"""Likewise of a plan."""
+DETOUR_M = 20.0
 """By how much a curve may cost more than the cheapest without obstacles, m."""
 MARGINS = (0.1, 0.05, 0.02, 0.01)
 """Clearances to obstacles, m, that are tried in order; less where start or target are closer."""
-TRIES = 4
-"""Paths from either end for each of them."""
+TRIES, TEMPERATURE = 8, 3.0
+"""Paths from either end for each of them, and by how much flatter than learned the drawn moves are distributed."""
 FITS = ("length", "width", "wheelbase", "rear_overhang", "max_steering")
 """Parameters of a car that a path depends on."""
 CARS = {name: (min(v), max(v)) for name in FITS for v in [[getattr(c, name) for c in VEHICLES.values()]]}
@@ -102,16 +104,18 @@ class Rollout:
     Args:
         task: the task.
         margin: clearance to obstacles, m.
+        most: greatest number of moves.
 
     Attributes:
         seen: (`OBSERVATION_SIZE`,) float32, what the network observes.
+        mask: (`MOVES`,) int8, which moves are possible; none if the car is stuck.
         done: whether the path is whole.
         lengths, curvatures: the moves so far, and the curve, m and 1/m.
         cost: of them, m.
     """
 
-    def __init__(self, task: Task, margin: float) -> None:
-        self.task = task
+    def __init__(self, task: Task, margin: float, most: int = MOST_MOVES) -> None:
+        self.task, self._most = task, most
         self.costs = DriveCosts(task.radius, min(margin, task.room), SEARCH.change_m, SEARCH.steer_m)
         self.seen = np.zeros(OBSERVATION_SIZE, dtype=np.float32)
         self._pose, self._last = task.slot.copy(), np.zeros(2)
@@ -123,13 +127,7 @@ class Rollout:
     @property
     def over(self) -> bool:
         """Whether the path is whole, too long, or the car is stuck."""
-        return self.done or len(self.lengths) >= MOST_MOVES or not self.mask.any()
-
-    @property
-    def mask(self) -> NDArray[np.int8]:
-        """Which moves are possible, (`MOVES`,); none if the car is stuck."""
-        free = np.abs(self._free)
-        return np.concatenate([free >= SHORTEST_M, free > SHORT_M]).astype(np.int8)
+        return self.done or len(self.lengths) >= self._most or not self.mask.any()
 
     def move(self, action: int) -> float:
         """Make a move; return its cost, m, and that of the curve if there is one."""
@@ -154,6 +152,8 @@ class Rollout:
             self._free, self.seen,
         )  # fmt: skip
         self.done = len(lengths) > 0
+        free = np.abs(self._free)
+        self.mask = np.concatenate([free >= SHORTEST_M, free > SHORT_M]).astype(np.int8)
         self.lengths += lengths.tolist()
         self.curvatures += curvatures.tolist()
         return cost if self.done else 0.0
@@ -208,7 +208,7 @@ class LearnedPlanner:
 
     Args:
         policy: a policy of sb3-contrib's MaskablePPO.
-        tries: paths that are tried from either end for each clearance: the likeliest, then drawn ones.
+        tries: paths that are drawn from either end for each clearance where the likeliest ones fail.
         finish: let hybrid A* plan where the network's paths cannot be driven.
     """
 
@@ -240,9 +240,13 @@ class LearnedPlanner:
                 )
         task = prepare(scene)
         for margin in dict.fromkeys(min(margin, task.room) for margin in MARGINS):
-            tried = [Rollout(each, margin) for _ in range(self._tries) for each in (task, task.swapped())]
-            self.go_on(tried, rivals=True)
-            best = min(tried, key=lambda path: (not path.done, path.cost))
+            for tries in (1, self._tries):
+                ends = (task, task.swapped()) * tries
+                tried = [Rollout(end, margin, PLANNED_MOVES) for end in ends]
+                self.go_on(tried, rivals=True)
+                best = min(tried, key=lambda path: (not path.done, path.cost))
+                if best.done:
+                    break
             if best.done:
                 way = np.array(best.lengths), np.array(best.curvatures)
                 lengths, curvatures = shorten_path(task.space, best.task.slot, *way, best.costs)
@@ -257,7 +261,7 @@ class LearnedPlanner:
         Of `rivals` the cheapest is wanted: all but the first two make drawn moves, and the dearer ones end early.
         """
         draws, best = np.random.default_rng(0), math.inf
-        for _ in range(MOST_MOVES):
+        while True:
             going = [i for i, path in enumerate(paths) if not path.over and path.cost < best]
             if not going:
                 break
@@ -265,7 +269,7 @@ class LearnedPlanner:
             if rivals:
                 noise = draws.gumbel(size=(len(paths), MOVES))
                 noise[:2] = 0.0
-                likely += noise[going]
+                likely += TEMPERATURE * noise[going]
             for i, action in zip(going, likely.argmax(axis=1).tolist(), strict=True):
                 paths[i].move(action)
                 if rivals and paths[i].done:

@@ -93,7 +93,7 @@ FLEET_CONFIGS = dict.fromkeys(_WITH_MASKS, TrainingConfig(32, "MultiInputPolicy"
 
 # Paths are short: two to fifteen moves.
 _IN_SCENES = {**_ON_POLICY, "n_steps": 32, "gamma": 0.99}
-SCENES_CONFIGS = {"maskable-ppo": TrainingConfig(256, "MultiInputPolicy", _IN_SCENES, 0.05, steps=500_000)}
+SCENES_CONFIGS = {"maskable-ppo": TrainingConfig(256, "MultiInputPolicy", _IN_SCENES, 0.05, steps=600_000)}
 """Config of each algorithm for planning in scenes."""
 
 

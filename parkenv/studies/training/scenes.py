@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import shapely
 from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from parkenv.driving.levels import level_scene
-from parkenv.driving.scene import Contour, Scene
-from parkenv.driving.vehicle import VehicleParameters, placed
+from parkenv.driving.scene import Scene
+from parkenv.driving.vehicle import VehicleParameters
 from parkenv.envs.sb3 import BatchVecEnv
 from parkenv.studies.training.configs import SCENES_CONFIGS
 from parkenv.studies.training.curve_file import Row
@@ -42,13 +40,9 @@ from planners.names import PARKING_PLANNER
 Observations = dict[str, NDArray[Any]]
 
 TIMES_TRIED = 8
-"""Mean number of times that a drawn scene is tried: drawing it takes as long as a few tries."""
+"""Mean number of times that a drawn scene is tried: drawing it takes as long as some tries."""
 DRAWN = 512
 """Number of drawn scenes at a time."""
-MOST_BOXES, FREE_M = 6, 0.3
-"""Largest number of boxes in a drawn scene beside those of its level, and their distance to the car's ends, m."""
-SWAPPED = 0.3
-"""Share of paths that begin at the other end."""
 FAILURE_M = 40.0
 """Cost of a path without end, m."""
 CLEARANCE_M = 0.05
@@ -133,26 +127,17 @@ class ScenesEnv(VectorEnv[Observations, NDArray[Any], NDArray[Any]]):
                 else:
                     self._tasks[self._rng.integers(DRAWN)] = task
             task = self._tasks[self._rng.integers(len(self._tasks))]
-            task = task.swapped() if self._rng.random() < SWAPPED else task
             path = Rollout(task, float(self._rng.choice(MARGINS)))
             if not path.over:
                 return path
 
     def _drawn(self) -> Scene:
-        """Draw a scene of a level, with a car of its own and further boxes in the aisle and around it."""
+        """Draw a scene of a level, with a car of its own."""
         rng = self._rng
         car = VehicleParameters(**{name: float(rng.uniform(*ends)) for name, ends in CARS.items()})
         # Seeds far above those of evaluations, tests and comparisons.
         seed = int(rng.integers(1 << 40, 1 << 62))
-        scene = level_scene(self.levels[rng.integers(len(self.levels))], seed, car)
-        ends = shapely.union_all(shapely.polygons(car.corners(np.stack([scene.start, scene.target]))))
-        boxes = []
-        for _ in range(rng.integers(MOST_BOXES + 1)):
-            size, at = rng.uniform(0.1, 5.0, 2), np.append(rng.uniform((-12.0, -4.0), (12.0, 10.0)), 0.0)
-            corners = placed(0.5 * size * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]), at)
-            if shapely.distance(ends, shapely.Polygon(corners)) > FREE_M:
-                boxes.append(Contour(corners))
-        return dataclasses.replace(scene, contours=scene.contours + tuple(boxes), crossings=())
+        return level_scene(self.levels[rng.integers(len(self.levels))], seed, car)
 
 
 class ScenesTraining(ParkingTraining):

@@ -527,7 +527,7 @@ class FleetTrainingSpec(TrainingSpec):
         default="0.1",
     )
     k: ObservedSlots = 5
-    steps: Steps = 500_000
+    steps: Steps = 600_000
     evaluate_every: EvaluateEvery | None = Field(None, description="A tenth of the steps if absent.")
     evaluation_episodes: Episodes = Field(
         8, description="Days of an evaluation; the test in the end has twice as many."
@@ -606,10 +606,10 @@ class ScenesTrainingSpec(TrainingSpec):
         default="all but moving",
         parse=levels_in,
     )
-    steps: Steps = 500_000
+    steps: Steps = 600_000
     evaluate_every: EvaluateEvery | None = Field(None, description="A tenth of the steps if absent.")
     evaluation_episodes: Episodes = Field(
-        32, description="Scenes of an evaluation, of each level; the test in the end has twice as many."
+        16, description="Scenes of an evaluation, of each level; the test in the end has twice as many."
     )
     agents: Several[Annotated[AgentItem, AfterValidator(_planner)]] = Field(
         (AgentSpec(name=PARKING_PLANNER),),
