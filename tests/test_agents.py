@@ -43,7 +43,7 @@ def test_unknown_names_and_options_are_refused_with_the_known_ones():
         make_agent("mdp", scenario, cost=3)
     with pytest.raises(InputError, match="within_m"):
         make_agent("first-free", scenario, within_m=0.0)
-    with pytest.raises(InputError, match=r"mdp\(failure_s='x'\) cannot be made: TypeError"):
+    with pytest.raises(InputError, match="failure_s is 'x', want a finite number"):
         make_agent("mdp", scenario, failure_s="x")
     with pytest.raises(InputError, match="agent is None, want a name"):
         make_agent(None, scenario)

@@ -225,7 +225,7 @@ class ManoeuvreStudy(Study):
             f"{row['agent']}: {row['driven']} of {row['scenes']} scenes were driven to their target without a contact, "
             f"within 5 cm and 0.01 rad. Planning took {row['planning_ms']:.0f} ms (median), "
             f"{row['planning_ms_p95']:.0f} ms (95 %), at most {row['planning_ms_max']:.0f} ms."
-            for row in summary["agents"]
+            for row in summary.get("agents", ())
         ]
 
     def outputs(self, result: Result) -> list[Task[object]]:
