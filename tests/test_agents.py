@@ -112,7 +112,14 @@ def test_agents_get_the_public_part_of_a_scenario_only(name):
     assert not hasattr(agent.problem, "occupancy")
 
 
-@pytest.mark.parametrize("name", [n for n in AGENT_NAMES if n != "oracle"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("network", "rollout")))
+        for name in AGENT_NAMES
+        if name != "oracle"
+    ],
+)
 def test_a_batch_of_observations_gives_the_actions_of_the_single_ones(name):
     scenario = make_scenario("campus")
     agent = make_agent(name, scenario)

@@ -62,6 +62,7 @@ def later(day, seconds):
     return day._replace(arrival=day.arrival + seconds, free_from=day.free_from + seconds)
 
 
+@pytest.mark.slow
 def test_it_is_never_above_the_best_schedule_of_a_tiny_day():
     rng = np.random.default_rng(1)
     gaps = []

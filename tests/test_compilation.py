@@ -95,6 +95,7 @@ def kept(folder):
     return {path: path.stat().st_mtime_ns for path in Path(folder).rglob("*.nbc")}
 
 
+@pytest.mark.slow
 def test_code_that_two_processes_have_compiled_works_together(own, tmp_path):
     """Numba's `sort` and `argsort` have functions of the same name, and each is the same one of its process."""
     for name, body in (("lowest", "x.sort(); return x[0]"), ("first", "return x.argsort()[0]")):
@@ -138,6 +139,7 @@ def test_a_folder_that_cannot_be_written_costs_time_and_is_told_of_once(own, tmp
     assert "NUMBA_CACHE_DIR" in told[1]
 
 
+@pytest.mark.slow
 def test_of_processes_that_need_the_same_code_one_compiles_it(own, tmp_path):
     cache = tmp_path / "cache"
     together = [ended(process) for process in [start(own, cache) for _ in range(3)]]

@@ -42,6 +42,7 @@ def trained():
     return counts, levels, forecast_days(counts, 0, settings=CurveSettings())
 
 
+@pytest.mark.slow
 def test_nothing_of_a_day_or_later_ones_reaches_its_forecast(trained):
     counts, _, before = trained
     changed = counts.occupied.copy()

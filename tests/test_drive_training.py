@@ -85,7 +85,10 @@ def small():
         yield
 
 
-@pytest.fixture(scope="module", params=sorted(STEPS))
+@pytest.fixture(
+    scope="module",
+    params=[pytest.param(name, marks=[pytest.mark.slow] * (name == "tqc")) for name in sorted(STEPS)],
+)
 def trained(request, tmp_path_factory):
     """A short training of each algorithm, and its folder."""
     folder = tmp_path_factory.mktemp(request.param)

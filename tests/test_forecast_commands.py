@@ -52,7 +52,13 @@ def test_an_evaluation_has_a_row_and_a_picture_for_each_model(tmp_path):
     assert json.loads((tmp_path / "b" / "summary.json").read_text())["rows"][0]["car_parks"] == 1
 
 
-@pytest.mark.parametrize(("days", "options"), [(1, []), (3, ["--from", "2024-01-01"]), (10, [])])
+@pytest.mark.parametrize(
+    ("days", "options"),
+    [
+        (1, []),
+        *(pytest.param(*each, marks=pytest.mark.slow) for each in ((3, ["--from", "2024-01-01"]), (10, []))),
+    ],
+)
 def test_a_short_record_is_no_trouble(tmp_path, days, options):
     counts = write(tmp_path / "counts.csv", days)
     ended = parkenv("occupancy", "evaluate", counts, *options, "--out", tmp_path / "out")

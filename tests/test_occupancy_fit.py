@@ -217,6 +217,7 @@ def test_nothing_to_fit_is_refused():
         fit_process(log, prior_sd=0.0)
 
 
+@pytest.mark.slow
 def test_the_real_logs_process_follows_the_day_and_survives_its_file(tmp_path):
     if not REAL_LOG.exists():
         pytest.skip("the CNRPark-EXT log is not in shared/data")
@@ -284,6 +285,7 @@ def summary(log):
     return np.array([log.occupied.mean(), each.std(ddof=1), changes])
 
 
+@pytest.mark.slow
 def test_worlds_fitted_to_the_first_days_of_the_real_log_are_like_its_later_days():
     """Weekdays, in order of time: the fit has seen none of the days that its worlds are compared with."""
     if not REAL_LOG.exists():

@@ -19,7 +19,7 @@ from parkenv.studies.study import ExecutionSpec
 from parkenv.world.facility import Facility
 from parkenv.world.tariff import Price, Zone
 
-pytestmark = SOCKETS
+pytestmark = [SOCKETS, pytest.mark.slow]
 
 
 @pytest.fixture(scope="module")

@@ -65,6 +65,7 @@ def test_smaller_pictures_are_another_session():
     assert len({survey.key_of(0) for survey in surveys}) == 2
 
 
+@pytest.mark.slow
 def test_a_survey_goes_on_where_it_was(tmp_path):
     study = SurveyStudy(scenario=scenario_spec("mini"), weather="sunny", every=15.0, sessions=1, jobs=1)
     run(study, tmp_path)

@@ -494,6 +494,7 @@ def test_straight_on_the_car_drives_at_the_limit_and_slower_where_that_is_lower(
     assert not fast.log.contacts
 
 
+@pytest.mark.slow
 def test_crossing_a_lane_costs_nothing_before_one_drives_on_from_there():
     driver, _, _ = started("mini")
     lot = driver.scenario.lot
