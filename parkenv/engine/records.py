@@ -468,13 +468,11 @@ FLEET = np.dtype(
         ("searching_s", np.float64),
         ("parked_s", np.float64),
         # Blocked lanes: length of a manoeuvre, s, 0 without blocking; by vertex, (n_vertices,): until when, s, float64,
-        # and by which car, int64; the vertex of these, int64, one for each junction. For how long cars show that they
-        # leave, s.
+        # and by which car, int64. For how long before they leave cars show it, s.
         ("manoeuvre_s", np.float64),
         ("n_vertices", np.int64),
         ("blocked_until", ADDRESS),
         ("blocked_by", ADDRESS),
-        ("junction_of_vertex", ADDRESS),
         ("leaving_soon_s", np.float64),
         # The live map: (n_slots,) LIVE_SLOT; its delay, s; a ring of REPORT records that are not on it yet: its size,
         # the first, and how many there are.
@@ -494,6 +492,8 @@ FLEET = np.dtype(
         # compiled policy, or 0.
         ("by_cost", ADDRESS),
         ("policy_data", ADDRESS),
+        # (n_vertices,) int64, the vertex by which a blocked lane is known: one for each junction.
+        ("junction_of_vertex", ADDRESS),
     ],
     align=True,
 )
