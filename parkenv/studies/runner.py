@@ -221,14 +221,20 @@ def _tables_of(study: Study) -> Sequence[Table]:
 
 
 def _put_in_order(stages: Sequence[Stage], results: Results) -> None:
-    """Put the rows of all stages in the order of their cells; a cell may be in several stages."""
+    """Put the rows of all stages in the order of their cells, in all tables that have the same keys.
+
+    A cell may be in several stages.
+    """
     order: dict[Table, dict[int, list[Key]]] = {}
+    alike: dict[Table, list[Table]] = {}
     for _, study, cells in stages:
+        alike[study.table] = [table for table in _tables_of(study) if (*table.keys,) == (*study.table.keys,)]
         of_table = order.setdefault(study.table, {})
         for work, items in cells:
             of_table.setdefault(id(work), []).extend(key for item in items for key in study.keys(work, item))
     for table, of_cells in order.items():
-        results.put_in_order([key for keys in of_cells.values() for key in keys], table)
+        for one in alike[table]:
+            results.put_in_order([key for keys in of_cells.values() for key in keys], one)
 
 
 def _draw(result: Result, progress: Progress) -> None:

@@ -432,8 +432,6 @@ class FleetStudy(Study):
 
         days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
         keys = [key for work, items in self.cells() for item in items for key in self.keys(work, item)]
-        for table in self.all_tables[1:]:
-            results.put_in_order(keys, table)
         blocks = results.rows(BLOCKS)
         shown = [blocks[key] for key in keys if key in blocks]
         zoned = [row for row in shown if has_zones(self.built[row["scenario"]])]
