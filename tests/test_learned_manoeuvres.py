@@ -102,7 +102,7 @@ def test_a_network_refuses_a_car_that_it_has_not_learned_to_drive():
     plan = manoeuvre_planner("learned")
     for vehicle in VEHICLES.values():
         scene = level_scene("perpendicular-normal", 1, vehicle)
-        assert park(scene, plan).judged().driven
+        assert park(scene, plan).judged.driven
     truck = dataclasses.replace(CAR, length=6.0, wheelbase=4.0)
     with pytest.raises(InputError, match="with length from"):
         park(level_scene("perpendicular-normal", 1, truck), plan)
@@ -147,11 +147,11 @@ def test_a_car_waits_for_others_that_it_would_touch(monkeypatch):
         scene = level_scene("oblique-moving", seed)
         path = next(paths_in_scene(scene))
         states, others = drive(scene, path, TrackingSettings())
-        assert Manoeuvre(scene, path, states, 0.0, others).judged().driven
+        assert Manoeuvre(scene, path, states, 0.0, others).judged.driven
         with monkeypatch.context() as patch:
             patch.setattr(manoeuvre, "_has_to_wait", lambda *_: False)
             states, others = drive(scene, path, TrackingSettings())
-            hit += Manoeuvre(scene, path, states, 0.0, others).judged().contact
+            hit += Manoeuvre(scene, path, states, 0.0, others).judged.contact
     assert hit >= 1
 
 

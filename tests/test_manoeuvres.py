@@ -146,7 +146,7 @@ def test_the_tightest_slot_is_left_and_entered_within_all_limits(tmp_path):
     (tmp_path / "slot.toml").write_text(own_text())
     scene = read_scene(tmp_path / "slot.toml")
     made = park(scene)
-    judged = made.judged()
+    judged = made.judged
     assert judged.driven, judged
     assert judged.clearance_m > 0.001
     states, limits = made.states, scene.vehicle
@@ -300,7 +300,7 @@ def test_all_public_scenes_are_driven(source):
     if not (PUBLIC / source).exists():
         pytest.skip(f"the scenes of {source} are not in shared/data")
     for scene in read_scenes(PUBLIC / source):
-        assert park(scene).judged().driven, scene.name
+        assert park(scene).judged.driven, scene.name
 
 
 def test_a_drive_is_shortened_until_the_deadline_and_within_the_limits():
@@ -309,7 +309,7 @@ def test_a_drive_is_shortened_until_the_deadline_and_within_the_limits():
 
     made = park(level_scene("perpendicular-normal", 0, TPCAP))
     shorter = shorten(made, 20.0)
-    judged, states = shorter.judged(), shorter.states
+    judged, states = shorter.judged, shorter.states
     assert judged.driven
     assert judged.clearance_m >= 0.015
     assert shorter.time_s < 0.8 * made.time_s

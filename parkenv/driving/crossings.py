@@ -21,9 +21,8 @@ PATIENCE_S = 3.0
 BACK_S = 4.0
 """For how long it does, s."""
 CAR = VehicleParameters()
-_STEPS = np.linspace(0.0, 1.0, 6)[
-    1:
-]  # moments between two states at which the car and the others are checked
+# Moments between two states at which the car and the others are checked.
+_STEPS = np.linspace(0.2, 1.0, 5)
 
 
 @dataclass(frozen=True)

@@ -30,10 +30,8 @@ WINDOW_M = 9.0
 
 _STEERINGS = np.array([0.0, 0.5, -0.5, 1.0, -1.0])
 _MOST_NODES = 60_000
-_TABLE, _SPREAD = (
-    1 << 17,
-    0x9E3779B1,
-)  # size of the hash table of cells, and a factor that spreads them over it
+# Size of the hash table of cells, and a factor that spreads them over it.
+_TABLE, _SPREAD = 1 << 17, 0x9E3779B1
 _TIGHT_CELL_M, _TIGHT_YAW_CELLS, _FINE_BELOW_M = 0.02, 720, 0.01  # halved where a move has less clearance
 _SHORTEST_M, _LONGEST_M = 0.02, 1.5  # of moves that end where the car would touch something
 

@@ -7,13 +7,14 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.crossings import CrossingTraffic, caused_contact
-from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
+from parkenv.driving.encounters import encounter_times
 from parkenv.driving.scene import ANGLE_TOLERANCE_RAD, POSITION_TOLERANCE_M, FootprintCheck, Scene
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
 from planners.driving.car_path import CarPath
@@ -42,16 +43,11 @@ EXACT = TrackingSettings(
 AIM_M, AIM_RAD = 0.03, 0.004
 """Largest distance, m, and angle, rad, of the pose aimed at from the target, within what a scene tolerates."""
 _ROOMY_M = 0.1  # room at the target, m, from which on the car aims at it exactly
-_CLOSE_M, _SURE = (
-    0.015,
-    0.8,
-)  # clearance, m, and share of the tolerance, from which on a fluent drive is enough
+# Clearance, m, and share of the tolerance, from which on a fluent drive is enough.
+_CLOSE_M, _SURE = 0.015, 0.8
 _LONGEST_S = 600.0
-_WAY_M, _WAY_CLEAR_M, _TIGHT_WAY_M = (
-    2.0,
-    0.02,
-    3.2,
-)  # of six ways, their clearance, and their sum in a tight slot, m
+# Length of six ways, their clearance, and their sum in a tight slot, m.
+_WAY_M, _WAY_CLEAR_M, _TIGHT_WAY_M = 2.0, 0.02, 3.2
 _BRAKING = 2.0  # m/s², for road users
 
 
@@ -89,8 +85,9 @@ class Manoeuvre:
         sign = np.sign(self.states[self.states[:, SPEED] != 0.0, SPEED])
         return int((sign[1:] != sign[:-1]).sum())
 
+    @cached_property
     def judged(self) -> Judgement:
-        """Judge what was driven by its footprints alone; the clearance is that to what stands."""
+        """The judgement of what was driven, by its footprints alone; the clearance is that to what stands."""
         check = self.scene.check(self.states[:, :3])
         crossings = self.scene.crossings
         if self.others is not None and caused_contact(
@@ -115,7 +112,7 @@ class Judgement(NamedTuple):
     error_rad: float
 
     @property
-    def merit(self) -> tuple[bool, bool, float]:
+    def score(self) -> tuple[bool, bool, float]:
         """Whether it was driven, and exactly enough, and the clearance up to the one that is enough."""
         far = max(self.error_m / POSITION_TOLERANCE_M, self.error_rad / ANGLE_TOLERANCE_RAD)
         return self.driven, self.driven and far <= _SURE, min(self.clearance_m, _CLOSE_M)
@@ -131,8 +128,8 @@ def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None)
         scene: the scene.
         plan: yields paths; `paths_in_scene` if None.
     """
-    paths, planning_s, tried = (plan or paths_in_scene)(scene), 0.0, list[tuple[Judgement, Manoeuvre]]()
-    while not any(judged.driven for judged, _ in tried):
+    paths, planning_s, tried = (plan or paths_in_scene)(scene), 0.0, list[Manoeuvre]()
+    while not any(made.judged.driven for made in tried):
         began = time.perf_counter()
         path = next(paths, None)
         planning_s += time.perf_counter() - began
@@ -141,13 +138,13 @@ def park(scene: Scene, plan: Callable[[Scene], Iterator[CarPath]] | None = None)
         for tracking in (TrackingSettings(), EXACT):
             states, others = drive(scene, path, tracking)
             made = Manoeuvre(scene, path, states, planning_s, others)
-            tried.append((made.judged(), made))
-            if tried[-1][0].merit == (True, True, _CLOSE_M):
+            if made.judged.score == (True, True, _CLOSE_M):
                 return made
+            tried.append(made)
     if not tried:
         start = np.concatenate([scene.start, np.zeros(STATE_SIZE - 3)])
         return Manoeuvre(scene, None, start[None], planning_s)
-    return max(tried, key=lambda each: each[0].merit)[1]
+    return max(tried, key=lambda made: made.judged.score)
 
 
 def paths_in_scene(scene: Scene) -> Iterator[CarPath]:
@@ -245,6 +242,5 @@ def _has_to_wait(
     vehicle: VehicleParameters, tracker: PathTracker, traffic: CrossingTraffic, speed: float
 ) -> bool:
     """Return whether a road user is in the way, now or soon."""
-    ahead = tracker.poses_ahead(PREDICTION_TIMES_S * max(abs(speed), START_SPEED))
-    own = vehicle.at_middle(ahead)
+    own = tracker.middle_ahead(speed)
     return bool(np.isfinite(encounter_times(vehicle, own, traffic.outlines, traffic.velocity)).any())

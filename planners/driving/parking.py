@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED, encounter_times
+from parkenv.driving.encounters import encounter_times
 from parkenv.driving.vehicle import VehicleParameters
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
@@ -156,8 +156,8 @@ class ParkingAgent(MapAgent):
         before, memory.others = memory.others, at
         velocity = np.zeros_like(at) if before is None else (at - before) / _CONTROL_S
         assert memory.tracker is not None
-        own = memory.tracker.poses_ahead(PREDICTION_TIMES_S * max(abs(speed), START_SPEED))
-        when = encounter_times(self.vehicle, self.vehicle.at_middle(own), outlines, velocity)
+        own = memory.tracker.middle_ahead(speed)
+        when = encounter_times(self.vehicle, own, outlines, velocity)
         return bool(np.isfinite(when).any())
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
+from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
 from parkenv.driving.vehicle import VehicleParameters, move_along
 from parkenv.errors import InputError
 from planners.driving.car_path import CarPath
@@ -65,10 +66,8 @@ class TrackingSettings:
 
 
 _CRAWL = 0.1  # m/s, lowest commanded speed before the end of the path
-_ARRIVED, _EXACTLY = (
-    0.01,
-    0.001,
-)  # m, from the end of a segment; the second where the car stops to turn its wheels
+# m, from the end of a segment; the second where the car stops to turn its wheels
+_ARRIVED, _EXACTLY = 0.01, 0.001
 _BRAKE_FROM = 0.85  # of the acceleration
 _LAG = 0.8  # steps
 _CLOSE, _CLOSER = 0.06, 0.005  # m, likewise, of where the car may stand
@@ -147,6 +146,11 @@ class PathTracker:
         station = np.minimum(segment.station[self._at] + distances, segment.station[-1])
         at = np.searchsorted(segment.station, station - 1e-9)
         return np.asarray(segment.poses[np.minimum(at, len(segment.poses) - 1)])
+
+    def middle_ahead(self, speed: float) -> FloatArray:
+        """Return where the car's middle will be on its path after `PREDICTION_TIMES_S`, (6, 3), at a speed, m/s."""
+        distances = PREDICTION_TIMES_S * max(abs(speed), START_SPEED)
+        return self._vehicle.at_middle(self.poses_ahead(distances))
 
     def _drive(
         self, segment: _Segment, station: float, left: float, speed: float, steering: float

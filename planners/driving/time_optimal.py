@@ -56,9 +56,9 @@ def shorten(made: Manoeuvre, deadline_s: float) -> Manoeuvre:
         InputError: CasADi is not installed.
     """
     until = time.perf_counter() + deadline_s
-    if made.path is None or made.others is not None or not made.judged().driven:
+    if made.path is None or made.others is not None or not made.judged.driven:
         return made
-    room_m = made.judged().clearance_m
+    room_m = made.judged.clearance_m
     best, least_m = made, min(room_m, _LEAST_CLEAR_M)
     for clear_m, share in _CLEAR:
         reference = _first(made)
@@ -67,7 +67,7 @@ def shorten(made: Manoeuvre, deadline_s: float) -> Manoeuvre:
             if found is None:
                 break
             driven = dataclasses.replace(made, states=follow(made.scene.vehicle, found, made.states[0]))
-            judged = driven.judged()
+            judged = driven.judged
             if judged.driven and judged.clearance_m >= least_m and driven.time_s < best.time_s:
                 best = driven
             saved, reference = reference.time_s - found.time_s, found

@@ -158,10 +158,6 @@ class ScenesTraining(ParkingTraining):
         """See `Training`: one for each level."""
         return {level: level for level in self.spec.levels}
 
-    def check(self) -> None:
-        """See `Training`: levels are checked by their specification."""
-        super().check()
-
     def make_env(self) -> BatchVecEnv:
         """Make a batch of paths."""
         return BatchVecEnv(ScenesEnv(self.config.n_envs, self.spec.levels))

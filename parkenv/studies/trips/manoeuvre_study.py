@@ -280,7 +280,7 @@ def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
     return {
         "case": name,
         "planned": made.path is not None,
-        **made.judged()._asdict(),
+        **made.judged._asdict(),
         "time_s": made.time_s,
         "length_m": made.length_m,
         "direction_changes": made.direction_changes,

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
-from parkenv.driving.encounters import PREDICTION_TIMES_S, START_SPEED
 from parkenv.driving.lot_obstacles import REACH_M, LotObstacles
 from parkenv.driving.parking_task import KINDS, ParkingTasks
 from parkenv.driving.road_users import RoadUsers
@@ -519,8 +518,7 @@ class VehicleController:
         if self.others is None:
             return False
         speed = abs(float(self.state[SPEED]))
-        ahead = tracker.poses_ahead(PREDICTION_TIMES_S * max(speed, START_SPEED))
-        when = self.others.encounter_times(self.vehicle.at_middle(ahead))
+        when = self.others.encounter_times(tracker.middle_ahead(speed))
         if np.isinf(when).all():
             self._stood_s = 0.0
             return False
