@@ -125,7 +125,6 @@ class Training(ABC):
         """What is said before the training begins."""
         return None
 
-    @abstractmethod
     def check(self) -> None:
         """Check, before training, that everything can be trained, tested and drawn.
 
