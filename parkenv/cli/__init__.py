@@ -35,6 +35,9 @@ COMMANDS = {
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", SEARCH),
     "commute": Entry("Let drivers come day after day, with a map that learns.", "drivers:Commute", SEARCH),
     "fleet": Entry("Let many cars search one lot, and compare what they know.", "drivers:Fleet", SEARCH),
+    "policy": Entry(
+        "Find what a town should do: prices, limits, permits, guidance, capacity.", "policy:Policy", SEARCH
+    ),
     "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
     "pomdp": Entry("Write the search in a small lot for POMDP solvers of others.", "compare:Pomdp", SEARCH),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),

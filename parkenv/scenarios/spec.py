@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from datetime import date, datetime
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -53,7 +54,8 @@ from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
-from parkenv.world.tariff import HOUR_S, NO_ZONE, VALUE_OF_TIME, added
+from parkenv.world.tariff import HOUR_S, NO_ZONE, VALUE_OF_TIME, Price, Zone, priced
+from parkenv.world.tariff import Hours as ZoneHours
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""
@@ -432,27 +434,29 @@ def _per_hour(text: str) -> float:
 
 
 def _price(text: str) -> tuple[str, object]:
-    """Parse ZONE=AMOUNT/h, or ZONE=+AMOUNT/h."""
+    """Parse ZONE=AMOUNT/h, ZONE=+AMOUNT/h, or ZONE=AMOUNT@HOURS;AMOUNT@HOURS."""
     zone, equals, amount = text.rpartition("=")
     if not (zone and equals):
         raise InputError(f"is {text!r:.60}, want ZONE=AMOUNT/h, such as centre=2/h")
+    if "@" in amount:
+        return zone, amount
     number = _per_hour(amount)
     return zone, f"+{number:g}" if amount.startswith("+") else number
 
 
 def _amount(value: object) -> object:
-    """Check a price, or a text such as +1 for one that is added."""
-    number = math.nan
+    """Check a price, a text such as +1 for one that is added, or prices by hours."""
+    number: float | Price = math.nan
     if isinstance(value, int | float | str) and not isinstance(value, bool):
         with contextlib.suppress(InputError):
-            number = added(value)
-    if not 0.0 <= number <= MAX_PRICE:
-        raise ValueError(f"a number from 0 to {MAX_PRICE:g}, or a text such as +1")
+            number = priced(value)
+    if isinstance(number, float) and not 0.0 <= number <= MAX_PRICE:
+        raise ValueError(f"a number from 0 to {MAX_PRICE:g}, a text such as +1, or 1 @ 08:00-12:00")
     return value if isinstance(value, str) else number
 
 
 _PRICE = {
-    "anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_PRICE}, {"type": "string", "pattern": r"^\+"}]
+    "anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_PRICE}, {"type": "string", "pattern": r"^\+|@"}]
 }
 _Amount = Annotated[float | str, BeforeValidator(_amount), WithJsonSchema(_PRICE)]
 
@@ -476,7 +480,8 @@ class Costs(Spec):
     prices: Annotated[dict[str, _Amount], BeforeValidator(_prices)] = option(
         {},
         f"Price of an hour in a zone of the lot, in any currency; {NO_ZONE}: in slots without a zone; +AMOUNT is "
-        "added. Once for each zone; * stands for any letters of the names of paid zones.",
+        "added; AMOUNT@HH:MM-HH:MM;... by hours. Once for each zone; * stands for any letters of the names of paid "
+        "zones.",
         name="--price",
         takes="ZONE=[+]AMOUNT/h",
         panel="Prices",
@@ -575,7 +580,42 @@ def _name(value: str) -> str:
     return value
 
 
-_MERGED = ("arrivals", "costs", "demand", "speeds")
+class ZoneSpec(Spec):
+    """Rules of a zone in place of the lot's, or of one that is cut out of it, such as the street of a market."""
+
+    of: str | None = Field(None, description="Zone that it is cut out of, whose rules it has else.")
+    facilities: Several[str] = Field(
+        (),
+        description="Facilities whose slots in that zone it takes; * stands for any letters. All if absent.",
+    )
+    price: Annotated[
+        float | str | dict[str, Any] | None, WithJsonSchema({"type": ["number", "string", "object"]})
+    ] = Field(None, description="Price of an hour, prices by hours (1 @ 08:00-12:00), or as in a lot file.")
+    hours: str | None = Field(
+        None, description="When one may park there: 'Mo,Tu,Th-Su 00:00-24:00; We 14:00-24:00', 24/7, off."
+    )
+    max_stay_s: float | None = Field(None, ge=0.0, le=1e7, description="Longest stay; 0: no limit.")
+    users: Several[str] | None = Field(None, description="Classes of drivers who may park there.")
+
+    def rules(self, name: str, base: Zone) -> Zone:
+        """Return the rules of the zone, those of its base where it has none of its own.
+
+        Raises:
+            InputError: a rule is none; the message names the field.
+        """
+        from parkenv.lots.formats.geojson_supply import price_of
+
+        own: dict[str, Any] = {"price": price_of(self.price)} if self.price is not None else {}
+        if self.hours is not None:
+            own["hours"] = ZoneHours.parse(self.hours)
+        if self.max_stay_s is not None:
+            own["max_stay_s"] = self.max_stay_s or None
+        if self.users is not None:
+            own["users"] = self.users
+        return replace(base, name=name, part_of=self.of or base.part_of, **own)
+
+
+_MERGED = ("arrivals", "costs", "demand", "speeds", "zones")
 """Tables of a scenario of which each value may be another one than the base's; others are replaced whole."""
 
 
@@ -619,6 +659,10 @@ class ScenarioSpec(Spec):
     demand: dict[PurposeName, PurposeSpec] = Field(
         {}, description="What many cars come for, by the name of the purpose, in the hours of `arrivals`."
     )
+    zones: dict[str, ZoneSpec] = Field(
+        {},
+        description="Rules of zones in place of the lot's, by name; with `of`, new zones that are cut out of it.",
+    )
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
     sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = option(
@@ -638,7 +682,8 @@ class ScenarioSpec(Spec):
     )
     base: PackagedLot | None = Field(
         None,
-        description="A packaged scenario for what is left out, also single values of arrivals, costs, demand, speeds.",
+        description="A packaged scenario for what is left out, also single values of arrivals, costs, demand, speeds, "
+        "zones.",
     )
 
     @model_validator(mode="before")

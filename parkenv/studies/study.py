@@ -40,6 +40,7 @@ STUDIES: Mapping[str, str] = {
     "commute": "parkenv.studies.commute.study:Commute",
     "fleet": "parkenv.studies.fleet.study:FleetStudy",
     "demand": "parkenv.studies.fleet.demand_study:DemandStudy",
+    "policy": "parkenv.studies.policy.study:PolicyStudy",
     "benchmark": "parkenv.studies.benchmark.study:Benchmark",
     "survey": "parkenv.studies.sensing.survey_study:SurveyStudy",
     "detectors": "parkenv.studies.sensing.detector_study:DetectorStudy",

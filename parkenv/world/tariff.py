@@ -162,6 +162,8 @@ class Price:
             own.
         charged: hours when parking is charged; only they count as stay. None: always.
         per_kwh: price of each kWh charged into the car, on top.
+        hourly: pairs of hours and the price of an hour then, instead of `per_hour`, `steps`, `free_s` and `charged`;
+            other hours are free.
 
     Raises:
         InputError: a value out of its range, or steps that fall; the message names the field.
@@ -178,10 +180,15 @@ class Price:
     daily_cap: float | None = None
     charged: Hours | None = None
     per_kwh: float = 0.0
+    hourly: tuple[tuple[Hours, float], ...] = ()
 
     def __post_init__(self) -> None:
         for name in ("per_hour", "free_s", "per_kwh"):
             require_number(name, getattr(self, name), least=0.0)
+        if self.hourly and (self.per_hour or self.steps or self.free_s or self.charged):
+            raise InputError("hourly is given, want neither per_hour, steps, free_s nor charged beside it")
+        for _, amount in self.hourly:
+            require_number("hourly", amount, least=0.0)
         if self.daily_cap is not None:
             require_number("daily_cap", self.daily_cap, least=0.0)
         object.__setattr__(self, "steps", tuple(map(tuple, self.steps)))
@@ -197,12 +204,36 @@ class Price:
                 )
             least_s, least = step
 
+    @classmethod
+    def parse(cls, text: str, field: str = "price") -> Price:
+        """Read prices by hours, as OpenStreetMap writes them: `1.5 @ 08:00-12:00; 3 @ Mo-Sa 12:00-15:00`.
+
+        Raises:
+            InputError: another text, or a price below 0.
+
+        Examples:
+            >>> price = Price.parse("1 @ 08:00-12:00; 3 @ 12:00-15:00")
+            >>> price.amount([9 * 3600.0, 11 * 3600.0], 2 * 3600.0).tolist()
+            [2.0, 4.0]
+        """
+        hourly = []
+        for part in text.split(";"):
+            amount, _, hours = part.partition("@")
+            try:
+                hourly.append((Hours.parse(hours.strip(), field), float(amount)))
+            except ValueError:
+                raise InputError(f"{field} is {text!r:.60}, want prices such as 1.5 @ 08:00-12:00") from None
+        return cls(hourly=tuple(hourly))
+
     def __bool__(self) -> bool:
         """Whether any stay costs anything."""
-        return any((self.per_hour, self.per_kwh, *(price for _, price in self.steps)))
+        amounts = (price for _, price in (*self.steps, *self.hourly))
+        return any((self.per_hour, self.per_kwh, *amounts))
 
     def raised(self, per_hour: float) -> Price:
         """Return the price with so much more an hour; a cap for a day stays."""
+        if self.hourly:
+            return replace(self, hourly=tuple((hours, price + per_hour) for hours, price in self.hourly))
         steps = tuple((stay_s, price + per_hour * stay_s / HOUR_S) for stay_s, price in self.steps)
         beyond = self.per_hour + per_hour if self.per_hour or not steps else 0.0
         return replace(self, per_hour=beyond, steps=steps)
@@ -234,6 +265,10 @@ class Price:
         return np.asarray(sum(np.minimum(part, cap) for part in parts) + np.zeros_like(stay))
 
     def _of(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
+        if self.hourly:
+            known = [(hours, price) for hours, price in self.hourly if price]
+            amounts = (hours.within(begin, stay) / HOUR_S * price for hours, price in known)
+            return np.asarray(sum(amounts, np.zeros(np.shape(stay))))
         charged = stay if self.charged is None else self.charged.within(begin, stay)
         charged = np.maximum(charged - self.free_s, 0.0)
         if not self.steps:
@@ -256,6 +291,7 @@ class Zone:
         max_stay_s: s, longest stay; where the price has charged hours, only these count.
         users: classes of users, one of which a driver must belong to: `public` (everyone), or names such as
             `permit-a`, `disabled`, `charging`, `customers`, `delivery`, `private`.
+        part_of: zone that it was cut out of: what drivers see in one they expect in the other.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -266,6 +302,7 @@ class Zone:
     hours: Hours | None = None
     max_stay_s: float | None = None
     users: tuple[str, ...] = (PUBLIC,)
+    part_of: str = ""
 
     def __post_init__(self) -> None:
         if self.max_stay_s is not None:
@@ -294,7 +331,8 @@ class Tariff:
 
     Args:
         per_hour: price of an hour by zone, at least 0, in any currency; a text such as `+1` is added to what an
-            hour of the zone costs, with its hours and steps as they are. A name may have `*` for any letters: that of
+            hour of the zone costs, with its hours and steps as they are; one such as `1 @ 08:00-12:00; 3 @ 12:00-18:00`
+            has prices by hours (`Price.parse`). A name may have `*` for any letters: that of
             all such zones that cost something. The first name of a zone counts; other zones keep their prices.
 
     Raises:
@@ -305,7 +343,10 @@ class Tariff:
 
     def __post_init__(self) -> None:
         for zone, price in self.per_hour.items():
-            require_number(f"price of zone {zone!r:.40}", added(price), least=0.0)
+            amount = priced(price)
+            require_number(
+                f"price of zone {zone!r:.40}", amount if isinstance(amount, float) else 0.0, least=0.0
+            )
         object.__setattr__(self, "per_hour", MappingProxyType(dict(self.per_hour)))
 
     def __bool__(self) -> bool:
@@ -318,9 +359,12 @@ class Tariff:
     def priced(self, zone: Zone) -> Zone:
         """Return the zone with the price that the tariff has for it, or as it is."""
         price = next((price for name, price in self.per_hour.items() if _means(name, zone)), None)
-        if isinstance(price, str):
-            return replace(zone, price=zone.price.raised(added(price)))
-        return zone if price is None else replace(zone, price=Price(price))
+        if price is None:
+            return zone
+        given = priced(price)
+        if isinstance(price, str) and isinstance(given, float):
+            return replace(zone, price=zone.price.raised(given))
+        return replace(zone, price=given if isinstance(given, Price) else Price(given))
 
     def require_zones(self, zones: Sequence[Zone], lot: str) -> None:
         """Check that a lot has every zone with a price.
@@ -335,20 +379,24 @@ class Tariff:
                 raise InputError(f"price: lot {lot!r:.40} has no {what} {name!r:.40}; {near}")
 
 
-def added(price: float | str) -> float:
-    """Return the amount of a price, of which a text that begins with + is added.
+def priced(price: float | str) -> float | Price:
+    """Return the amount of a price, or that which a text such as `+1` adds; of a text with `@`, prices by hours.
 
     Raises:
         InputError: it is another text.
     """
     if not isinstance(price, str):
-        return price
+        return float(price)
+    if "@" in price:
+        return Price.parse(price)
     try:
         if price.startswith("+"):
             return float(price)
     except ValueError:
         pass
-    raise InputError(f"price is {price!r:.40}, want an amount, or one that is added, such as +1")
+    raise InputError(
+        f"price is {price!r:.40}, want an amount, one that is added, such as +1, or 1 @ 08:00-12:00"
+    )
 
 
 def _means(name: str, zone: Zone) -> bool:

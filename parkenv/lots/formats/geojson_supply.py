@@ -42,7 +42,7 @@ def read_zones(document: Any) -> dict[str, Zone]:
                 raise InputError("its name is empty or has control characters")
             members = _members(given, ("price", "hours", "max_stay_s", "users"), "rules")
             if "price" in members:
-                members["price"] = _price(members["price"])
+                members["price"] = price_of(members["price"])
             if "hours" in members:
                 members["hours"] = Hours.parse(members["hours"])
             if not isinstance(members.get("users", []), list):
@@ -51,15 +51,24 @@ def read_zones(document: Any) -> dict[str, Zone]:
     return rules
 
 
-def _price(given: Any) -> Price:
+def price_of(given: Any) -> Price:
+    """Return the price of a number, that of an hour, of a text, by hours, or of the members of a price.
+
+    Raises:
+        InputError: it is none; the message names the field.
+    """
     if type(given) in (int, float):
         return Price(given)
+    if isinstance(given, str):
+        return Price.parse(given)
     members = _members(given, [f.name for f in fields(Price)], "price")
     steps = members.get("steps", [])
     if not isinstance(steps, list) or not all(isinstance(step, list) for step in steps):
         raise InputError(f"steps is {steps!r:.40}, want a list of pairs: stay in seconds and price")
     if "charged" in members:
         members["charged"] = Hours.parse(members["charged"], "charged")
+    if "hourly" in members:
+        members["hourly"] = Price.parse(str(members["hourly"]), "hourly").hourly
     return Price(**members)
 
 
@@ -77,6 +86,8 @@ def zone_document(zone: Zone) -> dict[str, Any]:
     price = {f.name: value for f in fields(Price) if (value := getattr(zone.price, f.name)) != f.default}
     if zone.price.charged is not None:
         price["charged"] = str(zone.price.charged)
+    if zone.price.hourly:
+        price["hourly"] = "; ".join(f"{amount:g} @ {hours}" for hours, amount in zone.price.hourly)
     document: dict[str, Any] = {"price": price} if price else {}
     if zone.hours is not None:
         document["hours"] = str(zone.hours)

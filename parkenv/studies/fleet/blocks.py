@@ -95,19 +95,20 @@ class Blocks:
         )
         several = np.bincount(pairs[:, 0]) > 1
         names, types = [], []
+        areas = np.array(lot.areas)[lot.area_of_zone]
         for number, zone in pairs.tolist():
             if number == len(lot.facilities):
-                names.append(lot.zones[zone])
+                names.append(str(areas[zone]))
                 types.append("zone")
             else:
                 its = lot.facilities[number]
-                names.append(f"{its.name}, {lot.zones[zone]}" if several[number] else its.name)
+                names.append(f"{its.name}, {areas[zone]}" if several[number] else its.name)
                 types.append(its.kind)
         twice = {name for name in names if names.count(name) > 1} if len({*names}) < len(names) else {NOWHERE}
         names = [
             f"{name} ({kind})" if name in twice else name for name, kind in zip(names, types, strict=True)
         ]
-        zones = tuple(lot.zones[zone] for zone in pairs[:, 1])
+        zones = tuple(areas[pairs[:, 1]].tolist())
         slots = np.bincount(of_slot, lot.capacity).astype(np.int64)
         return cls(tuple(names), tuple(types), zones, slots, of_slot)
 
@@ -115,6 +116,20 @@ class Blocks:
 def has_zones(scenario: Scenario) -> bool:
     """Return whether there is something to say of zones."""
     return scenario.has_rules or scenario.lot.zones != (NO_ZONE,)
+
+
+def area_prices(scenario: Scenario) -> dict[str, float]:
+    """Return what an hour costs in the zones of a lot; where parts were cut out of one, the mean over its spaces."""
+    lot = scenario.lot
+    price = np.array([float(zone.price.amount(scenario.priced_at_s, HOUR_S)) for zone in scenario.zone_rules])
+    spaces = np.bincount(lot.zone_of_slot, lot.capacity, len(lot.zones))
+    means = {}
+    for number, name in enumerate(lot.areas):
+        its = lot.area_of_zone == number
+        means[name] = float(
+            price[its][0] if its.sum() == 1 else np.average(price[its], weights=spaces[its]).round(2)
+        )
+    return means
 
 
 def paid(fleet: Fleet) -> FloatArray:

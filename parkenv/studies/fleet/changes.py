@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.show.plurals import interval_text, number_text, plural
-from parkenv.studies.fleet.setting import CAR_LISTS, GIVEN, NOWHERE, OWN, SETTING_COLUMNS, rate_text
+from parkenv.studies.fleet.setting import CAR_LISTS, COUNTED, GIVEN, NOWHERE, OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.fleet.tables import day_means, paired_days
 from parkenv.studies.results import Row
 
@@ -60,7 +60,8 @@ def summarize_changes(
         for what, before in (("scenario", {"scenario": first}), ("knows", {"knows": OWN, "share": 0.0})):
             earlier = by_setting.get(tuple((its | before)[name] for name in SETTING_COLUMNS), [])
             rate = its["arrivals_per_hour"]
-            if what == "scenario" and isinstance(rate, str) and rate != GIVEN:
+            follows = isinstance(rate, str) and rate != GIVEN and not purposes.get(str(its["scenario"]))
+            if what == "scenario" and (follows or rate == COUNTED):
                 continue  # a demand that follows counts has its own cars in every scenario
             if its[what] != before[what] and (pairs := paired_days(days, earlier)):
                 names = _words(what, its | before), _words(what, its)

@@ -75,11 +75,17 @@ def map_recordings(study: FleetStudy, rows: Rows) -> list[Recording]:
 
 def _town(scenario: Scenario) -> dict[str, Any]:
     lot, blocks = scenario.lot, Blocks.of(scenario.lot)
-    rules = {zone.name: rules_text(zone) for zone in scenario.zone_rules}
+    rules = [rules_text(zone) for zone in scenario.zone_rules]
+    first = np.unique(blocks.of_slot, return_index=True)[1]
     about = [
-        {"name": name, "type": kind, "zone": zone, "slots": slots, "rules": rules[zone]}
-        for name, kind, zone, slots in zip(
-            blocks.names, blocks.types, blocks.zones, blocks.slots.tolist(), strict=True
+        {"name": name, "type": kind, "zone": zone, "slots": slots, "rules": rules[number]}
+        for name, kind, zone, slots, number in zip(
+            blocks.names,
+            blocks.types,
+            blocks.zones,
+            blocks.slots.tolist(),
+            lot.zone_of_slot[first].tolist(),
+            strict=True,
         )
     ]
     return town_data(lot, about, blocks.of_slot)
@@ -99,6 +105,9 @@ def rules_text(zone: Zone) -> str:
         said.append(f"{table}{f', then {price.per_hour:g} an hour' if price.per_hour else ''}")
     elif price.per_hour:
         said.append(f"{price.per_hour:g} an hour")
+    elif price.hourly:
+        spans = (f"{amount:g} {str(hours).removeprefix('Mo-Su ')}" for hours, amount in price.hourly)
+        said.append(f"an hour: {', '.join(spans)}")
     if said:
         said[0] += f", {_time_text(price.free_s)} free" if price.free_s else ""
         said[0] += f", at most {price.daily_cap:g} a day" if price.daily_cap is not None else ""

@@ -47,7 +47,6 @@ from parkenv.studies.fleet.setting import (
 from parkenv.studies.results import CsvTable, Results, Row, Table
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
-from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
     from parkenv.engine.fleet import Fleet
@@ -296,21 +295,16 @@ class FleetStudy(Study):
         Raises:
             InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
         """
-        from parkenv.engine.fleet import DriverKind, Fleet
         from parkenv.studies.fleet.decision_limit import LimitedAgent
-        from parkenv.studies.fleet.drivers import demand_in, policy_of
+        from parkenv.studies.fleet.drivers import demand_in, guided_fleet
 
-        scenario = self.built[setting.scenario]
-        policy, agent = policy_of(setting.agent, scenario, setting.arrivals_per_hour)
-        kinds = [
-            DriverKind(setting.share, policy, setting.knows, shares=setting.knows == "shared"),
-            DriverKind(1.0 - setting.share, policy),
-        ]
-        fleet = Fleet(
-            scenario,
-            demand_in(self._followed(setting), setting.arrivals_per_hour, self.stay_s, self.patience_s),
-            drivers=kinds,
-            leave_full_lot=False,
+        rate = setting.arrivals_per_hour
+        fleet, agent = guided_fleet(
+            setting.agent,
+            self.built[setting.scenario],
+            demand_in(self._followed(setting), rate, self.stay_s, self.patience_s),
+            (setting.knows, setting.share),
+            rate,
             manoeuvre_s=self.blocked_s,
             **{name: getattr(self, name) for name in ("delay_s", "leaving_soon_s", "sees_cars")},
         )
@@ -426,7 +420,7 @@ class FleetStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.fleet.blocks import ALL, BLOCKS, has_zones, summarize_blocks
+        from parkenv.studies.fleet.blocks import ALL, BLOCKS, area_prices, has_zones, summarize_blocks
         from parkenv.studies.fleet.changes import summarize_changes
         from parkenv.studies.fleet.tables import summarize_days, summarize_hours
 
@@ -439,10 +433,7 @@ class FleetStudy(Study):
         mixed = [row for row in shown if set(row["purpose"]) != {ALL}]
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
-        prices = {
-            name: {zone.name: float(zone.price.amount(its.priced_at_s, HOUR_S)) for zone in its.zone_rules}
-            for name, its in self.built.items()
-        }
+        prices = {name: area_prices(its) for name, its in self.built.items()}
         purposes = {
             name: [purpose.name for purpose in its.demand.purposes]
             for name, its in self.built.items()

@@ -1,0 +1,63 @@
+"""The command `parkenv policy`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from rich.console import Console
+
+from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.tables import print_rows
+from parkenv.files.option import option
+from parkenv.show.report.tables import OF_FLEETS
+from parkenv.studies.fleet.tables import ONE_DAY
+from parkenv.studies.policy.study import PolicyStudy
+from parkenv.studies.results import without_nan
+from parkenv.studies.runner import Result
+
+ANSWER = (
+    "policy", "arrivals_per_hour", "in_band", "in_band_daily", "cruised_km", "cruised_km_of_today", "time_s", "revenue",
+    "revenue_of_today", "balked_fraction",
+)  # fmt: skip
+LOSERS = ("scenario", "arrivals_per_hour", "purpose", "change_s", "better_off", "worse_off", "paid_change")
+
+
+class Policy(StudyCommand):
+    """A file says what is wanted (aims), what may change (levers), and how many days may be simulated (budget).
+
+    The town is driven as it is today, with SFpark's rule, with prices that follow the occupancy, and with what an
+    evolution strategy proposes, all on the same days. What is best is told beside today and SFpark's rule on days and
+    demands that it was not made for: what is reached, what it costs whom, and how sure that is. today.json,
+    SFpark.json and ours.json are scenarios for `parkenv fleet`.
+    """
+
+    examples = """
+        parkenv policy council.toml --out results/policy --report
+        parkenv policy --scenario town --arrivals-per-hour 1.3x --budget 200
+        parkenv policy --resume --out results/policy
+        """
+
+    study: PolicyStudy = PolicyStudy()
+    spec: Path | None = option(None, "What is asked (.toml, .json).", takes="FILE", argument=True)
+    out: Path = option(
+        Path("results/policy"),
+        "Folder for summary.json, the policies as scenarios, trials.jsonl, and what `parkenv fleet` writes of the "
+        "held-out days.",
+        short="-o",
+    )
+
+    def asked_study(self) -> PolicyStudy:
+        """See `StudyCommand`."""
+        return self.study if self.spec is None else PolicyStudy.read(self.spec)
+
+    def show(self, console: Console, result: Result) -> None:
+        """Print what was found."""
+        summary = without_nan(result.summary)
+        if not summary.get("answer"):
+            return
+        print_rows(console, "The answer, on held-out days", summary["answer"], ANSWER, OF_FLEETS)
+        print_rows(console, "Who wins and who loses, against today", summary["losers"], LOSERS, OF_FLEETS)
+        for line in PolicyStudy.findings(summary):
+            console.print(line, soft_wrap=True)
+        if self.study.episodes == 1:
+            console.print(ONE_DAY, soft_wrap=True)

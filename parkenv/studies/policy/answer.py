@@ -1,0 +1,198 @@
+"""The answer of a policy study: what was reached on held-out days, who wins and loses, and in sentences."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.studies.fleet.blocks import ALL, BLOCKS, area_prices
+from parkenv.studies.fleet.changes import is_clear, summarize_changes
+from parkenv.studies.fleet.setting import OWN, rate_text
+from parkenv.studies.policy.town import share_in_band
+from parkenv.studies.results import Results, Row
+from parkenv.studies.statistics import columns_of, mean_interval, ratio_interval
+
+if TYPE_CHECKING:
+    from parkenv.studies.policy.study import HeldOut, PolicyStudy
+
+
+def answer_rows(
+    study: PolicyStudy, held_out: HeldOut, policies: Mapping[str, Row], results: Results
+) -> list[Row]:
+    """Return a row for each policy and held-out demand: what of the aims it reaches, with 95 % intervals over days.
+
+    `in_band` is the share of the block-hours whose mean over the days lies in the band, with a jackknife over days;
+    `in_band_daily` that of single days.
+    """
+    rows: list[Row] = []
+    today: dict[Any, dict[str, FloatArray]] = {}
+    blocks = results.rows(BLOCKS)
+    for setting, cell in zip(held_out.fleet_settings, held_out.cells(), strict=True):
+        days = results.of(held_out, cell)
+        if not days:
+            continue
+        rate = setting.arrivals_per_hour
+        shares = _occupancy(
+            study, [blocks[key] for item in cell.items for key in held_out.keys(setting, item)]
+        )
+        names = [study.town.blocks.names[i] for i in study.town.counted]
+        shares = shares[:, ~np.isin(names, policies[setting.scenario]["closed"])]
+        columns = range(shares.shape[2])
+        sums = {
+            "cruised_km": np.array([day["cars"] * day["cruised_m"] / 1000.0 for day in days]),
+            "time_s": np.array([day["total_s"] - day["parking_cost_s"] for day in days]),
+            "revenue": np.array([day["cars"] * day["paid"] for day in days]),
+        }
+        was = today.setdefault(rate, sums)
+        daily = [share_in_band(shares[[k]], columns, study.aims) for k in range(len(days))]
+        row = {
+            "policy": setting.scenario, "arrivals_per_hour": rate, "days": len(days),
+            "cars": sum(day["cars"] for day in days),
+            **columns_of("in_band", _jackknife(shares, columns, study)),
+            "in_band_daily": float(np.mean(daily)),
+            "occupancy": float(shares.mean()),
+        }  # fmt: skip
+        for name, its in sums.items():
+            row |= columns_of(name, mean_interval(its))
+            if was[name].sum():
+                row |= columns_of(f"{name}_of_today", ratio_interval(its, was[name]))
+        rows.append(row | {"balked_fraction": float(np.mean([day["balked_fraction"] for day in days]))})
+    return rows
+
+
+def _occupancy(study: PolicyStudy, days: Sequence[Row]) -> FloatArray:
+    """Return the occupancy of the counted blocks in the hours that count, (n_days, n_blocks, n_hours)."""
+    names = {study.town.blocks.names[i]: k for k, i in enumerate(study.town.counted)}
+    hours = {hour: k for k, hour in enumerate(hour for hour in study.town.hours if hour in study.aims.clock)}
+    shares = np.zeros((len(days), len(names), len(hours)))
+    for day, row in zip(shares, days, strict=True):
+        lines = zip(row["block"], row["purpose"], row["hour"], row["occupancy"], strict=True)
+        for block, purpose, hour, share in lines:
+            if purpose == ALL and block in names and hour in hours:
+                day[names[block], hours[hour]] = share
+    return shares
+
+
+def _jackknife(shares: FloatArray, columns: range, study: PolicyStudy) -> tuple[float, float, float]:
+    """Return the share in the band and its interval, from leaving out each day in turn (Tukey 1958)."""
+    from scipy.stats import t
+
+    n = len(shares)
+    found = share_in_band(shares, columns, study.aims)
+    if n < 2:
+        return found, np.nan, np.nan
+    left = np.array([share_in_band(np.delete(shares, k, axis=0), columns, study.aims) for k in range(n)])
+    error = np.sqrt((n - 1) / n * ((left - left.mean()) ** 2).sum()) * t.ppf(0.975, n - 1)
+    return found, max(found - float(error), 0.0), min(found + float(error), 1.0)
+
+
+def loser_rows(held_out: HeldOut, results: Results) -> list[Row]:
+    """Return what changes for the cars of each purpose, and for all, of each policy against today; see `changes`."""
+    settings = []
+    for cell in held_out.cells():
+        days = results.of(held_out, cell)
+        # Guidance is part of the policy.
+        if days:
+            settings.append([{**day, "knows": OWN, "share": 0.0} for day in days])
+    prices = {name: area_prices(its) for name, its in held_out.built.items()}
+    purposes = {
+        name: [one.name for one in its.demand.purposes]
+        for name, its in held_out.built.items()
+        if its.demand is not None
+    }
+    return [row for row in summarize_changes(settings, prices, purposes) if row["zone"] is None]
+
+
+def sentences(summary: Row) -> list[str]:
+    """Return what a council must know, in three sentences, and then what was assumed."""
+    rows = summary.get("answer") or []
+    if not rows:
+        return []
+    aims = summary["aims"]
+    rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in rows))
+    rate = rates[len(rates) // 2]
+    of = {row["policy"]: row for row in rows if row["arrivals_per_hour"] == rate}
+    today, rule, ours = of.values()
+    low, high = aims["band"]
+
+    def part(row: Row) -> str:
+        return f"{row['in_band']:.0%}{_interval(row, 'in_band', '.0%')}"
+
+    def less(row: Row, name: str) -> str:
+        change = row[f"{name}_of_today"] - 1.0
+        ends = [end - 1.0 for end in row[f"{name}_of_today_ci95"] if end is not None]
+        text = (
+            f" [{abs(ends[0]):.0%}, {abs(ends[1]):.0%}]" if len(ends) == 2 and ends[0] * ends[1] > 0.0 else ""
+        )
+        return f"{abs(change):.0%} {'less' if change < 0.0 else 'more'}{text}"
+
+    said = [
+        f"With this policy {part(ours)} of the block-hours from {aims['hours']} are {low:.0%} to {high:.0%} full, "
+        f"with today's prices {part(today)}, with SFpark's rule {part(rule)} ({rate_text(rate)}, held-out days)."
+    ]
+    if "cruised_km_of_today" in ours:
+        money = (
+            f", and {ours['revenue']:,.0f} a day is paid, {less(ours, 'revenue')}"
+            if "revenue_of_today" in ours
+            else ""
+        )
+        said.append(
+            f"Cars cruise {ours['cruised_km']:,.0f} km a day, {less(ours, 'cruised_km')} than today (SFpark's rule: "
+            f"{less(rule, 'cruised_km')}); a car takes {ours['time_s']:,.0f} s, today {today['time_s']:,.0f} s{money}."
+        )
+    losers = [
+        row
+        for row in summary["losers"]
+        if row["scenario"] == ours["policy"] and row["purpose"] and row["arrivals_per_hour"] == rate
+    ]
+    if losers:
+        losers = sorted(losers, key=lambda row: row["change_s"])
+        worst, best = losers[-1], losers[0]
+        said.append(
+            f"Prices counted as time, {_who(best)}, {_who(worst)}: "
+            f"{best['better_off']:.0%} and {worst['better_off']:.0%} of them are better off, "
+            f"{best['worse_off']:.0%} and {worst['worse_off']:.0%} worse off."
+        )
+    return [*said, *_other_demands(rows, rate, aims), _missed(ours, aims)]
+
+
+def _who(row: Row) -> str:
+    verb = "gain" if row["change_s"] < 0.0 else "lose"
+    text = f"{row['purpose']} {verb} {abs(row['change_s']):.0f} s a car"
+    return text if is_clear(row, "change_s") else f"{text} (no clear difference)"
+
+
+def _other_demands(rows: Sequence[Row], rate: Any, aims: Row) -> list[str]:
+    others = [row for row in rows if row["arrivals_per_hour"] != rate and row["policy"] == "ours"]
+    if not others:
+        return []
+    parts = [f"{row['in_band']:.0%} at {rate_text(row['arrivals_per_hour'])}" for row in others]
+    band = f"{aims['band'][0]:.0%} to {aims['band'][1]:.0%}"
+    return [
+        f"Where demand differs from what the policy was made for, in the band of {band}: {', '.join(parts)}."
+    ]
+
+
+def _missed(ours: Row, aims: Row) -> str:
+    missed = []
+    if aims.get("in_band") and ours["in_band"] < aims["in_band"]:
+        missed.append(f"{aims['in_band']:.0%} of the block-hours in the band, {ours['in_band']:.0%} reached")
+    for name, aim, words in (
+        ("cruised_km", "cruised", "of today's kilometres cruised"),
+        ("time_s", "time", "of today's time"),
+    ):
+        its = ours.get(f"{name}_of_today")
+        if aims.get(aim) is not None and its is not None and its > aims[aim]:
+            missed.append(f"at most {aims[aim]:.0%} {words}, {its:.0%} reached")
+    if aims.get("revenue") is not None and ours.get("revenue_of_today", 1.0) < aims["revenue"]:
+        missed.append(f"{aims['revenue']:.0%} of today's revenue, {ours['revenue_of_today']:.0%} reached")
+    return f"Missed: {'; '.join(missed)}." if missed else "All aims are reached."
+
+
+def _interval(row: Row, name: str, form: str) -> str:
+    low, high = row[f"{name}_ci95"]
+    known = None not in (low, high) and low == low
+    return f" [{low:{form}}, {high:{form}}]" if known else ""

@@ -1,0 +1,472 @@
+"""What a town should do: a search for a policy that reaches its aims, beside SFpark's rule and nothing done."""
+
+from __future__ import annotations
+
+from collections.abc import Generator, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
+
+import numpy as np
+from pydantic import Field
+
+from parkenv.errors import InputError
+from parkenv.files.option import option, words_in
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.fields import Figures, OneAgent, OneScenario, Seed, Values
+from parkenv.studies.fleet.setting import GIVEN, OWN, Demanded, Setting, times_demanded
+from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.policy.spec import Aims, Levers
+from parkenv.studies.results import JsonTable, Results, Row, Table
+from parkenv.studies.study import Cell, Stage, Study
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from parkenv.compiled.arrays import FloatArray
+    from parkenv.show.report.page import Page
+    from parkenv.studies.policy.town import Policy, PolicyTown
+    from parkenv.studies.report import Replay
+    from parkenv.studies.runner import Result
+    from parkenv.studies.workers import Task
+
+TODAY, RULE, OURS = "today", "SFpark", "ours"
+POLICIES = (TODAY, RULE, OURS)
+"""The policies that are told."""
+HELD_OUT = (0.9, 1.0, 1.1)
+"""Default demands of the held-out days, times that of the search."""
+
+
+class Trial(NamedTuple):
+    """A policy that is tried.
+
+    Attributes:
+        method: what proposed it.
+        round: in which round.
+        number: which of the round.
+        policy: what it is.
+    """
+
+    method: str
+    round: int
+    number: int
+    policy: Policy
+
+    @property
+    def columns(self) -> Row:
+        """Columns that identify it."""
+        return {"method": self.method, "round": self.round, "number": self.number}
+
+
+def _tried(row: Row) -> Row:
+    if np.array(row["occupancy"], np.float64).ndim != 2:
+        raise ValueError(row["occupancy"])
+    np.array([row["cruised_km"], row["time_s"], row["revenue"], *row["purpose_s"]], np.float64)
+    return row
+
+
+TRIALS = JsonTable("trials.jsonl", ("method", "round", "number", "day"), _tried, "day of a policy")
+"""Days of policies that were tried; see `PolicyTown.day`."""
+
+
+class PolicyStudy(Study):
+    """What a town should do: the policy that is nearest to its aims, told on days and demands that it was not made for.
+
+    All policies are tried on the same days. First the town as it is today, and SFpark's rule, round after round; then
+    prices that follow the occupancy with smaller and smaller steps (stochastic approximation; Robbins and Monro 1951,
+    averaged as by Polyak and Juditsky 1992); then an evolution strategy for functions that are noisy and cost much
+    (CMA-ES with margin; Hamano et al. 2022) moves the prices of each zone and hour, and every other lever. Of what
+    these found, the best on further days is ours.
+    """
+
+    table: ClassVar[Table] = TRIALS
+    block: ClassVar = 1
+    doing: ClassVar = "Trying policies"
+    unit: ClassVar = "days"
+    heading: ClassVar = "What the town should do"
+    table_titles: ClassVar = {
+        "answer": "The answer, on held-out days",
+        "losers": "Who wins and who loses, against today",
+        "tried": "What was tried, in the search",
+        "purposes": "Purposes, a day",
+    }
+
+    kind: Literal["policy"] = "policy"
+    scenario: OneScenario = Field(default_factory=lambda: scenario_spec("town"))
+    agent: OneAgent = AgentSpec(name="usual")
+    aims: Aims = Aims()
+    levers: Levers = Levers()
+    arrivals_per_hour: Values[Demanded] = option(
+        (GIVEN,),
+        "Demand of the days of the search, in turn: given, as the scenario has it, 1.2x, or cars an hour.",
+        takes="given|1.2x[,...]",
+        panel="Demand",
+        parse=words_in,
+    )
+    held_out: Values[Demanded] | None = option(
+        None,
+        "Demands that the answer is told for.",
+        takes="1.1x[,...]",
+        panel="Demand",
+        parse=words_in,
+        default="0.9, 1 and 1.1 times the first one of the search",
+    )
+    budget: int = option(400, "Days that the search may simulate.", ge=20, le=1_000_000)
+    days_each: int = option(2, "Days on which a policy is tried.", ge=1, le=1_000)
+    rounds: int = option(
+        10, "Rounds of SFpark's rule; the city changed prices ten times in two years.", ge=1, le=1_000
+    )
+    episodes: int = option(6, "Held-out days of each demand.", short="-n", ge=1, le=10_000)
+    seed: Seed = 0
+    figures: Figures = True
+
+    @property
+    def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
+        """See `Study`."""
+        return (TRIALS, *FleetStudy().all_tables)
+
+    @cached_property
+    def town(self) -> PolicyTown:
+        """The town and its levers.
+
+        Raises:
+            InputError: see `PolicyTown`.
+        """
+        from parkenv.scenarios.build import build
+        from parkenv.studies.policy.town import PolicyTown
+
+        return PolicyTown(build(self.scenario), self.levers, self.aims)
+
+    def check(self) -> None:
+        """See `Study`."""
+        from parkenv.studies.policy.town import Policy
+
+        if self.town.scenario.demand is None:
+            raise InputError(f"{self.scenario.source}: has no demand, want tables such as [demand.shoppers]")
+        _ = self.town.columns
+        for pick in range(max((len(its) for its in self.levers.choices.values()), default=1)):
+            its = tuple(min(pick, len(one) - 1) for one in self.levers.choices.values())
+            self._fleet(Policy(self.town.today, its), 0)
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        from parkenv.studies.fingerprints import flat_tables, search_settings
+
+        more = ("arrivals_per_hour", "budget", "days_each", "rounds", "seed")
+        tables = {name: getattr(self, name).model_dump(mode="json") for name in ("aims", "levers")}
+        return search_settings(self, *more) | {"agent": self.agent.label} | flat_tables(tables)
+
+    def _fleet(self, policy: Policy, day: int) -> Any:
+        from parkenv.studies.fleet.drivers import demand_in, guided_fleet
+
+        rate = self.arrivals_per_hour[day % len(self.arrivals_per_hour)]
+        key = None if policy.prices is None else policy.prices.tobytes(), policy.picks, rate
+        if self.town.fleet is not None and self.town.fleet[0] == key:
+            return self.town.fleet[1]
+        scenario, guidance = self.town.with_policy(policy), (self.levers.guidance, self.town.guided(policy))
+        demand = demand_in(scenario, rate, scenario.stay_s, np.inf)
+        self.town.fleet = key, guided_fleet(self.agent, scenario, demand, guidance, rate)
+        return self.town.fleet[1]
+
+    def run(self, work: Trial, items: Sequence[int]) -> list[Row]:
+        """See `Study`."""
+        rows = []
+        for day in items:
+            fleet, agent = self._fleet(work.policy, day)
+            fleet.reset(self.seed, day)
+            rows.append({**work.columns, "day": day, **self.town.day(fleet, [agent, agent])})
+        return rows
+
+    def label(self, work: Trial) -> str:
+        """See `Study`."""
+        return work.method
+
+    # ---- the search
+
+    def stages(self, results: Results) -> Iterator[Stage]:
+        """See `Study`: every stage proposes from the rows of those before, so that a resumed run is an unbroken one."""
+        search = Search(self, results)
+        yield from search.stages()
+        results.kept["policies"] = chosen = search.chosen
+        results.kept["tried"] = search.tried
+        held_out = self.held_out_study({name: self._answer(policy) for name, policy in chosen.items()})
+        yield Stage("Driving held-out days", held_out, held_out.cells())
+
+    def _answer(self, policy: Policy) -> Row:
+        """Return what a policy is, in plain values."""
+        picked = {
+            name: list(its) if isinstance(its, tuple) else its
+            for name, its in self.town.picked(policy).items()
+        }
+        is_open = self.town.is_open(policy)
+        shut = [self.town.blocks.names[i] for i in self.town.counted[~is_open]]
+        return {
+            "zones": self.town.tables(policy),
+            "picked": picked,
+            "guided": self.town.guided(policy),
+            "closed": shut,
+        }
+
+    def held_out_study(self, policies: Mapping[str, Row]) -> HeldOut:
+        """Return the study of held-out days, from `policies` of the summary."""
+        scenarios = []
+        for name, its in policies.items():
+            zones = {**self.scenario.tables().get("zones", {})}
+            for zone, table in its["zones"].items():
+                zones[zone] = zones.get(zone, {}) | table
+            scenarios.append(self.scenario.changed(name=name, zones=zones))
+        first = self.arrivals_per_hour[0]
+        times = times_demanded(first) if isinstance(first, str) else first
+        unit = "x" if isinstance(first, str) else ""
+        demands = self.held_out or tuple(f"{factor * times:g}{unit}" for factor in HELD_OUT)
+        return HeldOut(
+            scenarios=tuple(scenarios),
+            agents=(self.agent,),
+            arrivals_per_hour=demands,
+            days=self.episodes,
+            seed=(self.seed + 1) % 2**31,
+            guided=tuple(its["guided"] for its in policies.values()),
+            guidance=self.levers.guidance,
+            jobs=self.jobs,
+        )
+
+    # ---- the answer
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`."""
+        from parkenv.studies.policy.answer import answer_rows, loser_rows
+
+        policies = results.kept.get("policies")
+        if policies is None:
+            return {"rows": []}
+        told = {name: self._answer(policy) for name, policy in policies.items()}
+        held_out = self.held_out_study(told)
+        return {
+            **held_out.summarise(results),
+            "answer": answer_rows(self, held_out, told, results),
+            "losers": loser_rows(held_out, results),
+            "tried": results.kept["tried"],
+            "aims": self.aims.model_dump(mode="json"),
+            "policies": told,
+        }
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: those of the held-out days, and a scenario file for each policy."""
+        from functools import partial
+
+        held_out = self.held_out_study(result.summary["policies"])
+        files = [partial(spec.write, result.folder / f"{spec.name}.json") for spec in held_out.scenarios]
+        return [*files, *held_out.outputs(replace(result, study=held_out))]
+
+    @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`."""
+        from parkenv.studies.policy.answer import sentences
+
+        return sentences(summary)
+
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
+        """See `Study`."""
+        from parkenv.show.report.tables import OF_FLEETS, tables_of
+
+        page = super().page(summary, folder)
+        return page._replace(tables=tables_of(summary, cls.table_titles, OF_FLEETS))
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
+        """See `Study`: maps before and after."""
+        from parkenv.files.limited_reading import read_json
+        from parkenv.studies.fleet.day_map import DayMaps
+        from parkenv.studies.results import SUMMARY
+
+        return [DayMaps(self.held_out_study(read_json(folder / SUMMARY)["policies"]), folder)]
+
+
+class HeldOut(FleetStudy):
+    """Days of several policies, each with guidance of its own."""
+
+    guided: tuple[float, ...] = ()
+    guidance: str = "shared"
+
+    @cached_property
+    def fleet_settings(self) -> list[Setting]:
+        """See `FleetStudy`."""
+        return [
+            Setting(name, self.drivers[0], self.guidance if share else OWN, share, rate)
+            for rate in self.demands
+            for name, share in zip(self.built, self.guided, strict=True)
+        ]
+
+
+class Search:
+    """The search for a policy: what is tried next follows from what was found, in the order of the rounds.
+
+    Args:
+        study: aims, levers and budget.
+        results: where the rows are.
+
+    Attributes:
+        tried: a row for each round: what it reached.
+        chosen: the policies that are told, by their names, when all stages are over.
+    """
+
+    def __init__(self, study: PolicyStudy, results: Results) -> None:
+        self.study, self.town, self._results = study, study.town, results
+        self.tried: list[Row] = []
+        self._used = self._day = 0
+        self._today: list[Row] = []
+        self._found: dict[str, Policy] = {}
+        self.chosen: dict[str, Policy] = {}
+
+    def stages(self) -> Iterator[Stage]:
+        """Yield the rounds."""
+        from parkenv.studies.policy.town import Policy
+
+        each, today = self.study.days_each, Policy()
+        self._found[TODAY] = today
+        self._today = yield from self._days(TODAY, 0, [today], 2 * each, found=True)
+        yield from self._rule()
+        if self.study.aims.in_band:
+            yield from self._balance()
+        yield from self._evolve()
+        yield from self._choose()
+
+    def _days(
+        self, method: str, number: int, policies: Sequence[Policy], days: int, *, found: bool = False
+    ) -> Generator[Stage, None, list[Row]]:
+        """Yield a stage in which policies are tried on the same new days; return their rows, the first one's alone."""
+        items = range(self._day, self._day + days)
+        self._day, self._used = items.stop, self._used + days * len(policies)
+        trials = [Trial(method, number, k, policy) for k, policy in enumerate(policies)]
+        cells = [Cell(trial, items) for trial in trials]
+        yield Stage(f"{method}, round {number + 1}" if not found else method, self.study, cells)
+        self._rows = [self._results.of(self.study, cell) for cell in cells]
+        return self._rows[0]
+
+    def _measures(self, rows: Sequence[Row], policy: Policy, today: Sequence[Row] = ()) -> Row:
+        return self.town.measures(rows, self.town.is_open(policy), today or self._today)
+
+    def _score(self, measures: Row) -> float:
+        """Return what aims lack, and a little of what is beyond them: the lower the better."""
+        lacks = self.town.lacks(measures).values()
+        return sum(max(lack, 0.0) + 0.01 * lack for lack in lacks)
+
+    def _note(self, method: str, number: int, measures: Row) -> None:
+        score = self._score(measures)
+        self.tried.append(
+            {"method": method, "round": number + 1, "days": self._used, "score": score, **measures}
+        )
+
+    def _occupancy(self, rows: Sequence[Row]) -> FloatArray:
+        """Return the occupancy of each unit in each band, (n_units, n_bands), mean over its blocks and the days."""
+        from parkenv.studies.policy.spec import clock_hours
+
+        town = self.town
+        share = np.mean([row["occupancy"] for row in rows], axis=0)
+        slots = town.blocks.slots[town.counted].astype(float)
+        hours = [
+            [k for k, hour in enumerate(town.hours) if hour in clock_hours(band)]
+            for band in self.study.levers.hours
+        ]
+        by_band = np.stack(
+            [share[:, its].mean(axis=1) if its else np.full(len(share), np.nan) for its in hours], axis=1
+        )
+        total = np.zeros((len(town.units), len(hours)))
+        np.add.at(total, town.unit_of_block, by_band * slots[:, None])
+        return total / np.bincount(town.unit_of_block, slots, len(town.units))[:, None]
+
+    def _rule(self) -> Iterator[Stage]:
+        """Yield the rounds of SFpark's rule, which ends with the prices of the last one.
+
+        Above 80 % the price of a block and band rises by a step, from 30 to 60 % it falls by one, and below 30 % by two
+        (SFMTA, SFpark pilot project evaluation, 2014; Pierce and Shoup 2013).
+        """
+        from parkenv.studies.policy.town import Policy
+
+        prices, step = self.town.posted(self.town.today), self.study.levers.step
+        for number in range(self.study.rounds):
+            policy = Policy(prices)
+            rows = yield from self._days(RULE, number, [policy], self.study.days_each)
+            self._found[RULE] = policy
+            self._note(RULE, number, self._measures(rows, policy))
+            share = self._occupancy(rows)
+            change = np.select([share > 0.8, share < 0.3, share < 0.6], [step, -2 * step, -step], 0.0)
+            prices = self.town.posted(prices + change)
+
+    def _balance(self) -> Iterator[Stage]:
+        """Yield rounds in which prices follow occupancy to the middle of the band in smaller and smaller steps.
+
+        They have half of what is left of the budget; the mean over the later half of the rounds is what was found.
+        """
+        from parkenv.studies.policy.town import Policy
+
+        each, levers, aim = self.study.days_each, self.study.levers, float(np.mean(self.study.aims.band))
+        rounds = max((self.study.budget - self._used) // (2 * each), 2)
+        prices, total, kept = self.town.today, np.zeros_like(self.town.today), 0
+        for number in range(rounds):
+            policy = Policy(prices)
+            rows = yield from self._days("balance", number, [policy], each)
+            self._note("balance", number, self._measures(rows, policy))
+            share = self._occupancy(rows)
+            # A full block says nothing of how many more would come.
+            excess = np.nan_to_num(np.where(share > 0.97, 1.2, share) - aim)
+            prices = np.clip(prices + 2 * levers.spread * excess / (1 + number) ** 0.6, 0.0, levers.most)
+            if 2 * number >= rounds:
+                total, kept = total + prices, kept + 1
+        self._found["balance"] = Policy(total / kept if kept else prices)
+
+    def _evolve(self) -> Iterator[Stage]:
+        """Yield generations of the evolution strategy, which starts from the best that was found."""
+        from cmaes import CMAwM
+
+        from parkenv.studies.policy.town import Policy
+
+        found = [row for row in self.tried if row["method"] == "balance"]
+        start = self._found["balance"] if found and "balance" in self._found else Policy(self.town.today)
+        base = self.town.today if start.prices is None else start.prices
+        levers, choices = self.study.levers, self.study.levers.choices
+        zones = list(dict.fromkeys(zone for zone, _ in self.town.units))
+        of_unit = [zones.index(zone) for zone, _ in self.town.units]
+        n_shifts = len(zones) * len(levers.hours)
+        most = levers.most / levers.spread
+        bounds = np.array([(-most, most)] * n_shifts + [(0, len(its) - 1) for its in choices.values()], float)
+        steps = np.array([0.0] * n_shifts + [1.0] * len(choices))
+        if len(bounds) < 2:
+            bounds, steps = np.vstack([bounds, [(-1.0, 1.0)]]), np.append(steps, 0.0)  # it needs two
+        strategy = CMAwM(np.zeros(len(bounds)), 1.0, bounds, steps, seed=self.study.seed)
+
+        def policy_of(x: FloatArray) -> Policy:
+            shift = x[:n_shifts].reshape(len(zones), -1)[of_unit] * levers.spread
+            picks = tuple(round(k) for k in x[n_shifts : n_shifts + len(choices)])
+            return Policy(np.clip(base + shift, 0.0, levers.most), picks)
+
+        each, size = self.study.days_each, strategy.population_size
+        number = 0
+        while self._used + each * size <= self.study.budget and not strategy.should_stop():
+            asked = [strategy.ask() for _ in range(size)]
+            policies = [policy_of(x) for x, _ in asked]
+            yield from self._days("evolution", number, policies, each)
+            measures = [
+                self._measures(rows, policy) for rows, policy in zip(self._rows, policies, strict=True)
+            ]
+            scores = [self._score(one) for one in measures]
+            best = int(np.argmin(scores))
+            self._note("evolution", number, measures[best])
+            strategy.tell([(x, score) for (_, x), score in zip(asked, scores, strict=True)])
+            self._found["evolution, best"] = policies[best]
+            number += 1
+        if number:
+            self._found["evolution"] = policy_of(np.asarray(strategy.mean))
+
+    def _choose(self) -> Iterator[Stage]:
+        """Yield the days on which everything that was found is compared."""
+        names = list(self._found)
+        yield from self._days("choice", 0, list(self._found.values()), 4 * self.study.days_each, found=True)
+        scores = {}
+        for name, rows in zip(names, self._rows, strict=True):
+            measures = self._measures(rows, self._found[name], self._rows[0])
+            scores[name] = self._score(measures)
+            self._note(f"choice: {name}", 0, measures)
+        ours = min(scores, key=lambda name: scores[name])
+        self.chosen = {TODAY: self._found[TODAY], RULE: self._found[RULE], OURS: self._found[ours]}
