@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from parkenv.belief import day_belief
-from parkenv.belief.day_belief import DayBelief
+from parkenv.belief.day_belief import DOUBT, DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError, nearness
@@ -28,6 +28,19 @@ def logit(p):
 def test_before_any_observation_the_forecast_is_believed(level, slope):
     p, near, belief = forecast_of(60, level=level, slope=slope)
     np.testing.assert_allclose(DayBelief(belief, near).p_occupied(belief.time), p, atol=0.01)
+
+
+@pytest.mark.parametrize(("level", "slope"), [(0.0, 0.0), (0.8, 0.4)])
+def test_a_forecast_of_certainty_is_doubted(level, slope):
+    """A slot that is surely taken according to the forecast is free in half a `DOUBT` of all cases."""
+    _, near, belief = forecast_of(60, level=level, slope=slope)
+    belief.forecast[0] = 0.9999
+    sure, doubted = (DayBelief(belief, near, doubt=doubt).p_occupied(belief.time) for doubt in (0.0, DOUBT))
+    expected = belief.forecast + DOUBT * (0.5 - belief.forecast)
+    np.testing.assert_allclose(doubted - sure, expected - belief.forecast, atol=0.2 * DOUBT)
+    assert doubted[0] < 1.0 - 0.4 * DOUBT
+    known = DayBelief(belief, near, certain=True, doubt=DOUBT).p_occupied(belief.time)
+    np.testing.assert_allclose(known, belief.forecast, atol=1e-6)
 
 
 def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):

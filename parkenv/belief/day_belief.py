@@ -6,6 +6,8 @@ goal, drawn from the forecast's own `DayError`. On the day of an event the slots
 observation updates the weights of the hypotheses by Bayes' rule and so changes the belief about the other slots. The
 same update is applied to hypothetical observations while planning: if the car has not parked along a path, the slots
 further on are also more likely to be taken.
+
+A forecast from few days is too sure of single slots, which the posterior over days cannot tell: `DOUBT` allows for it.
 """
 
 from __future__ import annotations
@@ -47,6 +49,12 @@ P_TAKEN_AT_EVENT = 0.998
 WORTHLESS = 0.004
 """Probability that the forecast says nothing about the day: then its level is one of `OTHER_LEVELS`, logits."""
 OTHER_LEVELS, OTHER_SLOPES = np.array([-2.0, 0.0, 2.0, 4.0]), np.array([0.0, 2.0, 4.0])
+DOUBT = 0.02
+"""Probability that the forecast of a slot says nothing about it: then it is as likely free as taken, on a usual day.
+
+It has the greatest likelihood, of 0 to 0.2, on nine recorded days of 164 slots (CNRPark-EXT), each forecast from the
+days before it: slots that were to be free in 0.7 % of all cases were free in 1.4 %.
+"""
 _LEAST, _MOST = 1e-6, 1.0 - 1e-6
 
 
@@ -63,6 +71,8 @@ class DayBelief:
         rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
             None: there are no such cars.
         hypotheses: about the day: prior weights, (k,), and P(taken) under each, (n_slots, k); None: those above.
+        doubt: probability that the forecast of a slot says nothing about it (`DOUBT`); without effect where the
+            forecast is certain, among rivals, and with hypotheses of the caller.
 
     Examples:
         The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
@@ -86,6 +96,7 @@ class DayBelief:
         certain: bool = False,
         rival_rates: FloatArray | None = None,
         hypotheses: tuple[FloatArray, FloatArray] | None = None,
+        doubt: float = 0.0,
     ) -> None:
         forecast = np.clip(belief.forecast.astype(np.float64), _LEAST, _MOST)
         crowded = rival_rates is not None and bool(rival_rates.any())
@@ -100,7 +111,8 @@ class DayBelief:
             weight, p_taken = weight[: -len(EVENTS)], p_taken[:, : -len(EVENTS)]
             weight = weight / weight.sum()
         else:
-            weight, p_taken = _hypotheses(forecast, nearness, belief.day_error)
+            doubted = forecast + doubt * (0.5 - forecast)
+            weight, p_taken = _hypotheses(doubted, nearness, belief.day_error)
         if rival_rates is not None and crowded:
             # Free at the rate μ, taken at λ, and by rivals at r: P(free) = μ/(λ+μ+r)
             leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.day_belief import DayBelief
+from parkenv.belief.day_belief import DOUBT, DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import require_number
@@ -112,10 +112,11 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         explore: s, what the first observation of a slot with a forecast of 50 % is worth for later searches, with a map
             that learns from trips; it is in proportion to p(1 - p). A slot that nothing later on the path can beat is
             taken all the same.
+        doubt: probability that the forecast of a slot says nothing about it, if the day is learned; 0 to 1.
 
     Raises:
-        InputError: the budget is not positive, `explore` is negative, `most_vertices` is out of range, or no slot
-            can be observed.
+        InputError: the budget is not positive, `explore` is negative, `doubt` or `most_vertices` is out of range, or
+            no slot can be observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -127,12 +128,14 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         day: bool = True,
         most_vertices: int = MOST_VERTICES,
         explore: float = 0.0,
+        doubt: float = DOUBT,
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
         require_number("budget_ms", budget_ms, above=0.0)
         require_number("explore", explore, least=0.0)
-        self._explore = explore
+        require_number("doubt", doubt, least=0.0, most=1.0)
+        self._explore, self._doubt = explore, doubt
         self._day = day
         self._nearness = nearness(self.problem.walk_s)
         self._worth_passing_s = WORTH_PASSING_S if day else 0.0
@@ -178,7 +181,19 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:
         """Return the belief about the day and the slots of a part, before its observations."""
-        return DayBelief(belief.take(near.slots), self._nearness[near.slots], certain=not self._day)
+        slots, rival_rates = near.slots, self._rival_rates(belief)
+        return DayBelief(
+            belief.take(slots),
+            self._nearness[slots],
+            certain=not self._day,
+            rival_rates=None if rival_rates is None else rival_rates[slots],
+            doubt=self._doubt,
+        )
+
+    def _rival_rates(self, belief: SlotBelief) -> FloatArray | None:
+        """Return the rates at which rivals take each slot, (n_slots,) 1/s; None without rivals."""
+        del belief
+        return None
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
         """Update the memory, search for the best path, and take its first step or park."""

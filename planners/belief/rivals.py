@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv.belief.day_belief import DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
 from planners.belief.agent import BeliefAgent
-from planners.neighborhood import MOST_VERTICES, Neighborhood
+from planners.neighborhood import MOST_VERTICES
 
 PASSED = 3.0
 """Mean number of free slots that a rival passes, or drives on from to the next, before it takes one."""
@@ -75,15 +74,13 @@ class BeliefRivalsAgent(BeliefAgent):
         rival_s = drive_m[: lot.n_slots] / self.problem.v_drive + self.problem.finite_cost_s
         self._order = np.argsort(rival_s, kind="stable")
 
-    def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:
+    def _rival_rates(self, belief: SlotBelief) -> FloatArray:
         forecast = belief.forecast.astype(np.float64)
         leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
         per_s = CROWD * usual_arrivals(forecast, leaving)
         if self.arrivals_per_hour is not None:
             per_s = self.arrivals_per_hour / 3600.0
-        take_rates = _take_rates(1.0 - forecast, leaving, self._order, per_s, PASSED)
-        nearness = self._nearness[near.slots]
-        return DayBelief(belief.take(near.slots), nearness, not self._day, take_rates[near.slots])
+        return np.asarray(_take_rates(1.0 - forecast, leaving, self._order, per_s, PASSED))
 
 
 def usual_arrivals(forecast: FloatArray, leaving: FloatArray) -> float:

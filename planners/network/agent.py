@@ -46,8 +46,8 @@ class NetworkAgent(BeliefAgent):
     **Observation.** For each action that there is (a move along an edge, parking, waiting): the time that a quick
     look-ahead expects (`planners.network.lookahead`), what comes into view, whether the car turns back; and tokens, the
     slots that matter seen through that action: belief, age of the observation, drive, arrival cost
-    (`planners.network.features`). The belief is that of `belief`: it learns from observations how the day differs from
-    its forecast.
+    (`planners.network.features`). The belief is that of `belief` without doubt of single slots: it learns from
+    observations how the day differs from its forecast.
 
     **Network.** The tokens of an action are pooled by attention; each action then sees the mean and the maximum over
     all actions. The score of an action is the network's output minus the time that the look-ahead expects. Times are
@@ -74,7 +74,7 @@ class NetworkAgent(BeliefAgent):
         weights: str | os.PathLike[str] | NetworkPolicy = SHIPPED,
         most_vertices: int = MOST_VERTICES,
     ) -> None:
-        super().__init__(problem, most_vertices=most_vertices)
+        super().__init__(problem, most_vertices=most_vertices, doubt=0.0)  # as in its training
         self.policy = weights if isinstance(weights, NetworkPolicy) else NetworkPolicy.load(weights)
         self._failure_costs = np.array(FAILURE_COSTS)
         self._features = Features.empty()
