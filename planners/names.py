@@ -20,6 +20,7 @@ AGENTS: dict[str, tuple[str, str]] = {
     "network": ("planners.network.agent", "NetworkAgent"),
     "mdp-tuned": ("planners.thesis.tuning", "TunedAgent"),
     "exact": ("planners.bounds.exact", "ExactAgent"),
+    "bound": ("planners.bounds.relaxation", "SearchBound"),
 }
 """Module and class of each agent; modules are imported when an agent is made."""
 ALGORITHMS = {
@@ -43,5 +44,9 @@ WITHOUT_FORECAST = ("greedy-goal", "greedy-drive", "greedy-total", "first-free",
 """Agents that make no use of an occupancy forecast."""
 SMALL_LOTS_ONLY = ("exact",)
 """Agents for small lots and sensors without errors only."""
-AGENT_NAMES = tuple(name for name in AGENTS if name not in SMALL_LOTS_ONLY)
+BOUND = "bound"
+"""What no agent can beat in the mean; it drives no car."""
+UNBEATEN = ("oracle", BOUND)
+"""Names that compete with no agent: they know what agents do not."""
+AGENT_NAMES = tuple(name for name in AGENTS if name not in (*SMALL_LOTS_ONLY, BOUND))
 """Agents for all lots."""

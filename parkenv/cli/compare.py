@@ -37,7 +37,8 @@ MOST_SETTINGS = 12
 """Maximum number of settings to print in full; see the figures and files for larger grids."""
 SHOWN = (
     "scenario", *SETTING_AXES, "agent", "episodes", "total_s", "median_s", "gave_up_fraction", "difference_s",
-    "regret_s", "gap_to_exact", *COST_FIELDS, "parked_fraction", "replans", "decision_ms", "decision_ms_p99",
+    "regret_s", "gap_to_exact", "gap_to_bound", *COST_FIELDS, "parked_fraction", "replans", "decision_ms",
+    "decision_ms_p99",
 )  # fmt: skip
 """Columns that are printed."""
 

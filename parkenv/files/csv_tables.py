@@ -68,12 +68,17 @@ def _numbers(text: str) -> str:
 TEXT = Kind("text", str)
 NUMBER = Kind(f"a number, at most {MAX_NUMBER:g}", _number)
 NUMBER_OR_NAN = Kind(f"a number, at most {MAX_NUMBER:g}, or nan", _number_or_nan)
-NUMBER_OR_NOTHING = Kind(
-    f"a number, at most {MAX_NUMBER:g}, or nothing", lambda text: _number(text) if text else None
-)
 NUMBERS = Kind("numbers, or nan, separated by spaces", _numbers)
 WHOLE = Kind(f"a whole number of at most {_MAX_DIGITS} digits", _whole)
 YES_OR_NO = Kind("True or False", _yes_or_no)
+
+
+def or_nothing(kind: Kind) -> Kind:
+    """Return the kind of columns that may also be empty, which is None."""
+    return Kind(f"{kind.wanted}, or nothing", lambda text: kind.parse(text) if text else None)
+
+
+NUMBER_OR_NOTHING = or_nothing(NUMBER)
 
 
 def wholes(count: int | None = None) -> Kind:

@@ -14,10 +14,13 @@ from parkenv.compiled.arrays import BoolArray
 from parkenv.engine.state import SearchState
 from parkenv.mapping.trips import Trip
 from parkenv.show.search_record import Moment, SearchRecord
+from parkenv.studies.results import DECISIONS, Row, timed_row
 from parkenv.studies.simulate import Observer, Step, make_search, simulate
+from parkenv.world.cost_terms import METRICS
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent
 from planners.bounds.oracle import best_slot
+from planners.bounds.relaxation import SearchBound
 from planners.routes import DriveRoutes
 
 
@@ -153,6 +156,18 @@ class EpisodeRunner:
             decision_s=result.decision_s,
             moments=kept,
         )
+
+    def row(self, seed: int) -> Row:
+        """Return the row of `episodes.csv` of a search; `bound` drives none, and its row has a total alone."""
+        if not isinstance(self.agent, SearchBound):
+            return timed_row(self.run(seed))
+        self.env.reset(seed=seed)
+        state = self._state
+        total_s = self.agent.of_world(state.world, int(state.path[0]), state.arrival.time)
+        unknown = dict.fromkeys((*METRICS, "replans", "steps"))
+        times = {"arrival_s": round(state.arrival.time, 3), "occupancy": self.occupancy}
+        found = {"total_s": total_s, "truncated": False, "bound_s": self._bound_s(), DECISIONS: ""}
+        return {"seed": seed, "day": state.arrival.day, **times, "slot": "", **unknown, **found}
 
     @property
     def occupancy(self) -> float:

@@ -24,6 +24,7 @@ from parkenv.files.csv_tables import (
     Kind,
     csv_columns,
     csv_text,
+    or_nothing,
     typed_records,
     wholes,
 )
@@ -65,9 +66,13 @@ DECISIONS = "decisions_us"
 KINDS: Mapping[str, Kind] = {
     **dict.fromkeys(("scenario", "map", "agent", "day", "slot"), TEXT),
     **dict.fromkeys(("seed", "course", "day_number", "driver"), WHOLE),
-    **dict.fromkeys(("failed_parks", "slots_passed", "replans", "steps"), WHOLE),
-    **dict.fromkeys(("parked", "truncated"), YES_OR_NO),
-    **dict.fromkeys(("occupancy_level", "forecast_error"), NUMBER_OR_NOTHING),
+    # `bound` drives no car.
+    **dict.fromkeys(("failed_parks", "slots_passed", "replans", "steps"), or_nothing(WHOLE)),
+    **dict.fromkeys(
+        (*COST_FIELDS, "driven_m", "walked_m", "occupancy_level", "forecast_error"), NUMBER_OR_NOTHING
+    ),
+    "parked": or_nothing(YES_OR_NO),
+    "truncated": YES_OR_NO,
     DECISIONS: wholes(),
 }
 """What a column of an episode holds; all others hold numbers."""

@@ -23,6 +23,7 @@ from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
 
+_UNBEATEN = ("oracle", "bound")
 AGENT_COLORS = {
     "mdp": "#0072b2",
     "mdp-static": "#56b4e9",
@@ -34,6 +35,7 @@ AGENT_COLORS = {
     "usual": "#88ccee",
     "random": "#8c8c8c",
     "oracle": "#000000",
+    "bound": "#8c564b",
     "belief": "#cc79a7",
     "belief-rivals": "#661100",
     "exact": "#882255",
@@ -194,7 +196,7 @@ def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figu
     Raises:
         InputError: there are no rows.
     """
-    panels = {name: [row for row in rows if row["agent"] != "oracle"] for name, rows in panels.items()}
+    panels = {name: [row for row in rows if row["agent"] not in _UNBEATEN] for name, rows in panels.items()}
     _require_rows([row for rows in panels.values() for row in rows])
     columns = min(len(panels), 4)
     lines = -(-len(panels) // columns)
@@ -319,7 +321,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         total = np.array([row["total_s"] for row in own])
         # NaN where there is no interval, e.g. of a single search: no band there.
         low, high = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
-        dashes = (0, (4, 2)) if agent == "oracle" else "-"
+        dashes = (0, (4, 2)) if agent in _UNBEATEN else "-"
         # The interval of a line beyond the limit would only cover the others.
         ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.07, linewidth=0)
         ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)

@@ -83,6 +83,7 @@ _KNOWN = {
         Column("decision_ms", "a decision takes", "ms", 2, help="Median wall time of a decision"),
         Column("decision_ms_p99", "99 % of decisions below", "ms", 2, help="99th percentile of their wall times"),
         Column("gap_to_exact", "above the optimum", share=True, digits=2, signed=True),
+        Column("gap_to_bound", "above the bound", share=True, digits=1, help="At most so far above what is possible"),
         Column("steps", "decisions in training", digits=0),
         Column("steps_per_s", "decisions/s", digits=0),
         Column("model", "model"),
@@ -194,7 +195,7 @@ _ORDER = (
     "agent", "agents", "arrivals_per_hour", "knows", "share",
     "hour", "seed",
     "change_s", "members_change_s", "others_change_s", "paid_change", "better_off", "worse_off", "total_s", "median_s",
-    "gave_up_fraction", "difference_s", "gap_to_exact",
+    "gave_up_fraction", "difference_s", "gap_to_exact", "gap_to_bound",
     "price_of_anarchy", "price_over_bound", "search_s", "regret_s", *COST_FIELDS, "parked_fraction",
 )  # fmt: skip
 """The first columns, in this order."""

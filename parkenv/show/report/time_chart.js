@@ -66,7 +66,7 @@ function showTimeChart(root, table) {
   if (groups.size > 12) return false;
   // A few agents far off must not squash the others of their panel.
   const shown = [...groups.values()].flatMap((its) => {
-    const shortest = Math.min(...its.filter((row) => row.agent !== "oracle").map((row) => row.total_s[0]));
+    const shortest = Math.min(...its.filter((row) => !["oracle", "bound"].includes(row.agent)).map((row) => row.total_s[0]));
     return its.map((row) => row.total_s[2] ?? row.total_s[0]).filter((seconds) => seconds <= CUT * shortest);
   });
   const longest = Math.max(...rows.map((row) => row.total_s[2] ?? row.total_s[0]));

@@ -17,7 +17,7 @@ from parkenv.errors import InputError
 from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s, timed_row
+from parkenv.studies.results import EPISODES, SETTING_COLUMNS, Key, Row, decision_s
 from parkenv.studies.statistics import LEAST_PAIRS, columns_of, mean_interval, paired_differences, summarize
 from parkenv.studies.workers import Workers
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
@@ -27,6 +27,7 @@ from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 from planners.belief.agent import BeliefAgent
 from planners.belief.best_path import is_compiled
+from planners.names import BOUND, UNBEATEN
 
 BUDGET = "budget_ms"
 """The option of agents that plan for a time, ms a decision."""
@@ -80,7 +81,7 @@ class Case:
         if isinstance(runner.agent, BeliefAgent) and not is_compiled():
             # First runs: workers that all begin with the environment would wait for the one that compiles it.
             runner.agent.compile_ahead(_forecast_of(self.scenario, seeds[0]))
-        return [{**self.columns, **timed_row(runner.run(seed))} for seed in seeds]
+        return [{**self.columns, **runner.row(seed)} for seed in seeds]
 
     def runner(self) -> EpisodeRunner:
         """Return a runner of this case's episodes."""
@@ -206,7 +207,8 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     `leads` says whether no other agent of the setting, the oracle apart, is shown to be faster (`_mark_leaders`).
     If some agents plan for a given time, `planner` and `budget_ms` tell the two apart.
     If some cases are blind, `blind` says which: no slot is observed before an attempt.
-    If `exact` is among the agents, `gap_to_exact` is the relative excess of an agent's mean time over that of `exact`.
+    If `exact` or `bound` is among the agents, `gap_to_exact` and `gap_to_bound` are the relative excesses of an agent's
+    mean time over theirs.
 
     Args:
         cells: cases with the seeds of their episodes.
@@ -233,11 +235,12 @@ def table(cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Ro
     for its in by_setting.values():
         _mark_leaders(its)
     names = [c for c in SETTING_COLUMNS if c != "agent"]
-    optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == "exact"}
-    for row in rows:
-        best = optimum.get(tuple(row[c] for c in names))
-        if best is not None:
-            row["gap_to_exact"] = row["total_s"] / best - 1.0
+    for least in ("exact", BOUND):
+        optimum = {tuple(r[c] for c in names): r["total_s"] for r in rows if r["agent"] == least}
+        for row in rows:
+            best = optimum.get(tuple(row[c] for c in names))
+            if best is not None:
+                row[f"gap_to_{least}"] = row["total_s"] / best - 1.0
     return rows
 
 
@@ -245,15 +248,17 @@ def _mark_leaders(its: Sequence[tuple[Row, list[Row]]]) -> None:
     """Set `leads` in the rows of a setting, given with their episodes.
 
     An agent leads unless the 95 % interval of its paired difference to the lowest mean lies above 0. Several lead where
-    the searches cannot tell them apart. The oracle is no competitor.
+    the searches cannot tell them apart. The oracle and the bound are no competitors.
     """
     best = min(
-        (i for i in its if i[0]["agent"] != "oracle"), key=lambda i: float(i[0]["total_s"]), default=its[0]
+        (i for i in its if i[0]["agent"] not in UNBEATEN),
+        key=lambda i: float(i[0]["total_s"]),
+        default=its[0],
     )
     for row, episodes in its:
         behind = paired_differences(episodes, best[1])
         shown = len(behind) >= LEAST_PAIRS and mean_interval(behind)[1] > 0.0
-        row["leads"] = row["agent"] != "oracle" and not shown
+        row["leads"] = row["agent"] not in UNBEATEN and not shown
 
 
 def against_occupancy(rows: Sequence[Mapping[str, Any]], edges: Sequence[float]) -> list[Row]:

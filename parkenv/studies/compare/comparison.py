@@ -35,7 +35,7 @@ from parkenv.studies.fields import (
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
-from planners.names import HUMAN
+from planners.names import BOUND, HUMAN, UNBEATEN
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
@@ -141,7 +141,7 @@ class CaseStudy(Study):
         """See `Study`."""
         from parkenv.studies.compare.search_replay import SearchReplay
 
-        return [SearchReplay(self.cells(), folder)]
+        return [SearchReplay(_driven(self.cells()), folder)]
 
 
 class Comparison(CaseStudy):
@@ -378,9 +378,9 @@ class Comparison(CaseStudy):
             for name, (_, p) in self.constant_forecasts.items()
         }
         data = ComparisonResults(
-            self.cases,
+            _driven(self.cases),
             result.results.rows(self.table),
-            result.rows,
+            [row for row in result.rows if row["agent"] != BOUND],
             result.summary["occupancy_rows"],
             flat,
             self.seed,
@@ -396,7 +396,7 @@ class Comparison(CaseStudy):
         findings = []
         speeds = len({key[2:] for key in settings}) > 1
         for (name, failure, walk, drive), its in settings.items():
-            agents = [row for row in its if row["agent"] != "oracle"]
+            agents = [row for row in its if row["agent"] not in UNBEATEN]
             if len(agents) < 2:
                 continue
             leaders = sorted((row for row in agents if row["leads"]), key=lambda row: float(row["total_s"]))
@@ -415,8 +415,18 @@ class Comparison(CaseStudy):
                     f"{', '.join(row['agent'] for row in leaders)} is fastest; their mean total times are "
                     f"{best['total_s']:.1f} to {leaders[-1]['total_s']:.1f} s"
                 )
-            findings.append(f"{found}. The clairvoyant lower bound is {best['bound_s']:.1f} s.")
+            found += f". The clairvoyant lower bound is {best['bound_s']:.1f} s"
+            for row in its:
+                if row["agent"] == BOUND:
+                    gap = f"{best['agent']} is within {best['gap_to_bound']:.1%} of that"
+                    found += f". No agent can have a mean below {row['total_s']:.1f} s (bound); {gap}"
+            findings.append(f"{found}.")
         return findings
+
+
+def _driven(cells: Sequence[Cell]) -> list[Cell]:
+    """Return the cells in which cars drive: all but those of `bound`."""
+    return [cell for cell in cells if cell.work.agent != BOUND]
 
 
 def _works_blind(agent: AgentSpec) -> bool:

@@ -29,6 +29,7 @@ from parkenv.show.figures.times import (
     draw_time_split,
 )
 from parkenv.studies.compare.cases import Case, against_occupancy
+from planners.names import UNBEATEN
 
 Row = Mapping[str, Any]
 Setting = tuple[float, float, float]
@@ -174,7 +175,7 @@ def searches(results: ComparisonResults) -> Iterator[Drawn]:
             settings.setdefault((c["scenario"], setting), []).append(case)
     totals = {(*_setting_of(row), row["agent"]): row["total_s"] for row in results.rows}
     for (name, setting), cases in settings.items():
-        acting = [case for case in cases if case.agent != "oracle"]
+        acting = [case for case in cases if case.agent not in UNBEATEN]
         fastest = min(
             acting,
             key=lambda case: totals.get((*_setting_of(case.columns), case.label), np.inf),

@@ -380,6 +380,34 @@ def _count_below(address: int, begin: int, end: int, value: float, equal_too: bo
     return low - begin
 
 
+@kernel
+def process_law(process: Any, world: Any, slot: int) -> tuple[float, float, float, float, float]:
+    """Return P(taken) of a slot at the arrival, given the day, and the rates of its law.
+
+    Returns:
+        That probability; 1/s, rates of arrival in that hour and in the next; rates of departure in both.
+    """
+    n, hour = process.n_slots, world.hour
+    factors, profiles = float64s(process.factors), float64s(process.profiles)
+    following = (hour + 1) % WEEK_HOURS
+    p, _ = process_forecast(process, hour, world.second_of_hour, slot)
+    odds, later_odds = 1.0, 1.0
+    if has_days(process):
+        of_day = _odds_of_day(process, world, slot)
+        odds = _centring_odds(process, slot, p) * of_day
+        later_odds = _centring_odds(process, slot, _marginal_at_full_hour(process, following, slot)) * of_day
+    arriving = factors[slot] * profiles[hour] * odds
+    arriving_later = factors[slot] * profiles[following] * later_odds
+    leaving, leaving_later = profiles[WEEK_HOURS + hour], profiles[WEEK_HOURS + following]
+    return (
+        p * odds / (p * odds + 1.0 - p),
+        arriving,
+        arriving_later,
+        factors[n + slot] * leaving,
+        factors[n + slot] * leaving_later,
+    )
+
+
 @inlined
 def prefetch_forecast(address: int, hour: int, slot: int) -> None:
     """Load what `process_forecast` will read, without waiting for it; `address` is that of the PROCESS record."""

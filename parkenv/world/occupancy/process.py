@@ -28,6 +28,7 @@ from parkenv.world.occupancy.day_error import EXACT, DayError, nearness
 from parkenv.world.occupancy.kernel import EXTERNAL_KIND, PROCESS_KIND, draw_arrival, kernel
 from parkenv.world.occupancy.log import weekday_of
 from parkenv.world.occupancy.python_functions import functions_of
+from parkenv.world.occupancy.slot_law import SlotLaw
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_HOURS, WEEK_S
 from parkenv.world.week_hours import hour_of_week
 
@@ -67,6 +68,10 @@ class World(ABC):
     @abstractmethod
     def sojourn(self, slots: ArrayLike, time: float) -> IntArray:
         """(k,) int64, number of the current sojourn (period of constant state) of each slot; distinguishes cars."""
+
+    def law(self) -> SlotLaw | None:
+        """Return the law of the slots, given all that they have in common, such as the day; None: it is not known."""
+        return None
 
     def next_change(self, slots: ArrayLike, time: float, until: float) -> FloatArray:
         """(k,) float64, s: the first time in (`time`, `until`] of another sojourn of each slot; inf if there is none.
@@ -244,6 +249,14 @@ def _marginals(process: int, hour: int, second: float, marginals: FloatArray) ->
         marginals[slot] = kernels.process_forecast(kernels.process_at(process, 0), hour, second, slot)[0]
 
 
+@kernel
+def _laws(process: int, world: int, p_taken: FloatArray, rates: FloatArray) -> None:
+    for slot in range(p_taken.size):
+        p_taken[slot], rates[0, slot], rates[1, slot], rates[2, slot], rates[3, slot] = kernels.process_law(
+            kernels.process_at(process, 0), kernels.world_at(world, 0), slot
+        )
+
+
 class ProcessWorld(World):
     """One episode of an `OccupancyProcess`: a pure function of (process, key, arrival).
 
@@ -291,6 +304,13 @@ class ProcessWorld(World):
         ends = np.empty(slots.size)
         self._seek(slots, time, ends)
         return np.where(ends <= until, ends, np.inf)
+
+    def law(self) -> SlotLaw:
+        """Return the law of the slots, given the day."""
+        p_taken, rates = np.empty(len(self._cursors)), np.empty((4, len(self._cursors)))
+        _laws(self.process.address, address_of(self._record, kernels.WORLD), p_taken, rates)
+        ends = HOUR_S - float(self._record["second_of_hour"][0])
+        return SlotLaw(p_taken, rates[:2], rates[2:], ends)
 
     def _checked(self, slots: ArrayLike) -> IntArray:
         slots = np.ascontiguousarray(slots, np.int64)

@@ -1,0 +1,444 @@
+"""A lower bound on the mean total time of every agent: information relaxation with penalties.
+
+The clairvoyant bound gives a car the future of all slots, so it is far below what anyone can reach. Here a car that
+knows too much pays for it (Brown, Smith and Sun, *Information relaxations and duality in stochastic dynamic
+programs*, Operations Research 58, 2010). The slots are divided into groups. A car that comes to see a slot of a group
+is told when each slot of the group is free first, and it is told the day: more than an agent gets. In return it is
+charged the *penalty* of the group, which may be negative:
+
+    mean over what the group may be of value(what it is told) - value(what it is told in this world).
+
+Given the day slots are independent, so whatever the car did before, the mean of the penalty is zero. Therefore no agent
+has a lower mean than the mean, over worlds, of the best that a car with all knowledge of its world can do, penalties
+included. That is a shortest path over the sets of groups that have been seen, and holds for any `value`. The bound is
+close where `value` is nearly the least expected time from there: it is that of a car that keeps the best slot it was
+told of in mind, by dynamic programming over (set of groups, where the last one came into view, that slot).
+
+What is loose: the day is known; a whole group is seen at once; and when the taken slots of seen groups become free is
+known.
+"""
+
+from __future__ import annotations
+
+import heapq
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
+
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.heap import pop, push
+from parkenv.compiled.jit import compiled
+from parkenv.errors import InputError, require_whole
+from parkenv.world.occupancy.process import World
+from parkenv.world.occupancy.slot_law import SlotLaw
+from parkenv.world.scenario import SearchProblem
+from planners.bounds.oracle import best_slot
+from planners.routes import DriveRoutes
+
+MOST_SLOTS = 240
+"""Slots in groups, those with the least drive and walk. To park elsewhere costs at least as much as the next one."""
+MOST_STATES = 4_000
+"""Most pairs of a set of seen groups and the vertex where the last came into view: so fine are the groups."""
+FINE_S = 25.0
+"""s by which a slot must be worse than the best one for a group to be e times as wide there."""
+PERIODS = np.array([0.1, 0.25, 0.5, 1.0, 2.0, 4.0])
+"""Ends of the periods of waiting that `value` tells apart, in units of what a search takes if nothing is found."""
+_MOST_GROUPS = 62  # bits of a set
+_FAR_S = 3600.0
+_SURE = 1e-12
+
+
+class _Ways(NamedTuple):
+    """How groups come into view on the ways from a vertex.
+
+    A state is a set of seen groups, and the vertex from which the last of them came into view. Sets are bit masks in
+    ascending order, so a state's successors stand behind it.
+    """
+
+    sets: IntArray  # (n_sets,)
+    first: IntArray  # (n_sets + 1,) first state of each set
+    slot_s: FloatArray  # (n_states, n) drive to each seen slot that shows nothing new, s; inf for the others
+    direct_s: FloatArray  # (n_states, n) shortest drive to each seen slot, s; inf for the others
+    earliest_s: FloatArray  # (n_states,) s, least time to get there
+    first_next: IntArray  # (n_sets + 1,) first of each set's successors
+    next_state: IntArray
+    first_drive: IntArray  # (n_sets + 1,) where the set's drives begin
+    drive_s: FloatArray  # for each set, a row for each state and a column for each successor, s
+
+
+class _Start(NamedTuple):
+    """What the bound needs to know of a vertex where searches begin."""
+
+    slots: IntArray  # (n,) the slots in groups
+    group: IntArray  # (n,) the group of each
+    beyond_s: float  # s, least time of parking in any other slot
+    ways: _Ways
+
+
+class _News(NamedTuple):
+    """What a car may be told when it sees a group: of each slot one thing, or nothing.
+
+    That is: the slot is free on arrival; it becomes free in some period of waiting.
+    """
+
+    slot: IntArray  # (m,)
+    chance: FloatArray  # (m,)
+    group: IntArray  # (n,) of each slot
+
+
+class _World(NamedTuple):
+    """A world."""
+
+    told: IntArray  # (n,) what is told of each slot; m: nothing
+    free_s: FloatArray  # (n,) s, when each slot is free first that a car can have reached
+    cost_s: FloatArray  # (n,) s, arrival cost
+
+
+class SearchBound:
+    """`bound`: what every agent takes at least in the mean. It drives no car.
+
+    Args:
+        problem: lot, goal, speeds, costs and view range.
+        most_states: limits how fine the groups are, and so the time of a bound.
+
+    Raises:
+        InputError: `most_states` is not positive.
+    """
+
+    name: ClassVar[str] = "bound"
+
+    def __init__(self, problem: SearchProblem, most_states: int = MOST_STATES) -> None:
+        require_whole("most_states", most_states, least=1)
+        self._problem, self._most_states = problem, most_states
+        self._routes = DriveRoutes(problem)
+        self._starts: dict[int, _Start] = {}
+
+    def predict(
+        self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
+    ) -> tuple[Any, Any]:
+        """Raise an `InputError`: it is compared with agents, and is none."""
+        del observation, state, episode_start, deterministic
+        raise InputError(
+            "bound drives no car: it is what agents take at least; want it in parkenv compare alone"
+        )
+
+    def of_world(self, world: World, vertex: int, time: float) -> float:
+        """Return the bound of one world, s; their mean is the bound, a single search may take less.
+
+        Where the law of the slots is not known, as in a log, it is the clairvoyant bound.
+
+        Args:
+            world: the occupancy.
+            vertex: where the search begins.
+            time: when, s since Monday 00:00: the arrival of the world.
+        """
+        law = world.law()
+        if law is None:
+            best = best_slot(self._problem, self._routes, world, vertex, time)
+            return min(best.total_s, self._problem.give_up_s)
+        if vertex not in self._starts:
+            self._starts[vertex] = self._start(vertex)
+        start = self._starts[vertex]
+        after = self._routes.seconds_from(vertex)[start.slots]
+        free = world.next_free(start.slots, time) - time
+        for i in np.flatnonzero(free < after):
+            free[i] = world.next_free(start.slots[i : i + 1], time + after[i])[0] - time
+        return self._bound(start, law.take(start.slots), after, free)
+
+    def _start(self, vertex: int) -> _Start:
+        n, cost_s = self._problem.lot.n_slots, self._problem.arrival_cost_s
+        total_s = self._routes.seconds_from(vertex)[:n] + cost_s
+        order = np.argsort(total_s, kind="stable")[: np.isfinite(total_s).sum()]
+        slots, others = order[:MOST_SLOTS], order[MOST_SLOTS:]
+        apart_s = np.array([self._routes.seconds_from(slot)[slots] for slot in slots])
+        apart_s = np.minimum(np.minimum(apart_s, apart_s.T), _FAR_S)
+        worse_s = (total_s[slots] - total_s[slots[:1]])[np.triu_indices(len(slots), 1)[1]]
+        apart_s = apart_s[np.triu_indices(len(slots), 1)] * np.exp(-worse_s / FINE_S)
+        tree = linkage(apart_s, "average") if len(slots) > 1 else None
+        found, n_groups = None, 1
+        while n_groups <= min(len(slots), _MOST_GROUPS):
+            group = np.zeros(len(slots), np.int64)
+            if tree is not None:
+                group = fcluster(tree, n_groups, "maxclust").astype(np.int64) - 1
+            ways = self._ways(vertex, slots, group)
+            if ways is None:
+                break
+            found, n_groups = (group, ways), n_groups + 1 + n_groups // 8
+        assert found is not None
+        return _Start(slots, found[0], float(total_s[others[0]]) if len(others) else np.inf, found[1])
+
+    def _ways(self, vertex: int, slots: IntArray, group: IntArray) -> _Ways | None:
+        """Return the ways from a vertex; None if there are too many states, unless there is only one group."""
+        lot = self._problem.lot
+        of_slot = np.zeros(lot.n_slots, np.int64)
+        of_slot[slots] = 1 << group
+        shows = np.zeros(lot.n_vertices, np.int64)
+        shows[: lot.n_slots] = of_slot
+        starts, seen = self._problem.slots_in_view
+        np.bitwise_or.at(shows, np.repeat(np.arange(lot.n_vertices), np.diff(starts)), of_slot[seen])
+        root = int(shows[vertex])
+        gates: dict[int, dict[int, None]] = {root: {vertex: None}}
+        waiting, sets = [root], list[int]()
+        drives: list[tuple[FloatArray, list[tuple[int, int]]]] = []
+        n_states = 0
+        while waiting:
+            known = heapq.heappop(waiting)
+            n_states += len(gates[known])
+            if n_states > self._most_states and group.any():
+                return None
+            seconds = np.array(
+                [
+                    _drive_in_sight(v, known, shows, lot.neighbors, self._problem.move_cost_s)
+                    for v in gates[known]
+                ]
+            )
+            new = np.flatnonzero(np.isfinite(seconds.min(axis=0)) & (shows & ~known != 0))
+            following = [(known | int(shows[v]), int(v)) for v in new]
+            for more, v in following:
+                if more not in gates:
+                    gates[more] = {}
+                    heapq.heappush(waiting, more)
+                gates[more][v] = None
+            sets.append(known)
+            drives.append((seconds, following))
+        first = np.cumsum([0, *(len(gates[known]) for known in sets)])
+        number = {
+            (known, v): at + i
+            for known, at in zip(sets, first[:-1].tolist(), strict=True)
+            for i, v in enumerate(gates[known])
+        }
+        seen_slots = np.repeat((np.array(sets)[:, None] >> group) & 1 == 1, np.diff(first), axis=0)
+        slot_s = np.where(seen_slots, np.concatenate([seconds[:, slots] for seconds, _ in drives]), np.inf)
+        away_s = {v: self._routes.seconds_from(v)[slots] for v in {v for its in gates.values() for v in its}}
+        direct_s = np.where(seen_slots, [away_s[v] for known in sets for v in gates[known]], np.inf)
+        blocks = [seconds[:, [v for _, v in following]].ravel() for seconds, following in drives]
+        edges = (
+            np.cumsum([0, *(len(following) for _, following in drives)]),
+            np.array([number[state] for _, following in drives for state in following], np.int64),
+            np.cumsum([0, *(len(block) for block in blocks)]),
+            np.concatenate(blocks),
+        )
+        return _Ways(np.array(sets, np.int64), first, slot_s, direct_s, _earliest(first, *edges), *edges)
+
+    def _bound(self, start: _Start, law: SlotLaw, after: FloatArray, free: FloatArray) -> float:
+        """Return the bound.
+
+        Args:
+            start: where the search begins.
+            law: of the slots in groups, given the day.
+            after: (n,) s from the arrival until a car can be at each slot.
+            free: (n,) s from the arrival until each is free then, at that time or later.
+        """
+        cost_s = self._problem.arrival_cost_s[start.slots]
+        p_taken = law.p_taken_after(after)
+        nothing_s = float(after.mean()) + _wait_s(p_taken * law.leaving[0], cost_s)
+        ends = after + np.minimum(
+            PERIODS[:, None] * nothing_s, law.known_for_s - after
+        )  # (k, n) of periods of waiting
+        stays = law.stays(after, np.vstack([after, ends]))
+        chance = np.vstack([1.0 - p_taken, p_taken * -np.diff(stays, axis=0)])
+        slot, period = np.divmod(np.flatnonzero(chance.T > 0.0), len(chance))
+        from_s = np.vstack([np.zeros(len(after)), after, ends])[period, slot]
+        news = _News(slot, chance[period, slot], start.group)
+        told = np.full((len(after), len(chance) + 1), len(slot))
+        told[slot, period] = np.arange(len(slot))
+        now = (free > after) + (free > ends).sum(axis=0)
+        ways = start.ways
+        # Time left at a state if the car goes to a slot that is free from a moment on; no news: infinite
+        left_s = np.full((len(ways.earliest_s), len(slot) + 1), np.inf, np.float32)
+        left_s[:, :-1] = np.maximum(ways.direct_s[:, slot], from_s - ways.earliest_s[:, None]) + cost_s[slot]
+        world = _World(told[np.arange(len(after)), now], free, cost_s)
+        longest_s = min((PERIODS[-1] + 1.0) * nothing_s, self._problem.give_up_s)
+        value = _values(ways, news, left_s, longest_s)
+        return float(_least_s(ways, news, left_s, value, world, start.beyond_s, self._problem.give_up_s))
+
+
+def _wait_s(freed: FloatArray, cost_s: FloatArray) -> float:
+    """Return the least mean time, s, until one of the k best slots is freed, and its cost, over k."""
+    order = np.argsort(cost_s)
+    rate = np.cumsum(freed[order])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        mean_s = (1.0 + np.cumsum(freed[order] * cost_s[order])) / rate
+    return float(min(np.nanmin(mean_s, initial=np.inf), _FAR_S))
+
+
+@compiled(error_model="numpy")
+def _drive_in_sight(
+    vertex: int, known: int, shows: IntArray, neighbors: NDArray[np.int32], move_s: FloatArray
+) -> FloatArray:
+    """Return the drive, (n_vertices,) s, to vertices that show nothing new, and to those after them, where it ends."""
+    seconds = np.full(len(shows), np.inf)
+    keys, items, size = np.empty(4 * len(shows) + 1), np.empty(4 * len(shows) + 1, np.int32), 0
+    seconds[vertex] = 0.0
+    size = push(keys, items, size, 0.0, vertex)
+    while size > 0:
+        v, so_far = items[0], keys[0]
+        size = pop(keys, items, size)
+        if so_far > seconds[v] or shows[v] & ~known:
+            continue
+        for move in range(neighbors.shape[1]):
+            u = neighbors[v, move]
+            if u >= 0 and so_far + move_s[v, move] < seconds[u]:
+                seconds[u] = so_far + move_s[v, move]
+                size = push(keys, items, size, seconds[u], u)
+    return seconds
+
+
+@compiled(error_model="numpy")
+def _earliest(
+    first: IntArray, first_next: IntArray, next_state: IntArray, first_drive: IntArray, drive_s: FloatArray
+) -> FloatArray:
+    """Return the least time to each state, (n_states,) s."""
+    earliest = np.full(first[-1], np.inf)
+    earliest[0] = 0.0
+    for k in range(len(first) - 1):
+        n_next = first_next[k + 1] - first_next[k]
+        for x in range(first[k], first[k + 1]):
+            row = drive_s[first_drive[k] + (x - first[k]) * n_next :]
+            for i in range(n_next):
+                y = next_state[first_next[k] + i]
+                earliest[y] = min(earliest[y], earliest[x] + row[i])
+    return earliest
+
+
+@compiled(error_model="numpy")
+def _values(ways: _Ways, news: _News, left_s: NDArray[np.float32], longest_s: float) -> NDArray[np.float32]:
+    """Return about the least expected time, s, from each state if one slot is known, or none, (n_states, m + 1).
+
+    Args:
+        ways: the states.
+        news: what a car may be told.
+        left_s: (n_states, m + 1) s, time left if the car goes to a slot that it was told of; inf for the others.
+        longest_s: s, time left where no slot is known and nothing is left to be seen.
+    """
+    m = len(news.slot)
+    value, onward, seen = (
+        np.minimum(left_s, np.float32(longest_s)),
+        np.empty(m + 1),
+        np.empty(m + 1, np.int64),
+    )
+    for k in range(len(ways.sets) - 1, -1, -1):
+        n_seen = 0
+        for j in range(m):
+            if (ways.sets[k] >> news.group[news.slot[j]]) & 1:
+                seen[n_seen] = j
+                n_seen += 1
+        seen[n_seen] = m
+        n_next = ways.first_next[k + 1] - ways.first_next[k]
+        for i in range(n_next):
+            y = ways.next_state[ways.first_next[k] + i]
+            order, mean, rest = _mean_value(_set_of(y, ways) & ~ways.sets[k], left_s[y], value[y], news)
+            best_s = left_s[y][order]
+            for at in range(n_seen + 1):
+                place = np.searchsorted(best_s, left_s[y, seen[at]])
+                onward[at] = mean[place] + rest[place] * value[y, seen[at]]
+            for x in range(ways.first[k], ways.first[k + 1]):
+                drive = ways.drive_s[ways.first_drive[k] + (x - ways.first[k]) * n_next + i]
+                for at in range(n_seen + 1):
+                    value[x, seen[at]] = min(value[x, seen[at]], drive + onward[at])
+    return np.asarray(value)
+
+
+@compiled(error_model="numpy")
+def _least_s(
+    ways: _Ways,
+    news: _News,
+    left_s: NDArray[np.float32],
+    value: NDArray[np.float32],
+    world: _World,
+    beyond_s: float,
+    give_up_s: float,
+) -> float:
+    """Return the least time of a car that knows the world and pays the penalties.
+
+    Args:
+        ways: the states.
+        news: what a car may be told.
+        left_s: as in `_values`.
+        value: (n_states, m + 1) s, see there.
+        world: what the world is.
+        beyond_s: s, least time of parking in a slot without a group.
+        give_up_s: s, penalty that a car can choose where all groups have been seen.
+    """
+    total_s, penalty_s = np.full(len(left_s), np.inf), np.full(len(left_s), np.inf)
+    every, least = 0, np.inf
+    for group in news.group:
+        every |= 1 << group
+    # Before anything is seen, the car is where the first state is.
+    total_s[0] = penalty_s[0] = _penalty_s(0, 0, ways, news, left_s[0], value[0], world.told)
+    for k in range(len(ways.sets)):
+        for x in range(ways.first[k], ways.first[k + 1]):
+            least = min(least, beyond_s + penalty_s[x])
+            if ways.sets[k] == every:
+                least = min(least, total_s[x] + give_up_s)
+            for s in range(len(world.free_s)):
+                if ways.slot_s[x, s] < np.inf:
+                    parked_s = max(total_s[x] + ways.slot_s[x, s], world.free_s[s] + penalty_s[x])
+                    least = min(least, parked_s + world.cost_s[s])
+        n_next = ways.first_next[k + 1] - ways.first_next[k]
+        for i in range(n_next):
+            y = ways.next_state[ways.first_next[k] + i]
+            penalty = _penalty_s(ways.sets[k], y, ways, news, left_s[y], value[y], world.told)
+            for x in range(ways.first[k], ways.first[k + 1]):
+                drive = ways.drive_s[ways.first_drive[k] + (x - ways.first[k]) * n_next + i]
+                total_s[y] = min(total_s[y], total_s[x] + drive + penalty)
+                penalty_s[y] = min(penalty_s[y], penalty_s[x] + penalty)
+    return float(least)
+
+
+@compiled(error_model="numpy")
+def _penalty_s(
+    known: int,
+    y: int,
+    ways: _Ways,
+    news: _News,
+    left_s: NDArray[np.float32],
+    value: NDArray[np.float32],
+    told: IntArray,
+) -> float:
+    """Return the penalty, s, at a state for what it shows, where the groups `known` had been seen before."""
+    seen, none = _set_of(y, ways), len(news.slot)
+    before, best = none, none
+    for s in range(len(told)):
+        if (seen >> news.group[s]) & 1 and left_s[told[s]] < left_s[best]:
+            best = told[s]
+        if (known >> news.group[s]) & 1 and left_s[told[s]] < left_s[before]:
+            before = told[s]
+    order, mean, rest = _mean_value(seen & ~known, left_s, value, news)
+    place = np.searchsorted(left_s[order], left_s[before])
+    return float(mean[place] + rest[place] * value[before] - value[best])
+
+
+@compiled(error_model="numpy")
+def _set_of(state: int, ways: _Ways) -> int:
+    """Return the set of a state."""
+    return int(ways.sets[np.searchsorted(ways.first, state, side="right") - 1])
+
+
+@compiled(error_model="numpy")
+def _mean_value(
+    new: int, left_s: NDArray[np.float32], value: NDArray[np.float32], news: _News
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Average `value` at a state over what new groups may be.
+
+    Returns:
+        What may be told of their slots, best first, (k,); the sum of the value over the first i, weighted with the
+        probability that each is the best that is told, and the probability that none of them is told, (k + 1,).
+    """
+    order, k = np.empty(len(news.slot), np.int64), 0
+    for j in range(len(news.slot)):
+        if (new >> news.group[news.slot[j]]) & 1 and left_s[j] < np.inf:
+            order[k] = j
+            k += 1
+    order = order[:k]
+    order = order[np.argsort(left_s[order])]
+    mean, rest, other = np.zeros(k + 1), np.ones(k + 1), np.ones(len(news.group))
+    for i in range(k):
+        # What is told of a slot excludes the rest that may be told of it.
+        s, chance = news.slot[order[i]], news.chance[order[i]]
+        best = rest[i] / other[s] * chance if other[s] > _SURE else 0.0
+        other[s] -= chance
+        mean[i + 1], rest[i + 1] = mean[i] + best * value[order[i]], rest[i] - best
+    return order, mean, rest

@@ -1,0 +1,130 @@
+"""The lower bound by information relaxation: it is never above the optimum, and close to it."""
+
+import itertools
+
+import numpy as np
+import pytest
+from small_lots import small_lot
+
+from parkenv import compare, make_scenario
+from parkenv.compiled.keyed_random import world_key
+from parkenv.errors import InputError
+from parkenv.lots import grid_lot
+from parkenv.world.occupancy.process import Arrival, OccupancyProcess, World
+from parkenv.world.occupancy.slot_law import SlotLaw
+from parkenv.world.scenario import SearchProblem
+from planners.bounds.exact import ExactSolution
+from planners.bounds.exact_changing import ChangingSolution
+from planners.bounds.oracle import best_slot
+from planners.bounds.relaxation import SearchBound
+from planners.routes import DriveRoutes
+
+
+class StillWorld(World):
+    """Slots that stay as they are."""
+
+    def __init__(self, taken, p_taken):
+        self.taken = np.asarray(taken)
+        none = np.zeros((2, len(self.taken)))
+        self._law = SlotLaw(np.asarray(p_taken), none, none, 3600.0)
+
+    def occupied(self, slots, time):
+        return self.taken[slots]
+
+    def next_free(self, slots, time):
+        return np.where(self.taken[slots], np.inf, time)
+
+    def sojourn(self, slots, time):
+        return np.ones(np.size(slots), np.int64)
+
+    def law(self):
+        return self._law
+
+
+SHAPES = ((1, 4), (2, 2), (2, 3), (1, 6), (3, 2), (1, 5))
+
+
+def means(problem, p_taken, entry, most_states=4_000):
+    """The optimum, the bound and the clairvoyant bound, over all worlds that there are."""
+    routes, bound, mean, clairvoyant = DriveRoutes(problem), SearchBound(problem, most_states), 0.0, 0.0
+    for taken in itertools.product((False, True), repeat=problem.lot.n_slots):
+        world = StillWorld(taken, p_taken)
+        chance = np.prod(np.where(taken, p_taken, 1.0 - p_taken))
+        mean += chance * bound.of_world(world, entry, 0.0)
+        best = best_slot(problem, routes, world, entry, 0.0).total_s
+        clairvoyant += chance * min(best, problem.give_up_s)
+    return ExactSolution(problem, p_taken, entry).expected_s, mean, clairvoyant
+
+
+def require_below(seeds):
+    found = np.array([means(*small_lot(seed, SHAPES)) for seed in seeds])
+    exact, bound, clairvoyant = found.T
+    assert (bound <= exact + 1e-3).all()
+    assert (exact - bound).mean() < 0.25 * (exact - clairvoyant).mean()
+
+
+def test_it_is_never_above_the_optimum_and_far_closer_than_the_clairvoyant_bound():
+    require_below(range(24))
+
+
+@pytest.mark.slow
+def test_it_is_never_above_the_optimum_of_200_small_lots():
+    require_below(range(24, 224))
+
+
+def test_coarser_groups_give_a_lower_bound_that_still_holds():
+    problem, p_taken, entry = small_lot(4, SHAPES)
+    exact, fine, clairvoyant = means(problem, p_taken, entry)
+    _, coarse, _ = means(problem, p_taken, entry, most_states=1)
+    assert coarse <= fine + 1e-3 <= exact + 2e-3
+    assert coarse >= clairvoyant - 1e-3
+
+
+def process(p_taken, rate):
+    profile = np.ones(168)
+    return OccupancyProcess(p_taken * rate, profile, (1.0 - p_taken) * rate, profile)
+
+
+def test_it_holds_where_slots_change():
+    problem = SearchProblem(lot=grid_lot(1, 3), give_up_s=100.0)
+    p_taken, entry = np.array([0.9, 0.7, 0.8]), int(problem.lot.entry_vertices[0])
+    model, bound, routes = process(p_taken, 0.002), SearchBound(problem), DriveRoutes(problem)
+    exact = ChangingSolution(problem, p_taken, np.full(3, 0.002), 1.0, 40).expected_s(entry)
+    totals, clairvoyant = np.empty(1_000), np.empty(1_000)
+    arrival = Arrival(36_000.0)
+    for seed in range(1_000):
+        world = model.world(world_key(seed, 0), arrival)
+        totals[seed] = bound.of_world(world, entry, arrival.time)
+        best = best_slot(problem, routes, world, entry, arrival.time).total_s
+        clairvoyant[seed] = min(best, problem.give_up_s)
+    error = 3.0 * np.std(totals) / np.sqrt(len(totals))
+    assert clairvoyant.mean() - error <= totals.mean() <= exact + error
+    assert exact - totals.mean() < 0.5 * (exact - clairvoyant.mean())
+
+
+def test_the_law_of_a_world_is_that_of_its_slots_on_its_day():
+    scenario = make_scenario("campus")
+    model, slots = scenario.occupancy, np.arange(scenario.lot.n_slots)
+    arrival = Arrival(36_000.0 - 100.0)  # the hour ends on the way
+    taken, after, stayed = [], [], []
+    for seed in range(300):
+        world = model.world(world_key(seed, 0), arrival)
+        law = world.law()
+        here = world.occupied(slots, arrival.time)
+        taken.append((here - law.p_taken).mean())
+        after.append((world.occupied(slots, arrival.time + 900.0) - law.p_taken_after(900.0)).mean())
+        stays = law.stays(0.0, 900.0)
+        stayed.append(((world.next_free(slots, arrival.time) > arrival.time + 900.0) - stays)[here].mean())
+    for differences in (taken, after, stayed):
+        assert abs(np.mean(differences)) < 4.0 * np.std(differences) / np.sqrt(len(differences))
+        assert np.std(differences) < 0.06
+
+
+def test_it_is_compared_with_agents_and_drives_no_car():
+    found = compare(agents=["bound", "belief"], scenarios=["mini"], episodes=8, jobs=1, figures=False).rows
+    rows = {row["agent"]: row for row in found}
+    assert rows["belief"]["gap_to_bound"] == rows["belief"]["total_s"] / rows["bound"]["total_s"] - 1.0
+    assert rows["belief"]["leads"]
+    assert not rows["bound"]["leads"]
+    with pytest.raises(InputError, match="bound"):
+        SearchBound(make_scenario("mini")).predict({})
