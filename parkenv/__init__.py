@@ -23,9 +23,10 @@ if TYPE_CHECKING:
     from parkenv.errors import InputError
     from parkenv.lots import import_lot, load_lot
     from parkenv.scenarios.build import make_scenario, make_scenarios
+    from parkenv.studies.curve.curves import load_curves
     from parkenv.studies.runner import Result, open_run
     from parkenv.studies.simulate import simulate
-    from parkenv.studies.verbs import compare, fleet, survey, train
+    from parkenv.studies.verbs import compare, curve, fleet, survey, train
     from parkenv.world.lot import Lane, Mouth, ParkingLot, Turn
     from parkenv.world.occupancy.arrival_window import ArrivalWindow
     from parkenv.world.occupancy.log import OccupancyLog
@@ -58,8 +59,10 @@ _EXPORTS = {
     "Traffic": "parkenv.world.traffic",
     "Turn": "parkenv.world.lot",
     "compare": "parkenv.studies.verbs",
+    "curve": "parkenv.studies.verbs",
     "fleet": "parkenv.studies.verbs",
     "import_lot": "parkenv.lots",
+    "load_curves": "parkenv.studies.curve.curves",
     "load_lot": "parkenv.lots",
     "make_agent": "planners.agent",
     "make_scenario": "parkenv.scenarios.build",
@@ -88,8 +91,10 @@ __all__ = [
     "Traffic",
     "Turn",
     "compare",
+    "curve",
     "fleet",
     "import_lot",
+    "load_curves",
     "load_lot",
     "make_agent",
     "make_scenario",

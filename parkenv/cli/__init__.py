@@ -38,6 +38,9 @@ COMMANDS = {
     "policy": Entry(
         "Find what a town should do: prices, limits, permits, guidance, capacity.", "policy:Policy", SEARCH
     ),
+    "curve": Entry(
+        "Fit what searches are like as a function of occupancy, for other models.", "drivers:Curve", SEARCH
+    ),
     "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
     "pomdp": Entry("Write the search in a small lot for POMDP solvers of others.", "compare:Pomdp", SEARCH),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),

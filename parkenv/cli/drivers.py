@@ -1,4 +1,4 @@
-"""`parkenv commute` and `parkenv fleet`: drivers who come day after day, and many at a time."""
+"""`parkenv commute`, `fleet` and `curve`: drivers who come day after day, and many at a time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from parkenv.files.option import option
 from parkenv.show.plurals import plural
 from parkenv.show.report.tables import OF_FLEETS
 from parkenv.studies.commute.study import Commute as CommuteStudy
+from parkenv.studies.curve.study import CurveStudy
 from parkenv.studies.fleet.changes import sentence, shown_changes
 from parkenv.studies.fleet.setting import SETTING_COLUMNS
 from parkenv.studies.fleet.study import FleetStudy
@@ -38,7 +39,9 @@ OF_CHANGES = (
     "after", "before", "zone", "purpose", "change_s", "members_change_s", "others_change_s", "paid_change",
     "better_off", "worse_off",
 )  # fmt: skip
-"""Columns that are printed of settings, of zones, blocks and purposes, and of changes."""
+OF_DEMANDS = ("occupancy", "cruised_m", "walk_s", "failed_attempts", "balked_fraction")
+OF_ERRORS = ("mean", "mae", "relative", "bias", "noise", "relative_of_zones")
+"""Columns that are printed of settings, of zones, blocks and purposes, of changes, of demands, and of errors."""
 
 
 class Commute(AgentStudyCommand):
@@ -144,6 +147,42 @@ class Fleet(AgentStudyCommand):
         told += carried(without_nan(rows), self.study.most_balked)
         told += unreached(result.summary["reach"])
         for line in [*told, *departures(result.summary["hours"], rows)]:
+            console.print(line, soft_wrap=True)
+
+
+class Curve(AgentStudyCommand):
+    """All cars of a town are driven at several demands, with the same random numbers.
+
+    For each zone (a goal and the spaces around), hour and purpose the time that the search takes beyond the direct
+    drive, the walk, failed attempts and the share that finds no space are fitted as monotone functions of occupancy and
+    demand, pooled over zones, with 95 % intervals over days and zones. The table says how far they are off in zones,
+    towns and demands that were held out, beside the usual forms. Other models read the files in --out.
+    """
+
+    examples = """
+        parkenv curve town --out results/curve
+        parkenv curve town.toml other.toml -n 10
+        parkenv curve campus --arrivals-per-hour 40,80,120,160 --hours 08:00-12:00
+        parkenv curve --resume --out results/curve -n 20
+        """
+
+    study: CurveStudy = CurveStudy()
+    out: Path = option(
+        Path("results/curve"),
+        "Folder for experiment.json, days.csv, curve.csv, curve.json, activitysim.csv, matsim.csv, held_out.csv, "
+        "summary.json and curve.png.",
+        short="-o",
+    )
+
+    def show(self, console: Console, result: Result) -> None:
+        """Print how full a lot is at each demand, how far curves are off, and that in sentences."""
+        if not result.rows:
+            return
+        print_rows(console, self.study.title, result.rows, (*SETTING_COLUMNS, *OF_DEMANDS), OF_FLEETS)
+        if errors := without_nan(result.summary["errors"]):
+            title = self.study.table_titles["errors"]
+            print_rows(console, title, errors, ("held_out", "outcome", "form", *OF_ERRORS))
+        for line in self.study.findings(without_nan(result.summary)):
             console.print(line, soft_wrap=True)
 
 

@@ -139,6 +139,7 @@ COMMANDS = {
     "compare": "compare:Compare",
     "commute": "drivers:Commute",
     "fleet": "drivers:Fleet",
+    "curve": "drivers:Curve",
     "demand": "occupancy:Demand",
     "policy": "policy:Policy",
     "benchmark": "benchmark:RunSuite",
@@ -158,8 +159,8 @@ class Run(RunCommand, ExecutionSpec):
     """Settings that the file leaves out have the defaults of its command.
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
-    command: compare (the default), commute, fleet, demand, policy, benchmark, survey, detectors, demo, calibrate,
-    verify, train, park (scenes) or dataset.
+    command: compare (the default), commute, fleet, curve, demand, policy, benchmark, survey, detectors, demo,
+    calibrate, verify, train, park (scenes) or dataset.
     """
 
     examples = """

@@ -39,6 +39,7 @@ STUDIES: Mapping[str, str] = {
     "compare": "parkenv.studies.compare.comparison:Comparison",
     "commute": "parkenv.studies.commute.study:Commute",
     "fleet": "parkenv.studies.fleet.study:FleetStudy",
+    "curve": "parkenv.studies.curve.study:CurveStudy",
     "demand": "parkenv.studies.fleet.demand_study:DemandStudy",
     "policy": "parkenv.studies.policy.study:PolicyStudy",
     "benchmark": "parkenv.studies.benchmark.study:Benchmark",

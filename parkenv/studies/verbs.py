@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from parkenv.studies.compare.comparison import Comparison
+from parkenv.studies.curve.study import CurveStudy
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.runner import Result, run
 from parkenv.studies.sensing.survey_study import SurveyStudy
@@ -59,6 +60,30 @@ def fleet(
         InputError: see `compare`.
     """
     return _run(FleetStudy, fields, folder, resume, overwrite, progress)
+
+
+def curve(
+    *,
+    folder: Path | str | None = None,
+    resume: bool = False,
+    overwrite: bool = False,
+    progress: Progress | None = None,
+    **fields: Any,
+) -> Result:
+    """Fit what searches in a town are like as functions of occupancy and demand; `load_curves` reads them.
+
+    Args:
+        folder: see `compare`.
+        resume: see `compare`.
+        overwrite: see `compare`.
+        progress: see `compare`.
+        fields: fields of the specification, as in a file of kind `curve`: `scenarios`, `arrivals_per_hour`, `days`,
+            `reach_m` and others.
+
+    Raises:
+        InputError: see `compare`.
+    """
+    return _run(CurveStudy, fields, folder, resume, overwrite, progress)
 
 
 def survey(

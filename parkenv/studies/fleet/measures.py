@@ -46,6 +46,11 @@ class Roads:
         rows = np.searchsorted(self._entries, cars["entry"])
         return np.where(cars["slot"] >= 0, self._metres[rows, cars["slot"]], 0.0)
 
+    def direct_s(self, cars: NDArray[np.void]) -> FloatArray:
+        """Return the times of these drives, (n,) s; 0 without a slot."""
+        rows = np.searchsorted(self._entries, cars["entry"])
+        return np.where(cars["slot"] >= 0, self._drive_s[rows, cars["slot"]], 0.0)
+
     def cruised_m(self, cars: NDArray[np.void]) -> FloatArray:
         """Return what the drives of cars exceed the shortest ones by, (n,) m: all of it without a slot."""
         return np.maximum(cars["driven_m"] - self.direct_m(cars), 0.0)

@@ -49,9 +49,11 @@ from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
+    from parkenv.compiled.arrays import FloatArray, IntArray
     from parkenv.engine.fleet import Fleet
     from parkenv.scenarios.calibration import Calibration
     from parkenv.show.report.page import Page
+    from parkenv.studies.fleet.blocks import Tally
     from parkenv.studies.fleet.measures import Roads
     from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
@@ -331,7 +333,7 @@ class FleetStudy(Study):
         """
         import numpy as np
 
-        from parkenv.studies.fleet.blocks import Blocks, Tally, day_rows
+        from parkenv.studies.fleet.blocks import Tally
         from parkenv.studies.fleet.measures import car_lists, day_measures, filling
         from parkenv.world.occupancy.process import Arrival
 
@@ -360,9 +362,15 @@ class FleetStudy(Study):
         measured = day_measures(fleet, roads, members, filled, bound_s)
         lists = car_lists(fleet, members) if self._lists_cars else {}
         row = {**setting.columns, "day": day}
-        blocks = Blocks.of(fleet.scenario.lot)
-        of_tables = day_rows(fleet, blocks, tally, roads.cruised_m(fleet.cars), times, np.array(taken))
+        of_tables = self.day_tables(fleet, tally, times, np.array(taken))
         return {**row, **measured, **lists, **{file: row | its for file, its in of_tables.items()}}
+
+    def day_tables(self, fleet: Fleet, tally: Tally, times: FloatArray, taken: IntArray) -> dict[str, Row]:
+        """Return what a day tells besides its row: a row of each further table, by its file; see `day_rows`."""
+        from parkenv.studies.fleet.blocks import Blocks, day_rows
+
+        cruised_m = self._roads[fleet.scenario.name].cruised_m(fleet.cars)
+        return day_rows(fleet, Blocks.of(fleet.scenario.lot), tally, cruised_m, times, taken)
 
     @property
     def _lists_cars(self) -> bool:

@@ -1,0 +1,189 @@
+"""Fitted curves to call, and the files in which other models read them."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from functools import partialmethod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.interpolate import PchipInterpolator
+
+from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError, nearest
+from parkenv.files.atomic_write import atomic_write
+from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
+from parkenv.files.limited_reading import read_json
+from parkenv.studies.curve.fit import CurveTable, Paths, fit_form
+from parkenv.studies.fleet.blocks import ALL
+from parkenv.studies.results import Row, without_nan
+
+JSON = "curve.json"
+NAMES = ("scenario", "zone", "purpose", "hour")
+PERIODS = {"": (0, 48), "_EA": (3, 5), "_AM": (5, 9), "_MD": (9, 14), "_PM": (14, 18), "_EV": (18, 27)}
+"""Clock hours of the day, and of the time periods of ActivitySim's example (`network_los.yaml` of `prototype_mtc`)."""
+MOST_BYTES = 500_000_000
+"""Largest file of curves that is read."""
+_DIGITS = 5
+
+
+class CurveValue(NamedTuple):
+    """Values of a curve, and the ends of their 95 % intervals, in the shape of what was asked for."""
+
+    value: FloatArray
+    low: FloatArray
+    high: FloatArray
+
+
+class Curves:
+    """What a search in each zone, for each purpose and at each hour, is like, as a function of occupancy or demand.
+
+    A curve is known between the least and the most demand that was driven; beyond, it stays as it is there.
+
+    Args:
+        curves: by scenario, zone, purpose and hour, its columns: `occupancy`, `demand`, and value, low and high end of
+            each outcome, as `search_s`, `search_s_low` and `search_s_high`.
+
+    Examples:
+        >>> its = {"occupancy": [0.2, 0.8], "demand": [0.1, 0.4]}
+        >>> its |= {"search_s": [10.0, 70.0], "search_s_low": [8.0, 60.0], "search_s_high": [12.0, 80.0]}
+        >>> Curves({("town", "all", "all", "all"): its}).search_s(occupancy=[0.2, 0.5, 0.9]).value
+        array([10., 40., 70.])
+    """
+
+    def __init__(self, curves: Mapping[tuple[str, ...], Mapping[str, Sequence[float]]]) -> None:
+        self.curves = dict(curves)
+
+    def at(
+        self,
+        outcome: str,
+        *,
+        occupancy: ArrayLike | None = None,
+        demand: ArrayLike | None = None,
+        zone: Any = ALL,
+        hour: Any = ALL,
+        purpose: Any = ALL,
+        scenario: Any = None,
+    ) -> CurveValue:
+        """Return an outcome, such as `search_s`, with its interval; all arguments broadcast against each other.
+
+        Args:
+            outcome: one of `parkenv.studies.curve.fit.OUTCOMES`.
+            occupancy: share of the spaces around that is taken, from 0 to 1.
+            demand: or instead, cars that arrive in an hour for each space around.
+            zone: names of zones.
+            hour: clock hours of the arrival.
+            purpose: purposes.
+            scenario: scenarios; None for the first.
+
+        Raises:
+            InputError: both or neither of occupancy and demand are given, or there is no such curve.
+        """
+        if (occupancy is None) == (demand is None):
+            raise InputError("occupancy and demand are both given or both missing, want one of them")
+        along, given = ("occupancy", occupancy) if demand is None else ("demand", demand)
+        first = next(iter(self.curves))[0] if scenario is None else scenario
+        x, *names = np.broadcast_arrays(np.asarray(given, float), first, zone, purpose, hour)
+        values = np.empty((3, *x.shape))
+        asked = np.stack([its.astype(str) for its in names], axis=-1)
+        for key in {*map(tuple, asked.reshape(-1, len(NAMES)).tolist())}:
+            at, its = (asked == key).all(axis=-1), self._curve(key)
+            knots, unique = np.unique(np.array(its[along], float), return_index=True)
+            inside = np.clip(x[at], knots[0], knots[-1])
+            for k, column in enumerate((outcome, f"{outcome}_low", f"{outcome}_high")):
+                y = np.array(its[column], float)[unique]
+                values[k, at] = PchipInterpolator(knots, y)(inside) if len(knots) > 1 else y[0]
+        return CurveValue(*values)
+
+    def _curve(self, key: tuple[str, ...]) -> Mapping[str, Sequence[float]]:
+        if key not in self.curves:
+            for part, name, known in zip(NAMES, key, zip(*self.curves, strict=True), strict=True):
+                if name not in known:
+                    raise InputError(f"{part} is {name!r}; {nearest(name, dict.fromkeys(known))}")
+            raise InputError(f"{', '.join(key)}: no cars come, so there is no curve")
+        return self.curves[key]
+
+    search_s = partialmethod(at, "search_s")
+    walk_s = partialmethod(at, "walk_s")
+    failed_attempts = partialmethod(at, "failed_attempts")
+    balked_fraction = partialmethod(at, "balked_fraction")
+
+
+def load_curves(folder: Path | str) -> Curves:
+    """Read the curves in the folder of a run of `parkenv curve`.
+
+    Raises:
+        InputError: there are none, or the file is damaged.
+    """
+    path = Path(folder) / JSON
+    content = read_json(path, MOST_BYTES)
+    try:
+        return Curves({tuple(str(its[name]) for name in NAMES): its for its in content["curves"]})
+    except (KeyError, TypeError) as error:
+        raise InputError(f"{path}: want curves with {', '.join(NAMES)}") from error
+
+
+def write_curves(paths: Paths, table: CurveTable, folder: Path) -> None:
+    """Write `curve.csv`, `curve.json`, `activitysim.csv` and `matsim.csv` into a folder."""
+    names, n = [paths.names(index) for index in table.numbers.tolist()], len(paths.multiples)
+    columns = {name: values.round(_DIGITS).tolist() for name, values in table.columns.items()}
+    repeated = [[name for name in its for _ in range(n)] for its in zip(*names, strict=True)]
+    repeated += [
+        paths.multiples.tolist() * len(names),
+        *([x for row in its for x in row] for its in columns.values()),
+    ]
+    _write(
+        folder / "curve.csv",
+        csv_text((*NAMES, "multiple", *columns), [], header=True) + csv_columns(repeated),
+    )
+    curves = [
+        dict(zip(NAMES, its, strict=True)) | {name: values[k] for name, values in columns.items()}
+        for k, its in enumerate(names)
+    ]
+    whole = without_nan({"multiples": paths.multiples.tolist(), "curves": curves})
+    _write(folder / JSON, json.dumps(whole, allow_nan=False) + "\n")
+    terminal, links = zone_rows(paths, table)
+    write_csv(folder / "activitysim.csv", tuple(terminal[0]), terminal)
+    write_csv(folder / "matsim.csv", tuple(links[0]), links)
+
+
+def zone_rows(paths: Paths, table: CurveTable) -> tuple[list[Row], list[Row]]:
+    """Return a row of each zone for ActivitySim, and for MATSim.
+
+    ActivitySim's land use has the terminal time, minutes: search and walk at the scenario's own demand, or the nearest
+    to it, over the day and by period. MATSim's parking in QSim has spaces of links (each belongs to the nearest zone)
+    and a `BellochePenaltyFunction`: alpha exp(-beta occupancy) s of search.
+    """
+    usual, terminal, links = int(abs(paths.multiples - 1.0).argmin()), [], []
+    column = table.columns
+    minutes = (column["search_s"] + column["walk_s"])[:, usual] / 60.0
+    town, zone, purpose, hour = table.numbers.T
+    of_all = (purpose == (-1 if len(paths.purposes) > 1 else 0)) & (hour >= 0) & (zone >= 0)
+    for number, (name, zones) in enumerate(paths.towns.items()):
+        for at, zone_name in enumerate(zones.names):
+            its = np.flatnonzero(of_all & (town == number) & (zone == at))
+            if not its.size:
+                continue
+            row: Row = {"scenario": name, "zone_id": zone_name}
+            for period, (begin, end) in PERIODS.items():
+                inside = its[(paths.first_hour + hour[its] >= begin) & (paths.first_hour + hour[its] < end)]
+                weighed = np.average(minutes[inside], weights=table.cars[inside]) if inside.size else None
+                row[f"TERMINAL{period}"] = weighed if weighed is None else round(float(weighed), 2)
+            terminal.append(row)
+            weight = np.repeat(table.cars[its], len(paths.multiples))
+            b, (alpha,) = fit_form(
+                "a exp(b x)", column["occupancy"][its].ravel(), column["search_s"][its].ravel(), weight
+            )
+            x, y = zones.xy[at].round(2).tolist()
+            row = {"scenario": name, "zone": zone_name, "x": x, "y": y}
+            row |= dict(zip(("onstreet_spots", "offstreet_spots"), zones.own[at].tolist(), strict=True))
+            links.append(row | {"alpha": round(float(alpha), _DIGITS), "beta": -b})
+    return terminal, links
+
+
+def _write(path: Path, text: str) -> None:
+    with atomic_write(path) as beside:
+        beside.write_text(text, encoding="utf-8")

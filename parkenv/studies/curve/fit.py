@@ -1,0 +1,388 @@
+"""Curves fitted to the days of fleets at several demands, pooled over zones, with intervals and held-out errors.
+
+What a zone's searches are like is a monotone function of how full it is around, how many cars come, and both for the
+whole lot (gradient-boosted trees with monotone constraints, Poisson loss, over all zones), times factors of the zone's
+own, shrunk towards 1 by as much as they may be chance (empirical Bayes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, NamedTuple, Self
+
+import numpy as np
+from scipy.optimize import nnls
+from scipy.sparse import csr_matrix, vstack
+
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.studies.curve.zones import INDEX, OF_CARS, STATE, Zones
+from parkenv.studies.results import Row
+from parkenv.studies.workers import SERIAL, Workers
+
+FOLDS = 5
+"""Parts of the zones, each of which is held out once."""
+_GROWS, _PURPOSE = (1, 1, 1, 1, 0, 0, 0, 0), 5
+"""Features that a curve may only grow with: `STATE`; then hour, purpose, spaces around, and share of them counted."""
+_TREES = {
+    "max_iter": 80,
+    "learning_rate": 0.12,
+    "max_leaf_nodes": 12,
+    "min_samples_leaf": 30,
+    "l2_regularization": 1.0,
+}
+
+
+class Outcome(NamedTuple):
+    """What a curve tells: a sum for each car, of `OF_CARS`."""
+
+    label: str
+    total: Callable[[Mapping[str, FloatArray]], FloatArray]
+    of: str  # the cars
+    most: float = np.inf
+
+
+OUTCOMES = {
+    "search_s": Outcome("search time, s", lambda its: its["search_s"], "parked"),
+    "walk_s": Outcome("walk, s", lambda its: its["walk_s"], "parked"),
+    "failed_attempts": Outcome("failed attempts", lambda its: its["failed"], "cars"),
+    "balked_fraction": Outcome(
+        "share that finds no space", lambda its: its["cars"] - its["parked"], "cars", 1.0
+    ),
+}
+FORMS: Mapping[str, tuple[Callable[[FloatArray, float], list[FloatArray]], FloatArray]] = {
+    "a/(1 - x)": (lambda x, _: [1.0 / (1.0 - np.minimum(x, 0.99))], np.zeros(1)),
+    "t0 (1 + a x^b)": (lambda x, b: [np.ones(len(x)), x**b], np.linspace(1.0, 15.0, 29)),
+    "a exp(b x)": (lambda x, b: [np.exp(b * x)], np.linspace(0.0, 15.0, 61)),
+}
+"""Usual forms in the occupancy x: columns that are added with weights of at least 0, and the shapes b to try."""
+
+
+def fit_form(name: str, x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
+    """Fit a usual form by weighted least squares; return its shape b and the weights of its columns."""
+    columns, shapes = FORMS[name]
+    bins = np.unique((200 * x).astype(int), return_inverse=True)[1]
+    total = np.maximum(np.bincount(bins, weight), 1e-12)
+    x, y = (np.bincount(bins, weight * values) / total for values in (x, y))
+    root = np.sqrt(total)
+    fits = [(*nnls(np.stack(columns(x, b), axis=1) * root[:, None], y * root), b) for b in shapes.tolist()]
+    weights, _, b = min(fits, key=lambda fit: fit[1])
+    return b, weights
+
+
+def form_at(name: str, fit: tuple[float, FloatArray], x: FloatArray) -> FloatArray:
+    """Return the values of a fitted form."""
+    return np.asarray(np.dot(fit[1], FORMS[name][0](x, fit[0])))
+
+
+def fitted_forms(points: Sequence[Row]) -> dict[str, Callable[[FloatArray], FloatArray]]:
+    """Return the usual forms that fit measured zone-hours best."""
+    x, y, cars = (np.array([row[name] for row in points]) for name in ("occupancy", "measured", "cars"))
+    return {name: partial(form_at, name, fit_form(name, x, y, cars)) for name in FORMS} if len(x) else {}
+
+
+class Town(NamedTuple):
+    """The days of a scenario: its zones, the names of its purposes, and rows of `ZONES` by multiple and day."""
+
+    zones: Zones
+    purposes: Sequence[str]
+    days: Sequence[Sequence[Row]]
+
+
+@dataclass(frozen=True, eq=False)
+class Paths:
+    """Days of fleets: a path for each zone, purpose and hour in which cars come, through all multiples of the demand.
+
+    Attributes:
+        towns: the scenarios, by name.
+        purposes: names of all purposes.
+        multiples: (m,) ascending.
+        first_hour: clock hour of hour 0.
+        index: (n, 4) int64, numbers of town, zone, purpose and hour of each path.
+        features: (n, m, 8), see `_GROWS`.
+        sums: `OF_CARS`, (days, n, m) each.
+    """
+
+    towns: Mapping[str, Zones]
+    purposes: tuple[str, ...]
+    multiples: FloatArray
+    first_hour: int
+    index: IntArray
+    features: FloatArray
+    sums: Mapping[str, FloatArray]
+
+    @classmethod
+    def of(cls, towns: Mapping[str, Town], multiples: Sequence[float], first_hour: int) -> Self:
+        """Gather the rows of days, of which all demands have equally many."""
+        purposes = tuple(dict.fromkeys(name for town in towns.values() for name in town.purposes))
+        parts: list[tuple[Any, ...]] = []
+        for number, town in enumerate(towns.values()):
+            n_zones, hours = np.shape(town.days[0][0]["occupancy"])
+            of_cars = np.zeros((5, len(town.days[0]), len(multiples), n_zones, len(town.purposes), hours))
+            state = np.zeros((4, len(multiples), n_zones, hours))
+            for m, days in enumerate(town.days):
+                for day, row in enumerate(days):
+                    of_cars[:, day, m, row["zone"], row["purpose"], row["hour"]] = [
+                        row[name] for name in OF_CARS
+                    ]
+                    for values, name in zip(state[:, m], STATE, strict=True):
+                        values += np.array(row[name]) / len(days)
+            # More demand makes no zone emptier, but for chance.
+            state = np.maximum.accumulate(state, axis=1)
+            zone, purpose, hour = np.nonzero(of_cars[0].sum(axis=(0, 1)))
+            known = np.array([purposes.index(name) for name in town.purposes])[purpose]
+            spaces = town.zones.spaces.sum(axis=1)
+            fixed = np.stack([hour, known, np.log(spaces)[zone], (town.zones.spaces[:, 1] / spaces)[zone]])
+            fixed = np.broadcast_to(fixed[:, None], (4, len(multiples), len(zone)))
+            features = np.concatenate([state[:, :, zone, hour], fixed]).transpose(2, 1, 0)
+            index = np.stack([np.full_like(zone, number), zone, known, hour], axis=1)
+            parts.append((index, features, of_cars[:, :, :, zone, purpose, hour].transpose(0, 1, 3, 2)))
+        index, features, of_cars = (
+            np.concatenate([part[k] for part in parts], axis) for k, axis in enumerate((0, 0, 2))
+        )
+        zones = {name: town.zones for name, town in towns.items()}
+        sums = dict(zip(OF_CARS, of_cars, strict=True))
+        return cls(zones, purposes, np.array(multiples), first_hour, index, features, sums)
+
+    def groups(self, *columns: int) -> IntArray:
+        """Return the numbers of groups of paths that are alike in some columns of the index, (n,)."""
+        return np.asarray(np.unique(self.index[:, columns], axis=0, return_inverse=True)[1].ravel())
+
+    def totals(self, name: str) -> tuple[FloatArray, FloatArray]:
+        """Return sums of an outcome and numbers of cars, (days, n, m) each."""
+        return OUTCOMES[name].total(self.sums), self.sums[OUTCOMES[name].of]
+
+    def names(self, index: Sequence[int]) -> tuple[str, str, str, str]:
+        """Return the names of town, zone, purpose and clock hour; `all` for -1."""
+        town, zone, purpose, hour = index
+        name, zones = list(self.towns.items())[town]
+        numbered = (zones.names, zone), (self.purposes, purpose), (range(self.first_hour, 48), hour)
+        return name, *("all" if number < 0 else str(its[number]) for its, number in numbered)  # type: ignore[return-value]
+
+
+def _mean(total: Any, cars: Any, missing: float = 0.0) -> FloatArray:
+    return np.asarray(np.divide(total, cars, out=np.full(total.shape, missing), where=cars > 0.0))
+
+
+def fit_curve(
+    paths: Paths, name: str, train: FloatArray | BoolArray | float = 1.0, days: FloatArray | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Fit an outcome; return it as all zones have it in common, and with the factors of each zone, (n, m) each.
+
+    Args:
+        paths: the days.
+        name: of the outcome.
+        train: weights of the cells to fit to, which broadcast to (n, m).
+        days: how often each day counts; once by default.
+    """
+    from sklearn.ensemble import HistGradientBoostingRegressor
+    from threadpoolctl import threadpool_limits
+
+    of_days, cars_of_days = paths.totals(name)
+    share = np.ones(len(of_days)) / len(of_days) if days is None else days / days.sum()
+    total, cars = np.tensordot(share, of_days, 1), np.tensordot(share, cars_of_days, 1)
+    y, weight = _mean(total, cars), cars * train
+    if not (known := weight > 0.0).any() or not y[known].any():
+        return np.zeros_like(y), np.zeros_like(y)
+    trees = HistGradientBoostingRegressor(
+        loss="poisson", monotonic_cst=_GROWS, categorical_features=[_PURPOSE], early_stopping=False, **_TREES
+    )
+    # Threads that share cores wait for each other; and their sums are not the same on each machine.
+    with threadpool_limits(1):
+        trees.fit(paths.features[known], y[known], sample_weight=weight[known])
+        common = trees.predict(paths.features.reshape(-1, len(_GROWS))).reshape(y.shape)
+    own, seen = common.copy(), np.broadcast_to(np.asarray(train) > 0.0, y.shape)
+    for columns in ((0, 1), (0, 1, 2), (0, 1, 3)):
+        group = paths.groups(*columns)
+        own *= _factors(of_days * seen, cars * seen * own, group, share)[group][:, None]
+    most = OUTCOMES[name].most
+    return np.minimum(common, most), np.minimum(own, most)
+
+
+def _factors(of_days: FloatArray, expected: FloatArray, group: IntArray, share: FloatArray) -> FloatArray:
+    """Return by what each group of paths differs from what was expected, shrunk by as much as may be chance."""
+    seen = np.array([np.bincount(group, day.sum(axis=1)) for day in of_days])
+    mean = np.bincount(group, expected.sum(axis=1))
+    away = _mean(share @ seen - mean, mean)
+    chance = _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2)
+    spread = max(float((mean * (away**2 - chance)).sum() / max(mean.sum(), 1e-9)), 0.0)
+    return np.asarray(1.0 + away * spread / np.maximum(spread + chance, 1e-12))
+
+
+def held_out_parts(paths: Paths, seed: int) -> Iterator[tuple[str, BoolArray]]:
+    """Yield what is held out, and which cells, (n, m), one part after another.
+
+    These are `zones`, `towns`, and `demands`: one of the multiples between the least and the most.
+    """
+    zone, n = paths.groups(0, 1), len(paths.multiples)
+    every, count = np.ones((len(zone), n), bool), int(zone.max()) + 1
+    part = np.random.default_rng(seed).permutation(count) % FOLDS
+    for number in range(min(FOLDS, count) if count > 1 else 0):
+        yield "zones", every & (part[zone] == number)[:, None]
+    for town in range(len(paths.towns) if len(paths.towns) > 1 else 0):
+        yield "towns", every & (paths.index[:, 0] == town)[:, None]
+    for multiple in range(1, n - 1):
+        yield "demands", every & (np.arange(n) == multiple)
+
+
+def held_out_errors(
+    paths: Paths, seed: int, workers: Workers = SERIAL, progress: Callable[[], None] = lambda: None
+) -> tuple[list[Row], list[Row]]:
+    """Return how far curves and usual forms are off where they were not fitted, and the zone-hours of held-out zones.
+
+    Errors are over the zone-hours of each demand, weighted by the cars there; those of a perfect curve are the noise of
+    the days, half the difference between even and odd ones.
+    """
+    rows: list[Row] = []
+    shown: list[Row] = []
+    parts = list(held_out_parts(paths, seed))
+    fits = workers.in_order(
+        [partial(fit_curve, paths, name, ~held) for name in OUTCOMES for _, held in parts]
+    )
+    purposes = [(paths.index[:, 2] == purpose)[:, None] for purpose in range(len(paths.purposes))]
+    x = paths.features[..., 0]
+    for name in OUTCOMES:
+        total, cars = (its.mean(axis=0) for its in paths.totals(name))
+        y, known = _mean(total, cars), cars > 0.0
+        predicted: dict[tuple[str, str], FloatArray] = {}
+        for what, held in parts:
+            common, own = next(fits)
+            progress()
+            for form in ("curve", *FORMS):
+                values = predicted.setdefault((what, form), np.full_like(y, np.nan))
+                if form == "curve":
+                    values[held] = (own if what == "demands" else common)[held]
+                for its in purposes if form != "curve" else ():
+                    train, test = its & ~held & known, its & held
+                    if train.any():
+                        values[test] = form_at(form, fit_form(form, x[train], y[train], cars[train]), x[test])
+        for (what, form), values in predicted.items() if y.any() else ():
+            rows.append({"held_out": what, "outcome": name, "form": form, **_errors(paths, name, values)})
+        if name == "search_s" and ("zones", "curve") in predicted:
+            shown = _zone_hours(paths, predicted["zones", "curve"])
+    return rows, shown
+
+
+def _added(groups: IntArray, *values: FloatArray) -> list[FloatArray]:
+    """Return sums over groups of paths, (k, m) each."""
+    adds = csr_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))))
+    return [np.asarray(adds @ its) for its in values]
+
+
+def _zone_hours(paths: Paths, predicted: FloatArray) -> list[Row]:
+    total, cars = (its.mean(axis=0) for its in paths.totals("search_s"))
+    hours, first = paths.groups(0, 1, 3), np.unique(paths.groups(0, 1, 3), return_index=True)[1]
+    of = _added(hours, cars, total, cars * predicted)
+    of.insert(1, of[0] * paths.features[first, :, 0])
+    names = [paths.names(index) for index in paths.index[first].tolist()]
+    return [
+        {
+            "scenario": names[k][0],
+            "zone": names[k][1],
+            "hour": int(names[k][3]),
+            "multiple": float(paths.multiples[m]),
+        }
+        | {"cars": float(of[0][k, m])}
+        | {
+            c: float(its[k, m] / of[0][k, m])
+            for c, its in zip(("occupancy", "measured", "predicted"), of[1:], strict=True)
+        }
+        for k, m in np.argwhere(of[0] > 0.0).tolist()
+    ]
+
+
+def _errors(paths: Paths, name: str, predicted: FloatArray) -> Row:
+    of_days = [np.where(np.isfinite(predicted), its, 0.0) for its in paths.totals(name)]
+    days = np.arange(len(of_days[0])) % 2
+    values = *(its.mean(axis=0) for its in of_days), np.nan_to_num(predicted) * of_days[1].mean(axis=0)
+    total, cars, expected = _added(paths.groups(0, 1, 3), *values)
+    halves = (
+        _added(paths.groups(0, 1, 3), *(its[days == k].mean(axis=0) for its in of_days)) for k in (0, 1)
+    )
+    even, odd = (_mean(total, cars, np.nan) for total, cars in halves)
+    of_zones, _, expected_of_zones = _added(paths.groups(0, 1), *values)
+    whole = float(total.sum()) or np.nan  # of what never happens nothing is relative
+    return {
+        "zone_hours": int((cars > 0.0).sum()),
+        "searches": float(cars.sum()),
+        "mean": float(total.sum() / cars.sum()),
+        "mae": float(abs(total - expected).sum() / cars.sum()),
+        "relative": float(abs(total - expected).sum() / whole),
+        "bias": float((expected - total).sum() / whole),
+        "noise": float(np.nansum(cars * abs(even - odd)) / 2.0 / whole),
+        "relative_of_zones": float(abs(of_zones - expected_of_zones).sum() / whole),
+    }
+
+
+class CurveTable(NamedTuple):
+    """Curves as columns of (r, m): each row a zone, purpose and hour or all of them, over the multiples of the demand.
+
+    Attributes:
+        numbers: (r, 4) of town, zone, purpose and hour; -1 for all.
+        cars: (r,) that come on a day, in the mean over the multiples.
+        columns: `occupancy` and `demand`, and of each outcome the value, its 95 % interval (`_low`, `_high`), and what
+            was measured (`_seen`; NaN without cars).
+    """
+
+    numbers: IntArray
+    cars: FloatArray
+    columns: dict[str, FloatArray]
+
+
+def curve_table(
+    paths: Paths,
+    bootstraps: int,
+    seed: int,
+    workers: Workers = SERIAL,
+    progress: Callable[[], None] = lambda: None,
+) -> CurveTable:
+    """Fit all outcomes, with intervals by a bootstrap over days and zones, and add up zones, purposes and hours.
+
+    Args:
+        paths: the days.
+        bootstraps: how often they are drawn anew.
+        seed: seed of the draws.
+        workers: where fits run.
+        progress: called after each fit.
+    """
+    found, adds = [], []
+    for alls in range(8):
+        whole = [1 + column for column in range(len(INDEX)) if alls >> column & 1]
+        if 2 in whole and len(paths.purposes) == 1:
+            continue
+        its = paths.index.copy()
+        its[:, whole] = -1
+        of, row = np.unique(its, axis=0, return_inverse=True)
+        found.append(of)
+        adds.append(csr_matrix((np.ones(len(its)), (row.ravel(), np.arange(len(its))))))
+    sums = vstack(adds).tocsr()
+    # The mix of the searches is that of all demands together, so that what is monotone stays so.
+    mix = paths.sums["cars"].mean(axis=(0, 2))[:, None]
+
+    def added(values: FloatArray) -> FloatArray:
+        return np.asarray((sums @ (mix * values)) / (sums @ mix))
+
+    rng, zone = np.random.default_rng(seed), paths.groups(0, 1)
+    n_days, n_zones = len(paths.sums["cars"]), int(zone.max()) + 1
+    draws: list[Any] = [()]
+    for _ in range(bootstraps):
+        days, zones = (
+            np.bincount(rng.integers(0, n, n), minlength=n).astype(float) for n in (n_days, n_zones)
+        )
+        # Zones that are drawn weigh in what all have in common; each keeps factors of its own.
+        draws.append(((zones[zone][:, None] if n_zones > 1 else 1.0) + 1e-9, days))
+    fits = workers.in_order([partial(fit_curve, paths, name, *draw) for name in OUTCOMES for draw in draws])
+    columns = {name: added(paths.features[..., k]) for k, name in enumerate(STATE[:2])}
+    for name in OUTCOMES:
+        drawn = []
+        for _ in draws:
+            drawn.append(added(next(fits)[1]))
+            progress()
+        half = 1.96 * np.std(drawn[1:], axis=0, ddof=1)
+        total, cars = (np.asarray(sums @ its.mean(axis=0)) for its in paths.totals(name))
+        columns[f"{name}_seen"] = _mean(total, cars, np.nan)
+        columns[name] = drawn[0]
+        columns[f"{name}_low"] = np.maximum.accumulate(np.maximum(drawn[0] - half, 0.0), axis=1)
+        columns[f"{name}_high"] = np.maximum.accumulate(drawn[0] + half, axis=1)
+    return CurveTable(np.concatenate(found), np.asarray(sums @ mix)[:, 0], columns)

@@ -1,0 +1,213 @@
+"""Curves for other models: a town or a lot at several demands, and what searches there are like as functions of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+
+from parkenv.errors import InputError
+from parkenv.files.csv_tables import TEXT
+from parkenv.files.option import Inside, Option, option, words_in
+from parkenv.scenarios.spec import scenario_spec
+from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
+from parkenv.studies.fleet.setting import OWN, Demanded, times_demanded
+from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.results import CsvTable, Results, Row, Table
+from parkenv.studies.study import Study, counted
+from parkenv.studies.workers import Task
+from parkenv.world.week import HOUR_S
+
+if TYPE_CHECKING:
+    from parkenv.compiled.arrays import FloatArray, IntArray
+    from parkenv.engine.fleet import Fleet
+    from parkenv.show.report.page import Page
+    from parkenv.studies.curve.fit import Paths
+    from parkenv.studies.curve.zones import Zones
+    from parkenv.studies.fleet.blocks import Tally
+    from parkenv.studies.report import Replay
+    from parkenv.studies.runner import Result
+
+PICTURE = "curve.png"
+HELD_OUT = CsvTable(
+    "held_out.csv",
+    ("scenario", "zone", "hour", "multiple"),
+    ("cars", "occupancy", "measured", "predicted"),
+    {"scenario": TEXT, "zone": TEXT},
+    lists=None,
+)
+"""Search times, s, of zones that were held out, by hour and demand: in the mean of the days, and by the curve that was
+fitted to the others."""
+
+
+def _size(rate: float | str) -> float:
+    return times_demanded(rate) if isinstance(rate, str) else rate
+
+
+class CurveStudy(FleetStudy):
+    """Search time, walk, failed attempts and refusals of each zone as functions of occupancy and demand."""
+
+    heading: ClassVar = "Curves"
+    table_titles: ClassVar = {"errors": "How far off where they were not fitted", "rows": "Whole lots"}
+
+    kind: Literal["curve"] = "curve"  # type: ignore[assignment]
+    scenarios: Annotated[
+        ScenarioList,
+        Option("SCENARIO", takes="NAME|FILE|DIR", argument=True, default="town"),
+        Inside(without=TRAFFIC),
+    ] = (scenario_spec("town"),)
+    arrivals_per_hour: Values[Demanded] | None = option(
+        ("0.4x", "0.7x", "1x", "1.2x", "1.4x", "1.6x"),
+        "Demands to drive: multiples of the scenario's own, or else of the counted one; or cars an hour.",
+        takes="X|1.2x[,...]",
+        panel="Demand",
+        parse=words_in,
+    )
+    days: int = option(6, "Days of each demand.", name="--episodes", short="-n", ge=2, le=100_000)
+    reach_m: float = option(
+        300.0, "Walk to a goal up to which spaces are around it, m.", name="--reach", ge=1.0, le=10_000.0
+    )
+    bootstraps: int = option(20, "Draws of days and zones for intervals.", panel="Results", ge=2, le=10_000)
+
+    @property
+    def knowledge(self) -> tuple[str, ...]:
+        """See `FleetStudy`."""
+        return self.knows or (OWN,)
+
+    @property
+    def demands(self) -> tuple[float | str, ...]:
+        """See `FleetStudy`; ascending."""
+        return tuple(sorted(super().demands, key=_size))
+
+    @cached_property
+    def zones(self) -> dict[str, Zones]:
+        """The zones of each scenario, by its name."""
+        from parkenv.studies.curve.zones import Zones
+
+        places = {setting.scenario: len(self.fleet(setting)[0].scenarios) for setting in self.fleet_settings}
+        return {name: Zones.of(its, places[name], self.reach_m) for name, its in self.built.items()}
+
+    @property
+    def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
+        """See `Study`."""
+        from parkenv.studies.curve.zones import ZONES
+
+        return (self.table, ZONES)
+
+    def day_tables(self, fleet: Fleet, tally: Tally, times: FloatArray, taken: IntArray) -> dict[str, Row]:
+        """See `FleetStudy`."""
+        from parkenv.studies.curve.zones import ZONES, day_of_zones
+
+        del tally
+        name = fleet.scenario.name
+        return {ZONES.file: day_of_zones(fleet, self.zones[name], self._roads[name], times, taken)}
+
+    def check(self) -> None:
+        """See `Study`: all cars of a curve have equal drivers."""
+        for name, its in (("agents", self.drivers), ("knows", self.knowledge), ("shares", self.shares)):
+            if len(its) > 1:
+                raise InputError(f"{name} has {len(its)} values, want one: a curve is of equal drivers")
+        if len({isinstance(its, str) for its in self.demands}) > 1:
+            raise InputError(f"arrivals_per_hour is {self.demands}, want either multiples or cars an hour")
+        super().check()
+
+    def settings(self) -> Row:
+        """See `Study`."""
+        return super().settings() | {"reach_m": self.reach_m}
+
+    def _paths(self, results: Results) -> Paths | None:
+        """Return the days that all demands have; None before there are two."""
+        from parkenv.studies.curve.fit import Paths, Town
+        from parkenv.studies.curve.zones import ZONES
+        from parkenv.studies.fleet.blocks import purposes_of
+
+        rows = results.rows(ZONES)
+        days: dict[str, list[list[Row]]] = {name: [] for name in self.built}
+        purposes = {}
+        for setting, items in self.cells():
+            its = [rows[key] for day in items for key in self.keys(setting, day) if key in rows]
+            days[setting.scenario].append(its)
+            purposes[setting.scenario] = purposes_of(self.fleet(setting)[0])[0]
+        n_days = min(len(its) for of_town in days.values() for its in of_town)
+        if n_days < 2:
+            return None
+        towns = {
+            name: Town(self.zones[name], purposes[name], [its[:n_days] for its in days[name]])
+            for name in days
+        }
+        first_hour = int(next(iter(self.built.values())).arrival.start_s // HOUR_S)
+        return Paths.of(towns, [_size(its) for its in self.demands], first_hour)
+
+    def summarise(self, results: Results) -> Row:
+        """See `Study`; the curves, `curve.csv` and the files for other models, are written here."""
+        from parkenv.studies.curve.curves import write_curves
+        from parkenv.studies.curve.fit import OUTCOMES, curve_table, held_out_errors, held_out_parts
+        from parkenv.studies.fleet.tables import summarize_days
+
+        days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
+        summary: Row = {"rows": summarize_days(days), "errors": [], "cautions": self._cautions()}
+        if (paths := self._paths(results)) is None:
+            return summary
+        fits = len(OUTCOMES) * (len([*held_out_parts(paths, self.seed)]) + 1 + self.bootstraps)
+        how = self.seed, results.workers, counted(results.progress, "Fitting curves", fits)
+        errors, held_out = held_out_errors(paths, *how)
+        HELD_OUT.write(results.path, held_out)
+        write_curves(paths, curve_table(paths, self.bootstraps, *how), results.path)
+        zones = {name: len(its.names) for name, its in self.zones.items()}
+        return summary | {"zones": zones, "reach_m": self.reach_m, "errors": errors}
+
+    def outputs(self, result: Result) -> list[Task[object]]:
+        """See `Study`: a picture of the curves of each scenario."""
+        from parkenv.files.file_names import file_name
+        from parkenv.show.figures.curve import save_curves
+        from parkenv.show.plurals import plural
+        from parkenv.studies.curve.curves import load_curves
+        from parkenv.studies.curve.fit import fitted_forms
+        from parkenv.studies.fleet.blocks import ALL
+
+        if "zones" not in result.summary:
+            return []
+        curves, points, tasks = (
+            load_curves(result.folder).curves,
+            HELD_OUT.read(result.folder),
+            list[Task[object]](),
+        )
+        errors = [
+            r for r in result.summary["errors"] if (r["held_out"], r["outcome"]) == ("zones", "search_s")
+        ]
+        for name, zones in self.zones.items():
+            its = {p: curve for (s, z, p, h), curve in curves.items() if (s, z, h) == (name, ALL, ALL)}
+            its = {ALL: its[ALL]} | its
+            of_zones = [row for row in points if row["scenario"] == name]
+            title = f"{name}: {plural(len(zones.names), 'zone')}, {plural(self.days, 'day')} of each demand"
+            path = result.folder / (PICTURE if len(self.zones) == 1 else file_name(f"curve_{name}", ".png"))
+            tasks.append(partial(save_curves, its, of_zones, errors, fitted_forms(of_zones), title, path))
+        return tasks
+
+    @classmethod
+    def findings(cls, summary: Row) -> list[str]:
+        """See `Study`: how far the curves are off, beside the usual forms."""
+        from parkenv.studies.curve.fit import FORMS, OUTCOMES
+
+        found = [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
+        by = {(row["held_out"], row["outcome"], row["form"]): row for row in summary["errors"]}
+        for (what, outcome, form), row in by.items():
+            if form == "curve" and outcome in ("search_s", "walk_s"):
+                off, chance, of_zones = (row[key] for key in ("relative", "noise", "relative_of_zones"))
+                others = ", ".join(f"{by[what, outcome, name]['relative']:.0%} {name}" for name in FORMS)
+                found.append(
+                    f"{OUTCOMES[outcome].label.capitalize()}, {what} held out: {off:.1%} off by zone-hours "
+                    f"({row['mae']:.1f} of {row['mean']:.1f}), of which chance in the days alone makes {chance:.0%}; "
+                    f"{of_zones:.1%} by zones. Usual forms in the occupancy, fitted to the same: {others}."
+                )
+        return found
+
+    @classmethod
+    def page(cls, summary: Row, folder: Path) -> Page:
+        """See `Study`."""
+        return Study.page.__func__(cls, summary, folder)  # type: ignore[attr-defined, no-any-return]
+
+    def replays(self, folder: Path) -> Sequence[Replay]:
+        """See `Study`: a curve has none."""
+        return Study.replays(self, folder)

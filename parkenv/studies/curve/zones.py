@@ -1,0 +1,113 @@
+"""What a day of a fleet tells of each zone: the searches of the cars that go there, and how full it is around.
+
+A *zone* is a goal of the lot, and the spaces within a walk of it. Zones may have spaces in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+
+from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.engine.fleet import Fleet
+from parkenv.studies.fleet.blocks import hour_of, purposes_of
+from parkenv.studies.fleet.measures import Roads
+from parkenv.studies.fleet.setting import SETTING_COLUMNS
+from parkenv.studies.results import JsonTable, Row
+from parkenv.world.scenario import Scenario
+from parkenv.world.week import HOUR_S
+
+INDEX = ("zone", "purpose", "hour")
+OF_CARS = ("cars", "parked", "failed", "search_s", "walk_s")
+"""Sums over the cars that arrive in an hour, by zone, purpose and hour."""
+STATE = ("occupancy", "demand", "town_occupancy", "town_demand")
+"""Share of the spaces around that is taken, and cars that arrive in an hour for each, by zone and hour; and of all
+spaces of the lot, by hour."""
+
+
+def _checked(row: Row) -> Row:
+    whole = np.array([row[name] for name in (*INDEX, *OF_CARS)], np.int64)
+    if whole.ndim != 2 or [np.array(row[name], float).ndim for name in STATE] != [2, 2, 1, 1]:
+        raise ValueError("lists of other shapes")
+    return row
+
+
+ZONES = JsonTable("zones.jsonl", (*SETTING_COLUMNS, "day"), _checked, "day of zones")
+"""A line for each day: `OF_CARS` where cars arrive, with the numbers of zone, purpose and hour, and `STATE`. Hours
+count from the first of the day's arrivals."""
+
+
+@dataclass(frozen=True, eq=False)
+class Zones:
+    """The zones of a lot: one for each place that the cars of a fleet go to.
+
+    Attributes:
+        names: index of the goal of each.
+        xy: (n, 2) m, the goals.
+        near: (n, n_slots) 1 for slots within reach on foot; of a zone without any, for the nearest.
+        neighbors: (n, n) 1 for zones whose goals are within reach.
+        spaces: (n, 2) how many cars fit into them, in drawn slots and in counted facilities.
+        own: (n, 2) the same of the slots to which no zone is nearer.
+    """
+
+    names: tuple[str, ...]
+    xy: FloatArray
+    near: FloatArray
+    neighbors: FloatArray
+    spaces: FloatArray
+    own: IntArray
+
+    @classmethod
+    def of(cls, scenario: Scenario, places: int, reach_m: float) -> Self:
+        """Return the zones of a scenario whose fleets have so many places: all goals, or its own alone."""
+        lot, goals = scenario.lot, range(places) if places > 1 else [scenario.goal]
+        walk_m, xy = np.array([lot.walk_m(goal) for goal in goals]), np.array(lot.goals, float)[goals]
+        near = (walk_m <= np.maximum(reach_m, walk_m.min(axis=1, keepdims=True))).astype(float)
+        neighbors = (np.linalg.norm(xy[:, None] - xy, axis=2) <= reach_m).astype(float)
+        kinds = np.stack([lot.capacity * ~lot.is_counted, lot.capacity * lot.is_counted], axis=1)
+        own = np.zeros((len(xy), 2), np.int64)
+        np.add.at(own, walk_m.argmin(axis=0), kinds)
+        return cls(tuple(map(str, goals)), xy, near, neighbors, near @ kinds, own)
+
+
+def day_of_zones(
+    fleet: Fleet, zones: Zones, roads: Roads, times: FloatArray, taken: IntArray
+) -> dict[str, Any]:
+    """Return the row of `ZONES` of a day whose searches are over, without setting and day.
+
+    The search time of a car is what its time from the entry to its space exceeds the direct drive there by: detours,
+    failed attempts, queues, and the way inside a garage.
+
+    Args:
+        fleet: the fleet.
+        zones: the zones of its lot.
+        roads: its shortest drives.
+        times: (k,) s since Monday 00:00, at which slots were looked at.
+        taken: (k, n_slots) how many cars were in each.
+    """
+    names, purpose = purposes_of(fleet)
+    arrives = fleet.cars["parked_at"] < 0
+    cars, first, looks = fleet.cars[arrives], hour_of(fleet, times[:1]), hour_of(fleet, times)
+    n_looks = np.bincount(looks - first)
+    hour = np.minimum(hour_of(fleet, cars["arrival"]) - first, len(n_looks) - 1)
+    shape = len(zones.names), len(names), len(n_looks)
+    flat, parked = np.ravel_multi_index((cars["place"], purpose[arrives], hour), shape), cars["slot"] >= 0
+    search_s = np.maximum(cars["ended_at"] - cars["arrival"] - roads.direct_s(cars), 0.0)
+    values = (np.ones(len(cars)), parked, cars["failed_parks"], search_s * parked, cars["walk_s"] * parked)
+    sums = [np.bincount(flat, its, np.prod(shape)).reshape(shape) for its in values]
+    index, arrived = np.nonzero(sums[0]), sums[0].sum(axis=1)
+    there = np.array([taken[looks - first == k].mean(axis=0) for k in range(len(n_looks))]).T
+    spaces, all_spaces = zones.spaces.sum(axis=1, keepdims=True), fleet.scenario.lot.capacity.sum()
+    # The last hour may be a part of one.
+    hours = n_looks * (times[1] - times[0] if len(times) > 1 else HOUR_S) / HOUR_S
+    state = (
+        zones.near @ there / spaces, zones.neighbors @ arrived / spaces / hours, there.sum(axis=0) / all_spaces,
+        arrived.sum(axis=0) / all_spaces / hours,
+    )  # fmt: skip
+    return (
+        {name: its.tolist() for name, its in zip(INDEX, index, strict=True)}
+        | {name: np.rint(its[index]).astype(int).tolist() for name, its in zip(OF_CARS, sums, strict=True)}
+        | {name: its.round(4).tolist() for name, its in zip(STATE, state, strict=True)}
+    )

@@ -1,0 +1,224 @@
+"""Curves: what searches are like as a function of occupancy, fitted over zones, held out, called and written."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from command_line import parkenv as run
+from small_lots import features
+
+import parkenv
+from parkenv import ParkingLot
+from parkenv.errors import InputError
+from parkenv.lots import grid_lot, write_lot
+from parkenv.studies.curve.curves import Curves
+from parkenv.studies.curve.fit import (
+    FORMS,
+    OUTCOMES,
+    Paths,
+    Town,
+    curve_table,
+    fit_form,
+    form_at,
+    held_out_errors,
+)
+from parkenv.studies.curve.study import CurveStudy
+from parkenv.studies.curve.zones import OF_CARS, Zones
+from parkenv.studies.fleet.measures import Roads
+
+N_ZONES, HOURS, MULTIPLES, DAYS = 100, 4, (0.5, 1.0, 1.5, 2.0), 4
+
+
+def search_law(occupancy, demand):
+    """A made truth, which no usual form in the occupancy has: it rises with the demand, too."""
+    return 10.0 + 40.0 * occupancy**3 * (1.0 + 4.0 * demand)
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Days of a made town whose zones follow one law, and are up to a tenth off it, each in its own way."""
+    rng = np.random.default_rng(1)
+    capacity, own = rng.uniform(50.0, 150.0, N_ZONES), rng.uniform(0.9, 1.1, N_ZONES)
+    pull, by_hour = rng.uniform(0.2, 0.45, N_ZONES), np.array([0.6, 0.9, 1.1, 1.3])
+    rows = []
+    for multiple in MULTIPLES:
+        occupancy = np.minimum(multiple * pull[:, None] * by_hour, 0.97)
+        demand = multiple * rng.permutation(pull)[:, None] * by_hour[::-1]
+        rows.append([])
+        for _ in range(DAYS):
+            zone, hour = np.divmod(np.arange(N_ZONES * HOURS), HOURS)
+            cars = rng.poisson(60.0 * multiple, len(zone)) + 1
+            search_s = cars * (search_law(occupancy, demand) * own[:, None]).ravel()
+            search_s *= rng.gamma(400.0, 1.0 / 400.0, len(zone))
+            sums = (cars, cars, np.zeros_like(cars), search_s, 80.0 * cars)
+            rows[-1].append(
+                {
+                    "zone": zone,
+                    "purpose": np.zeros_like(zone),
+                    "hour": hour,
+                    **dict(zip(OF_CARS, sums, strict=True)),
+                }
+                | {"occupancy": occupancy, "demand": demand}
+                | {"town_occupancy": occupancy.mean(axis=0), "town_demand": demand.mean(axis=0)}
+            )
+    spaces = np.stack([capacity, np.zeros(N_ZONES)], axis=1)
+    zones = Zones(tuple(map(str, range(N_ZONES))), np.zeros((N_ZONES, 2)), *[np.ones(1)] * 2, spaces, spaces)
+    return Paths.of({"made": Town(zones, ("all",), rows)}, MULTIPLES, 8)
+
+
+def test_zones_that_are_held_out_are_predicted_and_better_than_by_usual_forms(made):
+    errors, points = held_out_errors(made, 0)
+    of = {
+        row["form"]: row["relative"]
+        for row in errors
+        if (row["held_out"], row["outcome"]) == ("zones", "search_s")
+    }
+    assert set(of) == {"curve", *FORMS}
+    assert of["curve"] < 0.1
+    assert of["curve"] < 0.8 * min(of[form] for form in FORMS)
+    assert len(points) == N_ZONES * HOURS * len(MULTIPLES)
+    assert not [row for row in errors if row["outcome"] == "failed_attempts"], "there were none"
+
+
+def test_curves_grow_with_demand_and_their_intervals_hold_the_truth(made):
+    table = curve_table(made, 8, 0)
+    value, low, high = (table.columns[f"search_s{end}"] for end in ("", "_low", "_high"))
+    assert (np.diff(value, axis=1) >= 0.0).all()
+    assert (np.diff(table.columns["occupancy"], axis=1) >= 0.0).all()
+    whole = (table.numbers[:, 1:] < 0).sum(axis=1) == 2  # one purpose: zones and hours added up
+    assert whole.sum() == 1
+    cars = made.sums["cars"].mean(axis=0)
+    truth = (cars * search_law(made.features[..., 0], made.features[..., 1])).sum(axis=0) / cars.sum(axis=0)
+    np.testing.assert_allclose(value[whole][0], truth, rtol=0.08)
+    assert (low < value).mean() > 0.99
+    assert (value < high).mean() > 0.99
+
+
+@pytest.mark.parametrize(
+    ("form", "law"),
+    [
+        ("a/(1 - x)", lambda x: 7.0 / (1.0 - x)),
+        ("t0 (1 + a x^b)", lambda x: 20.0 * (1.0 + 3.0 * x**4)),
+        ("a exp(b x)", lambda x: 3.0 * np.exp(3.5 * x)),
+    ],
+)
+def test_a_usual_form_finds_its_own_law(form, law):
+    x = np.linspace(0.0, 0.95, 500)
+    fit = fit_form(form, x, law(x), np.ones(500))
+    np.testing.assert_allclose(form_at(form, fit, x), law(x), rtol=0.02)
+
+
+@pytest.fixture(scope="module")
+def district(tmp_path_factory):
+    """A scenario file: six goals around 60 slots, and two purposes."""
+    folder, plain = tmp_path_factory.mktemp("district"), grid_lot(rows=4, columns=15)
+    (x0, y0), (x1, y1) = plain.slot_xy.min(axis=0), plain.slot_xy.max(axis=0)
+    goals = [(x, y) for x in np.linspace(x0, x1, 3) for y in (y0 - 5.0, y1 + 5.0)]
+    write_lot(ParkingLot(**features(plain) | {"goals": goals}), folder / "district.geojson")
+    spec = {
+        "lot": "district.geojson",
+        "arrivals": {"hours": "08:00-09:30"},
+        "demand": {
+            "shoppers": {
+                "arrivals_per_hour": 50,
+                "stay_s": 1800,
+                "patience_s": 400,
+                "goals": [3, 1, 1, 1, 1, 0],
+            },
+            "visitors": {"arrivals_per_hour": 20, "patience_s": 400, "goals": [1, 1, 1, 1, 1, 1]},
+        },
+    }
+    (folder / "district.json").write_text(json.dumps(spec))
+    return folder / "district.json"
+
+
+def test_a_day_of_zones_has_all_cars_and_what_their_searches_take_beyond_the_direct_drive(district):
+    study = CurveStudy.parse({"scenarios": [str(district)], "agents": ["greedy-drive"], "reach_m": 15.0}, "")
+    setting = study.fleet_settings[-1]
+    row = study.run_day(setting, 0)["zones.jsonl"]
+    fleet, _ = study.fleet(setting)
+    fleet.reset(study.seed, 0)
+    fleet.run()
+    parked = fleet.cars[fleet.cars["slot"] >= 0]
+    beyond_s = parked["ended_at"] - parked["arrival"] - Roads(fleet.scenario).direct_s(parked)
+    assert beyond_s.min() > -1e-6
+    assert sum(row["cars"]) == len(fleet.cars)
+    assert sum(row["parked"]) == len(parked)
+    assert sum(row["search_s"]) == pytest.approx(beyond_s.sum(), abs=len(row["cars"]))
+    places = np.bincount(row["zone"], row["cars"], 6)
+    assert places.tolist() == np.bincount(fleet.cars["place"], minlength=6).tolist()
+    demand = np.array(row["town_demand"]) * fleet.scenario.lot.n_slots * [1.0, 0.5]
+    assert demand.sum() == pytest.approx(len(fleet.cars), rel=0.01), "the last hour is half of one"
+    assert 0.0 < np.min(row["occupancy"]) < np.max(row["occupancy"]) <= 1.0
+
+
+def test_curves_are_called_with_arrays_and_say_what_there_is_not():
+    its = {"occupancy": [0.2, 0.5, 0.8], "demand": [0.1, 0.2, 0.4]}
+    its |= {f"search_s{end}": [10.0 + k, 20.0 + k, 60.0 + k] for k, end in enumerate(("", "_low", "_high"))}
+    curves = Curves({("town", zone, "all", hour): its for zone in "ab" for hour in ("8", "9")})
+    value = curves.search_s(occupancy=[[0.2], [0.65], [1.0]], zone=["a", "b"], hour=9).value
+    assert value.shape == (3, 2)
+    assert (value[0] == 10.0).all()
+    assert value[2] == pytest.approx(60.0)
+    assert 20.0 < value[1, 0] < 60.0
+    assert curves.search_s(demand=0.4, zone="a", hour=8).high == pytest.approx(62.0)
+    with pytest.raises(InputError, match="zone is 'c'"):
+        curves.search_s(occupancy=0.5, zone="c", hour=8)
+    with pytest.raises(InputError, match="occupancy and demand"):
+        curves.search_s(zone="a", hour=8)
+
+
+def test_the_command_writes_what_other_models_read_and_goes_on(district, tmp_path):
+    words = (
+        "--agents",
+        "greedy-drive",
+        "--arrivals-per-hour",
+        "0.5x,1x,1.5x",
+        "--bootstraps",
+        2,
+        "--reach",
+        15,
+    )
+    done = run("curve", district, *words, "-n", 2, "--no-figures", "--out", tmp_path / "a")
+    assert done.returncode == 0, done.stderr
+    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    assert summary["zones"] == {"district": 6}
+    for name, columns in {
+        "activitysim.csv": {"zone_id", "TERMINAL", "TERMINAL_AM"},
+        "matsim.csv": {"onstreet_spots", "offstreet_spots", "alpha", "beta"},
+        "curve.csv": {
+            "zone",
+            "purpose",
+            "hour",
+            "occupancy",
+            "search_s",
+            "search_s_low",
+            "balked_fraction_high",
+        },
+        "held_out.csv": {"measured", "predicted"},
+    }.items():
+        rows = list(csv.DictReader((tmp_path / "a" / name).open()))
+        assert columns <= set(rows[0]), name
+        if name == "matsim.csv":
+            assert sum(int(row["onstreet_spots"]) for row in rows) == 60
+    more = run("curve", "--resume", "-n", 3, "--out", tmp_path / "a")
+    assert more.returncode == 0, more.stderr
+    whole = run("curve", district, *words, "-n", 3, "--jobs", 1, "--out", tmp_path / "b")
+    assert whole.returncode == 0, whole.stderr
+    assert (tmp_path / "b" / "curve.png").exists()
+    for name in ("curve.json", "curve.csv", "held_out.csv", "zones.jsonl"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
+    curves = parkenv.load_curves(tmp_path / "b")
+    value, low, high = curves.search_s(
+        occupancy=[0.2, 0.9], zone="0", hour=8, purpose=["shoppers", "visitors"]
+    )
+    assert (low <= value).all()
+    assert (value <= high).all()
+    assert set(OUTCOMES) <= set(next(iter(curves.curves.values())))
+
+
+def test_a_curve_is_of_equal_drivers(tmp_path):
+    done = run("curve", "town", "--agents", "usual,greedy-total", "--out", tmp_path / "a")
+    assert done.returncode == 2
+    assert "agents" in done.stderr
