@@ -63,7 +63,9 @@ def made():
                 | {"town_occupancy": occupancy.mean(axis=0), "town_demand": demand.mean(axis=0)}
             )
     spaces = np.stack([capacity, np.zeros(N_ZONES)], axis=1)
-    zones = Zones(tuple(map(str, range(N_ZONES))), np.zeros((N_ZONES, 2)), *[np.ones(1)] * 2, spaces, spaces)
+    zones = Zones(
+        tuple(map(str, range(N_ZONES))), np.zeros((N_ZONES, 2)), *[np.ones(1)] * 2, spaces, spaces, 60.0
+    )
     return Paths.of({"made": Town(zones, ("all",), rows)}, MULTIPLES, 8)
 
 

@@ -100,7 +100,7 @@ def _draw_search(
         )
         top = max(top, float(np.quantile(y, 0.99)))
     grid = np.linspace(0.0, 0.98, 99)
-    for (name, form), line in zip(forms.items(), ("--", ":", "-."), strict=True):
+    for (name, form), line in zip(forms.items(), ("--", ":", "-."), strict=False):
         ax.plot(grid, form(grid), line, color=INK, linewidth=1.0, label=name)
     _draw_curve(ax, whole, "search_s", _COLORS[0], "curve of the whole lot")
     _finish(ax, "Search time", top, "search beyond the direct drive, s")

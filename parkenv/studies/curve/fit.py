@@ -2,7 +2,8 @@
 
 What a zone's searches are like is a monotone function of how full it is around, how many cars come, and both for the
 whole lot (gradient-boosted trees with monotone constraints, Poisson loss, over all zones), times factors of the zone's
-own, shrunk towards 1 by as much as they may be chance (empirical Bayes).
+own, shrunk towards 1 by as much as they may be chance (empirical Bayes). Of several towns, search times are in units of
+the time to drive along all streets around a zone.
 """
 
 from __future__ import annotations
@@ -149,6 +150,11 @@ class Paths:
         """Return the numbers of groups of paths that are alike in some columns of the index, (n,)."""
         return np.asarray(np.unique(self.index[:, columns], axis=0, return_inverse=True)[1].ravel())
 
+    def units(self) -> FloatArray:
+        """Return how long the streets of the town of each path take, over those of all towns, (n,)."""
+        streets_s = np.array([zones.streets_s for zones in self.towns.values()])
+        return np.asarray(streets_s / streets_s.mean())[self.index[:, 0]]
+
     def totals(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Return sums of an outcome and numbers of cars, (days, n, m) each."""
         return OUTCOMES[name].total(self.sums), self.sums[OUTCOMES[name].of]
@@ -182,7 +188,8 @@ def fit_curve(
     of_days, cars_of_days = paths.totals(name)
     share = np.ones(len(of_days)) / len(of_days) if days is None else days / days.sum()
     total, cars = np.tensordot(share, of_days, 1), np.tensordot(share, cars_of_days, 1)
-    y, weight = _mean(total, cars), cars * train
+    unit = paths.units()[:, None] if name == "search_s" else 1.0
+    y, weight = _mean(total, cars) / unit, cars * train * unit
     if not (known := weight > 0.0).any() or not y[known].any():
         return np.zeros_like(y), np.zeros_like(y)
     trees = HistGradientBoostingRegressor(
@@ -191,7 +198,7 @@ def fit_curve(
     # Threads that share cores wait for each other; and their sums are not the same on each machine.
     with threadpool_limits(1):
         trees.fit(paths.features[known], y[known], sample_weight=weight[known])
-        common = trees.predict(paths.features.reshape(-1, len(_GROWS))).reshape(y.shape)
+        common = trees.predict(paths.features.reshape(-1, len(_GROWS))).reshape(y.shape) * unit
     own, seen = common.copy(), np.broadcast_to(np.asarray(train) > 0.0, y.shape)
     for columns in ((0, 1), (0, 1, 2), (0, 1, 3)):
         group = paths.groups(*columns)
@@ -205,7 +212,10 @@ def _factors(of_days: FloatArray, expected: FloatArray, group: IntArray, share: 
     seen = np.array([np.bincount(group, day.sum(axis=1)) for day in of_days])
     mean = np.bincount(group, expected.sum(axis=1))
     away = _mean(share @ seen - mean, mean)
-    chance = _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2)
+    # Of a single day nothing tells chance from what is the zone's own.
+    chance = (
+        _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2) if len(seen) > 1 else np.full(len(mean), np.inf)
+    )
     spread = max(float((mean * (away**2 - chance)).sum() / max(mean.sum(), 1e-9)), 0.0)
     return np.asarray(1.0 + away * spread / np.maximum(spread + chance, 1e-12))
 

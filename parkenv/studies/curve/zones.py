@@ -50,6 +50,7 @@ class Zones:
         neighbors: (n, n) 1 for zones whose goals are within reach.
         spaces: (n, 2) how many cars fit into them, in drawn slots and in counted facilities.
         own: (n, 2) the same of the slots to which no zone is nearer.
+        streets_s: time to drive along all streets around a zone once, in the mean over zones, s.
     """
 
     names: tuple[str, ...]
@@ -58,6 +59,7 @@ class Zones:
     neighbors: FloatArray
     spaces: FloatArray
     own: IntArray
+    streets_s: float
 
     @classmethod
     def of(cls, scenario: Scenario, places: int, reach_m: float) -> Self:
@@ -69,7 +71,10 @@ class Zones:
         kinds = np.stack([lot.capacity * ~lot.is_counted, lot.capacity * lot.is_counted], axis=1)
         own = np.zeros((len(xy), 2), np.int64)
         np.add.at(own, walk_m.argmin(axis=0), kinds)
-        return cls(tuple(map(str, goals)), xy, near, neighbors, near @ kinds, own)
+        edge_s = np.where(lot.neighbors >= 0, lot.edge_length / (lot.edge_speed * scenario.v_drive), 0.0)
+        around = np.linalg.norm(xy[:, None] - lot.vertex_xy, axis=2) <= reach_m
+        streets_s = float((around @ edge_s.sum(axis=1)).mean()) or 1.0
+        return cls(tuple(map(str, goals)), xy, near, neighbors, near @ kinds, own, streets_s)
 
 
 def day_of_zones(
