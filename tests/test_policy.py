@@ -1,5 +1,6 @@
 """What a town should do: the best price of two streets, the same answer however it is run, and rules of zones."""
 
+import json
 import math
 
 import numpy as np
@@ -115,7 +116,7 @@ def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
         two_streets, budget=30, days_each=1, rounds=2, held_out=["0.5x"], episodes=2, aims=aims, levers=levers
     )
     study = study.changed(scenario=study.scenario.changed(arrivals={"hours": "08:00-10:00"}))
-    whole = run(study, tmp_path / "whole")
+    whole = run(study.changed(figures=True), tmp_path / "whole")
     calls = iter(range(100))
 
     def stop(*_):
@@ -126,6 +127,12 @@ def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
         run(study, tmp_path / "stopped", progress=stop)
     assert len((tmp_path / "stopped" / "trials.jsonl").read_text().splitlines()) < 30
     run(study, tmp_path / "stopped", resume=True)
+    ours = make_scenario(tmp_path / "whole" / "ours.json")
+    assert ours.lot.areas == ("far", "near")
+    assert (tmp_path / "whole" / "policy.png").exists()
+    page = PolicyStudy.page(json.loads((tmp_path / "whole" / "summary.json").read_text()), tmp_path)
+    assert [table["name"] for table in page.tables] == ["answer", "losers", "policy_blocks", "assumed"]
+    assert any("block-hours" in said for said in page.findings)
     assert files_of(tmp_path / "stopped") == files_of(tmp_path / "whole")
     assert [row["policy"] for row in whole.summary["answer"]] == ["today", "SFpark", "ours"]
 

@@ -9,9 +9,9 @@ from rich.console import Console
 from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import print_rows
 from parkenv.files.option import option
-from parkenv.show.report.tables import OF_FLEETS
+from parkenv.show.report.tables import OF_POLICIES
 from parkenv.studies.fleet.tables import ONE_DAY
-from parkenv.studies.policy.study import PolicyStudy
+from parkenv.studies.policy.study import PolicyStudy, middle_only
 from parkenv.studies.results import without_nan
 from parkenv.studies.runner import Result
 
@@ -19,7 +19,7 @@ ANSWER = (
     "policy", "arrivals_per_hour", "in_band", "in_band_daily", "cruised_km", "cruised_km_of_today", "time_s", "revenue",
     "revenue_of_today", "balked_fraction",
 )  # fmt: skip
-LOSERS = ("scenario", "arrivals_per_hour", "purpose", "change_s", "better_off", "worse_off", "paid_change")
+LOSERS = ("scenario", "purpose", "change_s", "better_off", "worse_off", "paid_change")
 
 
 class Policy(StudyCommand):
@@ -55,8 +55,10 @@ class Policy(StudyCommand):
         summary = without_nan(result.summary)
         if not summary.get("answer"):
             return
-        print_rows(console, "The answer, on held-out days", summary["answer"], ANSWER, OF_FLEETS)
-        print_rows(console, "Who wins and who loses, against today", summary["losers"], LOSERS, OF_FLEETS)
+        print_rows(console, "The answer, on held-out days", summary["answer"], ANSWER, OF_POLICIES)
+        print_rows(
+            console, "Who wins and who loses, against today", middle_only(summary), LOSERS, OF_POLICIES
+        )
         for line in PolicyStudy.findings(summary):
             console.print(line, soft_wrap=True)
         if self.study.episodes == 1:

@@ -241,7 +241,7 @@ def with_zones(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
                 if user not in users:
                     raise InputError(f"users has {user!r:.40}, no class of the lot; {nearest(user, users)}")
             if one.of is not None:
-                chosen = _named(one.facilities, facilities) if one.facilities else range(-1, len(facilities))
+                chosen = named(one.facilities, facilities) if one.facilities else range(-1, len(facilities))
                 its = (slot_zone == base) & np.isin(lot.facility_of_slot, list(chosen))
                 if not its.any():
                     raise InputError(f"facilities have no slot in zone {base!r:.40}, want some")
@@ -252,14 +252,18 @@ def with_zones(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
     return lot.rezoned(slot_zone.tolist(), rules)
 
 
-def _named(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the indices of the names that patterns mean, in which * stands for any letters."""
+def named(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
+    """Return the indices of the names that patterns mean, in which * stands for any letters.
+
+    Raises:
+        InputError: a pattern means none of them; the message names the nearest.
+    """
     found = []
     for pattern in patterns:
         its = re.compile(".*".join(map(re.escape, pattern.split("*"))))
         found += (new := [i for i, name in enumerate(names) if its.fullmatch(name)])
         if not new:
-            raise InputError(f"facilities has {pattern!r:.40}, none of the lot; {nearest(pattern, names)}")
+            raise InputError(f"{pattern!r:.60} is none of the lot's; {nearest(pattern, names)}")
     return found
 
 

@@ -20,7 +20,7 @@ from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
-from parkenv.world.tariff import HOUR_S, VALUE_OF_TIME, Tariff, Zone
+from parkenv.world.tariff import HOUR_S, VALUE_OF_TIME, Hours, Tariff, Zone
 from parkenv.world.traffic import Traffic
 
 KMH = 1 / 3.6  # 1 km/h in m/s
@@ -188,7 +188,16 @@ class SearchProblem:
     def zone_price(self, drivers: Drivers) -> FloatArray:
         """Return what drivers pay in each of the lot's zones, (..., n_zones) in the currency of the prices."""
         arrival, stay, kwh = np.broadcast_arrays(drivers.arrival_s, drivers.stay_s, drivers.kwh)
-        return np.stack([zone.price.amount(arrival, stay, kwh) for zone in self.zone_rules], axis=-1)
+        amounts, seconds = [], dict[Hours, FloatArray]()
+        for price in (zone.price for zone in self.zone_rules):
+            if price.hourly and price.daily_cap is None and not price.per_kwh:
+                # Many zones share their hours.
+                for hours in (hours for hours, _ in price.hourly if hours not in seconds):
+                    seconds[hours] = hours.within(arrival, stay)
+                amounts.append(price.of_hours(seconds))
+            else:
+                amounts.append(price.amount(arrival, stay, kwh))
+        return np.stack(amounts, axis=-1)
 
     def admits(self, drivers: Drivers) -> BoolArray:
         """Return whether drivers may park in each of the lot's zones, (..., n_zones) bool."""

@@ -257,6 +257,10 @@ class Price:
             cost = np.where(np.isfinite(stay), cost, np.where(week > 0.0, np.inf, 0.0))
         return np.asarray(cost + self.per_kwh * np.asarray(kwh) if self.per_kwh else cost)
 
+    def of_hours(self, seconds: Mapping[Hours, FloatArray]) -> FloatArray:
+        """Return what stays cost of which so many seconds fall into the hours of `hourly`, (...) each."""
+        return np.asarray(sum(seconds[hours] * (price / HOUR_S) for hours, price in self.hourly))
+
     def _of_days(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
         """Return what stays of at most a week cost where each 24 hours are capped."""
         cap = np.inf if self.daily_cap is None else self.daily_cap
@@ -266,9 +270,7 @@ class Price:
 
     def _of(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
         if self.hourly:
-            known = [(hours, price) for hours, price in self.hourly if price]
-            amounts = (hours.within(begin, stay) / HOUR_S * price for hours, price in known)
-            return np.asarray(sum(amounts, np.zeros(np.shape(stay))))
+            return self.of_hours({hours: hours.within(begin, stay) for hours, _ in self.hourly})
         charged = stay if self.charged is None else self.charged.within(begin, stay)
         charged = np.maximum(charged - self.free_s, 0.0)
         if not self.steps:

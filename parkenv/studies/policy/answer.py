@@ -9,11 +9,12 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.studies.fleet.blocks import ALL, BLOCKS, area_prices
-from parkenv.studies.fleet.changes import is_clear, summarize_changes
+from parkenv.studies.fleet.changes import LEAST_DAYS, is_clear, summarize_changes
 from parkenv.studies.fleet.setting import OWN, rate_text
 from parkenv.studies.policy.town import share_in_band
 from parkenv.studies.results import Results, Row
 from parkenv.studies.statistics import columns_of, mean_interval, ratio_interval
+from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
     from parkenv.studies.policy.study import HeldOut, PolicyStudy
@@ -106,14 +107,121 @@ def loser_rows(held_out: HeldOut, results: Results) -> list[Row]:
     return [row for row in summarize_changes(settings, prices, purposes) if row["zone"] is None]
 
 
+def block_rows(
+    study: PolicyStudy, held_out: HeldOut, policies: Mapping[str, Row], results: Results
+) -> list[Row]:
+    """Return what each block is today and with our policy, at the middle held-out demand, in the hours that count."""
+    rate, town, blocks = middle_rate(held_out), study.town, results.rows(BLOCKS)
+    shares, cars = {}, dict[str, float]()
+    for setting, cell in zip(held_out.fleet_settings, held_out.cells(), strict=True):
+        keys = [key for item in cell.items for key in held_out.keys(setting, item)]
+        if setting.arrivals_per_hour == rate and all(key in blocks for key in keys):
+            its = [blocks[key] for key in keys]
+            shares[setting.scenario] = _occupancy(study, its).mean(axis=(0, 2))
+            cars = dict.fromkeys(town.blocks.names, 0.0)  # with the last policy, ours
+            for row in its:
+                for block, purpose, count in zip(row["block"], row["purpose"], row["arrivals"], strict=True):
+                    if purpose == ALL and block in cars:
+                        cars[block] += count / len(its)
+    if len(shares) < len(policies):
+        return []
+    rows = []
+    for k, i in enumerate(town.counted.tolist()):
+        zone, unit = town.blocks.zones[i], town.units[town.unit_of_block[k]]
+        table = policies["ours"]["zones"].get(f"{unit[1]}, {zone}" if unit[1] else zone, {})
+        spans = [part.split(" @ ") for part in table.get("price", "").split("; ") if part]
+        today = town.today[town.unit_of_block[k]]
+        row = {"block": town.blocks.names[i], "zone": zone, "slots": int(town.blocks.slots[i])}
+        row["cars_a_day"] = cars[town.blocks.names[i]]
+        row |= {f"taken_{name}": float(share[k]) for name, share in shares.items()}
+        row |= {
+            "price_today": float(today.mean()),
+            "price_ours": float(np.mean([float(a) for a, _ in spans] or today)),
+        }
+        rows.append(
+            row
+            | {"prices_ours": ", ".join(f"{hours.replace(':00', '')}: {amount}" for amount, hours in spans)}
+        )
+    return rows
+
+
+def middle_rate(held_out: HeldOut) -> Any:
+    """Return the held-out demand in the middle, which sentences and maps are about."""
+    return held_out.demands[len(held_out.demands) // 2]
+
+
+def assumed_rows(study: PolicyStudy, held_out: HeldOut) -> list[Row]:
+    """Return what was assumed, a row each."""
+    scenario = study.town.scenario
+    demand = scenario.demand
+    purposes = demand.purposes if demand is not None else ()
+    names = (
+        f"{one.name} (an hour is worth {one.value_of_time or scenario.value_of_time:g})" for one in purposes
+    )
+    log = "the days of its log" if scenario.occupancy.recorded else "its forecast"
+    picked, window = ", ".join(study.levers.choices) or "none", scenario.arrival
+    facts = {
+        "town": f"{scenario.lot.name}, {int(scenario.lot.capacity.sum()):,} spaces",
+        "cars arrive": f"from {window.start_s / HOUR_S:g}:00 to {window.end_s / HOUR_S:g}:00",
+        "drivers": f"{study.agent.label}; they know all prices and rules, and expect what {log} say of today",
+        "demand of the search": ", ".join(rate_text(rate) for rate in study.arrivals_per_hour),
+        "purposes": ", ".join(names),
+        "elasticity": "nobody stays at home, comes at another time or stays shorter because of a price",
+        "prices": f"by {study.levers.by}, multiples of {study.levers.step:g} up to {study.levers.most:g}",
+        "other levers": picked,
+        "budget": f"{study.budget} days in the search",
+        "held out": f"{held_out.days} days each, seed {held_out.seed}: other cars than in the search",
+    }
+    return [{"assumption": name, "is": text} for name, text in facts.items()]
+
+
+def headlines(summary: Row) -> list[Row]:
+    """Return what a page says in large type."""
+    rows = summary.get("answer") or []
+    if not rows:
+        return []
+    rate = _middle(rows)
+    today, _, ours = (row for row in rows if row["arrivals_per_hour"] == rate)
+    low, high = summary["aims"]["band"]
+    made = [
+        {
+            "label": f"of the block-hours {low:.0%} to {high:.0%} full",
+            "value": f"{ours['in_band']:.0%}",
+            "interval": f"today {today['in_band']:.0%}",
+        }
+    ]
+    for name, label, unit in (
+        ("cruised_km", "cruised a day", "km"),
+        ("time_s", "a car, without prices", "s"),
+    ):
+        value = {
+            "label": label,
+            "value": f"{ours[name]:,.0f} {unit}",
+            "interval": f"today {today[name]:,.0f} {unit}",
+        }
+        made.append(value)
+    if today["revenue"] or ours["revenue"]:
+        paid = {
+            "label": "paid a day",
+            "value": f"{ours['revenue']:,.0f}",
+            "interval": f"today {today['revenue']:,.0f}",
+        }
+        made.append(paid)
+    return made
+
+
+def _middle(rows: Sequence[Row]) -> Any:
+    rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in rows))
+    return rates[len(rates) // 2]
+
+
 def sentences(summary: Row) -> list[str]:
     """Return what a council must know, in three sentences, and then what was assumed."""
     rows = summary.get("answer") or []
     if not rows:
         return []
     aims = summary["aims"]
-    rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in rows))
-    rate = rates[len(rates) // 2]
+    rate = _middle(rows)
     of = {row["policy"]: row for row in rows if row["arrivals_per_hour"] == rate}
     today, rule, ours = of.values()
     low, high = aims["band"]
@@ -125,7 +233,9 @@ def sentences(summary: Row) -> list[str]:
         change = row[f"{name}_of_today"] - 1.0
         ends = [end - 1.0 for end in row[f"{name}_of_today_ci95"] if end is not None]
         text = (
-            f" [{abs(ends[0]):.0%}, {abs(ends[1]):.0%}]" if len(ends) == 2 and ends[0] * ends[1] > 0.0 else ""
+            " [{:.0%}, {:.0%}]".format(*sorted(map(abs, ends)))
+            if len(ends) == 2 and ends[0] * ends[1] > 0.0
+            else ""
         )
         return f"{abs(change):.0%} {'less' if change < 0.0 else 'more'}{text}"
 
@@ -162,7 +272,7 @@ def sentences(summary: Row) -> list[str]:
 def _who(row: Row) -> str:
     verb = "gain" if row["change_s"] < 0.0 else "lose"
     text = f"{row['purpose']} {verb} {abs(row['change_s']):.0f} s a car"
-    return text if is_clear(row, "change_s") else f"{text} (no clear difference)"
+    return text if is_clear(row, "change_s") or row["days"] < LEAST_DAYS else f"{text} (no clear difference)"
 
 
 def _other_demands(rows: Sequence[Row], rate: Any, aims: Row) -> list[str]:

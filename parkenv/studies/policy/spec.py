@@ -70,7 +70,8 @@ class Levers(Spec):
     """What a town may change; the first alternative of a list is what is so today."""
 
     zones: Several[str] = Field(
-        (), description="Zones whose prices may change; those with a price for all if absent."
+        (),
+        description="Zones whose prices may change, * for any letters; those with a price for all if absent.",
     )
     by: Literal["block", "zone"] = Field(
         "block", description="Whether each block has its own price, or each zone."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple
 
@@ -15,7 +14,7 @@ from parkenv.files.option import option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Figures, OneAgent, OneScenario, Seed, Values
-from parkenv.studies.fleet.setting import GIVEN, OWN, Demanded, Setting, times_demanded
+from parkenv.studies.fleet.setting import GIVEN, OWN, Demanded, Setting, rate_text, times_demanded
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.policy.spec import Aims, Levers
 from parkenv.studies.results import JsonTable, Results, Row, Table
@@ -31,6 +30,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
     from parkenv.studies.workers import Task
 
+PICTURE = "policy.png"
 TODAY, RULE, OURS = "today", "SFpark", "ours"
 POLICIES = (TODAY, RULE, OURS)
 """The policies that are told."""
@@ -88,8 +88,8 @@ class PolicyStudy(Study):
     table_titles: ClassVar = {
         "answer": "The answer, on held-out days",
         "losers": "Who wins and who loses, against today",
-        "tried": "What was tried, in the search",
-        "purposes": "Purposes, a day",
+        "policy_blocks": "Block by block: spaces taken and prices, today and with this policy",
+        "assumed": "What was assumed",
     }
 
     kind: Literal["policy"] = "policy"
@@ -235,7 +235,7 @@ class PolicyStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.policy.answer import answer_rows, loser_rows
+        from parkenv.studies.policy.answer import answer_rows, assumed_rows, block_rows, loser_rows
 
         policies = results.kept.get("policies")
         if policies is None:
@@ -246,18 +246,47 @@ class PolicyStudy(Study):
             **held_out.summarise(results),
             "answer": answer_rows(self, held_out, told, results),
             "losers": loser_rows(held_out, results),
+            "policy_blocks": block_rows(self, held_out, told, results),
+            "assumed": assumed_rows(self, held_out),
             "tried": results.kept["tried"],
             "aims": self.aims.model_dump(mode="json"),
             "policies": told,
         }
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: those of the held-out days, and a scenario file for each policy."""
+        """See `Study`: maps before and after, a page with the days on a map, and a scenario file for each policy."""
         from functools import partial
 
+        from parkenv.show.figures.policy import save_policy_maps
+        from parkenv.studies.fleet.blocks import TABLES
+        from parkenv.studies.fleet.day_map import write_map_page
+        from parkenv.studies.policy.answer import middle_rate
+
         held_out = self.held_out_study(result.summary["policies"])
-        files = [partial(spec.write, result.folder / f"{spec.name}.json") for spec in held_out.scenarios]
-        return [*files, *held_out.outputs(replace(result, study=held_out))]
+        tasks: list[Task[object]] = [
+            partial(spec.write, result.folder / f"{spec.name}.json") for spec in held_out.scenarios
+        ]
+        rows = {table.file: list(result.results.rows(table).values()) for table in TABLES}
+        tasks.append(partial(write_map_page, held_out, result.summary, rows, result.folder))
+        if blocks := result.summary["policy_blocks"]:
+            of_block = np.full(len(self.town.blocks.names), -1)
+            of_block[self.town.counted] = np.arange(len(blocks))
+            of_slot = of_block[self.town.blocks.of_slot]
+
+            def by_slot(column: str) -> FloatArray:
+                values = np.array([*(row[column] for row in blocks), np.nan], np.float64)
+                return np.asarray(values[of_slot])
+
+            title = (
+                f"{self.scenario.title}, {self.aims.hours}, {rate_text(middle_rate(held_out))}, held-out days"
+            )
+            panels = [(name, by_slot(f"taken_{name}")) for name in result.summary["policies"]]
+            price = "ours: mean price of an hour", by_slot("price_ours")
+            path = result.folder / PICTURE
+            tasks.append(
+                partial(save_policy_maps, self.town.scenario.lot, panels, self.aims.band, price, title, path)
+            )
+        return tasks
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
@@ -269,10 +298,14 @@ class PolicyStudy(Study):
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
-        from parkenv.show.report.tables import OF_FLEETS, tables_of
+        from parkenv.show.report.page import Page
+        from parkenv.show.report.tables import OF_POLICIES, tables_of
+        from parkenv.studies.policy.answer import headlines
 
-        page = super().page(summary, folder)
-        return page._replace(tables=tables_of(summary, cls.table_titles, OF_FLEETS))
+        del folder
+        shown = {**summary, "losers": middle_only(summary)}
+        tables = tables_of(shown, cls.table_titles, OF_POLICIES)
+        return Page(cls.heading, cls.findings(summary), tables, headlines=headlines(summary))
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`: maps before and after."""
@@ -281,6 +314,23 @@ class PolicyStudy(Study):
         from parkenv.studies.results import SUMMARY
 
         return [DayMaps(self.held_out_study(read_json(folder / SUMMARY)["policies"]), folder)]
+
+
+def middle_only(summary: Row) -> list[Row]:
+    """Return who wins and who loses at the middle demand, in the columns that are shown."""
+    rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in summary.get("answer", ())))
+    rows = [row for row in summary.get("losers", ()) if row["arrivals_per_hour"] == rates[len(rates) // 2]]
+    shown = (
+        "scenario",
+        "purpose",
+        "cars_a_day",
+        "change_s",
+        "change_s_ci95",
+        "paid_change",
+        "better_off",
+        "worse_off",
+    )
+    return [{**{name: row[name] for name in shown}, "purpose": row["purpose"] or "all"} for row in rows]
 
 
 class HeldOut(FleetStudy):

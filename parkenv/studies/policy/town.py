@@ -10,8 +10,8 @@ import numpy as np
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.engine.fleet import Fleet
-from parkenv.errors import InputError, nearest
-from parkenv.scenarios.build import with_zones
+from parkenv.errors import InputError, naming, nearest
+from parkenv.scenarios.build import named, with_zones
 from parkenv.scenarios.spec import ZoneSpec
 from parkenv.studies.fleet.blocks import Blocks, paid
 from parkenv.studies.fleet.measures import Roads
@@ -61,7 +61,7 @@ class PolicyTown:
         self.blocks = Blocks.of(scenario.lot)
         self.fleet: tuple[Any, Any] | None = None
         lot, rules = scenario.lot, {zone.name: zone for zone in scenario.zone_rules}
-        for name in (*levers.zones, *levers.max_stay_s, *levers.users):
+        for name in (*levers.max_stay_s, *levers.users):
             if name not in rules:
                 raise InputError(
                     f"levers: lot {lot.name!r:.40} has no zone {name!r:.40}; {nearest(name, rules)}"
@@ -70,9 +70,9 @@ class PolicyTown:
         for name in levers.open:
             if name not in facilities:
                 raise InputError(f"levers: the lot has no facility {name!r:.40}; {nearest(name, facilities)}")
-        zones = levers.zones or tuple(
-            name for name, zone in rules.items() if zone.price and PUBLIC in zone.users
-        )
+        with naming("levers.zones"):
+            zones = tuple(list(rules)[k] for k in sorted(set(named(levers.zones, list(rules)))))
+        zones = zones or tuple(name for name, zone in rules.items() if zone.price and PUBLIC in zone.users)
         if not zones:
             raise InputError("levers.zones is missing: no zone has a price today, want the names of some")
         self.counted = np.flatnonzero(np.isin(self.blocks.zones, zones))
