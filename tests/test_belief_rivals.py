@@ -13,7 +13,7 @@ from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.lot import PARK
 from planners import make_agent
-from planners.belief.rivals import CROWD, PASSED, _take_rates, usual_arrivals
+from planners.belief.rivals import PASSED, _take_rates
 
 
 def actions(agent, scenario, seed):
@@ -106,30 +106,9 @@ def test_rivals_take_the_best_slots_whatever_is_observed_of_one():
     )
 
 
-def test_as_many_arrive_as_leave():
-    # Ten slots, each taken half of the time, for an hour at a time: five cars leave in an hour.
-    assert 3600.0 * usual_arrivals(np.full(10, 0.5), np.full(10, 1.0 / 3600.0)) == pytest.approx(5.0)
-
-
-def test_if_the_rate_is_not_known_a_multiple_of_the_usual_one_is_expected():
-    scenario = make_scenario("campus")
-    observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=1)
-    belief = SlotBelief.of_observation(observation)
-    forecast = belief.forecast.astype(np.float64)
-    usual = 3600.0 * usual_arrivals(forecast, belief.decay_rate * (1.0 - forecast))
-    assert 20.0 < usual < 1000.0
-    expected = []
-    for rate in (None, CROWD * usual, 0.5 * usual):
-        agent = make_agent("belief-rivals", scenario, arrivals_per_hour=rate)
-        _, memory = agent.predict(observation)
-        expected.append(memory.day.p_occupied(belief.time))
-    assert np.allclose(expected[0], expected[1])
-    assert expected[0].mean() > expected[2].mean() + 0.05
-
-
 def test_free_slots_near_the_entry_do_not_prove_that_nobody_wants_the_best_ones():
     scenario = make_scenario("campus")
-    agent = make_agent("belief-rivals", scenario)
+    agent = make_agent("belief-rivals", scenario, arrivals_per_hour=200)
     observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=1)
     belief = SlotBelief.of_observation(observation)
     best, worst = agent._order[:20], agent._order[-40:]
@@ -138,6 +117,20 @@ def test_free_slots_near_the_entry_do_not_prove_that_nobody_wants_the_best_ones(
     )
     known = belief.update(worst, np.zeros(len(worst), bool))
     assert memory.day.p_occupied(known.time)[best].min() > 0.8
+
+
+def test_drivers_who_know_the_same_make_tours_of_their_own():
+    scenario = make_scenario("campus")
+    observation, _ = gym.make("parkenv/Search-v2", scenario=scenario).reset(seed=1)
+    tours = {}
+    for name in ("belief", "belief-rivals"):
+        agent, tours[name] = make_agent(name, scenario), set()
+        for later_s in range(8):
+            driver = {**observation, "time": observation["time"] + np.array([later_s, 0.0], np.float32)}
+            action, memory = agent.predict(driver)
+            tours[name].add(agent.plan_preview(driver, int(action), memory).path)
+    assert len(tours["belief"]) == 1
+    assert len(tours["belief-rivals"]) >= 4
 
 
 def test_wrong_rates_are_refused():

@@ -25,7 +25,14 @@ from planners.agent import (
     require_observations,
 )
 from planners.belief.best_path import ATTEMPT, NOWHERE, Budget, best_path
-from planners.belief.planning_graph import SLOT, BeliefSnapshot, PathBuffers, path_buffers, set_slots
+from planners.belief.planning_graph import (
+    SLOT,
+    BeliefSnapshot,
+    PathBuffers,
+    PlanningGraph,
+    path_buffers,
+    set_slots,
+)
 from planners.neighborhood import MOST_VERTICES, Neighborhood, Neighborhoods
 from planners.routes import DriveRoutes
 
@@ -50,6 +57,7 @@ class BeliefSearch:
 
     # the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
     near: Neighborhood
+    arrival_s: float  # s since Monday 00:00, when the search began
     n_unobserved: int  # number of its slots that were unobserved when it was chosen
     day: DayBelief  # belief about the day and, given the day, about the slots
     state: NDArray[np.int8]  # (n_slots,) int8, `SlotBelief.state` at the last decision
@@ -151,25 +159,26 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         Args:
             belief: any belief about the lot.
         """
-        memory = self._search_of(self._neighborhoods.toward(int(self.problem.lot.entry_vertices[0])), belief)
-        near = memory.near
+        near = self._neighborhoods.toward(int(self.problem.lot.entry_vertices[0]))
+        memory = self._search_of(near, belief, 0.0)
         self._follow_best_path(int(near.vertices[0]), 0, belief.take(near.slots), memory)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch:
         """Choose the part of the lot to search."""
         vertex = int(observation["vertex"])
-        memory = self._search_of(self._neighborhoods.toward(vertex), belief)
+        memory = self._search_of(self._neighborhoods.toward(vertex), belief, float(observation["time"][0]))
         memory.time = -1.0
         if memory.near.index(vertex) < 0:
             memory.entry = memory.near.entry
         return memory
 
-    def _search_of(self, near: Neighborhood, belief: SlotBelief) -> BeliefSearch:
+    def _search_of(self, near: Neighborhood, belief: SlotBelief, arrival_s: float) -> BeliefSearch:
         n = near.n_slots
         return BeliefSearch(
             near=near,
             n_unobserved=n,
-            day=self._day_belief(near, belief),
+            arrival_s=arrival_s,
+            day=self._day_belief(near, belief, arrival_s),
             state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
             time=belief.time,
@@ -179,9 +188,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             past=[],
         )
 
-    def _day_belief(self, near: Neighborhood, belief: SlotBelief) -> DayBelief:
-        """Return the belief about the day and the slots of a part, before its observations."""
-        slots, rival_rates = near.slots, self._rival_rates(belief)
+    def _day_belief(self, near: Neighborhood, belief: SlotBelief, arrival_s: float) -> DayBelief:
+        """Return the belief about the day and the slots of a part before its observations, at an arrival."""
+        slots, rival_rates = near.slots, self._rival_rates(belief, arrival_s)
         return DayBelief(
             belief.take(slots),
             self._nearness[slots],
@@ -190,10 +199,14 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             doubt=self._doubt,
         )
 
-    def _rival_rates(self, belief: SlotBelief) -> FloatArray | None:
+    def _rival_rates(self, belief: SlotBelief, arrival_s: float) -> FloatArray | None:
         """Return the rates at which rivals take each slot, (n_slots,) 1/s; None without rivals."""
-        del belief
+        del belief, arrival_s
         return None
+
+    def _planning_graph(self, memory: BeliefSearch) -> PlanningGraph:
+        """Return the lot, or the part of it that is planned for, as the path search uses it."""
+        return memory.near.planning_graph(self.problem, self.failure_s)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
         """Update the memory, search for the best path, and take its first step or park."""
@@ -254,7 +267,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.failure_s,
             memory.remaining_s,
             self._budget,
-            near.planning_graph(self.problem, self.failure_s),
+            self._planning_graph(memory),
             snapshot(here, known, memory, self._explore),
             memory.paths,
         )
@@ -279,7 +292,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         """Change the planned part of the lot to the one around the car; keep what is known about it."""
         old = memory.near
         near = self._neighborhoods.around(vertex, np.flatnonzero(belief.observed_taken))
-        new = self._search_of(near, belief)
+        new = self._search_of(near, belief, memory.arrival_s)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
         new.missed_rate[theirs] = memory.missed_rate[ours]
         new.day.carry_over(memory.day, theirs, ours)

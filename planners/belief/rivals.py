@@ -1,9 +1,12 @@
 """`belief-rivals`: the planner in belief space, in a lot that other searching cars fill.
 
-Rivals arrive at a rate that is known, or follows from the forecast. Each passes the free slots in the order of the
-total time from the entry to the goal, and takes each with the same probability. So the best slots are taken most of the
-time, whatever the forecast says, and are gone soon where they are free; slots that are out of the way keep their
-forecast.
+**Herding.** Drivers who know the same and reason alike make the same tour, one behind the other: whoever follows finds
+what the car ahead has left, and nobody looks where cars leave meanwhile. So every driver has numbers of its own, drawn
+from its time of arrival: a taste for places that are nearly as good, and how many rivals it reckons with.
+
+**Rivals.** Each passes the free slots in the order of the total time from the entry to the goal, and takes each with
+the same probability. So the best slots are taken most of the time, whatever the forecast says, and are gone soon where
+they are free; slots that are out of the way keep their forecast.
 """
 
 from __future__ import annotations
@@ -20,31 +23,37 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
-from planners.belief.agent import BeliefAgent
+from planners.agent import Observation
+from planners.belief.agent import BeliefAgent, BeliefSearch
+from planners.belief.planning_graph import PlanningGraph
 from planners.neighborhood import MOST_VERTICES
 
 PASSED = 3.0
 """Mean number of free slots that a rival passes, or drives on from to the next, before it takes one."""
-CROWD = 2.5
-"""Expected rate of rivals as a multiple of the usual rate of arrivals, where it is not known.
+IN_VAIN_S = 90.0
+"""s of search after which the driver reckons with no rivals beside the usual cars.
 
-Underestimating rivals costs more than overestimating them: with too few, the car heads for the best slots with
-everyone else and circles there; with too many, it stops early and the driver walks a little further.
+With rivals in mind a driver leaves the best slots to others. If all do so and the lot is full, nobody finds what is
+left there.
+"""
+TASTE_S, TASTE_M = 8.0, 40.0
+"""A driver's taste: s by which it finds a place better or worse than it is at most; m from one best place to the next.
+
+With 16 s, cars on `campus` and Dragon Lake take as long as with 8.
 """
 
 
 class BeliefRivalsAgent(BeliefAgent):
     """`belief-rivals`: `belief`, which expects that rivals take free slots, the best ones first.
 
-    Where the rate of rivals is not known, it is taken to be `CROWD` times the rate at which cars usually arrive. In the
-    long run that is the rate at which cars leave (Little's law), which follows from the forecast and its decay rates.
-    It is not learned from the slots that are observed: those near the entry are free however many rivals want the best
-    ones, and would soon prove that there are none. In a lot whose slots never change, according to the forecast, nobody
-    arrives, and the agent is `belief`.
+    A driver reckons with 0 to 2 times as many rivals as arrive, evenly: some head for the best slots, others stop soon.
+    After `IN_VAIN_S` of search it reckons with none. Their number is not learned from the slots that are observed:
+    those near the entry are free however many rivals want the best ones, and would soon prove that there are none.
 
     Args:
         problem: lot, goal, speeds and costs.
-        arrivals_per_hour: rivals an hour; None: not known, see above. With 0 the agent is `belief`, action for action.
+        arrivals_per_hour: rivals an hour; None: not known, then the driver has its taste only. With 0 the agent is
+            `belief`, action for action.
         budget_ms: see `belief`.
         day: see `belief`.
         most_vertices: see `belief`.
@@ -74,23 +83,39 @@ class BeliefRivalsAgent(BeliefAgent):
         rival_s = drive_m[: lot.n_slots] / self.problem.v_drive + self.problem.finite_cost_s
         self._order = np.argsort(rival_s, kind="stable")
 
-    def _rival_rates(self, belief: SlotBelief) -> FloatArray:
+    def _planning_graph(self, memory: BeliefSearch) -> PlanningGraph:
+        graph = super()._planning_graph(memory)
+        if self.arrivals_per_hour == 0.0:
+            return graph
+        # A wave over the lot, of random direction and phase.
+        _, *angles = 2.0 * np.pi * own_numbers(memory.arrival_s)
+        heading, phase = angles
+        along_m = self.problem.lot.vertex_xy[memory.near.slots] @ [math.cos(heading), math.sin(heading)]
+        taste_s = TASTE_S * np.cos(2.0 * np.pi / TASTE_M * along_m + phase)
+        return graph._replace(cost_s=graph.cost_s + taste_s)
+
+    def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
+        """Begin again with what was observed, but without rivals, after a long search; then decide as `belief`."""
+        if memory.time <= IN_VAIN_S < belief.time:
+            memory.day = self._day_belief(memory.near, belief, memory.arrival_s)
+            for observations in memory.past:
+                memory.day.update(observations.take(memory.near.slots))
+        if memory.near.whole:
+            memory.past.append(belief.observations)
+        return super().decide(observation, belief, memory)
+
+    def _rival_rates(self, belief: SlotBelief, arrival_s: float) -> FloatArray:
         forecast = belief.forecast.astype(np.float64)
         leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
-        per_s = CROWD * usual_arrivals(forecast, leaving)
-        if self.arrivals_per_hour is not None:
-            per_s = self.arrivals_per_hour / 3600.0
+        per_s = 2.0 * own_numbers(arrival_s)[0] * (self.arrivals_per_hour or 0.0) / 3600.0
+        if belief.time > IN_VAIN_S:
+            per_s = 0.0
         return np.asarray(_take_rates(1.0 - forecast, leaving, self._order, per_s, PASSED))
 
 
-def usual_arrivals(forecast: FloatArray, leaving: FloatArray) -> float:
-    """Return how many cars per second arrive at a lot in the long run: as many as leave it (Little's law).
-
-    Args:
-        forecast: (n_slots,) P(taken).
-        leaving: (n_slots,) 1/s, rate at which a taken slot becomes free.
-    """
-    return float(leaving @ forecast)
+def own_numbers(arrival_s: float) -> FloatArray:
+    """Return three random numbers from 0 to 1 of the driver that arrives at a time, s since Monday 00:00, (3,)."""
+    return np.random.default_rng(int(64.0 * arrival_s)).random(3)
 
 
 @compiled(error_model="numpy")

@@ -83,8 +83,8 @@ class NetworkAgent(BeliefAgent):
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         self._neighbors, self._move_s = self.problem.lot.neighbors.copy(), self.problem.move_cost_s.copy()
 
-    def _search_of(self, near: Neighborhood, belief: SlotBelief) -> NetworkSearch:
-        base = super()._search_of(near, belief)
+    def _search_of(self, near: Neighborhood, belief: SlotBelief, arrival_s: float) -> NetworkSearch:
+        base = super()._search_of(near, belief, arrival_s)
         n = len(near.vertices)
         return NetworkSearch(
             **vars(base),
