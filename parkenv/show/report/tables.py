@@ -83,7 +83,7 @@ _KNOWN = {
         Column("decision_ms", "a decision takes", "ms", 2, help="Median wall time of a decision"),
         Column("decision_ms_p99", "99 % of decisions below", "ms", 2, help="99th percentile of their wall times"),
         Column("gap_to_exact", "above the optimum", share=True, digits=2, signed=True),
-        Column("gap_to_bound", "above the bound", share=True, digits=1, help="At most so far above what is possible"),
+        Column("gap_to_bound", "above the best possible, at most", share=True, digits=1),
         Column("steps", "decisions in training", digits=0),
         Column("steps_per_s", "decisions/s", digits=0),
         Column("model", "model"),
