@@ -76,7 +76,7 @@ NUMBER = "a number, at most 1e+12"
         (read_sessions, SESSION, "found", "9" * 20, "a whole number of at most 15 digits"),
         (read_sessions, SESSION, "slot_accuracy", "", f"{NUMBER}, or nan"),
         (read_sessions, SESSION, "time_s", "1e300", f"{NUMBER}, or nan"),
-        (read_rows, EPISODE, "parked", "yes", "True or False"),
+        (read_rows, EPISODE, "truncated", "yes", "True or False"),
         (read_rows, EPISODE, "total_s", "nan", NUMBER),
         (read_rows, EPISODE, "total_s", "", NUMBER),
         (read_rows, EPISODE, "occupancy_level", "full", f"{NUMBER}, or nothing"),
