@@ -7,6 +7,8 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
+from pydantic import Field
+
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import TEXT
 from parkenv.files.option import Inside, Option, option, words_in
@@ -56,7 +58,8 @@ class CurveStudy(FleetStudy):
         ScenarioList,
         Option("SCENARIO", takes="NAME|FILE|DIR", argument=True, default="town"),
         Inside(without=TRAFFIC),
-    ] = (scenario_spec("town"),)
+        # A factory, since a default with the paths of its files would stand in the schema.
+    ] = Field(default_factory=lambda: (scenario_spec("town"),))
     arrivals_per_hour: Values[Demanded] | None = option(
         ("0.4x", "0.7x", "1x", "1.2x", "1.4x", "1.6x"),
         "Demands to drive: multiples of the scenario's own, or else of the counted one; or cars an hour.",
