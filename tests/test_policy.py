@@ -2,9 +2,13 @@
 
 import json
 import math
+import subprocess
+import sys
+import time
 
 import numpy as np
 import pytest
+from command_line import parkenv
 
 from parkenv import InputError, make_scenario
 from parkenv.lots.formats.geojson import write_lot
@@ -99,12 +103,8 @@ def test_best_price_of_two_streets(two_streets):
     assert ours["time_s_of_today_ci95"][1] < 1.0
 
 
-def files_of(folder):
-    files = (*folder.glob("*.csv"), *folder.glob("*.jsonl"), folder / "summary.json")
-    return {path.name: path.read_bytes() for path in files}
-
-
-def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
+def small(scenario):
+    """Return a study with all stages and levers, in a fraction of a second."""
     aims = {"hours": "09:00-10:00", "cruised": None, "band": [0.001, 0.5]}
     levers = {
         "zones": ["near"],
@@ -112,10 +112,20 @@ def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
         "guided": [0.0, 0.5],
         "max_stay_s": {"near": [0, 1800]},
     }
-    study = asked(
-        two_streets, budget=30, days_each=1, rounds=2, held_out=["0.5x"], episodes=2, aims=aims, levers=levers
-    )
-    study = study.changed(scenario=study.scenario.changed(arrivals={"hours": "08:00-10:00"}))
+    days = {"budget": 22, "days_each": 1, "rounds": 2, "held_out": ["0.5x"], "episodes": 2}
+    study = asked(scenario, aims=aims, levers=levers, **days)
+    return study.changed(scenario=study.scenario.changed(arrivals={"hours": "08:00-10:00"}))
+
+
+def files_of(folder):
+    """Return what a run says, but for its command."""
+    summary = json.loads((folder / "summary.json").read_text()) | {"command": None}
+    files = (*folder.glob("*.csv"), *folder.glob("*.jsonl"))
+    return {path.name: path.read_bytes() for path in files} | {"summary": json.dumps(summary)}
+
+
+def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
+    study = small(two_streets)
     whole = run(study.changed(figures=True), tmp_path / "whole")
     calls = iter(range(100))
 
@@ -125,7 +135,7 @@ def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
 
     with pytest.raises(Interrupted):
         run(study, tmp_path / "stopped", progress=stop)
-    assert len((tmp_path / "stopped" / "trials.jsonl").read_text().splitlines()) < 30
+    assert len((tmp_path / "stopped" / "trials.jsonl").read_text().splitlines()) < 22
     run(study, tmp_path / "stopped", resume=True)
     ours = make_scenario(tmp_path / "whole" / "ours.json")
     assert ours.lot.areas == ("far", "near")
@@ -133,8 +143,28 @@ def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
     page = PolicyStudy.page(json.loads((tmp_path / "whole" / "summary.json").read_text()), tmp_path)
     assert [table["name"] for table in page.tables] == ["answer", "losers", "policy_blocks", "assumed"]
     assert any("block-hours" in said for said in page.findings)
+    assert {row["method"] for row in whole.summary["tried"]} >= {"SFpark", "balance", "evolution"}
     assert files_of(tmp_path / "stopped") == files_of(tmp_path / "whole")
     assert [row["policy"] for row in whole.summary["answer"]] == ["today", "SFpark", "ours"]
+
+
+@pytest.mark.slow
+def test_workers_and_a_signal_leave_the_answer_as_it_is(two_streets, tmp_path):
+    study, out, file = small(two_streets), tmp_path / "killed", tmp_path / "policy.json"
+    run(study, tmp_path / "whole")
+    study.changed(jobs=2).write(file)
+    process = subprocess.Popen([sys.executable, "-m", "parkenv", "policy", file, "--out", out])
+    deadline = time.monotonic() + 60.0
+    while not (out / "trials.jsonl").exists() or len((out / "trials.jsonl").read_text().splitlines()) < 4:
+        assert process.poll() is None
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    process.terminate()
+    assert process.wait() == 143
+    assert len((out / "trials.jsonl").read_text().splitlines()) < 22
+    done = parkenv("policy", file, "--out", out, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert files_of(out) == files_of(tmp_path / "whole")
 
 
 def test_a_policy_is_a_scenario(two_streets):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, model_serializer, model_validator
 
 from parkenv.errors import InputError
 from parkenv.files.spec_file import Several, Spec
@@ -52,6 +52,11 @@ class Aims(Spec):
         description="Largest loss of a purpose, prices as time, in the mean over its cars, s.",
     )
 
+    @model_serializer
+    def _with_none(self) -> dict[str, Any]:
+        """Keep None, which is no aim, and not the default."""
+        return {name: getattr(self, name) for name in type(self).model_fields}
+
     @property
     def clock(self) -> range:
         """The hours of the day that count for the band."""
@@ -81,7 +86,13 @@ class Levers(Spec):
         min_length=1,
         description="Hours that have prices of their own; others are free.",
     )
-    step: float = Field(0.25, gt=0.0, le=1e4, description="Prices are multiples of this.")
+    step: float = Field(
+        0.01,
+        gt=0.0,
+        le=1e4,
+        description="Prices are multiples of this; fine ones reach more of the band, see docs/policy.md.",
+    )
+    rule_step: Money = Field(0.25, description="Step of SFpark's rule, as in the city.")
     most: float = Field(8.0, gt=0.0, le=1e6, description="Highest price of an hour.")
     spread: float = Field(
         0.5, gt=0.0, le=1e5, description="By how much the first prices tried differ, an hour."

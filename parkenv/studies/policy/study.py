@@ -434,7 +434,7 @@ class Search:
         """
         from parkenv.studies.policy.town import Policy
 
-        prices, step = self.town.posted(self.town.today), self.study.levers.step
+        prices, step = self.town.posted(self.town.today), self.study.levers.rule_step
         for number in range(self.study.rounds):
             policy = Policy(prices)
             rows = yield from self._days(RULE, number, [policy], self.study.days_each)
@@ -447,21 +447,23 @@ class Search:
     def _balance(self) -> Iterator[Stage]:
         """Yield rounds in which prices follow occupancy to the middle of the band in smaller and smaller steps.
 
-        They have half of what is left of the budget; the mean over the later half of the rounds is what was found.
+        They have half of what is left of the budget, without other levers three quarters; the mean over the later half
+        of the rounds is what was found.
         """
         from parkenv.studies.policy.town import Policy
 
         each, levers, aim = self.study.days_each, self.study.levers, float(np.mean(self.study.aims.band))
-        rounds = max((self.study.budget - self._used) // (2 * each), 2)
+        share = 0.5 if levers.choices else 0.75
+        rounds = max(int(share * (self.study.budget - self._used)) // each, 2)
         prices, total, kept = self.town.today, np.zeros_like(self.town.today), 0
         for number in range(rounds):
             policy = Policy(prices)
             rows = yield from self._days("balance", number, [policy], each)
             self._note("balance", number, self._measures(rows, policy))
-            share = self._occupancy(rows)
+            taken = self._occupancy(rows)
             # A full block says nothing of how many more would come.
-            excess = np.nan_to_num(np.where(share > 0.97, 1.2, share) - aim)
-            prices = np.clip(prices + 2 * levers.spread * excess / (1 + number) ** 0.6, 0.0, levers.most)
+            excess = np.nan_to_num(np.where(taken > 0.97, 1.2, taken) - aim)
+            prices = np.clip(prices + 2 * levers.spread * excess / (1 + number) ** 0.75, 0.0, levers.most)
             if 2 * number >= rounds:
                 total, kept = total + prices, kept + 1
         self._found["balance"] = Policy(total / kept if kept else prices)
@@ -472,9 +474,8 @@ class Search:
 
         from parkenv.studies.policy.town import Policy
 
-        found = [row for row in self.tried if row["method"] == "balance"]
-        start = self._found["balance"] if found and "balance" in self._found else Policy(self.town.today)
-        base = self.town.today if start.prices is None else start.prices
+        balanced = self._found.get("balance")
+        base = self.town.today if balanced is None or balanced.prices is None else balanced.prices
         levers, choices = self.study.levers, self.study.levers.choices
         zones = list(dict.fromkeys(zone for zone, _ in self.town.units))
         of_unit = [zones.index(zone) for zone, _ in self.town.units]
@@ -484,7 +485,9 @@ class Search:
         steps = np.array([0.0] * n_shifts + [1.0] * len(choices))
         if len(bounds) < 2:
             bounds, steps = np.vstack([bounds, [(-1.0, 1.0)]]), np.append(steps, 0.0)  # it needs two
-        strategy = CMAwM(np.zeros(len(bounds)), 1.0, bounds, steps, seed=self.study.seed)
+        # Balanced prices are near to the best: 50 cents more empty a zone.
+        sigma = 1.0 if balanced is None else 0.2
+        strategy = CMAwM(np.zeros(len(bounds)), sigma, bounds, steps, seed=self.study.seed)
 
         def policy_of(x: FloatArray) -> Policy:
             shift = x[:n_shifts].reshape(len(zones), -1)[of_unit] * levers.spread
