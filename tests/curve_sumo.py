@@ -1,4 +1,4 @@
-"""Curves of made street networks against SUMO on others: `python tests/curve_sumo.py`, where SUMO is installed.
+"""Curves of made networks against SUMO on others: `python tests/curve_sumo.py [SEED ...]`, where SUMO is installed.
 
 Curves are fitted to days of fleets on ten networks, and predict the search times that SUMO has on three more, hour by
 hour, from how full these are there. Cars, arrivals, stays and entries are equal in both; drivers are `greedy-drive`.
@@ -15,14 +15,15 @@ from parkenv.lots.generators import city_lot
 from parkenv.studies.bench.sumo import run_fleet, run_sumo, sumo_folder
 from parkenv.studies.bench.town import SHIFT, SPEED, blocks_of
 from parkenv.studies.curve.fit import Paths, Town, fit_curve
-from parkenv.studies.curve.zones import OF_CARS, STATE, Zones
+from parkenv.studies.curve.lone_search import LoneSearches
+from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Zones
 from parkenv.studies.fleet.measures import Roads
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 from planners.heuristics import POLICIES
 
 SPACES, HOURS, DAYS = 250, 4, 1
 RATES = (0.5, 0.7, 0.85, 0.95)  # cars an hour for each space, which they take for an hour
-TRAINED, HELD_OUT = range(10, 20), range(3)
+TRAINED, HELD_OUT = range(10, 20), [int(word) for word in sys.argv[1:]] or range(3)
 
 
 def fleet_on(seed, rate):
@@ -47,9 +48,16 @@ def row_of(fleet, day):
     edges = 3600.0 * np.arange(HOURS + 1)
     inside = np.clip(day.left_s[known, None], 0.0, edges) - np.clip(day.began_s[known, None], 0.0, edges)
     occupancy = np.diff(inside.sum(axis=0)) / 3600.0 / spaces
+    looks = np.arange(0.0, HOURS * 3600.0, 300.0)
+    there = (day.began_s <= looks[:, None]) & (looks[:, None] < day.left_s) & known
+    taken = np.array([np.bincount(day.slot[its], minlength=fleet.scenario.lot.n_slots) for its in there])
+    lone = LoneSearches(fleet.scenarios).of_day(
+        fleet, taken, (looks // 3600.0).astype(int), np.ones(len(hour), bool), hour
+    )
+    alone = {name: np.bincount(hour, its, HOURS) for name, its in zip(LONE, lone, strict=True)}
     sums = dict(zip(OF_CARS, (came[0], came[1], 0 * came[0], came[2], 0 * came[0]), strict=True))
     state = dict(zip(STATE, ([occupancy], [came[0] / spaces], occupancy, came[0] / spaces), strict=True))
-    return {"zone": [0] * HOURS, "purpose": [0] * HOURS, "hour": range(HOURS), **sums, **state}
+    return {"zone": [0] * HOURS, "purpose": [0] * HOURS, "hour": range(HOURS), **sums, **alone, **state}
 
 
 def town_on(seed, run):
@@ -57,7 +65,7 @@ def town_on(seed, run):
     for rate in RATES:
         fleet = fleet_on(seed, rate)
         days.append([row_of(fleet, run(fleet, day)) for day in range(DAYS)])
-    return Town(Zones.of(fleet.scenario, 1, 1e5), ("all",), days)
+    return Town(Zones.of(fleet.scenarios, 1e5), ("all",), days)
 
 
 def in_sumo(fleet, day):

@@ -14,7 +14,9 @@ from parkenv.errors import InputError
 from parkenv.lots import grid_lot, write_lot
 from parkenv.studies.curve.curves import Curves
 from parkenv.studies.curve.fit import (
+    CURVE,
     FORMS,
+    LONE_SEARCH,
     OUTCOMES,
     Paths,
     Town,
@@ -23,8 +25,9 @@ from parkenv.studies.curve.fit import (
     form_at,
     held_out_errors,
 )
+from parkenv.studies.curve.lone_search import lone_searches
 from parkenv.studies.curve.study import CurveStudy
-from parkenv.studies.curve.zones import OF_CARS, Zones
+from parkenv.studies.curve.zones import LONE, OF_CARS, Zones
 from parkenv.studies.fleet.measures import Roads
 
 N_ZONES, HOURS, MULTIPLES, DAYS = 100, 4, (0.5, 1.0, 1.5, 2.0), 4
@@ -58,6 +61,7 @@ def made():
                     "purpose": np.zeros_like(zone),
                     "hour": hour,
                     **dict(zip(OF_CARS, sums, strict=True)),
+                    **dict.fromkeys(LONE, cars),  # tells nothing
                 }
                 | {"occupancy": occupancy, "demand": demand}
                 | {"town_occupancy": occupancy.mean(axis=0), "town_demand": demand.mean(axis=0)}
@@ -76,7 +80,7 @@ def test_zones_that_are_held_out_are_predicted_and_better_than_by_usual_forms(ma
         for row in errors
         if (row["held_out"], row["outcome"]) == ("zones", "search_s")
     }
-    assert set(of) == {"curve", *FORMS}
+    assert set(of) == {CURVE, LONE_SEARCH, *FORMS}
     assert of["curve"] < 0.1
     assert of["curve"] < 0.8 * min(of[form] for form in FORMS)
     assert len(points) == N_ZONES * HOURS * len(MULTIPLES)
@@ -153,6 +157,27 @@ def test_a_day_of_zones_has_all_cars_and_what_their_searches_take_beyond_the_dir
     demand = np.array(row["town_demand"]) * fleet.scenario.lot.n_slots * [1.0, 0.5]
     assert demand.sum() == pytest.approx(len(fleet.cars), rel=0.01), "the last hour is half of one"
     assert 0.0 < np.min(row["occupancy"]) < np.max(row["occupancy"]) <= 1.0
+
+
+@pytest.mark.parametrize(
+    ("believed", "expected"),
+    [
+        # First A: 10 s on foot and 10 s of drive; then B, 9 s on, 4 s of them through A: 23 s, 11 s more than the 12 s
+        # that the direct drive takes.
+        ([0.0, 0.0], [0.5 + 0.5 * 0.8, 0.5 + 0.1, 0.5 * 3.0 + 0.4 * 11.0, 0.5 * 10.0 + 0.4 * 40.0]),
+        # Whoever believes that A is full goes to B first, and then 6 + 2 s on to A.
+        ([0.9, 0.0], [0.8 + 0.2 * 0.5, 0.2 + 0.1, 0.1 * (10.0 + 3.0), 0.8 * 40.0 + 0.1 * 10.0]),
+    ],
+)
+def test_a_lone_search_goes_on_to_the_next_best_place_as_often_as_one_is_full(believed, expected):
+    car, places = np.zeros(1, np.int64), np.zeros(2, np.int64)
+    found = lone_searches(
+        *[car] * 3, np.ones(1), np.full(1, 900.0), np.zeros((1, 1)), 1.0, 1.0, np.array([believed]),
+        full=np.array([[0.5, 0.2]]), inside_s=np.array([[3.0, 0.0]]), entry_drive_s=np.array([[10.0, 12.0]]),
+        drive_s=np.array([[0.0, 9.0], [6.0, 0.0]]), through_s=np.array([4.0, 2.0]), walk_s=np.array([[10.0, 40.0]]),
+        enter_s=np.zeros(2), size=places + 1, zone=places, area=places,
+    )  # fmt: skip
+    np.testing.assert_allclose(found[:, 0], expected)
 
 
 def test_curves_are_called_with_arrays_and_say_what_there_is_not():

@@ -141,7 +141,7 @@ streets_at = record_at(STREETS)
 def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
     """Return the streets of a lot, for the problem of each goal."""
     lot, plain = problems[0].lot, heuristic_tables(GREEDY_DRIVE, problems, None)
-    streets = _streets(lot, np.asarray(problems[0].move_cost_s))
+    streets = streets_of(lot, np.asarray(problems[0].move_cost_s))
     n_junctions, n_streets = lot.n_vertices - lot.n_slots, len(streets["start"])
     first, area_of_slot = streets["place_first"][:-1], lot.area_of_zone[lot.zone_of_slot]
     # Rounding must not lift a bound above the cost.
@@ -191,7 +191,7 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
     return PolicyData(STREETS, numbers, arrays, kept=plain)
 
 
-def _streets(lot: ParkingLot, move_s: FloatArray) -> dict[str, NDArray[Any]]:
+def streets_of(lot: ParkingLot, move_s: FloatArray) -> dict[str, NDArray[Any]]:
     """Return the streets of a lot as arrays of `STREETS`."""
     n, neighbors = lot.n_slots, lot.neighbors
     # On from each slot: to a junction, else to the slot that lies in the same direction; not across the street.

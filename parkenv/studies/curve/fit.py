@@ -1,9 +1,9 @@
 """Curves fitted to the days of fleets at several demands, pooled over zones, with intervals and held-out errors.
 
-What a zone's searches are like is a monotone function of how full it is around, how many cars come, and both for the
-whole lot (gradient-boosted trees with monotone constraints, Poisson loss, over all zones), times factors of the zone's
-own, shrunk towards 1 by as much as they may be chance (empirical Bayes). Of several towns, search times are in units of
-the time to drive along all streets around a zone.
+What a zone's searches are like is a monotone function of how lone searches fare there, how full it is around, how many
+cars come, and both for the whole lot (gradient-boosted trees with monotone constraints, Poisson loss, over all zones),
+times factors of the zone's own, shrunk towards 1 by as much as they may be chance (empirical Bayes). Of several towns,
+search times are in units of the time to drive along all streets around a zone.
 """
 
 from __future__ import annotations
@@ -14,24 +14,27 @@ from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import isotonic_regression, nnls
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.studies.curve.zones import INDEX, OF_CARS, STATE, Zones
+from parkenv.studies.curve.zones import INDEX, LONE, OF_CARS, STATE, SUMS, Zones
 from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers
 
+CURVE, LONE_SEARCH = "curve", "lone search"
+"""What predicts, in tables of errors, besides `FORMS`."""
 FOLDS = 5
 """Parts of the zones, each of which is held out once."""
-_GROWS, _PURPOSE = (1, 1, 1, 1, 0, 0, 0, 0), 5
-"""Features that a curve may only grow with: `STATE`; then hour, purpose, spaces around, and share of them counted."""
+_GROWS, _PURPOSE = (1, 1, 1, 1, 0, 0, 1), 5
+"""Features that a curve may only grow with: `STATE`; not hour and purpose; the outcome of lone searches."""
 _TREES = {
     "max_iter": 80,
     "learning_rate": 0.12,
     "max_leaf_nodes": 12,
     "min_samples_leaf": 30,
     "l2_regularization": 1.0,
+    "max_bins": 64,
 }
 
 
@@ -101,8 +104,8 @@ class Paths:
         multiples: (m,) ascending.
         first_hour: clock hour of hour 0.
         index: (n, 4) int64, numbers of town, zone, purpose and hour of each path.
-        features: (n, m, 8), see `_GROWS`.
-        sums: `OF_CARS`, (days, n, m) each.
+        features: (n, m, 6), see `_GROWS`; all but the last.
+        sums: `SUMS`, (days, n, m) each.
     """
 
     towns: Mapping[str, Zones]
@@ -120,12 +123,13 @@ class Paths:
         parts: list[tuple[Any, ...]] = []
         for number, town in enumerate(towns.values()):
             n_zones, hours = np.shape(town.days[0][0]["occupancy"])
-            of_cars = np.zeros((5, len(town.days[0]), len(multiples), n_zones, len(town.purposes), hours))
+            shape = len(town.days[0]), len(multiples), n_zones, len(town.purposes), hours
+            of_cars = np.zeros((len(SUMS), *shape))
             state = np.zeros((4, len(multiples), n_zones, hours))
             for m, days in enumerate(town.days):
                 for day, row in enumerate(days):
                     of_cars[:, day, m, row["zone"], row["purpose"], row["hour"]] = [
-                        row[name] for name in OF_CARS
+                        row[name] for name in SUMS
                     ]
                     for values, name in zip(state[:, m], STATE, strict=True):
                         values += np.array(row[name]) / len(days)
@@ -133,9 +137,7 @@ class Paths:
             state = np.maximum.accumulate(state, axis=1)
             zone, purpose, hour = np.nonzero(of_cars[0].sum(axis=(0, 1)))
             known = np.array([purposes.index(name) for name in town.purposes])[purpose]
-            spaces = town.zones.spaces.sum(axis=1)
-            fixed = np.stack([hour, known, np.log(spaces)[zone], (town.zones.spaces[:, 1] / spaces)[zone]])
-            fixed = np.broadcast_to(fixed[:, None], (4, len(multiples), len(zone)))
+            fixed = np.broadcast_to(np.stack([hour, known])[:, None], (2, len(multiples), len(zone)))
             features = np.concatenate([state[:, :, zone, hour], fixed]).transpose(2, 1, 0)
             index = np.stack([np.full_like(zone, number), zone, known, hour], axis=1)
             parts.append((index, features, of_cars[:, :, :, zone, purpose, hour].transpose(0, 1, 3, 2)))
@@ -143,7 +145,7 @@ class Paths:
             np.concatenate([part[k] for part in parts], axis) for k, axis in enumerate((0, 0, 2))
         )
         zones = {name: town.zones for name, town in towns.items()}
-        sums = dict(zip(OF_CARS, of_cars, strict=True))
+        sums = dict(zip(SUMS, of_cars, strict=True))
         return cls(zones, purposes, np.array(multiples), first_hour, index, features, sums)
 
     def groups(self, *columns: int) -> IntArray:
@@ -158,6 +160,18 @@ class Paths:
     def totals(self, name: str) -> tuple[FloatArray, FloatArray]:
         """Return sums of an outcome and numbers of cars, (days, n, m) each."""
         return OUTCOMES[name].total(self.sums), self.sums[OUTCOMES[name].of]
+
+    def lone(self, name: str) -> FloatArray:
+        """Return an outcome as lone searches have it, (n, m), growing with the demand; see `LoneSearches`."""
+        sums = {of: self.sums[lone].sum(axis=0) for of, lone in zip(OF_CARS, ("cars", *LONE), strict=True)}
+        total, cars = OUTCOMES[name].total(sums), sums[OUTCOMES[name].of]
+        values = np.zeros(cars.shape)
+        for row, known in enumerate(cars > 0.0):
+            if known.any():
+                y, weights = total[row, known] / cars[row, known], cars[row, known]
+                fitted = isotonic_regression(y, weights=weights).x
+                values[row] = np.interp(self.multiples, self.multiples[known], fitted)
+        return values
 
     def names(self, index: Sequence[int]) -> tuple[str, str, str, str]:
         """Return the names of town, zone, purpose and clock hour; `all` for -1."""
@@ -192,13 +206,14 @@ def fit_curve(
     y, weight = _mean(total, cars) / unit, cars * train * unit
     if not (known := weight > 0.0).any() or not y[known].any():
         return np.zeros_like(y), np.zeros_like(y)
+    features = np.concatenate([paths.features, (paths.lone(name) / unit)[..., None]], axis=-1)
     trees = HistGradientBoostingRegressor(
         loss="poisson", monotonic_cst=_GROWS, categorical_features=[_PURPOSE], early_stopping=False, **_TREES
     )
     # Threads that share cores wait for each other; and their sums are not the same on each machine.
     with threadpool_limits(1):
-        trees.fit(paths.features[known], y[known], sample_weight=weight[known])
-        common = trees.predict(paths.features.reshape(-1, len(_GROWS))).reshape(y.shape) * unit
+        trees.fit(features[known], y[known], sample_weight=weight[known])
+        common = trees.predict(features.reshape(-1, len(_GROWS))).reshape(y.shape) * unit
     own, seen = common.copy(), np.broadcast_to(np.asarray(train) > 0.0, y.shape)
     for columns in ((0, 1), (0, 1, 2), (0, 1, 3)):
         group = paths.groups(*columns)
@@ -214,7 +229,7 @@ def _factors(of_days: FloatArray, expected: FloatArray, group: IntArray, share: 
     away = _mean(share @ seen - mean, mean)
     # Of a single day nothing tells chance from what is the zone's own.
     chance = (
-        _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2) if len(seen) > 1 else np.full(len(mean), np.inf)
+        _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2) if len(seen) > 1 else np.full(len(mean), 1e12)
     )
     spread = max(float((mean * (away**2 - chance)).sum() / max(mean.sum(), 1e-9)), 0.0)
     return np.asarray(1.0 + away * spread / np.maximum(spread + chance, 1e-12))
@@ -254,23 +269,24 @@ def held_out_errors(
     x = paths.features[..., 0]
     for name in OUTCOMES:
         total, cars = (its.mean(axis=0) for its in paths.totals(name))
-        y, known = _mean(total, cars), cars > 0.0
+        y, known, lone = _mean(total, cars), cars > 0.0, paths.lone(name)
         predicted: dict[tuple[str, str], FloatArray] = {}
         for what, held in parts:
             common, own = next(fits)
             progress()
-            for form in ("curve", *FORMS):
+            its_own = {CURVE: own if what == "demands" else common, LONE_SEARCH: lone}
+            for form in (*its_own, *FORMS):
                 values = predicted.setdefault((what, form), np.full_like(y, np.nan))
-                if form == "curve":
-                    values[held] = (own if what == "demands" else common)[held]
-                for its in purposes if form != "curve" else ():
+                if form in its_own:
+                    values[held] = its_own[form][held]
+                for its in purposes if form in FORMS else ():
                     train, test = its & ~held & known, its & held
                     if train.any():
                         values[test] = form_at(form, fit_form(form, x[train], y[train], cars[train]), x[test])
         for (what, form), values in predicted.items() if y.any() else ():
             rows.append({"held_out": what, "outcome": name, "form": form, **_errors(paths, name, values)})
-        if name == "search_s" and ("zones", "curve") in predicted:
-            shown = _zone_hours(paths, predicted["zones", "curve"])
+        if name == "search_s" and ("zones", CURVE) in predicted:
+            shown = _zone_hours(paths, predicted["zones", CURVE])
     return rows, shown
 
 

@@ -26,10 +26,12 @@ if TYPE_CHECKING:
     from parkenv.engine.fleet import Fleet
     from parkenv.show.report.page import Page
     from parkenv.studies.curve.fit import Paths
+    from parkenv.studies.curve.lone_search import LoneSearches
     from parkenv.studies.curve.zones import Zones
     from parkenv.studies.fleet.blocks import Tally
     from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
+    from parkenv.world.scenario import Scenario
 
 PICTURE = "curve.png"
 HELD_OUT = CsvTable(
@@ -88,8 +90,17 @@ class CurveStudy(FleetStudy):
         """The zones of each scenario, by its name."""
         from parkenv.studies.curve.zones import Zones
 
-        places = {setting.scenario: len(self.fleet(setting)[0].scenarios) for setting in self.fleet_settings}
-        return {name: Zones.of(its, places[name], self.reach_m) for name, its in self.built.items()}
+        return {name: Zones.of(its, self.reach_m) for name, its in self._goals.items()}
+
+    @cached_property
+    def _goals(self) -> dict[str, Sequence[Scenario]]:
+        return {setting.scenario: self.fleet(setting)[0].scenarios for setting in self.fleet_settings}
+
+    @cached_property
+    def _lone(self) -> dict[str, LoneSearches]:
+        from parkenv.studies.curve.lone_search import LoneSearches
+
+        return {name: LoneSearches(its) for name, its in self._goals.items()}
 
     @property
     def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
@@ -104,7 +115,11 @@ class CurveStudy(FleetStudy):
 
         del tally
         name = fleet.scenario.name
-        return {ZONES.file: day_of_zones(fleet, self.zones[name], self._roads[name], times, taken)}
+        return {
+            ZONES.file: day_of_zones(
+                fleet, self.zones[name], self._roads[name], self._lone[name], times, taken
+            )
+        }
 
     def check(self) -> None:
         """See `Study`: all cars of a curve have equal drivers."""
@@ -191,18 +206,21 @@ class CurveStudy(FleetStudy):
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: how far the curves are off, beside the usual forms."""
-        from parkenv.studies.curve.fit import FORMS, OUTCOMES
+        from parkenv.studies.curve.fit import CURVE, FORMS, LONE_SEARCH, OUTCOMES
 
         found = [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
         by = {(row["held_out"], row["outcome"], row["form"]): row for row in summary["errors"]}
         for (what, outcome, form), row in by.items():
-            if form == "curve" and outcome in ("search_s", "walk_s"):
+            if form == CURVE and outcome in ("search_s", "walk_s"):
                 off, chance, of_zones = (row[key] for key in ("relative", "noise", "relative_of_zones"))
-                others = ", ".join(f"{by[what, outcome, name]['relative']:.0%} {name}" for name in FORMS)
+                lone, *others = (
+                    f"{by[what, outcome, name]['relative']:.0%} {name}" for name in (LONE_SEARCH, *FORMS)
+                )
                 found.append(
                     f"{OUTCOMES[outcome].label.capitalize()}, {what} held out: {off:.1%} off by zone-hours "
                     f"({row['mae']:.1f} of {row['mean']:.1f}), of which chance in the days alone makes {chance:.0%}; "
-                    f"{of_zones:.1%} by zones. Usual forms in the occupancy, fitted to the same: {others}."
+                    f"{of_zones:.1%} by zones. Without any fit: {lone}. Usual forms in the occupancy, fitted to the "
+                    f"same: {', '.join(others)}."
                 )
         return found
 

@@ -5,6 +5,7 @@ A *zone* is a goal of the lot, and the spaces within a walk of it. Zones may hav
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -12,6 +13,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.engine.fleet import Fleet
+from parkenv.studies.curve.lone_search import LoneSearches
 from parkenv.studies.fleet.blocks import hour_of, purposes_of
 from parkenv.studies.fleet.measures import Roads
 from parkenv.studies.fleet.setting import SETTING_COLUMNS
@@ -22,20 +24,23 @@ from parkenv.world.week import HOUR_S
 INDEX = ("zone", "purpose", "hour")
 OF_CARS = ("cars", "parked", "failed", "search_s", "walk_s")
 """Sums over the cars that arrive in an hour, by zone, purpose and hour."""
+LONE = tuple(f"lone_{name}" for name in OF_CARS[1:])
+"""The same as lone searches have them; see `LoneSearches`."""
+SUMS = (*OF_CARS, *LONE)
 STATE = ("occupancy", "demand", "town_occupancy", "town_demand")
 """Share of the spaces around that is taken, and cars that arrive in an hour for each, by zone and hour; and of all
 spaces of the lot, by hour."""
 
 
 def _checked(row: Row) -> Row:
-    whole = np.array([row[name] for name in (*INDEX, *OF_CARS)], np.int64)
+    whole = np.array([row[name] for name in (*INDEX, *SUMS)], float)
     if whole.ndim != 2 or [np.array(row[name], float).ndim for name in STATE] != [2, 2, 1, 1]:
         raise ValueError("lists of other shapes")
     return row
 
 
 ZONES = JsonTable("zones.jsonl", (*SETTING_COLUMNS, "day"), _checked, "day of zones")
-"""A line for each day: `OF_CARS` where cars arrive, with the numbers of zone, purpose and hour, and `STATE`. Hours
+"""A line for each day: `SUMS` where cars arrive, with the numbers of zone, purpose and hour, and `STATE`. Hours
 count from the first of the day's arrivals."""
 
 
@@ -62,23 +67,23 @@ class Zones:
     streets_s: float
 
     @classmethod
-    def of(cls, scenario: Scenario, places: int, reach_m: float) -> Self:
-        """Return the zones of a scenario whose fleets have so many places: all goals, or its own alone."""
-        lot, goals = scenario.lot, range(places) if places > 1 else [scenario.goal]
+    def of(cls, scenarios: Sequence[Scenario], reach_m: float) -> Self:
+        """Return the zones of a fleet, from its scenarios, one for each goal."""
+        lot, goals = scenarios[0].lot, [one.goal for one in scenarios]
         walk_m, xy = np.array([lot.walk_m(goal) for goal in goals]), np.array(lot.goals, float)[goals]
         near = (walk_m <= np.maximum(reach_m, walk_m.min(axis=1, keepdims=True))).astype(float)
         neighbors = (np.linalg.norm(xy[:, None] - xy, axis=2) <= reach_m).astype(float)
         kinds = np.stack([lot.capacity * ~lot.is_counted, lot.capacity * lot.is_counted], axis=1)
         own = np.zeros((len(xy), 2), np.int64)
         np.add.at(own, walk_m.argmin(axis=0), kinds)
-        edge_s = np.where(lot.neighbors >= 0, lot.edge_length / (lot.edge_speed * scenario.v_drive), 0.0)
+        edge_m = np.where(lot.neighbors >= 0, lot.edge_length / lot.edge_speed, 0.0)
         around = np.linalg.norm(xy[:, None] - lot.vertex_xy, axis=2) <= reach_m
-        streets_s = float((around @ edge_s.sum(axis=1)).mean()) or 1.0
+        streets_s = float((around @ edge_m.sum(axis=1)).mean()) / scenarios[0].v_drive or 1.0
         return cls(tuple(map(str, goals)), xy, near, neighbors, near @ kinds, own, streets_s)
 
 
 def day_of_zones(
-    fleet: Fleet, zones: Zones, roads: Roads, times: FloatArray, taken: IntArray
+    fleet: Fleet, zones: Zones, roads: Roads, lone: LoneSearches, times: FloatArray, taken: IntArray
 ) -> dict[str, Any]:
     """Return the row of `ZONES` of a day whose searches are over, without setting and day.
 
@@ -89,6 +94,7 @@ def day_of_zones(
         fleet: the fleet.
         zones: the zones of its lot.
         roads: its shortest drives.
+        lone: its lone searches.
         times: (k,) s since Monday 00:00, at which slots were looked at.
         taken: (k, n_slots) how many cars were in each.
     """
@@ -100,7 +106,10 @@ def day_of_zones(
     shape = len(zones.names), len(names), len(n_looks)
     flat, parked = np.ravel_multi_index((cars["place"], purpose[arrives], hour), shape), cars["slot"] >= 0
     search_s = np.maximum(cars["ended_at"] - cars["arrival"] - roads.direct_s(cars), 0.0)
-    values = (np.ones(len(cars)), parked, cars["failed_parks"], search_s * parked, cars["walk_s"] * parked)
+    values = (
+        np.ones(len(cars)), parked, cars["failed_parks"], search_s * parked, cars["walk_s"] * parked,
+        *lone.of_day(fleet, taken, looks - first, arrives, hour),
+    )  # fmt: skip
     sums = [np.bincount(flat, its, np.prod(shape)).reshape(shape) for its in values]
     index, arrived = np.nonzero(sums[0]), sums[0].sum(axis=1)
     there = np.array([taken[looks - first == k].mean(axis=0) for k in range(len(n_looks))]).T
@@ -113,6 +122,6 @@ def day_of_zones(
     )  # fmt: skip
     return (
         {name: its.tolist() for name, its in zip(INDEX, index, strict=True)}
-        | {name: np.rint(its[index]).astype(int).tolist() for name, its in zip(OF_CARS, sums, strict=True)}
+        | {name: its[index].round(2).tolist() for name, its in zip(SUMS, sums, strict=True)}
         | {name: its.round(4).tolist() for name, its in zip(STATE, state, strict=True)}
     )

@@ -1,0 +1,162 @@
+"""How long one driver more would search, from how full each street and garage is: a model without any fitted number.
+
+The driver goes to the place that is cheapest by its rule, through it if it has no space, and on from there to the next.
+A *place* is a run of slots on one side of a street, between two junctions and in one zone, or a counted facility. Each
+has a space as often as it had one in that hour of the day, whatever others had, so the chances of all ways that a
+search may go are products.
+
+Rules are those of `planners.heuristics`, over places: `usual` (and any other agent) weighs the arrival cost against the
+drive over the chance that it expects of a space; where places were full, others of their kind promise less.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.sparse.csgraph import dijkstra
+
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import compiled
+from parkenv.engine.fleet import Fleet
+from parkenv.world.occupancy.process import Arrival
+from parkenv.world.scenario import Scenario
+from parkenv.world.week import HOUR_S
+from planners.heuristics.streets import DOUBT, streets_of
+
+RULES = {"greedy-drive": (0.0, 1.0), "greedy-goal": (1.0, 1e-6), "greedy-total": (1.0, 3.0)}
+"""What a second of arrival cost and one of the drive count for drivers that expect nothing of places."""
+_ENOUGH = 0.01
+"""Chance that nothing was found yet below which a search is not followed any more."""
+
+
+class LoneSearches:
+    """Searches of one driver more in the days of a scenario.
+
+    Args:
+        scenarios: those of a fleet, one for each goal.
+    """
+
+    def __init__(self, scenarios: Sequence[Scenario]) -> None:
+        problem, lot = scenarios[0], scenarios[0].lot
+        streets = streets_of(lot, np.asarray(problem.move_cost_s))
+        begin, end = streets["place_first"][:-1], streets["place_first"][1:] - 1
+        self._slots, self._begin, self._size = streets["slots"], begin, (end - begin + 1).astype(np.int64)
+        first, last, zone = self._slots[begin], self._slots[end], lot.zone_of_slot[self._slots[begin]]
+        self._capacity, self._entries = lot.capacity, np.unique(lot.entry_vertices)
+        drives = lot.drive_matrix(timed=True)
+        drive_s = [dijkstra(drives, indices=its)[:, first] / problem.v_drive for its in (self._entries, last)]
+        through_s, walk_s = (
+            (streets["along_s"][end] - streets["along_s"][begin]),
+            [one.walk_s for one in scenarios],
+        )
+        self._inside_s = np.zeros((2, len(first)))
+        for place in np.flatnonzero(lot.is_counted[first]):
+            facility = lot.facilities[lot.facility_of_slot[first[place]]]
+            self._inside_s[:, place] = np.add(facility.gate_s, facility.inside_s)
+        self._of_places = (
+            *drive_s, through_s, self._mean(np.array(walk_s)), self._mean(problem.enter_s), self._size, zone,
+            lot.area_of_zone[zone],
+        )  # fmt: skip
+
+    def _mean(self, of_slots: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(of_slots[..., self._slots], self._begin, axis=-1) / self._size)
+
+    def of_day(
+        self, fleet: Fleet, taken: IntArray, looks: IntArray, which: BoolArray, hour: IntArray
+    ) -> FloatArray:
+        """Return what lone searches of cars of a day are like, (4, n): see `lone_searches`.
+
+        Args:
+            fleet: the fleet; all cars have the rule of its first kind of drivers.
+            taken: (k, n_slots) how many cars were in each slot at each look.
+            looks: (k,) hours of the day's looks, from 0.
+            which: (n_cars,) the cars, n of them.
+            hour: (n,) the hours in which they arrive.
+        """
+        rule, cars = fleet.drivers[0].policy, fleet.cars[which]
+        weights = RULES.get("" if rule is None else rule.name)
+        no_space = np.logical_and.reduceat((taken >= self._capacity)[:, self._slots], self._begin, axis=1)
+        full, filled, believed = np.zeros((3, int(looks[-1]) + 1, len(self._size)))
+        for k in range(len(full)):
+            full[k], filled[k] = (
+                no_space[looks == k].mean(axis=0),
+                self._mean(taken[looks == k].mean(axis=0) / self._capacity),
+            )
+            if weights is None:
+                arrival = Arrival(fleet.begin + (k + 0.5) * HOUR_S, fleet.day.date)
+                believed[k] = self._mean(np.asarray(fleet.scenario.occupancy.forecast(arrival).p_occupied))
+        empty_s, full_s = self._inside_s
+        return np.asarray(lone_searches(
+            np.searchsorted(self._entries, cars["entry"]), cars["place"].astype(np.int64), hour, cars["walks"].copy(),
+            cars["patience_s"].copy(), fleet.zone_cost_s()[which], *(weights or (1.0, 1.0)), believed, full,
+            empty_s + filled * (full_s - empty_s), *self._of_places,
+        ))  # fmt: skip
+
+
+@compiled(error_model="numpy")
+def lone_searches(
+    entry: IntArray, goal: IntArray, hour: IntArray, walks: FloatArray, patience_s: FloatArray, zone_cost_s: FloatArray,
+    per_cost: float, per_drive: float, believed: FloatArray, full: FloatArray, inside_s: FloatArray,
+    entry_drive_s: FloatArray, drive_s: FloatArray, through_s: FloatArray, walk_s: FloatArray, enter_s: FloatArray,
+    size: IntArray, zone: IntArray, area: IntArray,
+) -> FloatArray:  # fmt: skip
+    """Follow searches from place to place.
+
+    Args:
+        entry: (n,) row of `entry_drive_s`.
+        goal: (n,) row of `walk_s`.
+        hour: (n,) row of `believed`, `full` and `inside_s`.
+        walks: (n,) 2 where the walk back counts, else 1.
+        patience_s: (n,) drive after which nobody goes on, s.
+        zone_cost_s: (n, n_zones) what parking costs, s; infinite where it is forbidden.
+        per_cost: what a second of arrival cost counts.
+        per_drive: what a second of the drive counts.
+        believed: (n_hours, n_places) P(taken) that drivers expect of a slot.
+        full: (n_hours, n_places) chance that a place has no space.
+        inside_s: (n_hours, n_places) time at the barrier and inside, s.
+        entry_drive_s: (n_entries, n_places) drive to the beginning of a place, s.
+        drive_s: (n_places, n_places) drive from the end of one to the beginning of another, s.
+        through_s: (n_places,) drive through it, s.
+        walk_s: (n_goals, n_places) walk, s.
+        enter_s: (n_places,) what drivers expect of `inside_s`.
+        size: (n_places,) slots.
+        zone: (n_places,) column of `zone_cost_s`.
+        area: (n_places,) numbers of zones that fill alike.
+
+    Returns:
+        (4, n) chance to park; places without a space on the way; search time beyond the direct drive, and walk, s, both
+        times the chance.
+    """
+    found = np.zeros((4, len(entry)))
+    cost_s, expected_free = np.empty(len(size)), np.empty(area.max() + 1)
+    for car in range(len(entry)):
+        p, full_now, direct_s = believed[hour[car]], full[hour[car]], entry_drive_s[entry[car]]
+        for k in range(len(size)):
+            cost = walk_s[goal[car], k] * walks[car] + zone_cost_s[car, zone[k]] + enter_s[k]
+            cost_s[k] = per_cost * cost if cost < np.inf else np.inf
+        expected_free[:] = 0.0
+        ahead_s, driven_s, left = direct_s, 0.0, 1.0
+        while left > _ENOUGH and driven_s <= patience_s[car]:
+            best, best_s = -1, np.inf
+            for k in range(len(size)):
+                index_s = cost_s[k] + per_drive * ahead_s[k]
+                if index_s < best_s:
+                    odds = (1.0 - p[k]) * DOUBT / (DOUBT + expected_free[area[k]])
+                    index_s = cost_s[k] + per_drive * ahead_s[k] / (1.0 - (p[k] / (p[k] + odds)) ** size[k])
+                    if index_s < best_s:
+                        best, best_s = k, index_s
+            if best < 0:
+                break
+            driven_s += ahead_s[best]
+            here = left * (1.0 - full_now[best])
+            left -= here
+            found[0, car] += here
+            found[1, car] += left
+            found[2, car] += here * (max(driven_s - direct_s[best], 0.0) + inside_s[hour[car], best])
+            found[3, car] += here * walk_s[goal[car], best] * walks[car]
+            expected_free[area[best]] += size[best] * (1.0 - p[best])
+            cost_s[best] = np.inf
+            driven_s += through_s[best]
+            ahead_s = drive_s[best]
+    return found
