@@ -1,5 +1,6 @@
 """The lower bound by information relaxation: it is never above the optimum, and close to it."""
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -13,6 +14,7 @@ from parkenv.lots import grid_lot
 from parkenv.world.occupancy.process import Arrival, OccupancyProcess, World
 from parkenv.world.occupancy.slot_law import SlotLaw
 from parkenv.world.scenario import SearchProblem
+from parkenv.world.tariff import Zone
 from planners.bounds.exact import ExactSolution
 from planners.bounds.exact_changing import ChangingSolution
 from planners.bounds.oracle import best_slot
@@ -128,3 +130,10 @@ def test_it_is_compared_with_agents_and_drives_no_car():
     assert not rows["bound"]["leads"]
     with pytest.raises(InputError, match="bound"):
         SearchBound(make_scenario("mini")).predict({})
+
+
+def test_a_driver_who_may_park_nowhere_gives_up():
+    rules = {"permits": Zone("permits", users=("permit-a",))}
+    lot = dataclasses.replace(grid_lot(1, 4), slot_zone=np.full(4, "permits"), zone_rules=rules)
+    problem = SearchProblem(lot=lot, give_up_s=600.0)
+    assert SearchBound(problem).of_world(StillWorld([False] * 4, np.zeros(4)), 0, 0.0) == 600.0

@@ -91,7 +91,7 @@ class _News(NamedTuple):
 class _World(NamedTuple):
     """A world."""
 
-    told: IntArray  # (n,) what is told of each slot; m: nothing
+    group: IntArray  # (n,) the group of each slot
     free_s: FloatArray  # (n,) s, when each slot is free first that a car can have reached
     cost_s: FloatArray  # (n,) s, arrival cost
 
@@ -113,7 +113,7 @@ class SearchBound:
         require_whole("most_states", most_states, least=1)
         self._problem, self._most_states = problem, most_states
         self._routes = DriveRoutes(problem)
-        self._starts: dict[int, _Start] = {}
+        self._starts: dict[int, _Start | None] = {}
 
     def predict(
         self, observation: Any, state: Any = None, episode_start: Any = None, deterministic: bool = True
@@ -141,16 +141,21 @@ class SearchBound:
         if vertex not in self._starts:
             self._starts[vertex] = self._start(vertex)
         start = self._starts[vertex]
+        if start is None:
+            return self._problem.give_up_s
         after = self._routes.seconds_from(vertex)[start.slots]
         free = world.next_free(start.slots, time) - time
         for i in np.flatnonzero(free < after):
             free[i] = world.next_free(start.slots[i : i + 1], time + after[i])[0] - time
         return self._bound(start, law.take(start.slots), after, free)
 
-    def _start(self, vertex: int) -> _Start:
+    def _start(self, vertex: int) -> _Start | None:
+        """Return the groups of slots for searches from a vertex; None if they can park nowhere."""
         n, cost_s = self._problem.lot.n_slots, self._problem.arrival_cost_s
         total_s = self._routes.seconds_from(vertex)[:n] + cost_s
         order = np.argsort(total_s, kind="stable")[: np.isfinite(total_s).sum()]
+        if not len(order):
+            return None
         slots, others = order[:MOST_SLOTS], order[MOST_SLOTS:]
         apart_s = np.array([self._routes.seconds_from(slot)[slots] for slot in slots])
         apart_s = np.minimum(np.minimum(apart_s, apart_s.T), _FAR_S)
@@ -249,10 +254,10 @@ class SearchBound:
         # Time left at a state if the car goes to a slot that is free from a moment on; no news: infinite
         left_s = np.full((len(ways.earliest_s), len(slot) + 1), np.inf, np.float32)
         left_s[:, :-1] = np.maximum(ways.direct_s[:, slot], from_s - ways.earliest_s[:, None]) + cost_s[slot]
-        world = _World(told[np.arange(len(after)), now], free, cost_s)
+        world = _World(start.group, free, cost_s)
         longest_s = min((PERIODS[-1] + 1.0) * nothing_s, self._problem.give_up_s)
-        value = _values(ways, news, left_s, longest_s)
-        return float(_least_s(ways, news, left_s, value, world, start.beyond_s, self._problem.give_up_s))
+        penalty = _penalties(ways, news, left_s, longest_s, told[np.arange(len(after)), now])
+        return float(_least_s(ways, penalty, world, start.beyond_s, self._problem.give_up_s))
 
 
 def _wait_s(freed: FloatArray, cost_s: FloatArray) -> float:
@@ -304,21 +309,23 @@ def _earliest(
 
 
 @compiled(error_model="numpy")
-def _values(ways: _Ways, news: _News, left_s: NDArray[np.float32], longest_s: float) -> NDArray[np.float32]:
-    """Return about the least expected time, s, from each state if one slot is known, or none, (n_states, m + 1).
+def _penalties(
+    ways: _Ways, news: _News, left_s: NDArray[np.float32], longest_s: float, told: IntArray
+) -> FloatArray:
+    """Return the penalty, s, of each way on from a set, and of what the first state shows, (n_next + 1,).
+
+    `value`, of each state and slot that is known, or none, is about the least expected time from there.
 
     Args:
         ways: the states.
         news: what a car may be told.
         left_s: (n_states, m + 1) s, time left if the car goes to a slot that it was told of; inf for the others.
         longest_s: s, time left where no slot is known and nothing is left to be seen.
+        told: (n,) what is told of each slot in this world.
     """
     m = len(news.slot)
-    value, onward, seen = (
-        np.minimum(left_s, np.float32(longest_s)),
-        np.empty(m + 1),
-        np.empty(m + 1, np.int64),
-    )
+    value = np.minimum(left_s, np.float32(longest_s))
+    penalty, onward, seen = np.empty(len(ways.next_state) + 1), np.empty(m + 1), np.empty(m + 1, np.int64)
     for k in range(len(ways.sets) - 1, -1, -1):
         n_seen = 0
         for j in range(m):
@@ -329,45 +336,43 @@ def _values(ways: _Ways, news: _News, left_s: NDArray[np.float32], longest_s: fl
         n_next = ways.first_next[k + 1] - ways.first_next[k]
         for i in range(n_next):
             y = ways.next_state[ways.first_next[k] + i]
-            order, mean, rest = _mean_value(_set_of(y, ways) & ~ways.sets[k], left_s[y], value[y], news)
+            of_set = _set_of(y, ways)
+            order, mean, rest = _mean_value(of_set & ~ways.sets[k], left_s[y], value[y], news)
             best_s = left_s[y][order]
             for at in range(n_seen + 1):
                 place = np.searchsorted(best_s, left_s[y, seen[at]])
                 onward[at] = mean[place] + rest[place] * value[y, seen[at]]
+            before = _best_told(ways.sets[k], left_s[y], news, told)
+            after = _best_told(of_set, left_s[y], news, told)
+            place = np.searchsorted(best_s, left_s[y, before])
+            penalty[ways.first_next[k] + i] = mean[place] + rest[place] * value[y, before] - value[y, after]
             for x in range(ways.first[k], ways.first[k + 1]):
                 drive = ways.drive_s[ways.first_drive[k] + (x - ways.first[k]) * n_next + i]
                 for at in range(n_seen + 1):
                     value[x, seen[at]] = min(value[x, seen[at]], drive + onward[at])
-    return np.asarray(value)
+    order, mean, rest = _mean_value(ways.sets[0], left_s[0], value[0], news)
+    best = _best_told(ways.sets[0], left_s[0], news, told)
+    penalty[-1] = mean[-1] + rest[-1] * value[0, m] - value[0, best]
+    return penalty
 
 
 @compiled(error_model="numpy")
-def _least_s(
-    ways: _Ways,
-    news: _News,
-    left_s: NDArray[np.float32],
-    value: NDArray[np.float32],
-    world: _World,
-    beyond_s: float,
-    give_up_s: float,
-) -> float:
+def _least_s(ways: _Ways, penalty: FloatArray, world: _World, beyond_s: float, give_up_s: float) -> float:
     """Return the least time of a car that knows the world and pays the penalties.
 
     Args:
         ways: the states.
-        news: what a car may be told.
-        left_s: as in `_values`.
-        value: (n_states, m + 1) s, see there.
+        penalty: s, see `_penalties`.
         world: what the world is.
         beyond_s: s, least time of parking in a slot without a group.
         give_up_s: s, penalty that a car can choose where all groups have been seen.
     """
-    total_s, penalty_s = np.full(len(left_s), np.inf), np.full(len(left_s), np.inf)
+    total_s, penalty_s = np.full(len(ways.earliest_s), np.inf), np.full(len(ways.earliest_s), np.inf)
     every, least = 0, np.inf
-    for group in news.group:
+    for group in world.group:
         every |= 1 << group
     # Before anything is seen, the car is where the first state is.
-    total_s[0] = penalty_s[0] = _penalty_s(0, 0, ways, news, left_s[0], value[0], world.told)
+    total_s[0] = penalty_s[0] = penalty[-1]
     for k in range(len(ways.sets)):
         for x in range(ways.first[k], ways.first[k + 1]):
             least = min(least, beyond_s + penalty_s[x])
@@ -379,36 +384,23 @@ def _least_s(
                     least = min(least, parked_s + world.cost_s[s])
         n_next = ways.first_next[k + 1] - ways.first_next[k]
         for i in range(n_next):
-            y = ways.next_state[ways.first_next[k] + i]
-            penalty = _penalty_s(ways.sets[k], y, ways, news, left_s[y], value[y], world.told)
+            edge = ways.first_next[k] + i
+            y = ways.next_state[edge]
             for x in range(ways.first[k], ways.first[k + 1]):
                 drive = ways.drive_s[ways.first_drive[k] + (x - ways.first[k]) * n_next + i]
-                total_s[y] = min(total_s[y], total_s[x] + drive + penalty)
-                penalty_s[y] = min(penalty_s[y], penalty_s[x] + penalty)
+                total_s[y] = min(total_s[y], total_s[x] + drive + penalty[edge])
+                penalty_s[y] = min(penalty_s[y], penalty_s[x] + penalty[edge])
     return float(least)
 
 
 @compiled(error_model="numpy")
-def _penalty_s(
-    known: int,
-    y: int,
-    ways: _Ways,
-    news: _News,
-    left_s: NDArray[np.float32],
-    value: NDArray[np.float32],
-    told: IntArray,
-) -> float:
-    """Return the penalty, s, at a state for what it shows, where the groups `known` had been seen before."""
-    seen, none = _set_of(y, ways), len(news.slot)
-    before, best = none, none
+def _best_told(known: int, left_s: NDArray[np.float32], news: _News, told: IntArray) -> int:
+    """Return the best of what is told of the slots of known groups: that with the least time left at a state."""
+    best = len(news.slot)
     for s in range(len(told)):
-        if (seen >> news.group[s]) & 1 and left_s[told[s]] < left_s[best]:
+        if (known >> news.group[s]) & 1 and left_s[told[s]] < left_s[best]:
             best = told[s]
-        if (known >> news.group[s]) & 1 and left_s[told[s]] < left_s[before]:
-            before = told[s]
-    order, mean, rest = _mean_value(seen & ~known, left_s, value, news)
-    place = np.searchsorted(left_s[order], left_s[before])
-    return float(mean[place] + rest[place] * value[before] - value[best])
+    return int(best)
 
 
 @compiled(error_model="numpy")
