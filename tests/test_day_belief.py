@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from parkenv.belief import day_belief
-from parkenv.belief.day_belief import DOUBT, DayBelief
+from parkenv.belief.day_belief import DOUBT, EVENT, DayBelief
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.day_error import DayError, nearness
@@ -43,9 +43,8 @@ def test_a_forecast_of_certainty_is_doubted(level, slope):
     np.testing.assert_allclose(known, belief.forecast, atol=1e-6)
 
 
-def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
+def test_it_finds_the_level_of_the_day_from_its_observations():
     """On days drawn from the forecast's own error, P(taken) of what is not observed is right in the mean."""
-    monkeypatch.setattr(day_belief, "EVENTS", {1.0: 1e-12})
     p, near, before = forecast_of(300, level=0.8, slope=0.4)
     rng, error, found, forecast_errors = np.random.default_rng(1), DayError(0.8, 0.4), [], []
     centre = centred_logits(p, error.deviations(near))
@@ -54,7 +53,7 @@ def test_it_finds_the_level_of_the_day_from_its_observations(monkeypatch):
         truth = 1.0 / (1.0 + np.exp(-(centre + level + slope * near)))
         seen = rng.permutation(300)[:100]
         belief = before.update(seen, rng.random(100) < truth[seen])
-        day = DayBelief(before, near)
+        day = DayBelief(before, near, event=0.0)
         day.update(belief.observations)
         rest = np.setdiff1d(np.arange(300), seen)
         found.append((day.p_occupied(belief.time) - truth)[rest])
@@ -102,7 +101,7 @@ def test_sensor_errors_and_repeated_observations_count_for_what_they_say():
     """Against Bayes' rule by enumeration of the states of three slots under each hypothesis."""
     p, near, belief = forecast_of(3, level=1.0)
 
-    weight, p_if = day_belief._hypotheses(p, near, belief.day_error)
+    weight, p_if = day_belief._hypotheses(p, near, belief.day_error, EVENT)
     posterior, day = np.zeros((len(weight), 8)), DayBelief(belief, near)
     states = np.array(list(itertools.product((False, True), repeat=3)))
     for h in range(len(weight)):
@@ -139,14 +138,13 @@ def test_seen_again_at_once_says_nothing_and_after_long_says_as_much_as_another_
     assert moved(1.0, 1e5) > 1.2 * once
 
 
-def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day(monkeypatch):
-    monkeypatch.setattr(day_belief, "EVENTS", {1.0: 1e-12})
+def test_another_part_of_the_lot_starts_with_what_is_known_of_the_day():
     _, near, whole = forecast_of(80)
     seen = whole.update(np.arange(30), np.ones(30, dtype=bool))
     first, second = np.arange(0, 50), np.arange(20, 80)
     at_once, old, new = (
-        DayBelief(whole, near),
-        *(DayBelief(whole.take(part), near[part]) for part in (first, second)),
+        DayBelief(whole, near, event=0.0),
+        *(DayBelief(whole.take(part), near[part], event=0.0) for part in (first, second)),
     )
     at_once.update(seen.observations)
     old.update(seen.take(first).observations)

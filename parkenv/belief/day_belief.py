@@ -30,11 +30,13 @@ LEVELS, SLOPES = 9, 5
 """Numbers of levels and slopes. Searches take as long with 21 levels, within noise, and 1 % longer with five."""
 REACH, FREEDOM = 4.2, 4.0
 """Largest value and degrees of freedom of the t-distribution of levels and slopes, before it is scaled."""
-EVENTS = dict.fromkeys((0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0), 0.08 / 7)
-"""Fraction of the slots, those nearest to the goal, that an event fills -> its probability among very many slots.
+EVENT_SHARES = np.array([0.6, 0.65, 0.7, 0.75, 0.8, 0.9, 1.0])
+"""Fractions of the slots, those nearest to the goal, that an event may fill, equally likely."""
+EVENT = 0.08
+"""Probability of an event among very many slots.
 
-With higher probabilities the car would turn round after fewer taken slots: sooner on the day of an event, and more
-often without need on other days.
+With a higher probability the car turns round after fewer taken slots: sooner on the day of an event, and more often
+without need on other days.
 """
 MEAN_EXCESS, USUAL_EXCESS = 0.09, 0.15
 """Fractions of the slots: by how much occupancy is above its forecast in the mean, where it is; on one day in five.
@@ -71,8 +73,9 @@ class DayBelief:
         rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
             None: there are no such cars.
         hypotheses: about the day: prior weights, (k,), and P(taken) under each, (n_slots, k); None: those above.
-        doubt: probability that the forecast of a slot says nothing about it (`DOUBT`); without effect where the
-            forecast is certain, among rivals, and with hypotheses of the caller.
+        doubt: probability that the forecast of a slot says nothing about it (`DOUBT`).
+        event: probability that an event has filled the slots near the goal (`EVENT`). This and `doubt` are without
+            effect where the forecast is certain, among rivals, and with hypotheses of the caller.
 
     Examples:
         The forecast is 60 % for every slot. The first ten slots are all taken, so P(taken) of the others rises.
@@ -97,28 +100,29 @@ class DayBelief:
         rival_rates: FloatArray | None = None,
         hypotheses: tuple[FloatArray, FloatArray] | None = None,
         doubt: float = 0.0,
+        event: float = EVENT,
     ) -> None:
         forecast = np.clip(belief.forecast.astype(np.float64), _LEAST, _MOST)
         crowded = rival_rates is not None and bool(rival_rates.any())
         # Rivals make slopes and events of their own: with them, days differ by their level only.
-        self._n_events = 0 if certain or crowded or hypotheses is not None else len(EVENTS)
+        self._n_events = 0 if certain or crowded or hypotheses is not None else len(EVENT_SHARES)
         if hypotheses is not None:
             weight, p_taken = hypotheses
         elif certain:
             weight, p_taken = np.ones(1), forecast[:, None]
         elif crowded:
-            weight, p_taken = _hypotheses(forecast, nearness, np.array([belief.day_error[0], 0.0]))
-            weight, p_taken = weight[: -len(EVENTS)], p_taken[:, : -len(EVENTS)]
+            weight, p_taken = _hypotheses(forecast, nearness, np.array([belief.day_error[0], 0.0]), EVENT)
+            weight, p_taken = weight[: -len(EVENT_SHARES)], p_taken[:, : -len(EVENT_SHARES)]
             weight = weight / weight.sum()
         else:
             doubted = forecast + doubt * (0.5 - forecast)
-            weight, p_taken = _hypotheses(doubted, nearness, belief.day_error)
+            weight, p_taken = _hypotheses(doubted, nearness, belief.day_error, event)
         if rival_rates is not None and crowded:
             # Free at the rate μ, taken at λ, and by rivals at r: P(free) = μ/(λ+μ+r)
             leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
             gone = np.divide(rival_rates, leaving, out=np.zeros(len(leaving)), where=leaving > 0.0)
             p_taken = 1.0 - 1.0 / (1.0 / (1.0 - p_taken) + gone[:, None])
-        self._log_weight, self._p_taken = np.log(weight), p_taken
+        self._log_weight, self._p_taken = np.log(np.maximum(weight, 1e-300)), p_taken
         self._forecast, self._decay_rate = (
             belief.forecast.astype(np.float64),
             belief.decay_rate.astype(np.float64),
@@ -180,7 +184,7 @@ class DayBelief:
 
 
 def _hypotheses(
-    forecast: FloatArray, nearness: FloatArray, day_error: NDArray[np.floating]
+    forecast: FloatArray, nearness: FloatArray, day_error: NDArray[np.floating], event: float
 ) -> tuple[FloatArray, FloatArray]:
     """Return prior weights, (k,), and P(taken), (n_slots, k), of the hypotheses about the day.
 
@@ -188,10 +192,10 @@ def _hypotheses(
     """
     error = DayError(*(float(e) for e in day_error))
     n = len(forecast)
-    within = np.argsort(np.argsort(-nearness))[:, None] < n * np.array(list(EVENTS))
+    within = np.argsort(np.argsort(-nearness))[:, None] < n * EVENT_SHARES
     filled = (1.0 - forecast) @ within / n
     rarer = np.exp(-np.maximum(filled - USUAL_EXCESS, 0.0) / MEAN_EXCESS)
-    event_weight = np.array(list(EVENTS.values())) * n / (n + HALF_EVENTS_AT) * rarer
+    event_weight = event / len(EVENT_SHARES) * n / (n + HALF_EVENTS_AT) * rarer
     at_event = np.maximum(forecast, P_TAKEN_AT_EVENT)
     share = within @ event_weight
     usual = np.maximum((forecast - share * at_event) / (1.0 - share), 0.5 * forecast)

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.day_belief import DOUBT, DayBelief
+from parkenv.belief.day_belief import DOUBT, EVENT, DayBelief
 from parkenv.belief.slot_belief import UNOBSERVED, Observations, SlotBelief
 from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.errors import require_number
@@ -121,10 +121,12 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             that learns from trips; it is in proportion to p(1 - p). A slot that nothing later on the path can beat is
             taken all the same.
         doubt: probability that the forecast of a slot says nothing about it, if the day is learned; 0 to 1.
+        event: probability that an event has filled the slots near the goal, if the day is learned; 0 to 0.9. It is
+            lower in small lots, and where the forecast has many of these slots free.
 
     Raises:
-        InputError: the budget is not positive, `explore` is negative, `doubt` or `most_vertices` is out of range, or
-            no slot can be observed.
+        InputError: the budget is not positive, `explore` is negative, `doubt`, `event` or `most_vertices` is out of
+            range, or no slot can be observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -137,13 +139,15 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         most_vertices: int = MOST_VERTICES,
         explore: float = 0.0,
         doubt: float = DOUBT,
+        event: float = EVENT,
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
         require_number("budget_ms", budget_ms, above=0.0)
         require_number("explore", explore, least=0.0)
         require_number("doubt", doubt, least=0.0, most=1.0)
-        self._explore, self._doubt = explore, doubt
+        require_number("event", event, least=0.0, most=0.9)
+        self._explore, self._doubt, self._event = explore, doubt, event
         self._day = day
         self._nearness = nearness(self.problem.walk_s)
         self._worth_passing_s = WORTH_PASSING_S if day else 0.0
@@ -197,6 +201,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             certain=not self._day,
             rival_rates=None if rival_rates is None else rival_rates[slots],
             doubt=self._doubt,
+            event=self._event,
         )
 
     def _rival_rates(self, belief: SlotBelief, arrival_s: float) -> FloatArray | None:
