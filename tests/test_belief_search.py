@@ -81,7 +81,7 @@ def choices(scenario, monkeypatch, seed=1, **options):
 
     def noted(*arguments):
         choice = best_path(*arguments)
-        made.append((arguments[3], choice))
+        made.append((arguments[4], choice))
         return choice
 
     monkeypatch.setattr("planners.belief.agent.best_path", noted)
@@ -120,6 +120,28 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ah
     _, _, high = mean_interval(ours - theirs)
     assert high < -ahead_s
     assert ours.mean() < mean_s
+
+
+def test_it_looks_at_all_of_a_full_lot_again_and_again():
+    """Among slots that differ a little it must not drive to and fro between the likeliest ones."""
+    lot = grid_lot(4, 30)
+    n = lot.n_slots
+    taken = OccupancyProcess.from_demand(np.full(n, 25.0), np.zeros(168), 1e9)
+    logits = np.random.default_rng(0).normal(1.5, 1.0, n)
+    forecast = OccupancyProcess.from_demand(logits, np.zeros(168), 3600.0)
+    scenario = Scenario(name="full", lot=lot, occupancy=taken, prior=forecast)
+    env, agent, memory = (
+        gym.make("parkenv/Search-v2", scenario=scenario),
+        make_agent("belief", scenario),
+        None,
+    )
+    observation, _ = env.reset(seed=0)
+    path = []
+    for _ in range(600):
+        action, memory = agent.predict(observation, memory)
+        observation, *_ = env.step(action)
+        path.append(int(observation["vertex"]))
+    assert min(len(set(path[i : i + 150])) for i in (150, 300, 450)) > 80
 
 
 def test_knowing_the_day_helps_the_planner_of_the_thesis_too():

@@ -68,6 +68,7 @@ class BeliefSearch:
     news_at: float
     # (k,) int64, the vertices that the path of the last decision passes first; up to `DEPTH`
     targets: IntArray
+    heading: int  # without these, the slot that the path drives to first; -1: it has just been observed
     paths: PathBuffers  # buffers of the path search
     # what was observed before this decision, step by step; empty if the part is the whole lot
     past: list[Observations]
@@ -102,13 +103,14 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
 
     **Where it does not.** If the forecast is right, the thesis's planner with a failure cost tuned to the forecast is
     as close to the best path as this one. Allowing for forecast errors costs a little time on such days. If an event
-    has filled a lot against the forecast, drivers who take the first free slot still do better. Each path is evaluated
-    on its own, without the option to change to another path after an observation. Estimates depend on the position of
-    the car, so it could alternate between two paths for ever; until it observes something new, it therefore keeps its
-    path unless another one is better than the time that this path was expected to take, or that time is over. Another
-    look at a slot that is still taken is not new: the path counted on it. If a sensor misses slots, a
-    slot that was in view and not detected is observed again only from vertices where a detection is more likely than
-    not. A slot that is not detected from its own vertex either is attempted.
+    has filled a lot against the forecast, drivers who take the first free slot still do better. Each path is
+    evaluated on its own, without the option to change to another path after an observation. Estimates depend on the
+    position of the car, so it could alternate between two paths for ever; until it observes something new, it
+    therefore keeps its path, and the slot that it drives to, unless another one is better than the time that this
+    path was expected to take, or that time is over. Another look at a slot that is still taken is not new: the path
+    counted on it. If a sensor misses slots, a slot that was in view and not detected is observed again only from
+    vertices where a detection is more likely than not. A slot that is not detected from its own vertex either is
+    attempted.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -188,6 +190,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             time=belief.time,
             news_at=belief.time,
             targets=np.zeros(0, dtype=np.int64),
+            heading=-1,
             paths=path_buffers(len(FAILURE_COSTS) + 1, n, len(near.vertices)),
             past=[],
         )
@@ -246,8 +249,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         if len(first):
             memory.news_at = belief.time
         if (state != memory.state).any():
-            memory.remaining_s = math.inf
+            memory.remaining_s, memory.heading = math.inf, -1
         memory.state = state
+        if memory.heading in known.observations.slots:
+            memory.heading = -1
         here = near.index(vertex)
         if belief.time > memory.time:
             memory.day.update(known.observations)
@@ -269,6 +274,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         choice = best_path(
             here,
             memory.targets,
+            memory.heading,
             memory.failure_s,
             memory.remaining_s,
             self._budget,
@@ -278,7 +284,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         )
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
         memory.replans += not (kept or math.isnan(memory.failure_s))
-        memory.targets, memory.failure_s = choice.targets, choice.failure_s
+        memory.targets, memory.heading, memory.failure_s = choice.targets, choice.heading, choice.failure_s
         # A path that has had its time is given up for a new plan.
         memory.remaining_s = choice.remaining_s if choice.remaining_s > 0.0 else math.inf
         memory.expected_s = min(choice.onward_s, choice.at_hand_s)

@@ -43,6 +43,7 @@ class PathChoice(NamedTuple):
     slot: int  # that slot, or -1
     next_vertex: int  # the next vertex on the path, `ATTEMPT` or `NOWHERE`
     targets: IntArray  # (k,) int64, the vertices to pass before the path follows the thesis's planner
+    heading: int  # without targets, the slot that the path drives to first; else -1
     failure_s: float  # s, failure cost of that planner on it
     work: int  # evaluation steps spent on inserting targets; exceeds the budget by one candidate at most
 
@@ -67,6 +68,7 @@ class Candidate(NamedTuple):
 def best_path(
     vertex: int,
     targets: IntArray,
+    heading: int,
     failure_s: float,
     remaining_s: float,
     budget: Budget,
@@ -82,6 +84,7 @@ def best_path(
     Args:
         vertex: where the car is.
         targets: (k,) int64, targets of the last decision's path.
+        heading: the slot that it was driving to, if it had none; -1: to one that was observed since.
         failure_s: s, failure cost of the last decision's path.
         remaining_s: s, time expected to remain on that path, or inf if something was observed since. The path is kept
             unless another is better than this: estimates depend on the position of the car, so it could turn round for
@@ -94,7 +97,7 @@ def best_path(
     # Nearest vertices first: with a small budget they matter most for the next step.
     order = np.argsort(graph.drive_s[vertex], kind="stable")
     return PathChoice(
-        *_best_path(vertex, targets, failure_s, remaining_s, budget, order, graph, belief, paths)
+        *_best_path(vertex, targets, heading, failure_s, remaining_s, budget, order, graph, belief, paths)
     )
 
 
@@ -107,6 +110,7 @@ def is_compiled() -> bool:
 def _best_path(
     vertex: int,
     targets: IntArray,
+    heading: int,
     failure_s: float,
     remaining_s: float,
     budget: Budget,
@@ -114,7 +118,7 @@ def _best_path(
     graph: PlanningGraph,
     belief: BeliefSnapshot,
     paths: PathBuffers,
-) -> tuple[float, float, float, int, int, IntArray, float, int]:
+) -> tuple[float, float, float, int, int, IntArray, int, float, int]:
     """Return the fields of `PathChoice`."""
     costs = budget.failure_costs
     plans = _plans(vertex, failure_s, costs, graph, belief, paths)
@@ -129,7 +133,8 @@ def _best_path(
     if len(targets) and targets[0] == vertex and not is_worth_an_attempt(vertex, 0.0, -1.0, graph, belief):
         targets = targets[1:]
     path = _path_at(len(costs), paths)
-    n_stops, left_s = rollout_path(vertex, targets, failure_s, graph, belief, path)
+    n_stops, left_s = rollout_path(vertex, targets, heading, failure_s, graph, belief, path)
+    heading = path.stops[1].target
     best = _evaluate(vertex, n_stops, left_s, remaining_s, options, fallback_s, graph, belief, path)
     chosen = path
     # The known free slots make the others better, too, so from there on these cannot become the best.
@@ -139,9 +144,10 @@ def _best_path(
             vertex, plans.n_stops[c], plans.left_s[c], np.inf, options, fallback_s, graph, belief, plan
         )
         if found.onward_s < best.onward_s - _ROUNDING_S:
-            best, targets, failure_s, chosen, n_stops = (
+            best, targets, heading, failure_s, chosen, n_stops = (
                 found,
                 targets[:0],
+                plan.stops[1].target,
                 costs[c],
                 plan,
                 plans.n_stops[c],
@@ -149,7 +155,7 @@ def _best_path(
         plans.search_s[c] = np.inf
         c = _least(plans.search_s)
     if best.onward_s == np.inf:
-        return np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], failure_s, 0
+        return np.inf, np.inf, at_hand_s, slot, NOWHERE, targets[:0], -1, failure_s, 0
 
     work = 0
     for _ in range(budget.depth - len(targets)):
@@ -174,8 +180,20 @@ def _best_path(
         if len(targets) == n_before:
             break
         chosen = path
-        n_stops, _ = rollout_path(vertex, targets, failure_s, graph, belief, path)
-    return best.onward_s, best.remaining_s, at_hand_s, slot, best.next_vertex, targets, failure_s, work
+        n_stops, _ = rollout_path(vertex, targets, -1, failure_s, graph, belief, path)
+    if len(targets):
+        heading = -1
+    return (
+        best.onward_s,
+        best.remaining_s,
+        at_hand_s,
+        slot,
+        best.next_vertex,
+        targets,
+        heading,
+        failure_s,
+        work,
+    )
 
 
 def action_values(
@@ -215,7 +233,7 @@ def _action_values(
     values, path = np.full(len(following), np.inf), _path_at(0, paths)
     search_s, no_options, no_fallback_s = np.inf, np.empty(0, np.int64), np.zeros(len(belief.slots))
     for cost in failure_costs:
-        n_stops, left_s = rollout_path(vertex, no_options, cost, graph, belief, path)
+        n_stops, left_s = rollout_path(vertex, no_options, -1, cost, graph, belief, path)
         found = _evaluate(vertex, n_stops, left_s, np.inf, no_options, no_fallback_s, graph, belief, path)
         search_s = min(search_s, found.onward_s)
     options, fallback_s = _options_and_fallbacks(vertex, search_s, graph, belief)
@@ -227,7 +245,7 @@ def _action_values(
             )
             values[i] = min(values[i], move_s + value)
         for cost in failure_costs:
-            n_stops, left_s = rollout_path(vertex, target, cost, graph, belief, path)
+            n_stops, left_s = rollout_path(vertex, target, -1, cost, graph, belief, path)
             found = _evaluate(vertex, n_stops, left_s, np.inf, options, fallback_s, graph, belief, path)
             if found.next_vertex == following[i]:
                 values[i] = min(values[i], found.onward_s)
@@ -290,7 +308,7 @@ def _plan(
 ) -> float:
     """Roll out and evaluate the path of one failure cost; return its expected time, s."""
     path = _path_at(c, paths)
-    n_stops, left_s = rollout_path(vertex, np.empty(0, np.int64), costs[c], graph, belief, path)
+    n_stops, left_s = rollout_path(vertex, np.empty(0, np.int64), -1, costs[c], graph, belief, path)
     plans.n_stops[c], plans.left_s[c] = n_stops, left_s
     for other in range(len(costs)):
         if (
@@ -359,7 +377,7 @@ def _insert_target(
             ):
                 continue
             trial[place] = u
-            n_stops, left_s = rollout_path(vertex, trial, failure_s, graph, belief, path)
+            n_stops, left_s = rollout_path(vertex, trial, -1, failure_s, graph, belief, path)
             work += 30 * (n_stops + path.stops[n_stops].first) + len(belief.slots)
             found = _evaluate(vertex, n_stops, left_s, np.inf, options, fallback_s, graph, belief, path)
             if found.onward_s < best.onward_s - _IMPROVEMENT_S:

@@ -34,6 +34,7 @@ OBSERVE_AGAIN_S = 10.0
 def rollout_path(
     vertex: int,
     targets: IntArray,
+    heading: int,
     failure_s: float,
     graph: PlanningGraph,
     belief: BeliefSnapshot,
@@ -46,6 +47,7 @@ def rollout_path(
     Args:
         vertex: where the car is.
         targets: (k,) int64, vertices to pass first, in order.
+        heading: without targets, the slot that the plan drives to first; -1: it has to choose one.
         failure_s: s, failure cost of the thesis's planner.
         graph: the lot.
         belief: the belief.
@@ -68,7 +70,7 @@ def rollout_path(
             n_unproven += 1
     stops[0].vertex, stops[0].time, stops[0].first, stops[1].first = vertex, 0.0, 0, 0
     k, n_observations, time, n_passed = 0, 0, 0.0, 0
-    choose, target = True, -1
+    choose, target = heading < 0, heading
     reset_weights(belief, path)
     weights = path.weights[: len(belief.weights)]
     while k + 3 < len(stops) and n_observations < len(observations):
@@ -91,7 +93,7 @@ def rollout_path(
             time += graph.drive_s[vertex, following]
             vertex = following
         k += 1
-        stops[k].vertex, stops[k].time = vertex, time
+        stops[k].vertex, stops[k].time, stops[k].target = vertex, time, target
         # Observations from here, and the result of an attempt if they do not show the target.
         n_views = graph.view_starts[vertex + 1] - graph.view_starts[vertex]
         for i in range(n_views + 1):
@@ -146,6 +148,7 @@ def rollout_path(
                 return k + 1, graph.give_up_s
             if k == 1:
                 stops[1].vertex, stops[1].time, stops[2].first = stops[0].vertex, graph.wait_s, 0
+                stops[1].target = -1
                 return 2, spared_s
             return k, spared_s
     # Half of the path is representative of what follows if at least as many slots are still unobserved.

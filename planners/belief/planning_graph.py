@@ -57,6 +57,7 @@ STOP = np.dtype(
     [
         ("vertex", np.int64),
         ("time", np.float64),
+        ("target", np.int64),  # the vertex that the car was driving to
         ("first", np.int64),  # index of its first observation; the last precedes the next stop's first
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
         ("stop_s", np.float64),  # scratch: expected time of driving to the best slot that is known now
