@@ -4,7 +4,7 @@ from dataclasses import fields
 
 import numpy as np
 
-from parkenv import Lane, ParkingLot, SensorModel
+from parkenv import Lane, OccupancyProcess, ParkingLot, Scenario, SensorModel
 from parkenv.lots import grid_lot
 from parkenv.world.scenario import SearchProblem
 
@@ -76,3 +76,12 @@ def cut_in_two():
             "goals": west.goals + shift,
         }
     )
+
+
+def full_lot(lot):
+    """A scenario in which all slots are taken for good, and forecast to be free now and then, some more than others."""
+    n = lot.n_slots
+    taken = OccupancyProcess.from_demand(np.full(n, 25.0), np.zeros(168), 1e9)
+    logits = np.random.default_rng(0).normal(1.5, 1.0, n)
+    forecast = OccupancyProcess.from_demand(logits, np.zeros(168), 3600.0)
+    return Scenario(name="full", lot=lot, occupancy=taken, prior=forecast)

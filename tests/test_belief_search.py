@@ -3,7 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
-from small_lots import cut_in_two, features, small_lot
+from small_lots import cut_in_two, features, full_lot, small_lot
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel, make_scenario
 from parkenv.lots import grid_lot
@@ -124,12 +124,7 @@ def test_it_beats_the_planner_of_the_thesis_where_its_map_is_wrong(day_error, ah
 
 def test_it_looks_at_all_of_a_full_lot_again_and_again():
     """Among slots that differ a little it must not drive to and fro between the likeliest ones."""
-    lot = grid_lot(4, 30)
-    n = lot.n_slots
-    taken = OccupancyProcess.from_demand(np.full(n, 25.0), np.zeros(168), 1e9)
-    logits = np.random.default_rng(0).normal(1.5, 1.0, n)
-    forecast = OccupancyProcess.from_demand(logits, np.zeros(168), 3600.0)
-    scenario = Scenario(name="full", lot=lot, occupancy=taken, prior=forecast)
+    scenario = full_lot(grid_lot(4, 30))
     env, agent, memory = (
         gym.make("parkenv/Search-v2", scenario=scenario),
         make_agent("belief", scenario),

@@ -6,6 +6,7 @@ import json
 import gymnasium as gym
 import numpy as np
 import pytest
+from small_lots import full_lot
 
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.errors import InputError
@@ -277,3 +278,10 @@ def test_trainings_are_repeatable_and_learn(tmp_path):
     assert (tmp_path / "0" / MODEL).stat().st_mtime_ns == before
     with pytest.raises(InputError, match="steps is 0"):
         training.spec.changed(steps=0)
+
+
+def test_it_does_not_prove_a_full_lot_full():
+    """To see the last slot taken ends a search with the penalty; until then a car may leave."""
+    scenario = make_scenario(full_lot(grid_lot(2, 20)), day_error=0.8)
+    env = gym.make("parkenv/Search-v2", scenario=scenario, max_episode_steps=200)
+    assert simulate(env, make_agent("network", scenario), 0).truncated

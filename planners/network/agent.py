@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.belief.slot_belief import SlotBelief
+from parkenv.belief.slot_belief import OBSERVED_FREE, UNOBSERVED, SlotBelief
 from parkenv.compiled.arrays import FloatArray
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
@@ -23,6 +23,9 @@ from planners.network.policy import SHIPPED, NetworkPolicy
 
 CIRCLING = 0.1
 """Penalty of an action, in time scales, for each visit of its end since something new was observed."""
+
+HARDLY_ANY = 0.1
+"""Expected number of free slots among those that were not observed, below which `belief` drives."""
 
 
 @dataclass
@@ -55,7 +58,8 @@ class NetworkAgent(BeliefAgent):
     slots, and turning the map changes nothing.
 
     **Limits.** It cannot be better than its tokens: what happens beyond the eight best slots is known to it only
-    through the look-ahead. A network does not explain itself.
+    through the look-ahead. In a full lot it goes round in circles, or looks at the last slot and so proves the lot
+    full: where hardly a free slot is left to be found, `belief` drives. A network does not explain itself.
 
     Args:
         problem: lot, goal, speeds and costs.
@@ -109,8 +113,13 @@ class NetworkAgent(BeliefAgent):
     def _follow_best_path(
         self, vertex: int, here: int, known: SlotBelief, memory: BeliefSearch
     ) -> int | None:
-        """Return the action with the best score."""
+        """Return the action with the best score; that of `belief` where hardly a free slot is left to be found."""
         assert isinstance(memory, NetworkSearch)
+        if memory.near.whole and not (memory.state == OBSERVED_FREE).any():
+            p_free = 1.0 - memory.day.p_occupied(known.time)
+            if p_free[memory.state == UNOBSERVED].sum() < HARDLY_ANY:
+                memory.previous = vertex
+                return super()._follow_best_path(vertex, here, known, memory)
         self.last_features = self.features(vertex, here, known, memory)
         self.last_scores = self.policy.scores(self.last_features) - self._circling(vertex, here, memory)
         memory.visited_at[here] = memory.time
