@@ -13,6 +13,7 @@ from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.world.lot import PARK
 from planners import make_agent
+from planners.belief.agent import Crowd
 from planners.belief.rivals import PASSED, _take_rates
 
 
@@ -74,6 +75,19 @@ def test_where_slots_vanish_it_prefers_the_free_slot_at_hand_to_a_better_one_fur
     crowded, _ = make_agent("belief-rivals", scenario, arrivals_per_hour=20_000).predict(observation)
     assert calm != PARK
     assert crowded == PARK
+    cars = np.zeros((2, scenario.lot.n_vertices), np.int8)
+    for in_view in (0, 100):
+        cars[0, here] = in_view
+        learned, _ = make_agent("belief-rivals", scenario).predict({**observation, "cars": cars})
+        assert (learned == PARK) == (in_view > 0), "whoever meets many cars reckons with many"
+
+
+def test_a_car_is_met_when_it_comes_into_view_and_not_while_it_stays_there():
+    crowd = Crowd(8 * 3600.0)
+    assert crowd.after({}) == crowd, "cars are not observed"
+    for in_view, met in ((0, 0), (1, 1), (1, 1), (2, 2), (0, 2), (1, 3)):
+        crowd = crowd.after({"cars": np.array([[0, in_view], [0, 0]], np.int8)})
+        assert crowd.met == met
 
 
 def test_rivals_take_the_best_slots_first_and_all_find_one():
@@ -145,3 +159,6 @@ def test_an_experiment_tells_it_the_demand():
     for name, rate in (("belief-rivals", 120.0), ("belief-rivals(arrivals_per_hour=30)", 30.0)):
         _, (agent, _) = its.fleet(Setting("mini", AgentSpec.of(name), "own", 0.0, 120.0))
         assert agent.arrivals_per_hour == rate
+    sighted = its.changed(sees_cars=True)
+    _, (agent, _) = sighted.fleet(Setting("mini", AgentSpec.of("belief-rivals"), "own", 0.0, 120.0))
+    assert agent.arrivals_per_hour is None, "it counts the cars that it meets"

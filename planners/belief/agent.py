@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,13 +51,28 @@ STALE_S = 60.0  # s without a newly observed slot after which the search moves o
 PREVIEW_S = 60.0  # s, horizon of the plan preview
 
 
+class Crowd(NamedTuple):
+    """When a driver came, and what it has seen of other searching cars."""
+
+    arrival_s: float  # s since Monday 00:00, when the search began
+    in_view: int = 0  # number of cars in view at the last decision
+    met: int = 0  # number of times that one has come into view
+
+    def after(self, observation: Observation) -> Crowd:
+        """Return what it has seen after one more observation."""
+        if "cars" not in observation:
+            return self
+        in_view = int(observation["cars"][0].sum())
+        return Crowd(self.arrival_s, in_view, self.met + max(in_view - self.in_view, 0))
+
+
 @dataclass
 class BeliefSearch:
     """Memory of an episode."""
 
     # the part of the lot that is planned for. The arrays below cover its slots, in its numbering.
     near: Neighborhood
-    arrival_s: float  # s since Monday 00:00, when the search began
+    crowd: Crowd
     n_unobserved: int  # number of its slots that were unobserved when it was chosen
     day: DayBelief  # belief about the day and, given the day, about the slots
     state: NDArray[np.int8]  # (n_slots,) int8, `SlotBelief.state` at the last decision
@@ -166,25 +181,26 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             belief: any belief about the lot.
         """
         near = self._neighborhoods.toward(int(self.problem.lot.entry_vertices[0]))
-        memory = self._search_of(near, belief, 0.0)
+        memory = self._search_of(near, belief, Crowd(0.0))
         self._follow_best_path(int(near.vertices[0]), 0, belief.take(near.slots), memory)
 
     def begin(self, observation: Observation, belief: SlotBelief) -> BeliefSearch:
         """Choose the part of the lot to search."""
         vertex = int(observation["vertex"])
-        memory = self._search_of(self._neighborhoods.toward(vertex), belief, float(observation["time"][0]))
+        crowd = Crowd(float(observation["time"][0])).after(observation)
+        memory = self._search_of(self._neighborhoods.toward(vertex), belief, crowd)
         memory.time = -1.0
         if memory.near.index(vertex) < 0:
             memory.entry = memory.near.entry
         return memory
 
-    def _search_of(self, near: Neighborhood, belief: SlotBelief, arrival_s: float) -> BeliefSearch:
+    def _search_of(self, near: Neighborhood, belief: SlotBelief, crowd: Crowd) -> BeliefSearch:
         n = near.n_slots
         return BeliefSearch(
             near=near,
             n_unobserved=n,
-            arrival_s=arrival_s,
-            day=self._day_belief(near, belief, arrival_s),
+            crowd=crowd,
+            day=self._day_belief(near, belief, crowd),
             state=np.full(n, UNOBSERVED, dtype=np.int8),
             missed_rate=np.zeros(n),
             time=belief.time,
@@ -195,9 +211,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             past=[],
         )
 
-    def _day_belief(self, near: Neighborhood, belief: SlotBelief, arrival_s: float) -> DayBelief:
+    def _day_belief(self, near: Neighborhood, belief: SlotBelief, crowd: Crowd) -> DayBelief:
         """Return the belief about the day and the slots of a part before its observations, at an arrival."""
-        slots, rival_rates = near.slots, self._rival_rates(belief, arrival_s)
+        slots, rival_rates = near.slots, self._rival_rates(belief, crowd)
         return DayBelief(
             belief.take(slots),
             self._nearness[slots],
@@ -207,9 +223,9 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             event=self._event,
         )
 
-    def _rival_rates(self, belief: SlotBelief, arrival_s: float) -> FloatArray | None:
+    def _rival_rates(self, belief: SlotBelief, crowd: Crowd) -> FloatArray | None:
         """Return the rates at which rivals take each slot, (n_slots,) 1/s; None without rivals."""
-        del belief, arrival_s
+        del belief, crowd
         return None
 
     def _planning_graph(self, memory: BeliefSearch) -> PlanningGraph:
@@ -303,7 +319,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         """Change the planned part of the lot to the one around the car; keep what is known about it."""
         old = memory.near
         near = self._neighborhoods.around(vertex, np.flatnonzero(belief.observed_taken))
-        new = self._search_of(near, belief, memory.arrival_s)
+        new = self._search_of(near, belief, memory.crowd)
         _, ours, theirs = np.intersect1d(old.slots, near.slots, assume_unique=True, return_indices=True)
         new.missed_rate[theirs] = memory.missed_rate[ours]
         new.day.carry_over(memory.day, theirs, ours)

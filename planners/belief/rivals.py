@@ -4,6 +4,9 @@
 what the car ahead has left, and nobody looks where cars leave meanwhile. So every driver has numbers of its own, drawn
 from its time of arrival: a taste for places that are nearly as good, and how many rivals it reckons with.
 
+**How many** there are it is told, or infers from the cars that it meets. Slots do not tell: where all think that nobody
+else is searching, those behind the entry stay free, and everybody is the surer of it.
+
 **Rivals.** Each passes the free slots in the order of the total time from the entry to the goal, and takes each with
 the same probability. So the best slots are taken most of the time, whatever the forecast says, and are gone soon where
 they are free; slots that are out of the way keep their forecast.
@@ -24,7 +27,7 @@ from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
-from planners.belief.agent import BeliefAgent, BeliefSearch
+from planners.belief.agent import BeliefAgent, BeliefSearch, Crowd
 from planners.belief.planning_graph import PlanningGraph
 from planners.neighborhood import MOST_VERTICES
 
@@ -35,6 +38,13 @@ IN_VAIN_S = 90.0
 
 With rivals in mind a driver leaves the best slots to others. If all do so and the lot is full, nobody finds what is
 left there.
+"""
+MET_S = 20.0
+"""A driver that has met n cars reckons with n / `MET_S` rivals a second: of 160 an hour, 39 % meet one within 15 s."""
+ROOM = 2.0
+"""All rivals are reckoned with if at least so many times as many arrive as can park in the slots free by forecast.
+
+The fewer there are, the smaller a part of them: with room for all, it helps nobody to leave the best slots to them.
 """
 TASTE_S, TASTE_M = 8.0, 40.0
 """A driver's taste: s by which it finds a place better or worse than it is at most; m from one best place to the next.
@@ -47,12 +57,12 @@ class BeliefRivalsAgent(BeliefAgent):
     """`belief-rivals`: `belief`, which expects that rivals take free slots, the best ones first.
 
     A driver reckons with 0 to 2 times as many rivals as arrive, evenly: some head for the best slots, others stop soon.
-    After `IN_VAIN_S` of search it reckons with none. Their number is not learned from the slots that are observed:
-    those near the entry are free however many rivals want the best ones, and would soon prove that there are none.
+    After `IN_VAIN_S` of search it reckons with none.
 
     Args:
         problem: lot, goal, speeds and costs.
-        arrivals_per_hour: rivals an hour; None: not known, then the driver has its taste only. With 0 the agent is
+        arrivals_per_hour: rivals an hour; None: not known, then it learns them from the other cars in view, if they are
+            observed (`sees_cars` of `parkenv.engine.fleet.Fleet`), and else has its taste only. With 0 the agent is
             `belief`, action for action.
         budget_ms: see `belief`.
         day: see `belief`.
@@ -88,29 +98,37 @@ class BeliefRivalsAgent(BeliefAgent):
         if self.arrivals_per_hour == 0.0:
             return graph
         # A wave over the lot, of random direction and phase.
-        _, *angles = 2.0 * np.pi * own_numbers(memory.arrival_s)
+        _, *angles = 2.0 * np.pi * own_numbers(memory.crowd.arrival_s)
         heading, phase = angles
         along_m = self.problem.lot.vertex_xy[memory.near.slots] @ [math.cos(heading), math.sin(heading)]
         taste_s = TASTE_S * np.cos(2.0 * np.pi / TASTE_M * along_m + phase)
         return graph._replace(cost_s=graph.cost_s + taste_s)
 
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
-        """Begin again with what was observed, but without rivals, after a long search; then decide as `belief`."""
-        if memory.time <= IN_VAIN_S < belief.time:
-            memory.day = self._day_belief(memory.near, belief, memory.arrival_s)
+        """Decide as `belief`; when another car is met, and after a long search, first infer the day anew."""
+        crowd = memory.crowd.after(observation)
+        learns = self.arrivals_per_hour is None and crowd.met != memory.crowd.met
+        memory.crowd = crowd
+        if learns or memory.time <= IN_VAIN_S < belief.time:
+            memory.day = self._day_belief(memory.near, belief, crowd)
             for observations in memory.past:
                 memory.day.update(observations.take(memory.near.slots))
         if memory.near.whole:
             memory.past.append(belief.observations)
         return super().decide(observation, belief, memory)
 
-    def _rival_rates(self, belief: SlotBelief, arrival_s: float) -> FloatArray:
+    def _rival_rates(self, belief: SlotBelief, crowd: Crowd) -> FloatArray:
         forecast = belief.forecast.astype(np.float64)
         leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
-        per_s = 2.0 * own_numbers(arrival_s)[0] * (self.arrivals_per_hour or 0.0) / 3600.0
         if belief.time > IN_VAIN_S:
             per_s = 0.0
-        return np.asarray(_take_rates(1.0 - forecast, leaving, self._order, per_s, PASSED))
+        elif self.arrivals_per_hour is not None:
+            per_s = self.arrivals_per_hour / 3600.0
+        else:
+            per_s = crowd.met / MET_S
+        per_s *= min(1.0, per_s / max(ROOM * float((1.0 - forecast) @ leaving), 1e-12))
+        number = 2.0 * own_numbers(crowd.arrival_s)[0]
+        return np.asarray(_take_rates(1.0 - forecast, leaving, self._order, number * per_s, PASSED))
 
 
 def own_numbers(arrival_s: float) -> FloatArray:

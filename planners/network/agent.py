@@ -14,7 +14,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
-from planners.belief.agent import BeliefAgent, BeliefSearch, snapshot
+from planners.belief.agent import BeliefAgent, BeliefSearch, Crowd, snapshot
 from planners.belief.planning_graph import MOST_HYPOTHESES, PlanningGraph
 from planners.neighborhood import MOST_VERTICES, Neighborhood
 from planners.network.features import FAILURE_COSTS, PARKING, WAITING, Features, Situation, observe
@@ -87,8 +87,8 @@ class NetworkAgent(BeliefAgent):
         # Copies: the lot's arrays are read-only, for which numba would compile every function again.
         self._neighbors, self._move_s = self.problem.lot.neighbors.copy(), self.problem.move_cost_s.copy()
 
-    def _search_of(self, near: Neighborhood, belief: SlotBelief, arrival_s: float) -> NetworkSearch:
-        base = super()._search_of(near, belief, arrival_s)
+    def _search_of(self, near: Neighborhood, belief: SlotBelief, crowd: Crowd) -> NetworkSearch:
+        base = super()._search_of(near, belief, crowd)
         n = len(near.vertices)
         return NetworkSearch(
             **vars(base),

@@ -88,13 +88,14 @@ def guided_fleet(
         scenario: the lot.
         demand: who comes.
         guidance: what members know, one of `KNOWLEDGE`, and their share of the cars.
-        arrivals_per_hour: see `policy_of`.
+        arrivals_per_hour: see `policy_of`; cars that see others count them instead.
         options: of `Fleet`.
 
     Raises:
         InputError: see `policy_of`.
     """
-    policy, agent = policy_of(spec, scenario, arrivals_per_hour)
+    told = None if options.get("sees_cars") else arrivals_per_hour
+    policy, agent = policy_of(spec, scenario, told)
     knows, share = guidance
     kinds = [DriverKind(share, policy, knows, shares=knows == "shared"), DriverKind(1.0 - share, policy)]
     return Fleet(scenario, demand, drivers=kinds, leave_full_lot=False, **options), agent

@@ -154,7 +154,8 @@ class FleetStudy(Study):
     )
     sees_cars: bool = option(
         False,
-        "Let agents observe other cars in view, in a further key of the observation.",
+        "Let agents observe other cars in view, in a further key of the observation. `belief-rivals` then counts them "
+        "and is not told how many arrive.",
         panel="Interactions",
     )
     calibrated: FilePath | None = option(
