@@ -14,7 +14,7 @@ from functools import partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
-from scipy.optimize import isotonic_regression, nnls
+from scipy.optimize import nnls
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
@@ -165,13 +165,11 @@ class Paths:
         """Return an outcome as lone searches have it, (n, m), growing with the demand; see `LoneSearches`."""
         sums = {of: self.sums[lone].sum(axis=0) for of, lone in zip(OF_CARS, ("cars", *LONE), strict=True)}
         total, cars = OUTCOMES[name].total(sums), sums[OUTCOMES[name].of]
-        values = np.zeros(cars.shape)
-        for row, known in enumerate(cars > 0.0):
-            if known.any():
-                y, weights = total[row, known] / cars[row, known], cars[row, known]
-                fitted = isotonic_regression(y, weights=weights).x
-                values[row] = np.interp(self.multiples, self.multiples[known], fitted)
-        return values
+        # Isotonic regression over the multiples (its min-max formula); k is the last of some, i the first.
+        sums_to = [np.pad(its.cumsum(axis=1), ((0, 0), (1, 0))) for its in (total, cars)]
+        means = _mean(*(its[:, None, 1:] - its[:, :-1, None] for its in sums_to), np.nan)
+        grown = [np.fmin.reduce(means[:, : k + 1, k:], axis=2) for k in range(len(self.multiples))]
+        return np.nan_to_num(np.stack([np.fmax.reduce(its, axis=1) for its in grown], axis=1))
 
     def names(self, index: Sequence[int]) -> tuple[str, str, str, str]:
         """Return the names of town, zone, purpose and clock hour; `all` for -1."""

@@ -2,8 +2,7 @@
 
 The driver goes to the place that is cheapest by its rule, through it if it has no space, and on from there to the next.
 A *place* is a run of slots on one side of a street, between two junctions and in one zone, or a counted facility. Each
-has a space as often as it had one in that hour of the day, whatever others had, so the chances of all ways that a
-search may go are products.
+has a space as often as it had one in that hour of the day, whatever others had.
 
 Rules are those of `planners.heuristics`, over places: `usual` (and any other agent) weighs the arrival cost against the
 drive over the chance that it expects of a space; where places were full, others of their kind promise less.
@@ -45,19 +44,17 @@ class LoneSearches:
         first, last, zone = self._slots[begin], self._slots[end], lot.zone_of_slot[self._slots[begin]]
         self._capacity, self._entries = lot.capacity, np.unique(lot.entry_vertices)
         drives = lot.drive_matrix(timed=True)
-        drive_s = [dijkstra(drives, indices=its)[:, first] / problem.v_drive for its in (self._entries, last)]
-        through_s, walk_s = (
-            (streets["along_s"][end] - streets["along_s"][begin]),
-            [one.walk_s for one in scenarios],
-        )
+        to_first_s = [
+            dijkstra(drives, indices=its)[:, first] / problem.v_drive for its in (self._entries, last)
+        ]
+        to_first_s[1] += (streets["along_s"][end] - streets["along_s"][begin])[:, None]
+        walk_s = self._mean(np.array([one.walk_s for one in scenarios]))
         self._inside_s = np.zeros((2, len(first)))
         for place in np.flatnonzero(lot.is_counted[first]):
             facility = lot.facilities[lot.facility_of_slot[first[place]]]
             self._inside_s[:, place] = np.add(facility.gate_s, facility.inside_s)
-        self._of_places = (
-            *drive_s, through_s, self._mean(np.array(walk_s)), self._mean(problem.enter_s), self._size, zone,
-            lot.area_of_zone[zone],
-        )  # fmt: skip
+        area = lot.area_of_zone[zone]
+        self._of_places = (*to_first_s, walk_s, self._mean(problem.enter_s), self._size, zone, area)
 
     def _mean(self, of_slots: FloatArray) -> FloatArray:
         return np.asarray(np.add.reduceat(of_slots[..., self._slots], self._begin, axis=-1) / self._size)
@@ -98,31 +95,15 @@ class LoneSearches:
 def lone_searches(
     entry: IntArray, goal: IntArray, hour: IntArray, walks: FloatArray, patience_s: FloatArray, zone_cost_s: FloatArray,
     per_cost: float, per_drive: float, believed: FloatArray, full: FloatArray, inside_s: FloatArray,
-    entry_drive_s: FloatArray, drive_s: FloatArray, through_s: FloatArray, walk_s: FloatArray, enter_s: FloatArray,
+    entry_drive_s: FloatArray, drive_s: FloatArray, walk_s: FloatArray, enter_s: FloatArray,
     size: IntArray, zone: IntArray, area: IntArray,
 ) -> FloatArray:  # fmt: skip
-    """Follow searches from place to place.
+    """Follow the searches of n cars from place to place, in all ways that they may go.
 
-    Args:
-        entry: (n,) row of `entry_drive_s`.
-        goal: (n,) row of `walk_s`.
-        hour: (n,) row of `believed`, `full` and `inside_s`.
-        walks: (n,) 2 where the walk back counts, else 1.
-        patience_s: (n,) drive after which nobody goes on, s.
-        zone_cost_s: (n, n_zones) what parking costs, s; infinite where it is forbidden.
-        per_cost: what a second of arrival cost counts.
-        per_drive: what a second of the drive counts.
-        believed: (n_hours, n_places) P(taken) that drivers expect of a slot.
-        full: (n_hours, n_places) chance that a place has no space.
-        inside_s: (n_hours, n_places) time at the barrier and inside, s.
-        entry_drive_s: (n_entries, n_places) drive to the beginning of a place, s.
-        drive_s: (n_places, n_places) drive from the end of one to the beginning of another, s.
-        through_s: (n_places,) drive through it, s.
-        walk_s: (n_goals, n_places) walk, s.
-        enter_s: (n_places,) what drivers expect of `inside_s`.
-        size: (n_places,) slots.
-        zone: (n_places,) column of `zone_cost_s`.
-        area: (n_places,) numbers of zones that fill alike.
+    Tables have a column for each place, and a row for each entry, goal or hour; those of `zone_cost_s` are for each car
+    and `zone`. `believed` is P(taken) that drivers expect of a slot, `full` the chance that there is no space,
+    `inside_s` the time at the barrier and inside, `enter_s` what drivers expect of it, and `drive_s` leads from the
+    beginning of a place through it to that of another. An `area` are zones that fill alike.
 
     Returns:
         (4, n) chance to park; places without a space on the way; search time beyond the direct drive, and walk, s, both
@@ -157,6 +138,5 @@ def lone_searches(
             found[3, car] += here * walk_s[goal[car], best] * walks[car]
             expected_free[area[best]] += size[best] * (1.0 - p[best])
             cost_s[best] = np.inf
-            driven_s += through_s[best]
             ahead_s = drive_s[best]
     return found
