@@ -40,7 +40,6 @@ OF_CHANGES = (
     "better_off", "worse_off",
 )  # fmt: skip
 OF_DEMANDS = ("occupancy", "cruised_m", "walk_s", "failed_attempts", "balked_fraction")
-OF_ERRORS = ("mean", "mae", "relative", "bias", "noise", "relative_of_zones")
 """Columns that are printed of settings, of zones, blocks and purposes, of changes, of demands, and of errors."""
 
 
@@ -179,10 +178,10 @@ class Curve(AgentStudyCommand):
         if not result.rows:
             return
         print_rows(console, self.study.title, result.rows, (*SETTING_COLUMNS, *OF_DEMANDS), OF_FLEETS)
-        if errors := without_nan(result.summary["errors"]):
-            title = self.study.table_titles["errors"]
-            print_rows(console, title, errors, ("held_out", "outcome", "form", *OF_ERRORS))
-        for line in self.study.findings(without_nan(result.summary)):
+        summary = without_nan(result.summary)
+        if summary["errors"]:
+            print_rows(console, self.study.table_titles["errors"], summary["errors"], summary["errors"][0])
+        for line in self.study.findings(summary):
             console.print(line, soft_wrap=True)
 
 

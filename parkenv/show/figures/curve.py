@@ -22,7 +22,7 @@ _GREY, _COLORS = "#9a9a9a", ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f0
 def save_curves(
     curves: Mapping[str, Mapping[str, Sequence[float]]],
     points: Sequence[Row],
-    errors: Sequence[Row],
+    errors: Row,
     forms: Mapping[str, Callable[[FloatArray], FloatArray]],
     title: str,
     path: str | Path,
@@ -35,7 +35,7 @@ def save_curves(
     Args:
         curves: columns of the curve of each purpose, all of them first; see `Curves`.
         points: of `held_out.csv`.
-        errors: rows of the search time of held-out zones.
+        errors: of the search time of held-out zones: of `curve` and other predictors, and `chance`.
         forms: usual forms, fitted to the points.
         title: title of the figure.
         path: the PNG to write.
@@ -116,12 +116,13 @@ def _draw_held_out(ax: Axes, points: Sequence[Row]) -> None:
     ax.grid(visible=True)
 
 
-def _draw_errors(ax: Axes, errors: Sequence[Row]) -> None:
-    names, values = ([row[name] for row in errors] for name in ("form", "relative"))
-    bars = ax.barh(names, values, color=[_COLORS[0], *[_GREY] * (len(names) - 1)], height=0.6)
-    ax.bar_label(bars, [f"{value:.0%}" for value in values], padding=3)
-    ax.axvline(errors[0]["noise"], color=INK, linewidth=1.0, linestyle="--")
-    ax.text(errors[0]["noise"], len(names) - 0.45, "  chance in the days", fontsize=7.5, va="center")
-    ax.set(xlim=(0, 1.15 * max(values)), ylim=(len(names) - 0.2, -0.6), title="Off by, zones held out")
+def _draw_errors(ax: Axes, errors: Row) -> None:
+    off = dict(errors)
+    chance, names = off.pop("chance"), list(off)
+    bars = ax.barh(names, list(off.values()), color=[_COLORS[0], *[_GREY] * (len(names) - 1)], height=0.6)
+    ax.bar_label(bars, [f"{value:.0%}" for value in off.values()], padding=3)
+    ax.axvline(chance, color=INK, linewidth=1.0, linestyle="--")
+    ax.text(chance, len(names) - 0.45, "  chance in the days", fontsize=7.5, va="center")
+    ax.set(xlim=(0, 1.15 * max(off.values())), ylim=(len(names) - 0.2, -0.6), title="Off by, zones held out")
     ax.xaxis.set_major_formatter(PercentFormatter(1.0))
     ax.grid(visible=True, axis="x")

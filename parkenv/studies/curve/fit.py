@@ -23,7 +23,7 @@ from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers
 
 CURVE, LONE_SEARCH = "curve", "lone search"
-"""What predicts, in tables of errors, besides `FORMS`."""
+MOST_CHANCE = 0.3
 FOLDS = 5
 """Parts of the zones, each of which is held out once."""
 _GROWS, _PURPOSE = (1, 1, 1, 1, 0, 0, 1), 5
@@ -61,6 +61,7 @@ FORMS: Mapping[str, tuple[Callable[[FloatArray, float], list[FloatArray]], Float
     "a exp(b x)": (lambda x, b: [np.exp(b * x)], np.linspace(0.0, 15.0, 61)),
 }
 """Usual forms in the occupancy x: columns that are added with weights of at least 0, and the shapes b to try."""
+PREDICTORS = (CURVE, LONE_SEARCH, *FORMS)
 
 
 def fit_form(name: str, x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:
@@ -254,8 +255,9 @@ def held_out_errors(
 ) -> tuple[list[Row], list[Row]]:
     """Return how far curves and usual forms are off where they were not fitted, and the zone-hours of held-out zones.
 
-    Errors are over the zone-hours of each demand, weighted by the cars there; those of a perfect curve are the noise of
-    the days, half the difference between even and odd ones.
+    Errors are over the zone-hours of each demand, weighted by the cars there, and relative to what was measured; those
+    of a perfect curve are chance in the days, half the difference between even and odd ones. Where chance is more than
+    `MOST_CHANCE`, nothing is said.
     """
     rows: list[Row] = []
     shown: list[Row] = []
@@ -281,8 +283,11 @@ def held_out_errors(
                     train, test = its & ~held & known, its & held
                     if train.any():
                         values[test] = form_at(form, fit_form(form, x[train], y[train], cars[train]), x[test])
-        for (what, form), values in predicted.items() if y.any() else ():
-            rows.append({"held_out": what, "outcome": name, "form": form, **_errors(paths, name, values)})
+        for what in dict.fromkeys(what for what, _ in predicted) if y.any() else ():
+            errors = {form: _errors(paths, name, predicted[what, form]) for form in PREDICTORS}
+            relative = {form: its.pop("relative") for form, its in errors.items()}
+            if errors[CURVE]["chance"] < MOST_CHANCE:
+                rows.append({"held_out": what, "outcome": OUTCOMES[name].label} | relative | errors[CURVE])
         if name == "search_s" and ("zones", CURVE) in predicted:
             shown = _zone_hours(paths, predicted["zones", CURVE])
     return rows, shown
@@ -328,14 +333,13 @@ def _errors(paths: Paths, name: str, predicted: FloatArray) -> Row:
     of_zones, _, expected_of_zones = _added(paths.groups(0, 1), *values)
     whole = float(total.sum()) or np.nan  # of what never happens nothing is relative
     return {
+        "relative": float(abs(total - expected).sum() / whole),
+        "chance": float(np.nansum(cars * abs(even - odd)) / 2.0 / whole),
+        "of_zones": float(abs(of_zones - expected_of_zones).sum() / whole),
+        "mean": float(total.sum() / cars.sum()),
+        "bias": float((expected - total).sum() / whole),
         "zone_hours": int((cars > 0.0).sum()),
         "searches": float(cars.sum()),
-        "mean": float(total.sum() / cars.sum()),
-        "mae": float(abs(total - expected).sum() / cars.sum()),
-        "relative": float(abs(total - expected).sum() / whole),
-        "bias": float((expected - total).sum() / whole),
-        "noise": float(np.nansum(cars * abs(even - odd)) / 2.0 / whole),
-        "relative_of_zones": float(abs(of_zones - expected_of_zones).sum() / whole),
     }
 
 

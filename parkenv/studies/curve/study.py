@@ -181,7 +181,7 @@ class CurveStudy(FleetStudy):
         from parkenv.show.figures.curve import save_curves
         from parkenv.show.plurals import plural
         from parkenv.studies.curve.curves import load_curves
-        from parkenv.studies.curve.fit import fitted_forms
+        from parkenv.studies.curve.fit import PREDICTORS, fitted_forms
         from parkenv.studies.fleet.blocks import ALL
 
         if "zones" not in result.summary:
@@ -191,37 +191,30 @@ class CurveStudy(FleetStudy):
             HELD_OUT.read(result.folder),
             list[Task[object]](),
         )
-        errors = [
-            r for r in result.summary["errors"] if (r["held_out"], r["outcome"]) == ("zones", "search_s")
-        ]
+        errors = [r for r in result.summary["errors"] if r["held_out"] == "zones"][:1]
+        off = {key: row[key] for row in errors for key in (*PREDICTORS, "chance")}
         for name, zones in self.zones.items():
             its = {p: curve for (s, z, p, h), curve in curves.items() if (s, z, h) == (name, ALL, ALL)}
             its = {ALL: its[ALL]} | its
             of_zones = [row for row in points if row["scenario"] == name]
             title = f"{name}: {plural(len(zones.names), 'zone')}, {plural(self.days, 'day')} of each demand"
             path = result.folder / (PICTURE if len(self.zones) == 1 else file_name(f"curve_{name}", ".png"))
-            tasks.append(partial(save_curves, its, of_zones, errors, fitted_forms(of_zones), title, path))
+            tasks.append(partial(save_curves, its, of_zones, off, fitted_forms(of_zones), title, path))
         return tasks
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
         """See `Study`: how far the curves are off, beside the usual forms."""
-        from parkenv.studies.curve.fit import CURVE, FORMS, LONE_SEARCH, OUTCOMES
+        from parkenv.studies.curve.fit import CURVE, FORMS
 
         found = [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
-        by = {(row["held_out"], row["outcome"], row["form"]): row for row in summary["errors"]}
-        for (what, outcome, form), row in by.items():
-            if form == CURVE and outcome in ("search_s", "walk_s"):
-                off, chance, of_zones = (row[key] for key in ("relative", "noise", "relative_of_zones"))
-                lone, *others = (
-                    f"{by[what, outcome, name]['relative']:.0%} {name}" for name in (LONE_SEARCH, *FORMS)
-                )
-                found.append(
-                    f"{OUTCOMES[outcome].label.capitalize()}, {what} held out: {off:.1%} off by zone-hours "
-                    f"({row['mae']:.1f} of {row['mean']:.1f}), of which chance in the days alone makes {chance:.0%}; "
-                    f"{of_zones:.1%} by zones. Without any fit: {lone}. Usual forms in the occupancy, fitted to the "
-                    f"same: {', '.join(others)}."
-                )
+        for row in summary["errors"]:
+            label, best = row["outcome"].partition(",")[0], min(row[form] for form in FORMS)
+            found.append(
+                f"{label.capitalize()}, {row['held_out']} held out: {row[CURVE]:.1%} off by zone-hours, of which "
+                f"chance in so few days makes {row['chance']:.0%}; means over the day {row['of_zones']:.1%}. "
+                f"The best of the usual forms in the occupancy, fitted to the same: {best:.0%}."
+            )
         return found
 
     @classmethod
