@@ -167,10 +167,11 @@ class Paths:
         sums = {of: self.sums[lone].sum(axis=0) for of, lone in zip(OF_CARS, ("cars", *LONE), strict=True)}
         total, cars = OUTCOMES[name].total(sums), sums[OUTCOMES[name].of]
         # Isotonic regression over the multiples (its min-max formula); k is the last of some, i the first.
-        sums_to = [np.pad(its.cumsum(axis=1), ((0, 0), (1, 0))) for its in (total, cars)]
-        means = _mean(*(its[:, None, 1:] - its[:, :-1, None] for its in sums_to), np.nan)
+        to = [np.pad(its.cumsum(axis=1), ((0, 0), (1, 0))) for its in (total, cars)]
+        total, cars = (its[:, None, 1:] - its[:, :-1, None] for its in to)
+        means = _mean(total, cars, np.nan)
         grown = [np.fmin.reduce(means[:, : k + 1, k:], axis=2) for k in range(len(self.multiples))]
-        return np.nan_to_num(np.stack([np.fmax.reduce(its, axis=1) for its in grown], axis=1))
+        return np.asarray(np.nan_to_num(np.stack([np.fmax.reduce(its, axis=1) for its in grown], axis=1)))
 
     def names(self, index: Sequence[int]) -> tuple[str, str, str, str]:
         """Return the names of town, zone, purpose and clock hour; `all` for -1."""
@@ -336,10 +337,9 @@ def _errors(paths: Paths, name: str, predicted: FloatArray) -> Row:
         "relative": float(abs(total - expected).sum() / whole),
         "chance": float(np.nansum(cars * abs(even - odd)) / 2.0 / whole),
         "of_zones": float(abs(of_zones - expected_of_zones).sum() / whole),
-        "mean": float(total.sum() / cars.sum()),
+        "measured": float(total.sum() / cars.sum()),
         "bias": float((expected - total).sum() / whole),
         "zone_hours": int((cars > 0.0).sum()),
-        "searches": float(cars.sum()),
     }
 
 
