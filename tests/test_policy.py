@@ -14,9 +14,11 @@ from parkenv import InputError, make_scenario
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.studies.policy.study import PolicyStudy
 from parkenv.studies.policy.town import Policy
-from parkenv.studies.runner import Interrupted, run
+from parkenv.studies.runner import run
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, ParkingLot
+from parkenv.world.occupancy.log import weekday_of
+from parkenv.world.occupancy.process import Arrival
 from parkenv.world.tariff import Price, Tariff, Zone
 
 GATE_S, PER_HOUR, STAY_S, VALUE = 20.0, 200.0, 3600.0, 12.0
@@ -55,6 +57,13 @@ def two_streets(tmp_path_factory):
         value_of_time = {VALUE}
         """
     (folder / "two.toml").write_text(tables)
+    lines = [
+        f"2024-01-0{day}T{hour:02d}:00:00,{name},{(hour + day) % 2}"
+        for day in (1, 2)
+        for name in "AB"
+        for hour in range(8, 19)
+    ]
+    (folder / "days.csv").write_text("\n".join(["datetime,slot_id,occupied", *lines]))
     return folder / "two.toml"
 
 
@@ -114,7 +123,9 @@ def small(scenario):
     }
     days = {"budget": 22, "days_each": 1, "rounds": 2, "held_out": ["0.5x"], "episodes": 2}
     study = asked(scenario, aims=aims, levers=levers, **days)
-    return study.changed(scenario=study.scenario.changed(arrivals={"hours": "08:00-10:00"}))
+    log = {"log": str(scenario.parent / "days.csv"), "mapping": "same"}
+    tables = {"arrivals": {"hours": "08:00-10:00"}, "occupancy": log, "forecast": {}}
+    return study.changed(scenario=study.scenario.changed(**tables))
 
 
 def files_of(folder):
@@ -124,28 +135,16 @@ def files_of(folder):
     return {path.name: path.read_bytes() for path in files} | {"summary": json.dumps(summary)}
 
 
-def test_stopped_search_goes_on_to_the_same_answer(two_streets, tmp_path):
-    study = small(two_streets)
-    whole = run(study.changed(figures=True), tmp_path / "whole")
-    calls = iter(range(100))
-
-    def stop(*_):
-        if next(calls) == 20:
-            raise KeyboardInterrupt
-
-    with pytest.raises(Interrupted):
-        run(study, tmp_path / "stopped", progress=stop)
-    assert len((tmp_path / "stopped" / "trials.jsonl").read_text().splitlines()) < 22
-    run(study, tmp_path / "stopped", resume=True)
-    ours = make_scenario(tmp_path / "whole" / "ours.json")
-    assert ours.lot.areas == ("far", "near")
-    assert (tmp_path / "whole" / "policy.png").exists()
-    page = PolicyStudy.page(json.loads((tmp_path / "whole" / "summary.json").read_text()), tmp_path)
+def test_search_ends_with_an_answer(two_streets, tmp_path):
+    summary = run(small(two_streets).changed(figures=True), tmp_path).summary
+    assert make_scenario(tmp_path / "ours.json").lot.areas == ("far", "near")
+    assert (tmp_path / "policy.png").exists()
+    page = PolicyStudy.page(json.loads((tmp_path / "summary.json").read_text()), tmp_path)
     assert [table["name"] for table in page.tables] == ["answer", "losers", "policy_blocks", "assumed"]
     assert any("block-hours" in said for said in page.findings)
-    assert {row["method"] for row in whole.summary["tried"]} >= {"SFpark", "balance", "evolution"}
-    assert files_of(tmp_path / "stopped") == files_of(tmp_path / "whole")
-    assert [row["policy"] for row in whole.summary["answer"]] == ["today", "SFpark", "ours"]
+    assert {row["method"] for row in summary["tried"]} >= {"SFpark", "balance", "evolution"}
+    assert all(np.min(its["expects"]) >= 0.0 for its in summary["policies"].values())
+    assert [row["policy"] for row in summary["answer"]] == ["today", "SFpark", "ours"]
 
 
 @pytest.mark.slow
@@ -165,6 +164,21 @@ def test_workers_and_a_signal_leave_the_answer_as_it_is(two_streets, tmp_path):
     done = parkenv("policy", file, "--out", out, "--resume")
     assert done.returncode == 0, done.stderr
     assert files_of(out) == files_of(tmp_path / "whole")
+
+
+def test_drivers_expect_what_they_have_learned(two_streets):
+    town = small(two_streets).town
+    days = [{"taken": [[0.25, 0.5], [0.75, 1.0]]}, {"taken": [[0.75, 0.5], [0.75, 1.0]]}]
+    once = Policy().learned(days, 1.0)
+    policy = once.learned([{"taken": [[0.0, 0.0], [0.0, 0.0]]}], 0.2)
+    assert policy.expects.tolist() == pytest.approx(np.array([[0.4, 0.4], [0.6, 0.8]]))
+    scenario = town.with_policy(policy)
+    (day,) = {day.date for day in scenario.occupancy.arrival_days(scenario.arrival)[:1]}
+    midnight = weekday_of(day) * 86_400.0
+    for hour, expected in ((8, [0.4, 0.6]), (9, [0.4, 0.8])):
+        # In the middle of a half-hour; between these, log-odds are linear.
+        found = scenario.forecast(Arrival(midnight + hour * 3600.0 + 900.0, day)).p_occupied
+        assert found[town.blocks.of_slot.argsort()].tolist() == pytest.approx(expected, abs=1e-4)
 
 
 def test_a_policy_is_a_scenario(two_streets):

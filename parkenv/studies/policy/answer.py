@@ -158,12 +158,14 @@ def assumed_rows(study: PolicyStudy, held_out: HeldOut) -> list[Row]:
     names = (
         f"{one.name} (an hour is worth {one.value_of_time or scenario.value_of_time:g})" for one in purposes
     )
-    log = "the days of its log" if scenario.occupancy.recorded else "its forecast"
+    log = "the days of its log say of today" if scenario.occupancy.recorded else "its forecast says of today"
+    if study.learns and study.town.has_log:
+        log = "earlier days with the same policy were like, by block and hour"
     picked, window = ", ".join(study.levers.choices) or "none", scenario.arrival
     facts = {
         "town": f"{scenario.lot.name}, {int(scenario.lot.capacity.sum()):,} spaces",
         "cars arrive": f"from {window.start_s / HOUR_S:g}:00 to {window.end_s / HOUR_S:g}:00",
-        "drivers": f"{study.agent.label}; they know all prices and rules, and expect what {log} say of today",
+        "drivers": f"{study.agent.label}; they know all prices and rules, and expect what {log}",
         "demand of the search": ", ".join(rate_text(rate) for rate in study.arrivals_per_hour),
         "purposes": ", ".join(names),
         "elasticity": "nobody stays at home, comes at another time or stays shorter because of a price",

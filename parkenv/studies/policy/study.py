@@ -29,11 +29,14 @@ if TYPE_CHECKING:
     from parkenv.studies.report import Replay
     from parkenv.studies.runner import Result
     from parkenv.studies.workers import Task
+    from parkenv.world.scenario import Scenario
 
 PICTURE = "policy.png"
 TODAY, RULE, OURS = "today", "SFpark", "ours"
 POLICIES = (TODAY, RULE, OURS)
 """The policies that are told."""
+LEARNING = 4
+"""Rounds in which drivers learn the policies that are compared."""
 HELD_OUT = (0.9, 1.0, 1.1)
 """Default demands of the held-out days, times that of the search."""
 
@@ -62,7 +65,9 @@ class Trial(NamedTuple):
 def _tried(row: Row) -> Row:
     if np.array(row["occupancy"], np.float64).ndim != 2:
         raise ValueError(row["occupancy"])
-    np.array([row["cruised_km"], row["time_s"], row["revenue"], *row["purpose_s"]], np.float64)
+    np.array(
+        [row["cruised_km"], row["time_s"], row["revenue"], *row["purpose_s"], *row["taken"][0]], np.float64
+    )
     return row
 
 
@@ -117,6 +122,11 @@ class PolicyStudy(Study):
     rounds: int = option(
         10, "Rounds of SFpark's rule; the city changed prices ten times in two years.", ge=1, le=1_000
     )
+    learns: bool = option(
+        True,
+        "Whether drivers learn how full a policy makes each block in each hour, if the scenario has a log; else they "
+        "expect what its days were like.",
+    )
     episodes: int = option(6, "Held-out days of each demand.", short="-n", ge=1, le=10_000)
     seed: Seed = 0
     figures: Figures = True
@@ -153,7 +163,7 @@ class PolicyStudy(Study):
         """See `Study`."""
         from parkenv.studies.fingerprints import flat_tables, search_settings
 
-        more = ("arrivals_per_hour", "budget", "days_each", "rounds", "seed")
+        more = ("arrivals_per_hour", "budget", "days_each", "rounds", "learns", "seed")
         tables = {name: getattr(self, name).model_dump(mode="json") for name in ("aims", "levers")}
         return search_settings(self, *more) | {"agent": self.agent.label} | flat_tables(tables)
 
@@ -161,7 +171,8 @@ class PolicyStudy(Study):
         from parkenv.studies.fleet.drivers import demand_in, guided_fleet
 
         rate = self.arrivals_per_hour[day % len(self.arrivals_per_hour)]
-        key = None if policy.prices is None else policy.prices.tobytes(), policy.picks, rate
+        arrays = (None if its is None else its.tobytes() for its in (policy.prices, policy.expects))
+        key = *arrays, policy.picks, rate
         if self.town.fleet is not None and self.town.fleet[0] == key:
             return self.town.fleet[1]
         scenario, guidance = self.town.with_policy(policy), (self.levers.guidance, self.town.guided(policy))
@@ -205,6 +216,7 @@ class PolicyStudy(Study):
             "zones": self.town.tables(policy),
             "picked": picked,
             "guided": self.town.guided(policy),
+            "expects": None if policy.expects is None else policy.expects.round(4).tolist(),
             "closed": shut,
         }
 
@@ -227,6 +239,7 @@ class PolicyStudy(Study):
             days=self.episodes,
             seed=(self.seed + 1) % 2**31,
             guided=tuple(its["guided"] for its in policies.values()),
+            expects=tuple(its.get("expects") for its in policies.values()),
             guidance=self.levers.guidance,
             jobs=self.jobs,
         )
@@ -334,10 +347,24 @@ def middle_only(summary: Row) -> list[Row]:
 
 
 class HeldOut(FleetStudy):
-    """Days of several policies, each with guidance of its own."""
+    """Days of several policies, each with guidance of its own, and what its drivers expect."""
 
     guided: tuple[float, ...] = ()
     guidance: str = "shared"
+    expects: tuple[list[list[float]] | None, ...] = ()
+
+    @cached_property
+    def built(self) -> dict[str, Scenario]:
+        """See `FleetStudy`."""
+        from parkenv.studies.fleet.blocks import Blocks
+        from parkenv.studies.policy.town import expecting
+
+        built = super().built
+        blocks = Blocks.of(built[TODAY].lot)
+        return {
+            name: expecting(one, blocks, None if expects is None else np.array(expects))
+            for (name, one), expects in zip(built.items(), self.expects, strict=True)
+        }
 
     @cached_property
     def fleet_settings(self) -> list[Setting]:
@@ -363,6 +390,7 @@ class Search:
 
     def __init__(self, study: PolicyStudy, results: Results) -> None:
         self.study, self.town, self._results = study, study.town, results
+        self._learns = study.learns and study.town.has_log
         self.tried: list[Row] = []
         self._used = self._day = 0
         self._today: list[Row] = []
@@ -373,14 +401,31 @@ class Search:
         """Yield the rounds."""
         from parkenv.studies.policy.town import Policy
 
-        each, today = self.study.days_each, Policy()
-        self._found[TODAY] = today
-        self._today = yield from self._days(TODAY, 0, [today], 2 * each, found=True)
+        days, today = 2 * self.study.days_each, Policy()
+        self._today = yield from self._days(TODAY, 0, [today], days, found=True)
+        if self._learns:
+            today = today.learned(self._today, 1.0)
+            self._today = yield from self._days(TODAY, 1, [today], days, found=True)
+        self._found[TODAY] = self._learned(today, self._today, 0.5)
         yield from self._rule()
         if self.study.aims.in_band:
             yield from self._balance()
         yield from self._evolve()
+        if self._learns:
+            yield from self._learn()
         yield from self._choose()
+
+    def _learned(self, policy: Policy, days: Sequence[Row], weight: float) -> Policy:
+        """Return a policy with drivers who also know these days of it, or as it is if drivers do not learn."""
+        return policy.learned(days, weight) if self._learns else policy
+
+    def _learn(self) -> Iterator[Stage]:
+        """Yield rounds in which drivers learn all policies that were found."""
+        for number in range(LEARNING):
+            names = list(self._found)
+            yield from self._days("learning", number, list(self._found.values()), self.study.days_each)
+            for name, rows in zip(names, self._rows, strict=True):
+                self._found[name] = self._found[name].learned(rows, 1.0 / (number + 3))
 
     def _days(
         self, method: str, number: int, policies: Sequence[Policy], days: int, *, found: bool = False
@@ -435,38 +480,44 @@ class Search:
         from parkenv.studies.policy.town import Policy
 
         prices, step = self.town.posted(self.town.today), self.study.levers.rule_step
+        expects = self._found[TODAY].expects
         for number in range(self.study.rounds):
-            policy = Policy(prices)
+            policy = Policy(prices, expects=expects)
             rows = yield from self._days(RULE, number, [policy], self.study.days_each)
             self._found[RULE] = policy
             self._note(RULE, number, self._measures(rows, policy))
             share = self._occupancy(rows)
             change = np.select([share > 0.8, share < 0.3, share < 0.6], [step, -2 * step, -step], 0.0)
             prices = self.town.posted(prices + change)
+            expects = self._learned(policy, rows, 0.5).expects
 
     def _balance(self) -> Iterator[Stage]:
         """Yield rounds in which prices follow occupancy to the middle of the band in smaller and smaller steps.
 
-        They have half of what is left of the budget, without other levers three quarters; the mean over the later half
-        of the rounds is what was found.
+        They have half of what is left of the budget, without other levers three quarters; the means over the later half
+        of the rounds are what was found. Drivers who learn do so with the same weights: were they to expect no more
+        than the last days, all would go where it was empty.
         """
         from parkenv.studies.policy.town import Policy
 
         each, levers, aim = self.study.days_each, self.study.levers, float(np.mean(self.study.aims.band))
         share = 0.5 if levers.choices else 0.75
         rounds = max(int(share * (self.study.budget - self._used)) // each, 2)
-        prices, total, kept = self.town.today, np.zeros_like(self.town.today), 0
+        prices, expects, later = self.town.today, self._found[TODAY].expects, []
         for number in range(rounds):
-            policy = Policy(prices)
+            policy = Policy(prices, expects=expects)
             rows = yield from self._days("balance", number, [policy], each)
             self._note("balance", number, self._measures(rows, policy))
             taken = self._occupancy(rows)
             # A full block says nothing of how many more would come.
             excess = np.nan_to_num(np.where(taken > 0.97, 1.2, taken) - aim)
-            prices = np.clip(prices + 2 * levers.spread * excess / (1 + number) ** 0.75, 0.0, levers.most)
+            weight = 1.0 / (1 + number) ** 0.75
+            prices = np.clip(prices + 2 * levers.spread * excess * weight, 0.0, levers.most)
+            expects = self._learned(policy, rows, weight).expects
             if 2 * number >= rounds:
-                total, kept = total + prices, kept + 1
-        self._found["balance"] = Policy(total / kept if kept else prices)
+                later.append((prices, expects))
+        mean = [None if its[0] is None else np.mean(its, axis=0) for its in zip(*later, strict=True)]
+        self._found["balance"] = Policy(mean[0], expects=mean[1])
 
     def _evolve(self) -> Iterator[Stage]:
         """Yield generations of the evolution strategy, which starts from the best that was found."""
@@ -476,6 +527,7 @@ class Search:
 
         balanced = self._found.get("balance")
         base = self.town.today if balanced is None or balanced.prices is None else balanced.prices
+        expects = (balanced or self._found[TODAY]).expects
         levers, choices = self.study.levers, self.study.levers.choices
         zones = list(dict.fromkeys(zone for zone, _ in self.town.units))
         of_unit = [zones.index(zone) for zone, _ in self.town.units]
@@ -492,7 +544,7 @@ class Search:
         def policy_of(x: FloatArray) -> Policy:
             shift = x[:n_shifts].reshape(len(zones), -1)[of_unit] * levers.spread
             picks = tuple(round(k) for k in x[n_shifts : n_shifts + len(choices)])
-            return Policy(np.clip(base + shift, 0.0, levers.most), picks)
+            return Policy(np.clip(base + shift, 0.0, levers.most), picks, expects)
 
         each, size = self.study.days_each, strategy.population_size
         number = 0

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -17,9 +18,10 @@ from parkenv.studies.fleet.blocks import Blocks, paid
 from parkenv.studies.fleet.measures import Roads
 from parkenv.studies.policy.spec import Aims, Levers, clock_hours
 from parkenv.studies.results import Row
+from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.scenario import Scenario
 from parkenv.world.tariff import HOUR_S, PUBLIC
-from parkenv.world.week import DAY_S
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S
 
 LOOK_S = 300.0
 """Time between two looks at the slots, s."""
@@ -32,10 +34,42 @@ class Policy(NamedTuple):
     Attributes:
         prices: (n_units, n_bands) prices of an hour, before they are rounded to what is posted; None: today's.
         picks: chosen alternative of each of `Levers.choices`.
+        expects: (n_blocks, n_hours) what drivers expect: the share of a block's slots that is taken, and how often a
+            counted facility is full, in the hours in which cars arrive; None: what the scenario says.
     """
 
     prices: FloatArray | None = None
     picks: tuple[int, ...] = ()
+    expects: FloatArray | None = None
+
+    def learned(self, days: Sequence[Row], weight: float) -> Policy:
+        """Return this policy with drivers who know further days of it, rows of `PolicyTown.day`.
+
+        Args:
+            days: the days.
+            weight: of these days, beside what was expected before.
+        """
+        taken = np.mean([day["taken"] for day in days], axis=0)
+        before = taken if self.expects is None else self.expects
+        return self._replace(expects=(1.0 - weight) * before + weight * taken)
+
+
+def hours_of(scenario: Scenario) -> range:
+    """Return the hours of the day in which cars arrive."""
+    window = scenario.arrival
+    return range(int(window.start_s // HOUR_S), int(-(-window.end_s // HOUR_S)))
+
+
+def expecting(scenario: Scenario, blocks: Blocks, expects: FloatArray | None) -> Scenario:
+    """Return a scenario that has a log with drivers who expect what `Policy` says of the blocks."""
+    if expects is None:
+        return scenario
+    taken, periods = np.full((scenario.lot.n_slots, DAY_PERIODS), np.nan), DAY_PERIODS // DAY_HOURS
+    hours = hours_of(scenario)
+    taken[:, hours.start * periods : hours.stop * periods] = np.repeat(expects, periods, axis=1)[
+        blocks.of_slot
+    ]
+    return scenario.replace(occupancy=replace(cast(RecordedOccupancy, scenario.occupancy), expected=taken))
 
 
 class PolicyTown:
@@ -49,6 +83,7 @@ class PolicyTown:
     Attributes:
         units: zone and facility (empty: all) of each price.
         today: (n_units, n_bands) what an hour costs today in the middle of each band.
+        is_counted: (n_blocks,) bool, which blocks are counted facilities.
         counted: the blocks that count, as indices into `blocks`.
         fleet: that of the policy that was driven last, for its next day.
 
@@ -59,6 +94,8 @@ class PolicyTown:
     def __init__(self, scenario: Scenario, levers: Levers, aims: Aims) -> None:
         self.scenario, self.levers, self.aims = scenario, levers, aims
         self.blocks = Blocks.of(scenario.lot)
+        self.is_counted = np.zeros(len(self.blocks.names), bool)
+        self.is_counted[self.blocks.of_slot[scenario.lot.is_counted]] = True
         self.fleet: tuple[Any, Any] | None = None
         lot, rules = scenario.lot, {zone.name: zone for zone in scenario.zone_rules}
         for name in (*levers.max_stay_s, *levers.users):
@@ -94,6 +131,11 @@ class PolicyTown:
         self.today = np.array(
             [[float(rules[zone].price.amount(weekday + s, HOUR_S)) for s in middle] for zone, _ in self.units]
         )
+
+    @property
+    def has_log(self) -> bool:
+        """Whether drivers expect what the days of a log were like."""
+        return self.scenario.prior is None and isinstance(self.scenario.occupancy, RecordedOccupancy)
 
     def posted(self, prices: FloatArray) -> FloatArray:
         """Return prices as they are posted: in steps, from 0 to the highest."""
@@ -140,7 +182,8 @@ class PolicyTown:
         """Return the scenario with a policy."""
         tables = self.tables(policy)
         specs = {name: ZoneSpec.parse(table, f"zones.{name}") for name, table in tables.items()}
-        return self.scenario.replace(lot=with_zones(self.scenario.lot, specs))
+        changed = self.scenario.replace(lot=with_zones(self.scenario.lot, specs))
+        return expecting(changed, self.blocks, policy.expects)
 
     def is_open(self, policy: Policy) -> BoolArray:
         """Return which of the counted blocks are open with a policy, (n,) bool."""
@@ -155,8 +198,7 @@ class PolicyTown:
     @cached_property
     def hours(self) -> range:
         """Hours of the day in which cars arrive."""
-        window = self.scenario.arrival
-        return range(int(window.start_s // HOUR_S), int(-(-window.end_s // HOUR_S)))
+        return hours_of(self.scenario)
 
     def day(self, fleet: Fleet, agents: Sequence[Any]) -> Row:
         """Drive the day of a fleet that has been reset; return what it tells."""
@@ -165,21 +207,26 @@ class PolicyTown:
             fleet.run(agents, until=max(midnight + time, fleet.begin))
             looks.append(np.bincount(self.blocks.of_slot, fleet.counts(), len(self.blocks.names)))
         fleet.run(agents)
-        shares = (np.array(looks) / self.blocks.slots)[:, self.counted]
+        every = np.array(looks) / self.blocks.slots
+        # What drivers expect of a counted facility is whether it is full.
+        taken = np.where(self.is_counted, every >= 1.0, every)
         arrives = fleet.cars["parked_at"] < 0
         cars = fleet.cars[arrives]
         purposes = [cars["total_s"][cars["purpose"] == k] for k in range(len(fleet.demand.purposes))]
         return {
             "cars": len(cars),
-            "occupancy": shares.reshape(len(self.hours), -1, len(self.counted))
-            .mean(axis=1)
-            .T.round(5)
-            .tolist(),
+            "occupancy": self._by_hour(every[:, self.counted], 5),
+            "taken": self._by_hour(taken, 3),
             "cruised_km": float(self.roads.cruised_m(cars).sum()) / 1000.0,
             "time_s": float((cars["total_s"] - cars["parking_cost_s"]).mean()),
             "revenue": float(paid(fleet)[arrives].sum()),
             "purpose_s": [float(its.mean()) if len(its) else 0.0 for its in purposes],
         }
+
+    def _by_hour(self, looks: FloatArray, digits: int) -> list[list[float]]:
+        """Return means over the hours, (n_blocks, n_hours), of what looks found, (n_looks, n_blocks)."""
+        hourly = looks.reshape(len(self.hours), -1, looks.shape[1]).mean(axis=1)
+        return [[round(share, digits) for share in its] for its in hourly.T.tolist()]
 
     def _times(self) -> Iterator[float]:
         for hour in self.hours:
