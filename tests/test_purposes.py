@@ -192,6 +192,9 @@ def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
     assert rich.sum() == 5
     assert_array_equal(costs[rich, 0], 300.0)
     assert_array_equal(costs[~rich], [[900.0, 0.0]] * 5)
+    for car in range(10):
+        alone = its.walk_s + its.parking_cost_of(fleet.drivers_of(car)) + its.enter_s
+        assert_array_equal(fleet.arrival_cost_s(car), alone)
     with pytest.raises(InputError, match="permit-b"):
         Fleet(its, Demand(Headways(2), classes={"permit-b": 1.0})).reset()
 
