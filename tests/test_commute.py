@@ -24,7 +24,6 @@ from parkenv.studies.runner import run
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.recorded import RecordedOccupancy
-from planners.agent import make_agent
 
 SMALL = {
     "scenarios": ["mini"],
@@ -155,19 +154,6 @@ def test_a_map_of_a_commute_is_a_forecast(tmp_path):
     learned = known.forecast(arrival)
     assert np.ptp(learned.p_occupied) > 0.05
     assert learned.day_error.level > 0.0
-
-
-def test_a_bonus_for_observations_lets_the_car_see_more():
-    scenario = make_scenario("jam")
-    days = calendar(scenario, 2)
-    seen = []
-    for bonus in (0, 1.0):
-        agent = AgentSpec.of(f"belief(explore={bonus})")
-        rows = CommuteRun(scenario, agent, "empty", 0, 3, 0).run(days, [])
-        seen.append(np.mean([len(np.unique(row[TRIP].slots)) for row in rows]))
-    assert seen[1] > seen[0] + 5
-    with pytest.raises(InputError, match="explore is -1"):
-        make_agent("belief", scenario, explore=-1.0)
 
 
 @pytest.mark.slow

@@ -134,16 +134,13 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed
             to be right whatever is observed.
         most_vertices: a larger lot is planned for in part (`Neighborhoods`).
-        explore: s, what the first observation of a slot with a forecast of 50 % is worth for later searches, with a map
-            that learns from trips; it is in proportion to p(1 - p). A slot that nothing later on the path can beat is
-            taken all the same.
         doubt: probability that the forecast of a slot says nothing about it, if the day is learned; 0 to 1.
         event: probability that an event has filled the slots near the goal, if the day is learned; 0 to 0.9. It is
             lower in small lots, and where the forecast has many of these slots free.
 
     Raises:
-        InputError: the budget is not positive, `explore` is negative, `doubt`, `event` or `most_vertices` is out of
-            range, or no slot can be observed.
+        InputError: the budget is not positive, `doubt`, `event` or `most_vertices` is out of range, or no slot can be
+            observed.
     """
 
     name: ClassVar[str] = "belief"
@@ -154,17 +151,15 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         budget_ms: float = 1.0,
         day: bool = True,
         most_vertices: int = MOST_VERTICES,
-        explore: float = 0.0,
         doubt: float = DOUBT,
         event: float = EVENT,
     ) -> None:
         super().__init__(problem)
         require_observations(self.name, problem)
         require_number("budget_ms", budget_ms, above=0.0)
-        require_number("explore", explore, least=0.0)
         require_number("doubt", doubt, least=0.0, most=1.0)
         require_number("event", event, least=0.0, most=0.9)
-        self._explore, self._doubt, self._event = explore, doubt, event
+        self._doubt, self._event = doubt, event
         self._day = day
         self._nearness = nearness(self.problem.walk_s)
         self._worth_passing_s = WORTH_PASSING_S if day else 0.0
@@ -295,7 +290,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
             memory.remaining_s,
             self._budget,
             self._planning_graph(memory),
-            snapshot(here, known, memory, self._explore),
+            snapshot(here, known, memory),
             memory.paths,
         )
         kept = choice.failure_s == memory.failure_s and np.array_equal(choice.targets, memory.targets)
@@ -355,14 +350,14 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         return PlanPreview(tuple(path))
 
 
-def snapshot(here: int, known: SlotBelief, memory: BeliefSearch, explore: float) -> BeliefSnapshot:
+def snapshot(here: int, known: SlotBelief, memory: BeliefSearch) -> BeliefSnapshot:
     """Return the belief about the slots of a part as the path search uses it."""
     weights, p_free_if = memory.day.mixture()
     slots = np.empty(len(memory.state), SLOT)
     slots["missed_rate"], slots["state"] = memory.missed_rate, memory.state
     belief = BeliefSnapshot(slots, weights, p_free_if)
     drive_s = memory.near.table.seconds[here]
-    set_slots(belief, known.parts, memory.day.p_occupied(known.time), drive_s, explore)
+    set_slots(belief, known.parts, memory.day.p_occupied(known.time), drive_s)
     return belief
 
 

@@ -179,7 +179,6 @@ def _set_costs(
             then_s = drive + seen.cost_s + seen.loss_s * decayed if drive < np.inf else np.inf
             back_s[i] = min(stop_s, then_s)
         n_kept += newest - oldest
-        bonus_s = 0.0
         for j in range(first, last):
             observation = observations[j]
             slot = observation.slot
@@ -188,9 +187,6 @@ def _set_costs(
             loss_s = (1.0 - at.p_free_usual) * (fallback_s[slot] + graph.failure_s - cost_s)
             observation.expected_s = drive + cost_s + loss_s * decayed_part(at.decay_rate, drive)
             observation.loss_s = loss_s
-            if observation.is_first:
-                bonus_s += at.bonus_s
-        stop.bonus_s = bonus_s
         _sort_observations(first, last, path)
         for j in range(first, last):
             observation = observations[j]
@@ -227,7 +223,7 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
     for k in range(n_stops - 1, 0, -1):
         # `value_s` and `nothing` hold the values at the next stop; `onward` is the drive there.
         stop = stops[k]
-        first, last, ahead_s, bonus_s = stop.first, stops[k + 1].first, stop.ahead_s, stop.bonus_s
+        first, last, ahead_s = stop.first, stops[k + 1].first, stop.ahead_s
         oldest, newest = stop.oldest, stop.newest
         # From here on these are forgotten.
         for r in range(oldest, stops[k + 1].oldest):
@@ -242,7 +238,7 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
             expected += rest * observation.p_free * (observation.expected_s if observation.parks else later)
             rest *= 1.0 - observation.p_free
             observation.rest, observation.value = rest, expected
-        nothing = expected + rest * min(stop.stop_s, then_s) - bonus_s
+        nothing = expected + rest * min(stop.stop_s, then_s)
         in_mind_s, back_s = (
             value_s[oldest:newest],
             kept_s[stop.first_kept : stop.first_kept + newest - oldest],
@@ -257,7 +253,6 @@ def _stop_optimally(n_stops: int, left_s: float, path: PathBuffer) -> tuple[floa
                     if observations[j].expected_s < back_s[i]:
                         in_mind_s[i] = observations[j].value + observations[j].rest * in_mind_s[i]
                         break
-                in_mind_s[i] -= bonus_s
         onward = stop.time - stops[k - 1].time
     return onward + nothing, then_s
 

@@ -46,7 +46,6 @@ SLOT = np.dtype(
         ("leaving", np.float64),  # 1/s, rate at which a taken slot is left
         ("odds", np.float64),  # P(taken)/P(free) at about the earliest arrival of the car; inf where hopeless
         ("least_odds", np.float64),  # the value to which those decay
-        ("bonus_s", np.float64),  # s, value of its first observation for later searches
         ("missed_rate", np.float64),  # highest detection rate among the views from which it was not detected
         ("state", np.int64),  # `SlotBelief.state`
     ]
@@ -61,7 +60,6 @@ STOP = np.dtype(
         ("first", np.int64),  # index of its first observation; the last precedes the next stop's first
         ("ahead_s", np.float64),  # scratch: least time to the goal after any later observation
         ("stop_s", np.float64),  # scratch: expected time of driving to the best slot that is known now
-        ("bonus_s", np.float64),  # scratch: value of its first observations for later searches
         # scratch: `PathBuffer.remembered` from `oldest` on, before `newest`, are in mind on arrival here; the expected
         # times of driving back to them begin at `first_kept`
         ("oldest", np.int64),
@@ -131,9 +129,7 @@ class BeliefSnapshot(NamedTuple):
 
 
 @leaf
-def set_slots(
-    belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray, explore: float
-) -> None:
+def set_slots(belief: BeliefSnapshot, parts: FloatArray, p_occupied: FloatArray, drive_s: FloatArray) -> None:
     """Fill in the records of the slots, except what was observed of them.
 
     Args:
@@ -141,7 +137,6 @@ def set_slots(
         parts: (4 * n_slots,) float64, see `SlotBelief`.
         p_occupied: (n_slots,) P(taken) now.
         drive_s: (n_vertices,) s, drive time from the car.
-        explore: s, value of the first observation of a slot with a forecast of 50 % for later searches.
     """
     n = len(belief.slots)
     for s in range(n):
@@ -156,7 +151,6 @@ def set_slots(
         at.p_free, at.p_free_usual, at.decay_rate, at.leaving = p_free, usual, rate, leaving
         at.odds = (1.0 - on_arrival) / on_arrival if on_arrival > 0.0 else np.inf
         at.least_odds = 1.0 / usual - 1.0
-        at.bonus_s = 4.0 * explore * forecast * (1.0 - forecast)
 
 
 @leaf

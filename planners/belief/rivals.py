@@ -67,7 +67,6 @@ class BeliefRivalsAgent(BeliefAgent):
         budget_ms: see `belief`.
         day: see `belief`.
         most_vertices: see `belief`.
-        explore: see `belief`.
 
     Raises:
         InputError: see `belief`; `arrivals_per_hour` is negative or not finite.
@@ -82,9 +81,8 @@ class BeliefRivalsAgent(BeliefAgent):
         budget_ms: float = 1.0,
         day: bool = True,
         most_vertices: int = MOST_VERTICES,
-        explore: float = 0.0,
     ) -> None:
-        super().__init__(problem, budget_ms, day, most_vertices, explore)
+        super().__init__(problem, budget_ms, day, most_vertices)
         if arrivals_per_hour is not None and not 0.0 <= arrivals_per_hour < math.inf:
             raise InputError(f"arrivals_per_hour is {arrivals_per_hour}, want a finite number of at least 0")
         self.arrivals_per_hour = arrivals_per_hour

@@ -150,7 +150,7 @@ class NetworkAgent(BeliefAgent):
             known.forecast.astype(np.float64),
             known.observed_at.astype(np.float64),
         )
-        belief = snapshot(here, known, memory, 0.0)
+        belief = snapshot(here, known, memory)
         observe(now, memory.by_cost, self._failure_costs, memory.graph, belief, memory.scratch, out)
         return out
 

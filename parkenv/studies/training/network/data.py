@@ -138,7 +138,7 @@ def _label(
     following = np.array([memory.near.index(int(lot.neighbors[vertex, a])) for a in moves])
     known = SlotBelief.of_observation(observation).take(memory.near.slots)
     graph = memory.near.planning_graph(place.env.scenario, place.teacher.failure_s)
-    belief = snapshot(here, known, memory, 0.0)
+    belief = snapshot(here, known, memory)
     values = np.full(ACTION_COUNT, np.nan)
     if (following >= 0).all() and len(moves):
         values[moves] = action_values(here, following, np.array(FAILURE_COSTS), graph, belief, memory.paths)
