@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.limited_reading import csv_records
+from parkenv.files.limited_reading import MAX_BYTES, csv_records
 
 MAX_NUMBER = 1e12
 """Maximum absolute value of a number; sums and squares of larger ones could overflow."""
@@ -92,6 +92,7 @@ def typed_records(
     kind_of: Callable[[str], Kind],
     columns: Sequence[str] | None = None,
     *,
+    most: int = MAX_BYTES,
     whole_lines: bool = False,
 ) -> Iterator[tuple[int, dict[str, Any]]]:
     """Yield the rows of a table with their line numbers; none if there is no file.
@@ -100,6 +101,7 @@ def typed_records(
         path: the file.
         kind_of: returns what a column holds, by its name.
         columns: the columns that it must have, in order; None for any.
+        most: maximum size, bytes unpacked.
         whole_lines: leave out a last line without its end, which a crash cut off.
 
     Raises:
@@ -108,7 +110,7 @@ def typed_records(
     """
     if not path.exists():
         return
-    for line, record in csv_records(path, whole_lines=whole_lines):
+    for line, record in csv_records(path, most, whole_lines=whole_lines):
         if columns is not None and tuple(record) != tuple(columns):
             raise InputError(f"{path}: not written by this version of parkenv; use another folder")
         row = {}

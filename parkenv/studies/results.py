@@ -40,6 +40,8 @@ if TYPE_CHECKING:
 Row = dict[str, Any]
 Key = tuple[Any, ...]
 
+MOST_BYTES = 1_000_000_000
+"""Largest table of a run: a day of a town has thousands of rows, and what was written must be read again."""
 SETTING_COLUMNS = ("scenario", "occupancy_level", "agent", *SETTING_AXES)
 KEY_COLUMNS = (*SETTING_COLUMNS, "seed")
 """Columns that identify an episode of a comparison."""
@@ -159,7 +161,7 @@ class CsvTable(Table):
         def kind_of(column: str) -> Kind:
             return self.kinds.get(column, self.other)
 
-        return [row for _, row in typed_records(path, kind_of, columns, whole_lines=True)]
+        return [row for _, row in typed_records(path, kind_of, columns, most=MOST_BYTES, whole_lines=True)]
 
     def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
         """See `Table`; lists come first: a finished row would not run again for them."""
@@ -199,6 +201,7 @@ class LongTable(Table):
             folder / self.file,
             lambda column: self.kinds.get(column, self.other),
             (*self.keys, *in_line),
+            most=MOST_BYTES,
             whole_lines=True,
         )
         for _, record in records:
@@ -242,7 +245,7 @@ class JsonTable(Table):
         if not path.exists():
             return []
         # A crash may leave a last line without its end.
-        whole = read_text(path).rpartition("\n")[0]
+        whole = read_text(path, MOST_BYTES).rpartition("\n")[0]
         rows = []
         for number, line in enumerate(whole.splitlines(), start=1):
             row = parse_json(line, f"{path}: line {number}")
