@@ -23,7 +23,7 @@ from planners.heuristics import POLICIES
 
 SPACES, HOURS, DAYS = 250, 4, 1
 RATES = (0.5, 0.7, 0.85, 0.95)  # cars an hour for each space, which they take for an hour
-TRAINED, HELD_OUT = range(10, 20), [int(word) for word in sys.argv[1:]] or range(3)
+TRAINED, HELD_OUT = range(10, 20), range(3)
 
 
 def fleet_on(seed, rate):
@@ -73,9 +73,9 @@ def in_sumo(fleet, day):
     return run_sumo(fleet, sumo_folder(), 0.5, (HOURS + 1) * 3600.0)
 
 
-def main():
+def main(held_out):
     towns = {f"ours {seed}": town_on(seed, lambda fleet, day: run_fleet(fleet, 0, day)) for seed in TRAINED}
-    for seed in HELD_OUT:
+    for seed in held_out:
         towns[f"ours {seed}"] = town_on(seed, lambda fleet, day: run_fleet(fleet, 0, day))
         towns[f"SUMO {seed}"] = town_on(seed, in_sumo)
     paths = Paths.of(towns, RATES, 8)
@@ -95,4 +95,4 @@ def main():
 
 
 if __name__ == "__main__":
-    main()
+    main([int(word) for word in sys.argv[1:]] or HELD_OUT)
