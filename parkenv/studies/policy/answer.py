@@ -111,7 +111,7 @@ def block_rows(
     study: PolicyStudy, held_out: HeldOut, policies: Mapping[str, Row], results: Results
 ) -> list[Row]:
     """Return what each block is today and with our policy, at the middle held-out demand, in the hours that count."""
-    rate, town, blocks = middle_rate(held_out), study.town, results.rows(BLOCKS)
+    rate, town, blocks = held_out.middle_rate, study.town, results.rows(BLOCKS)
     shares, cars = {}, dict[str, float]()
     for setting, cell in zip(held_out.fleet_settings, held_out.cells(), strict=True):
         keys = [key for item in cell.items for key in held_out.keys(setting, item)]
@@ -143,11 +143,6 @@ def block_rows(
             | {"prices_ours": ", ".join(f"{hours.replace(':00', '')}: {amount}" for amount, hours in spans)}
         )
     return rows
-
-
-def middle_rate(held_out: HeldOut) -> Any:
-    """Return the held-out demand in the middle, which sentences and maps are about."""
-    return held_out.demands[len(held_out.demands) // 2]
 
 
 def assumed_rows(study: PolicyStudy, held_out: HeldOut) -> list[Row]:

@@ -273,7 +273,6 @@ class PolicyStudy(Study):
         from parkenv.show.figures.policy import save_policy_maps
         from parkenv.studies.fleet.blocks import TABLES
         from parkenv.studies.fleet.day_map import write_map_page
-        from parkenv.studies.policy.answer import middle_rate
 
         held_out = self.held_out_study(result.summary["policies"])
         tasks: list[Task[object]] = [
@@ -291,7 +290,7 @@ class PolicyStudy(Study):
                 return np.asarray(values[of_slot])
 
             title = (
-                f"{self.scenario.title}, {self.aims.hours}, {rate_text(middle_rate(held_out))}, held-out days"
+                f"{self.scenario.title}, {self.aims.hours}, {rate_text(held_out.middle_rate)}, held-out days"
             )
             panels = [(name, by_slot(f"taken_{name}")) for name in result.summary["policies"]]
             price = "ours: mean price of an hour", by_slot("price_ours")
@@ -374,6 +373,16 @@ class HeldOut(FleetStudy):
             for rate in self.demands
             for name, share in zip(self.built, self.guided, strict=True)
         ]
+
+    @property
+    def middle_rate(self) -> float | str:
+        """The demand in the middle, which sentences and maps are about."""
+        return self.demands[len(self.demands) // 2]
+
+    @property
+    def shown_settings(self) -> list[Setting]:
+        """See `FleetStudy`."""
+        return [one for one in self.fleet_settings if one.arrivals_per_hour == self.middle_rate]
 
 
 class Search:
