@@ -651,13 +651,10 @@ class Fleet:
     def arrival_cost_s(self, car: int) -> NDArray[np.float64]:
         """Return what arriving in each slot costs a car, (n_slots,) s: walk, and parking for its own stay."""
         problem, walks = self.scenarios[self._cars["place"][car]], self._cars["walks"][car]
-        if self._record["zone_cost_s"]:
-            # Computed for all cars at once; for one at a time, tariffs take a millisecond each.
-            parking_s = (
-                problem.lot.slot_parking_cost_s + self._kept["zone_cost_s"][car, problem.lot.zone_of_slot]
-            )
-        else:
-            parking_s = problem.parking_cost_of(self.drivers_of(car))
+        # Computed for all cars at once; for one at a time, tariffs take a millisecond each.
+        known = self._record["zone_cost_s"]
+        zone_cost_s = self._kept["zone_cost_s"][car] if known else problem.zone_cost_s(self.drivers_of(car))
+        parking_s = problem.lot.slot_parking_cost_s + zone_cost_s[problem.lot.zone_of_slot]
         return np.asarray(problem.walk_s * walks + parking_s + problem.enter_s)
 
     def zone_cost_s(self) -> NDArray[np.float64]:
