@@ -11,7 +11,7 @@ from parkenv.cli.tables import print_rows
 from parkenv.files.option import option
 from parkenv.show.report.tables import OF_POLICIES
 from parkenv.studies.fleet.tables import ONE_DAY
-from parkenv.studies.policy.study import PolicyStudy, middle_only
+from parkenv.studies.policy.study import PolicyStudy
 from parkenv.studies.results import without_nan
 from parkenv.studies.runner import Result
 
@@ -52,6 +52,8 @@ class Policy(StudyCommand):
 
     def show(self, console: Console, result: Result) -> None:
         """Print what was found."""
+        from parkenv.studies.policy.answer import middle_only
+
         summary = without_nan(result.summary)
         if not summary.get("answer"):
             return

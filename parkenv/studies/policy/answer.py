@@ -207,6 +207,25 @@ def headlines(summary: Row) -> list[Row]:
     return made
 
 
+def middle_only(summary: Row) -> list[Row]:
+    """Return who wins and who loses at the middle demand, in the columns that are shown."""
+    if not (losers := summary.get("losers")):
+        return []
+    rate = _middle(summary["answer"])
+    rows = [row for row in losers if row["arrivals_per_hour"] == rate]
+    shown = (
+        "scenario",
+        "purpose",
+        "cars_a_day",
+        "change_s",
+        "change_s_ci95",
+        "paid_change",
+        "better_off",
+        "worse_off",
+    )
+    return [{**{name: row[name] for name in shown}, "purpose": row["purpose"] or "all"} for row in rows]
+
+
 def _middle(rows: Sequence[Row]) -> Any:
     rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in rows))
     return rates[len(rates) // 2]

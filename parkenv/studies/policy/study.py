@@ -312,7 +312,7 @@ class PolicyStudy(Study):
         """See `Study`."""
         from parkenv.show.report.page import Page
         from parkenv.show.report.tables import OF_POLICIES, tables_of
-        from parkenv.studies.policy.answer import headlines
+        from parkenv.studies.policy.answer import headlines, middle_only
 
         del folder
         shown = {**summary, "losers": middle_only(summary)}
@@ -326,23 +326,6 @@ class PolicyStudy(Study):
         from parkenv.studies.results import SUMMARY
 
         return [DayMaps(self.held_out_study(read_json(folder / SUMMARY)["policies"]), folder)]
-
-
-def middle_only(summary: Row) -> list[Row]:
-    """Return who wins and who loses at the middle demand, in the columns that are shown."""
-    rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in summary.get("answer", ())))
-    rows = [row for row in summary.get("losers", ()) if row["arrivals_per_hour"] == rates[len(rates) // 2]]
-    shown = (
-        "scenario",
-        "purpose",
-        "cars_a_day",
-        "change_s",
-        "change_s_ci95",
-        "paid_change",
-        "better_off",
-        "worse_off",
-    )
-    return [{**{name: row[name] for name in shown}, "purpose": row["purpose"] or "all"} for row in rows]
 
 
 class HeldOut(FleetStudy):
