@@ -14,7 +14,7 @@ from parkenv import InputError, make_scenario
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.studies.policy.study import PolicyStudy
 from parkenv.studies.policy.town import Policy
-from parkenv.studies.runner import run
+from parkenv.studies.runner import Interrupted, run
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, ParkingLot
 from parkenv.world.occupancy.log import weekday_of
@@ -145,6 +145,22 @@ def test_search_ends_with_an_answer(two_streets, tmp_path):
     assert {row["method"] for row in summary["tried"]} >= {"SFpark", "balance", "evolution"}
     assert all(np.min(its["expects"]) >= 0.0 for its in summary["policies"].values())
     assert [row["policy"] for row in summary["answer"]] == ["today", "SFpark", "ours"]
+
+
+def test_an_interrupted_run_tells_of_the_demands_that_all_policies_have_driven(two_streets, tmp_path):
+    study = small(two_streets).changed(held_out=["0.5x", "1x"])
+    for first, (days, rates) in enumerate({1: [], 8: ["0.5x"] * 3}.items()):
+
+        def stop(doing, done, total, days=days):
+            if doing == "Driving held-out days" and done == days:
+                raise KeyboardInterrupt
+
+        with pytest.raises(Interrupted):
+            run(study, tmp_path, resume=first > 0, progress=stop)
+        summary = json.loads((tmp_path / "summary.partial.json").read_text())
+        assert [row["arrivals_per_hour"] for row in summary["answer"]] == rates
+        page = PolicyStudy.page(summary, tmp_path)
+        assert bool(page.findings) == bool(page.headlines) == bool(rates)
 
 
 @pytest.mark.slow

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -59,6 +60,12 @@ def rate_of(value: float | str) -> float | str:
 def times_demanded(rate: str) -> float:
     """Return how many times the demand that is given or counted this is."""
     return 1.0 if rate in (GIVEN, COUNTED) else float(rate.removesuffix("x"))
+
+
+def middle_of(rates: Iterable[float | str]) -> float | str:
+    """Return the demand in the middle of several, in their order: that which a page tells of first."""
+    demands = list(dict.fromkeys(rates))
+    return demands[len(demands) // 2]
 
 
 _NUMBER_OR_TIMES = {

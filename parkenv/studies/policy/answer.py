@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.studies.fleet.blocks import ALL, BLOCKS, area_prices
 from parkenv.studies.fleet.changes import LEAST_DAYS, is_clear, summarize_changes
-from parkenv.studies.fleet.setting import OWN, rate_text
+from parkenv.studies.fleet.setting import OWN, Setting, middle_of, rate_text
 from parkenv.studies.policy.town import share_in_band
 from parkenv.studies.results import Results, Row
 from parkenv.studies.statistics import columns_of, mean_interval, ratio_interval
@@ -18,11 +18,42 @@ from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
     from parkenv.studies.policy.study import HeldOut, PolicyStudy
+    from parkenv.world.scenario import Scenario
 
 
-def answer_rows(
-    study: PolicyStudy, held_out: HeldOut, policies: Mapping[str, Row], results: Results
-) -> list[Row]:
+class Driven(NamedTuple):
+    """Held-out days of a policy.
+
+    Attributes:
+        setting: the policy and the demand.
+        days: rows of the days.
+        blocks: rows of `BLOCKS` of the days.
+    """
+
+    setting: Setting
+    days: list[Row]
+    blocks: list[Row]
+
+
+def driven(held_out: HeldOut, results: Results) -> list[Driven]:
+    """Return the days of all policies at the demands at which all of them are driven: only these are compared."""
+    cells, blocks = held_out.cells(), results.rows(BLOCKS)
+    unfinished = {
+        cell.work.arrivals_per_hour for cell in cells if len(results.of(held_out, cell)) < len(cell.items)
+    }
+    return [
+        Driven(
+            work,
+            results.of(held_out, cell),
+            [blocks[key] for day in days for key in held_out.keys(work, day)],
+        )
+        for cell in cells
+        for work, days in [cell]
+        if work.arrivals_per_hour not in unfinished
+    ]
+
+
+def answer_rows(study: PolicyStudy, held_out: Sequence[Driven], policies: Mapping[str, Row]) -> list[Row]:
     """Return a row for each policy and held-out demand: what of the aims it reaches, with 95 % intervals over days.
 
     `in_band` is the share of the block-hours whose mean over the days lies in the band, with a jackknife over days;
@@ -30,15 +61,9 @@ def answer_rows(
     """
     rows: list[Row] = []
     today: dict[Any, dict[str, FloatArray]] = {}
-    blocks = results.rows(BLOCKS)
-    for setting, cell in zip(held_out.fleet_settings, held_out.cells(), strict=True):
-        days = results.of(held_out, cell)
-        if not days:
-            continue
+    for setting, days, blocks in held_out:
         rate = setting.arrivals_per_hour
-        shares = _occupancy(
-            study, [blocks[key] for item in cell.items for key in held_out.keys(setting, item)]
-        )
+        shares = _occupancy(study, blocks)
         names = [study.town.blocks.names[i] for i in study.town.counted]
         shares = shares[:, ~np.isin(names, policies[setting.scenario]["closed"])]
         columns = range(shares.shape[2])
@@ -90,40 +115,33 @@ def _jackknife(shares: FloatArray, columns: range, study: PolicyStudy) -> tuple[
     return found, max(found - float(error), 0.0), min(found + float(error), 1.0)
 
 
-def loser_rows(held_out: HeldOut, results: Results) -> list[Row]:
+def loser_rows(held_out: Sequence[Driven], built: Mapping[str, Scenario]) -> list[Row]:
     """Return what changes for the cars of each purpose, and for all, of each policy against today; see `changes`."""
-    settings = []
-    for cell in held_out.cells():
-        days = results.of(held_out, cell)
-        # Guidance is part of the policy.
-        if days:
-            settings.append([{**day, "knows": OWN, "share": 0.0} for day in days])
-    prices = {name: area_prices(its) for name, its in held_out.built.items()}
+    # Guidance is part of the policy.
+    settings = [[{**day, "knows": OWN, "share": 0.0} for day in its.days] for its in held_out]
+    prices = {name: area_prices(its) for name, its in built.items()}
     purposes = {
         name: [one.name for one in its.demand.purposes]
-        for name, its in held_out.built.items()
+        for name, its in built.items()
         if its.demand is not None
     }
     return [row for row in summarize_changes(settings, prices, purposes) if row["zone"] is None]
 
 
 def block_rows(
-    study: PolicyStudy, held_out: HeldOut, policies: Mapping[str, Row], results: Results
+    study: PolicyStudy, held_out: Sequence[Driven], rate: float | str, policies: Mapping[str, Row]
 ) -> list[Row]:
-    """Return what each block is today and with our policy, at the middle held-out demand, in the hours that count."""
-    rate, town, blocks = held_out.middle_rate, study.town, results.rows(BLOCKS)
-    shares, cars = {}, dict[str, float]()
-    for setting, cell in zip(held_out.fleet_settings, held_out.cells(), strict=True):
-        keys = [key for item in cell.items for key in held_out.keys(setting, item)]
-        if setting.arrivals_per_hour == rate and all(key in blocks for key in keys):
-            its = [blocks[key] for key in keys]
-            shares[setting.scenario] = _occupancy(study, its).mean(axis=(0, 2))
+    """Return what each block is today and with our policy, at a held-out demand, in the hours that count."""
+    town, shares, cars = study.town, dict[str, FloatArray](), dict[str, float]()
+    for setting, _, blocks in held_out:
+        if setting.arrivals_per_hour == rate:
+            shares[setting.scenario] = _occupancy(study, blocks).mean(axis=(0, 2))
             cars = dict.fromkeys(town.blocks.names, 0.0)  # with the last policy, ours
-            for row in its:
+            for row in blocks:
                 for block, purpose, count in zip(row["block"], row["purpose"], row["arrivals"], strict=True):
                     if purpose == ALL and block in cars:
-                        cars[block] += count / len(its)
-    if len(shares) < len(policies):
+                        cars[block] += count / len(blocks)
+    if not shares:
         return []
     rows = []
     for k, i in enumerate(town.counted.tolist()):
@@ -177,7 +195,7 @@ def headlines(summary: Row) -> list[Row]:
     rows = summary.get("answer") or []
     if not rows:
         return []
-    rate = _middle(rows)
+    rate = middle_of(row["arrivals_per_hour"] for row in rows)
     today, _, ours = (row for row in rows if row["arrivals_per_hour"] == rate)
     low, high = summary["aims"]["band"]
     made = [
@@ -211,7 +229,7 @@ def middle_only(summary: Row) -> list[Row]:
     """Return who wins and who loses at the middle demand, in the columns that are shown."""
     if not (losers := summary.get("losers")):
         return []
-    rate = _middle(summary["answer"])
+    rate = middle_of(row["arrivals_per_hour"] for row in summary["answer"])
     rows = [row for row in losers if row["arrivals_per_hour"] == rate]
     shown = (
         "scenario",
@@ -226,18 +244,13 @@ def middle_only(summary: Row) -> list[Row]:
     return [{**{name: row[name] for name in shown}, "purpose": row["purpose"] or "all"} for row in rows]
 
 
-def _middle(rows: Sequence[Row]) -> Any:
-    rates = list(dict.fromkeys(row["arrivals_per_hour"] for row in rows))
-    return rates[len(rates) // 2]
-
-
 def sentences(summary: Row) -> list[str]:
     """Return what a council must know, in three sentences, and then what was assumed."""
     rows = summary.get("answer") or []
     if not rows:
         return []
     aims = summary["aims"]
-    rate = _middle(rows)
+    rate = middle_of(row["arrivals_per_hour"] for row in rows)
     of = {row["policy"]: row for row in rows if row["arrivals_per_hour"] == rate}
     today, rule, ours = of.values()
     low, high = aims["band"]

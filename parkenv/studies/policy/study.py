@@ -14,7 +14,7 @@ from parkenv.files.option import option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Figures, OneAgent, OneScenario, Seed, Values
-from parkenv.studies.fleet.setting import GIVEN, OWN, Demanded, Setting, rate_text, times_demanded
+from parkenv.studies.fleet.setting import GIVEN, OWN, Demanded, Setting, middle_of, rate_text, times_demanded
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.policy.spec import Aims, Levers
 from parkenv.studies.results import JsonTable, Results, Row, Table
@@ -248,18 +248,19 @@ class PolicyStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.policy.answer import answer_rows, assumed_rows, block_rows, loser_rows
+        from parkenv.studies.policy.answer import answer_rows, assumed_rows, block_rows, driven, loser_rows
 
         policies = results.kept.get("policies")
         if policies is None:
             return {"rows": []}
         told = {name: self._answer(policy) for name, policy in policies.items()}
         held_out = self.held_out_study(told)
+        days = driven(held_out, results)
         return {
             **held_out.summarise(results),
-            "answer": answer_rows(self, held_out, told, results),
-            "losers": loser_rows(held_out, results),
-            "policy_blocks": block_rows(self, held_out, told, results),
+            "answer": answer_rows(self, days, told),
+            "losers": loser_rows(days, held_out.built),
+            "policy_blocks": block_rows(self, days, held_out.middle_rate, told),
             "assumed": assumed_rows(self, held_out),
             "tried": results.kept["tried"],
             "aims": self.aims.model_dump(mode="json"),
@@ -359,8 +360,8 @@ class HeldOut(FleetStudy):
 
     @property
     def middle_rate(self) -> float | str:
-        """The demand in the middle, which sentences and maps are about."""
-        return self.demands[len(self.demands) // 2]
+        """The demand that maps are about; see `middle_of`."""
+        return middle_of(self.demands)
 
     @property
     def shown_settings(self) -> list[Setting]:
