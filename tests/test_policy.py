@@ -12,6 +12,7 @@ from command_line import parkenv
 
 from parkenv import InputError, make_scenario
 from parkenv.lots.formats.geojson import write_lot
+from parkenv.studies.policy.answer import sentences
 from parkenv.studies.policy.study import PolicyStudy
 from parkenv.studies.policy.town import Policy
 from parkenv.studies.runner import Interrupted, run
@@ -145,6 +146,10 @@ def test_search_ends_with_an_answer(two_streets, tmp_path):
     assert {row["method"] for row in summary["tried"]} >= {"SFpark", "balance", "evolution"}
     assert all(np.min(its["expects"]) >= 0.0 for its in summary["policies"].values())
     assert [row["policy"] for row in summary["answer"]] == ["today", "SFpark", "ours"]
+    for most_s, missed in ((60.0, True), (120.0, False)):
+        aims = summary["aims"] | {"in_band": 0.0, "time": None, "loss_s": most_s}
+        losers = [row | {"change_s": 90.0} for row in summary["losers"]]
+        assert ("90 s" in sentences(summary | {"aims": aims, "losers": losers})[-1]) == missed
 
 
 def test_an_interrupted_run_tells_of_the_demands_that_all_policies_have_driven(two_streets, tmp_path):

@@ -282,20 +282,20 @@ def sentences(summary: Row) -> list[str]:
             f"Cars cruise {ours['cruised_km']:,.0f} km a day, {less(ours, 'cruised_km')} than today (SFpark's rule: "
             f"{less(rule, 'cruised_km')}); a car takes {ours['time_s']:,.0f} s, today {today['time_s']:,.0f} s{money}."
         )
-    losers = [
+    changes = [
         row
         for row in summary["losers"]
-        if row["scenario"] == ours["policy"] and row["purpose"] and row["arrivals_per_hour"] == rate
+        if row["scenario"] == ours["policy"] and row["arrivals_per_hour"] == rate
     ]
+    losers = sorted((row for row in changes if row["purpose"]), key=lambda row: row["change_s"])
     if losers:
-        losers = sorted(losers, key=lambda row: row["change_s"])
         worst, best = losers[-1], losers[0]
         said.append(
             f"Prices counted as time, {_who(best)}, {_who(worst)}: "
             f"{best['better_off']:.0%} and {worst['better_off']:.0%} of them are better off, "
             f"{best['worse_off']:.0%} and {worst['worse_off']:.0%} worse off."
         )
-    return [*said, *_other_demands(rows, rate, aims), _missed(ours, aims)]
+    return [*said, *_other_demands(rows, rate, aims), _missed(ours, aims, losers or changes)]
 
 
 def _who(row: Row) -> str:
@@ -315,7 +315,7 @@ def _other_demands(rows: Sequence[Row], rate: Any, aims: Row) -> list[str]:
     ]
 
 
-def _missed(ours: Row, aims: Row) -> str:
+def _missed(ours: Row, aims: Row, losers: Sequence[Row]) -> str:
     missed = []
     if aims.get("in_band") and ours["in_band"] < aims["in_band"]:
         missed.append(f"{aims['in_band']:.0%} of the block-hours in the band, {ours['in_band']:.0%} reached")
@@ -328,6 +328,9 @@ def _missed(ours: Row, aims: Row) -> str:
             missed.append(f"at most {aims[aim]:.0%} {words}, {its:.0%} reached")
     if aims.get("revenue") is not None and ours.get("revenue_of_today", 1.0) < aims["revenue"]:
         missed.append(f"{aims['revenue']:.0%} of today's revenue, {ours['revenue_of_today']:.0%} reached")
+    worst_s = max((row["change_s"] for row in losers), default=0.0)
+    if aims.get("loss_s") is not None and worst_s > aims["loss_s"]:
+        missed.append(f"at most {aims['loss_s']:g} s lost by a car of any purpose, {worst_s:.0f} s lost")
     return f"Missed: {'; '.join(missed)}." if missed else "All aims are reached."
 
 
