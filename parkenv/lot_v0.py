@@ -184,7 +184,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
 
     ## Observation space
     The `Dict` of `parkenv/Search-v2`: `vertex`, `time`, `p_occupied`, `belief`, `day_error`, `action_mask`. It holds
-    what the car knows, by default what it has observed itself, and its forecast for its own arrival. Where parking has
+    what the car knows (by default its own observations) and its forecast for its own arrival. Where parking has
     prices, `stay_s`, `Box(0, inf, (1,), float32)`, is the car's own stay, s, which it pays for.
 
     ## Rewards
@@ -194,7 +194,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
 
     ## Starting state
     `reset(seed=s)` fixes arrivals, entries, goals, stays, and the cars that stand in the lot when the world begins,
-    whatever the agents do. Later `reset()` calls go through further worlds of the same seed. All cars of the world are
+    whatever the agents do. Later `reset()` calls draw further worlds of the same seed. All cars of the world are
     in `agents` from the start; the first to be selected is the first to arrive. `options` are ignored.
 
     ## Episode end
@@ -211,7 +211,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
       apart on average; they stay for an hour on average (both exponentially distributed).
     - `demand`: a `parkenv.world.demand.Demand` instead of `cars`: Poisson or listed arrivals, stays, patience, entries,
       goals.
-    - `background`: who else takes slots: `residents`, cars that stand there at the beginning and leave once; `process`,
+    - `background`: other cars that take slots: `residents`, which are parked at the start and leave once; `process`,
       the scenario's occupancy all day; `none`.
     - `max_cycles`: limit of a car's decisions.
     - `render_mode`: `rgb_array` (480, 640, 3) or `human` (needs the extra `human`).
@@ -219,9 +219,9 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
       cars, `delay_s` later; `reserve`, the slot that a guidance system reserves for them; `full`, every slot.
     - `leave_full_lot`: whether a car that knows every slot to be taken gives up at once; otherwise at the end of its
       patience.
-    - `manoeuvre_s`: above 0, cars that park, leave or stand block their lane, and queues form.
-    - `leaving_soon_s`: above 0, cars show for that time that they leave, in a further key of the observation,
-      `leaving`, and a car that stands before such a slot holds it.
+    - `manoeuvre_s`: above 0, cars that park, leave or stand still block their lane, and queues form.
+    - `leaving_soon_s`: above 0, cars signal for that time that they are about to leave, in a further key of the
+      observation, `leaving`; a car that waits at such a slot holds it.
     - `sees_cars`: whether observations have the key `cars`: the other cars in view. `parkenv.engine.fleet.Fleet`
       describes these options and keys.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.

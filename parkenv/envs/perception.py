@@ -136,7 +136,7 @@ class SearchPerceptionEnv(SensingSearchEnv):
 
     ## Version history
     - v2: observations gain `day_error` and `step_observed`; packaged scenarios have days that differ from their
-      forecast; pictures are 400 px wide unless told otherwise.
+      forecast; pictures are 400 px wide by default.
     - v1: observations gain `belief`.
     - v0: first version.
     """

@@ -84,7 +84,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     | `belief` | `Box((4 * n_slots,), float32)` | the belief state behind `p_occupied`, four parts as below |
     | `step_observed` | `Box((4 * k,), float32)` | what the last step observed, four parts as below |
     | `day_error` | `Box(0, 5, (2,), float32)` | how far whole days differ from the forecast, logits, as below |
-    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | the valid actions at this vertex |
 
     `belief` has four parts of n_slots numbers each; unpack them with
     `forecast, decay_rate, p_observed, observed_at = observation["belief"].reshape(4, -1)`:
@@ -125,7 +125,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     The car is at the scenario's entry, at a time drawn from its arrival window. The first observation holds only the
     forecast; from then on the car observes slots from the vertex where each step ends.
     `reset(seed=s)` fixes arrival, entry and the state of every slot at every time, whatever the agent does; later
-    `reset()` calls go through further worlds of the same seed.
+    `reset()` calls continue with further worlds of the same seed.
 
     `reset(options={"entry": 1, "arrival": "Tue 08:30", "place": "street"})`, or some of them, choose where and when
     this episode begins: the entry by its index; the arrival as a time of the week, s since Monday 00:00 or a text, on a
@@ -135,7 +135,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
     - Terminated: parked; or the lot is *proven full*: every slot was observed in this search, and taken when last
       observed. Then the search ends with the give-up penalty `give_up_s`, the time to park elsewhere.
     - Truncated: after the step limit of the spec, 2000 (`max_episode_steps` of `gymnasium.make`); Gymnasium's wrapper
-      says so again at every step until the next reset.
+      repeats it at every step until the next reset.
     - `close()` ends the episode, too.
 
     `info` holds the episode's metrics so far: drive_s, failed_s, walk_s, parking_cost_s, gave_up_s, total_s, driven_m,
@@ -169,7 +169,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
       slots are truly taken, hidden from the agent, and as colours the agent's belief.
     - `observation`: `full`, as above; `occupancy`, the same without `belief` and `step_observed`; or `local`, a `Dict`
       of `local` and `action_mask` that describes the car's surroundings, see `parkenv.engine.local_observation`.
-      For studies of what information is worth, `occupancy` has two twins with other numbers in `p_occupied`: `step`
+      For studies of the value of information, two variants of `occupancy` put other numbers in `p_occupied`: `step`
       has what the last step observed, 1 taken, 0 free and 0.5 for all other slots, and `truth` has the hidden state
       of all slots, which no driver knows. `parkenv compare` gives neither to any agent.
     - `k`: number of slots that `local` describes, 5 if None.
@@ -369,7 +369,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         return _compiled_step(self._is_exact)
 
     def action_masks(self) -> NDArray[np.bool_]:
-        """Return the actions that the graph has here, (5,) bool; sb3-contrib expects this name."""
+        """Return the mask of valid actions at this vertex, (5,) bool; sb3-contrib expects this name."""
         mask: NDArray[np.bool_] = self.scenario.action_masks[self.state.vertex].astype(np.bool_)
         return mask
 

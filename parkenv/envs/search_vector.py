@@ -69,7 +69,7 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     - `observation="occupancy"`: the same without `belief` and `step_observed`, which saves copying them.
     - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.engine.local_observation`. Its size and
       cost are the same on every lot.
-    - `observation="truth"` and `"step"`: twins of `occupancy` with other numbers in `p_occupied`.
+    - `observation="truth"` and `"step"`: variants of `occupancy` with other numbers in `p_occupied`.
     - `observation="scan"`: a `Dict` of `scan` and `action_mask`, in one scenario; see
       `parkenv.envs.scan_observation`.
 

@@ -77,7 +77,7 @@ class SearchSensorsEnv(SensingSearchEnv):
     |-----|-------|---------|
     | `vertex` | `Discrete(n_vertices)` | position of the car; vertex i < n_slots is in front of slot i |
     | `time` | `Box(0, 1e8, (2,), float32)` | s since Monday 00:00; s since the search began |
-    | `action_mask` | `Box(0, 1, (5,), int8)` | the actions that the graph has here |
+    | `action_mask` | `Box(0, 1, (5,), int8)` | the valid actions at this vertex |
     | `count` | `Discrete(K + 1)` | number of captures of the last step; 0 after parking |
     | `pose` | `Box(-1e7, 1e7, (K, 3), float32)` | x, y in m, yaw in rad of the vehicle, lot frame |
     | `captured_at` | `Box(0, 1e8, (K,), float32)` | s since the search began |
@@ -125,7 +125,7 @@ road users |
 
     ## Version history
     - v2: observations gain `day_error`; packaged scenarios have days that differ from their forecast; pictures are
-      400 px wide unless told otherwise.
+      400 px wide by default.
     - v1: same version number as `parkenv/Search-v2`.
     - v0: first version.
     """
