@@ -216,6 +216,9 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
         assert columns <= set(rows[0]), name
         if name == "matsim.csv":
             assert sum(int(row["onstreet_spots"]) for row in rows) == 60
+    errors, rows = CurveStudy.page(summary, tmp_path / "a").tables
+    assert all(column["share"] for column in errors["columns"] if column["key"] in ("curve", *FORMS))
+    assert "slots taken" in [column["label"] for column in rows["columns"]]
     curves = parkenv.load_curves(tmp_path / "a")
     both = ["shoppers", "visitors"]
     value, low, high = curves.search_s(occupancy=[0.2, 0.9], zone="0", hour=8, purpose=both)

@@ -175,12 +175,14 @@ class Curve(AgentStudyCommand):
 
     def show(self, console: Console, result: Result) -> None:
         """Print how full a lot is at each demand, how far curves are off, and that in sentences."""
+        from parkenv.studies.curve.fit import PREDICTORS
+
         if not result.rows:
             return
         print_rows(console, self.study.title, result.rows, (*SETTING_COLUMNS, *OF_DEMANDS), OF_FLEETS)
         summary = without_nan(result.summary)
-        if summary["errors"]:
-            print_rows(console, self.study.table_titles["errors"], summary["errors"], summary["errors"][0])
+        if errors := summary["errors"]:
+            print_rows(console, self.study.table_titles["errors"], errors, errors[0], PREDICTORS)
         for line in self.study.findings(summary):
             console.print(line, soft_wrap=True)
 

@@ -36,8 +36,6 @@ class Column(NamedTuple):
     help: str = ""
 
 
-OF_CURVES = ("curve", "lone search", "a/(1 - x)", "t0 (1 + a x^b)", "a exp(b x)")
-"""What predicts searches, in the tables of `parkenv curve`."""
 _GIVEN = (*SETTING_AXES, "arrivals_per_hour")
 """Columns of numbers that somebody chose, which have all their digits."""
 _OPTIONAL = tuple(term.field for term in COST_TERMS if term.optional)
@@ -186,7 +184,6 @@ _KNOWN = {
         Column("paid_change", "change, paid a car", digits=2, signed=True, help=f"{_PAIRED}; in the prices' currency"),
         Column("better_off", "better off", share=True, digits=0, help="Cars that gain at least a second"),
         Column("worse_off", "worse off", share=True, digits=0, help="Cars that lose at least a second"),
-        *(Column(key, key, share=True, digits=0) for key in OF_CURVES),
         Column("chance", "chance in the days", share=True, digits=0),
         Column("of_zones", "curve, day means", share=True, digits=0),
         Column("measured", "mean measured"),

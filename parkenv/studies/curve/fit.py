@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.show.report.tables import Column
 from parkenv.studies.curve.zones import INDEX, LONE, OF_CARS, STATE, SUMS, Zones
 from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers
@@ -61,7 +62,8 @@ FORMS: Mapping[str, tuple[Callable[[FloatArray, float], list[FloatArray]], Float
     "a exp(b x)": (lambda x, b: [np.exp(b * x)], np.linspace(0.0, 15.0, 61)),
 }
 """Usual forms in the occupancy x: columns that are added with weights of at least 0, and the shapes b to try."""
-PREDICTORS = (CURVE, LONE_SEARCH, *FORMS)
+PREDICTORS = {name: Column(name, name, share=True, digits=0) for name in (CURVE, LONE_SEARCH, *FORMS)}
+"""What predicts searches: columns of errors."""
 
 
 def fit_form(name: str, x: FloatArray, y: FloatArray, weight: FloatArray) -> tuple[float, FloatArray]:

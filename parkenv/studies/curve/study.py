@@ -220,7 +220,11 @@ class CurveStudy(FleetStudy):
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`."""
-        return Study.page.__func__(cls, summary, folder)  # type: ignore[attr-defined, no-any-return]
+        from parkenv.show.report.tables import OF_FLEETS, tables_of
+        from parkenv.studies.curve.fit import PREDICTORS
+
+        page: Page = Study.page.__func__(cls, summary, folder)  # type: ignore[attr-defined]
+        return page._replace(tables=tables_of(summary, cls.table_titles, OF_FLEETS | PREDICTORS))
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`: a curve has none."""
