@@ -414,5 +414,6 @@ def curve_table(
         columns[f"{name}_seen"] = _mean(total, cars, np.nan)
         columns[name] = drawn[0]
         columns[f"{name}_low"] = np.maximum.accumulate(np.maximum(drawn[0] - half, 0.0), axis=1)
-        columns[f"{name}_high"] = np.maximum.accumulate(drawn[0] + half, axis=1)
+        high = np.minimum(drawn[0] + half, OUTCOMES[name].most)
+        columns[f"{name}_high"] = np.maximum.accumulate(high, axis=1)
     return CurveTable(np.concatenate(found), np.asarray(sums @ mix)[:, 0], columns)
