@@ -195,9 +195,13 @@ def test_curves_are_called_with_arrays_and_say_what_there_is_not():
         curves.search_s(occupancy=0.5, zone="c", hour=8)
     with pytest.raises(InputError, match="occupancy and demand"):
         curves.search_s(zone="a", hour=8)
+    with pytest.raises(InputError, match="outcome is 'search'"):
+        curves.at("search", occupancy=0.5, zone="a", hour=8)
+    with pytest.raises(InputError, match="curves"):
+        Curves({})
 
 
-WORDS = ("--agents", "greedy-drive", "--arrivals-per-hour", "0.5x,1.5x", "--bootstraps", 2, "--reach", 15)
+WORDS = ("--agents", "greedy-drive", "--arrivals-per-hour", "30,80", "--bootstraps", 2, "--reach", 15)
 
 
 def test_the_command_writes_what_other_models_read(district, tmp_path):

@@ -17,7 +17,7 @@ from parkenv.errors import InputError, nearest
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
 from parkenv.files.limited_reading import read_json
-from parkenv.studies.curve.fit import CurveTable, Paths, fit_form
+from parkenv.studies.curve.fit import OUTCOMES, CurveTable, Paths, fit_form
 from parkenv.studies.fleet.blocks import ALL
 from parkenv.studies.results import Row, without_nan
 
@@ -47,6 +47,9 @@ class Curves:
         curves: by scenario, zone, purpose and hour, its columns: `occupancy`, `demand`, and value, low and high end of
             each outcome, as `search_s`, `search_s_low` and `search_s_high`.
 
+    Raises:
+        InputError: there are none.
+
     Examples:
         >>> its = {"occupancy": [0.2, 0.8], "demand": [0.1, 0.4]}
         >>> its |= {"search_s": [10.0, 70.0], "search_s_low": [8.0, 60.0], "search_s_high": [12.0, 80.0]}
@@ -56,6 +59,8 @@ class Curves:
 
     def __init__(self, curves: Mapping[tuple[str, ...], Mapping[str, Sequence[float]]]) -> None:
         self.curves = dict(curves)
+        if not self.curves:
+            raise InputError("curves is empty, want at least one")
 
     def at(
         self,
@@ -80,7 +85,7 @@ class Curves:
             scenario: scenarios; None for the first.
 
         Raises:
-            InputError: both or neither of occupancy and demand are given, or there is no such curve.
+            InputError: both or neither of occupancy and demand are given, or there is no such outcome or curve.
         """
         if (occupancy is None) == (demand is None):
             raise InputError("occupancy and demand are both given or both missing, want one of them")
@@ -91,6 +96,8 @@ class Curves:
         asked = np.stack([its.astype(str) for its in names], axis=-1)
         for key in {*map(tuple, asked.reshape(-1, len(NAMES)).tolist())}:
             at, its = (asked == key).all(axis=-1), self._curve(key)
+            if outcome not in its:
+                raise InputError(f"outcome is {outcome!r:.40}; {nearest(outcome, OUTCOMES)}")
             knots, unique = np.unique(np.array(its[along], float), return_index=True)
             inside = np.clip(x[at], knots[0], knots[-1])
             for k, column in enumerate((outcome, f"{outcome}_low", f"{outcome}_high")):
@@ -122,7 +129,7 @@ def load_curves(folder: Path | str) -> Curves:
     content = read_json(path, MOST_BYTES)
     try:
         return Curves({tuple(str(its[name]) for name in NAMES): its for its in content["curves"]})
-    except (KeyError, TypeError) as error:
+    except (InputError, KeyError, TypeError) as error:
         raise InputError(f"{path}: want curves with {', '.join(NAMES)}") from error
 
 
