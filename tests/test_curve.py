@@ -232,6 +232,13 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
     assert all(column["share"] for column in errors["columns"] if column["key"] in ("curve", *FORMS))
     assert "slots taken" in [column["label"] for column in rows["columns"]]
     curves = parkenv.load_curves(tmp_path / "a")
+    its = curves.curves["district", "0", "all", "8"]  # its own demand is 70 cars an hour
+    (row,) = (
+        row for row in csv.DictReader((tmp_path / "a" / "activitysim.csv").open()) if row["zone_id"] == "0"
+    )
+    assert float(row["TERMINAL_AM"]) == pytest.approx(
+        (its["search_s"][1] + its["walk_s"][1]) / 60.0, abs=0.01
+    )
     both = ["shoppers", "visitors"]
     value, low, high = curves.search_s(occupancy=[0.2, 0.9], zone="0", hour=8, purpose=both)
     assert (low <= value).all()

@@ -160,16 +160,15 @@ def write_curves(paths: Paths, table: CurveTable, folder: Path) -> None:
 def zone_rows(paths: Paths, table: CurveTable) -> tuple[list[Row], list[Row]]:
     """Return a row of each zone for ActivitySim, and for MATSim.
 
-    ActivitySim's land use has the terminal time, minutes: search and walk at the scenario's own demand, or the nearest
-    to it, over the day and by period. MATSim's parking in QSim has spaces of links (each belongs to the nearest zone)
-    and a `BellochePenaltyFunction`: alpha exp(-beta occupancy) s of search.
+    ActivitySim's land use has the terminal time, minutes: search and walk at `Paths.usual`, over the day and by period.
+    MATSim's parking in QSim has spaces of links (each belongs to the nearest zone) and a `BellochePenaltyFunction`:
+    alpha exp(-beta occupancy) s of search.
     """
-    usual, terminal, links = int(abs(paths.multiples - 1.0).argmin()), [], []
-    column = table.columns
-    minutes = (column["search_s"] + column["walk_s"])[:, usual] / 60.0
+    terminal, links, column = [], [], table.columns
     town, zone, purpose, hour = table.numbers.T
     of_all = (purpose == (-1 if len(paths.purposes) > 1 else 0)) & (hour >= 0) & (zone >= 0)
     for number, (name, zones) in enumerate(paths.towns.items()):
+        minutes = (column["search_s"] + column["walk_s"])[:, paths.usual[name]] / 60.0
         for at, zone_name in enumerate(zones.names):
             its = np.flatnonzero(of_all & (town == number) & (zone == at))
             if not its.size:

@@ -90,11 +90,19 @@ def fitted_forms(points: Sequence[Row]) -> dict[str, Callable[[FloatArray], Floa
 
 
 class Town(NamedTuple):
-    """The days of a scenario: its zones, the names of its purposes, and rows of `ZONES` by multiple and day."""
+    """The days of a scenario.
+
+    Attributes:
+        zones: its zones.
+        purposes: names of its purposes.
+        days: rows of `ZONES` by multiple and day.
+        usual: the multiple that is its own demand.
+    """
 
     zones: Zones
     purposes: Sequence[str]
     days: Sequence[Sequence[Row]]
+    usual: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,7 +112,8 @@ class Paths:
     Attributes:
         towns: the scenarios, by name.
         purposes: names of all purposes.
-        multiples: (m,) ascending.
+        multiples: (m,) ascending; of demands in cars an hour, these.
+        usual: by town, the number of the multiple that is nearest to its own demand.
         first_hour: clock hour of hour 0.
         index: (n, 4) int64, numbers of town, zone, purpose and hour of each path.
         features: (n, m, 6), see `_GROWS`; all but the last.
@@ -114,6 +123,7 @@ class Paths:
     towns: Mapping[str, Zones]
     purposes: tuple[str, ...]
     multiples: FloatArray
+    usual: Mapping[str, int]
     first_hour: int
     index: IntArray
     features: FloatArray
@@ -147,9 +157,10 @@ class Paths:
         index, features, of_cars = (
             np.concatenate([part[k] for part in parts], axis) for k, axis in enumerate((0, 0, 2))
         )
-        zones = {name: town.zones for name, town in towns.items()}
+        zones, x = {name: town.zones for name, town in towns.items()}, np.array(multiples)
+        usual = {name: int(abs(x - town.usual).argmin()) for name, town in towns.items()}
         sums = dict(zip(SUMS, of_cars, strict=True))
-        return cls(zones, purposes, np.array(multiples), first_hour, index, features, sums)
+        return cls(zones, purposes, x, usual, first_hour, index, features, sums)
 
     def groups(self, *columns: int) -> IntArray:
         """Return the numbers of groups of paths that are alike in some columns of the index, (n,)."""

@@ -14,7 +14,7 @@ from parkenv.files.csv_tables import TEXT
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
-from parkenv.studies.fleet.setting import OWN, Demanded, times_demanded
+from parkenv.studies.fleet.setting import OWN, Demanded, middle_of, times_demanded
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.results import CsvTable, Results, Row, Table
 from parkenv.studies.study import Study, counted
@@ -151,11 +151,20 @@ class CurveStudy(FleetStudy):
         if n_days < 2:
             return None
         towns = {
-            name: Town(self.zones[name], purposes[name], [its[:n_days] for its in days[name]])
+            name: Town(
+                self.zones[name], purposes[name], [its[:n_days] for its in days[name]], self._usual(name)
+            )
             for name in days
         }
         first_hour = int(next(iter(self.built.values())).arrival.start_s // HOUR_S)
         return Paths.of(towns, [_size(its) for its in self.demands], first_hour)
+
+    def _usual(self, name: str) -> float:
+        """Return a scenario's own demand as `demands` has it; in cars an hour, without its own, the middle one."""
+        own, window, middle = self.built[name].demand, self.built[name].arrival, middle_of(self.demands)
+        if isinstance(middle, str):
+            return 1.0
+        return middle if own is None else own.expected / (window.end_s - window.start_s) * HOUR_S
 
     def summarise(self, results: Results) -> Row:
         """See `Study`; the curves, `curve.csv` and the files for other models, are written here."""
