@@ -188,3 +188,63 @@ def test_rollouts_are_the_same_under_a_seed_and_no_worse_than_their_heuristic():
         takes.setdefault(name, []).append(total_s)
     assert takes["rollout"][0] == takes["rollout"][1]
     assert np.mean(takes["rollout"][0]) < np.mean(takes["greedy-total"])
+
+
+def test_days_unlike_their_forecast_have_their_slots_from_the_belief_about_the_day():
+    """Their worlds have the shape of an event: the slots near the goal are taken together more often than not."""
+    env, _ = searching(day_error=0.8)
+    observation, _ = env.reset(seed=1, options=START)
+    here, n, rng = int(observation["vertex"]), 20_000, np.random.default_rng(0)
+    action = int(np.flatnonzero(observation["action_mask"][:PARK])[0])
+    all_taken = []
+    for any_day in (False, True):
+        model = parkenv.model(env.unwrapped.scenario, any_day)
+        belief = model.initial_belief(observation)
+        worlds = model.sample(belief, rng, n)
+        worlds.step(np.full(n, action))
+        seen = [worlds.observation(i) for i in range(n)]
+        taken = np.array([one.taken for one in seen])
+        expected = belief.day.p_occupied(0.0)[seen[0].slots]
+        error = np.sqrt(expected * (1.0 - expected) / n)
+        assert seen[0].vertex != here
+        assert (np.abs(taken.mean(axis=0) - expected) < 4 * error + 0.003).all(), "they may change on the way"
+        all_taken.append(taken.all(axis=1).mean() / expected.prod())
+    assert all_taken[0] < all_taken[1]
+
+
+def test_belief_as_the_base_of_rollouts_is_left_only_for_what_is_surely_better():
+    env, _ = searching(name="mini", day_error=0.8)
+    scenario = env.unwrapped.scenario
+    takes = {}
+    for name, options in (
+        ("belief", {}),
+        *[("rollout", {"base": "belief", "simulations": 48, "any_day": True})] * 2,
+        ("rollout", {"base": "belief", "simulations": 12, "ahead": 0}),
+    ):
+        agent = make_agent(name, scenario, **options)
+        total_s = [parkenv.simulate(env, agent, seed=seed).info["total_s"] for seed in range(8)]
+        takes.setdefault((name, options.get("ahead")), []).append(total_s)
+    (alone,), (first, again), (to_the_end,) = takes.values()
+    assert first == again
+    for total_s in (first, to_the_end):
+        assert np.median(np.abs(np.subtract(total_s, alone))) == 0.0, "it is level with it in most searches"
+        assert np.mean(total_s) < np.mean(alone) + 5.0
+
+
+def test_a_copy_of_a_search_moves_on_without_it():
+    env, _ = searching(name="mini", day_error=0.8)
+    agent = make_agent("belief", env.unwrapped.scenario)
+    observation, _ = env.reset(seed=3)
+    action, memory = agent.predict(observation)
+    kept = memory.copy()
+    expected_s, state = memory.expected_s, memory.state.copy()
+    weights = memory.day.mixture()[0]
+    for _ in range(6):
+        observation, _, over, _, _ = env.step(int(action))
+        if over:
+            break
+        action, memory = agent.predict(observation, memory)
+    assert (memory.state != state).any()
+    assert kept.expected_s == expected_s
+    np.testing.assert_array_equal(kept.state, state)
+    np.testing.assert_array_equal(kept.day.mixture()[0], weights)

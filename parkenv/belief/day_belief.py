@@ -128,7 +128,7 @@ class DayBelief:
             belief.decay_rate.astype(np.float64),
         )
         # P(taken) right after each slot's last observation: under each hypothesis, and of the slot alone; when that was
-        self._p_then = np.empty_like(self._p_taken)
+        self._p_then = np.array(self._p_taken)
         self._p_alone = forecast.copy()
         self._observed_at = np.full(len(forecast), -1.0)
 
@@ -163,7 +163,7 @@ class DayBelief:
         return other
 
     def on_days(self, slots: IntArray, time: float) -> tuple[FloatArray, FloatArray]:
-        """Return the probabilities of all hypotheses, (k,), and P(taken) under each of observed slots, (n, k)."""
+        """Return the probabilities of all hypotheses, (k,), and P(taken) under each of some slots, (n, k)."""
         elapsed = time - self._observed_at[slots]
         leaving = self._decay_rate[slots] * (1.0 - self._forecast[slots])
         p_taken = _decayed(self._p_taken[slots], leaving, self._p_then[slots], elapsed)

@@ -6,7 +6,7 @@ sees the future.
 
 Worlds follow the forecast: each slot is a two-state Markov chain with the forecast as its mean and the decay rate as
 its speed, and the day has the level and the slope that `day_error` states. Given observations, the day is drawn from
-its posterior, and the slots given the day.
+its posterior, and the slots given the day. On request, days may also be unlike any forecast, as `belief` assumes.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtr
 
-from parkenv.belief.day_belief import DayBelief
+from parkenv.belief.day_belief import DOUBT, DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.memory import call_at
@@ -249,6 +249,9 @@ class Model:
 
     Args:
         problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept.
+        any_day: whether days may be unlike their forecast, with the probabilities of `belief` (`DayBelief`): an event
+            has filled the slots near the goal, the forecast is worthless, or that of single slots is. Such a day has
+            its slots from then; those that change later follow the forecast.
 
     Attributes:
         problem: the public part.
@@ -257,8 +260,8 @@ class Model:
         InputError: a lot with live counts of facilities, which the model does not have.
     """
 
-    def __init__(self, problem: SearchProblem) -> None:
-        self.problem = problem.public()
+    def __init__(self, problem: SearchProblem, any_day: bool = False) -> None:
+        self.problem, self._any_day = problem.public(), any_day
         if len(self.problem.live_slots):
             raise InputError(f"lot {self.problem.lot.name!r} has live counts, want one without them")
 
@@ -278,9 +281,12 @@ class Model:
         forecast = np.clip(slots.forecast, MIN_PROBABILITY, MAX_PROBABILITY)
         error = DayError(*(float(one) for one in seen.day_error))
         near, days = nearness(self.problem.walk_s), _Days.of(error)
-        centre = centred_logits(forecast, error.deviations(near))
-        logits = centre[:, None] + days.level + near[:, None] * days.slope
-        day = DayBelief(slots, near, hypotheses=(days.weight, 1.0 / (1.0 + np.exp(-logits))))
+        if self._any_day:
+            day = DayBelief(slots, near, doubt=DOUBT)
+        else:
+            centre = centred_logits(forecast, error.deviations(near))
+            logits = centre[:, None] + days.level + near[:, None] * days.slope
+            day = DayBelief(slots, near, hypotheses=(days.weight, 1.0 / (1.0 + np.exp(-logits))))
         day.update(_last_observations(slots, forecast))
         rate, hours = np.clip(slots.decay_rate, _LEAST_RATE, MAX_RATE), np.ones(WEEK_HOURS)
         world = OccupancyProcess(forecast * rate, hours, (1.0 - forecast) * rate, hours, error, near)
@@ -300,22 +306,27 @@ class Model:
         self._require_own(belief)
         require_whole("n", n)
         require_whole("copies", copies, least=1)
-        seen = np.flatnonzero(belief.slots.observed)
-        p_day, p_taken = belief.day.on_days(seen, belief.slots.time)
+        slots = np.flatnonzero(belief.slots.observed)
+        n_observed, level, slope = len(slots), np.zeros(n), np.zeros(n)
+        if self._any_day:
+            # These days are no level and slope, so all slots are drawn now.
+            slots = np.concatenate([slots, np.flatnonzero(~belief.slots.observed)])
+        p_day, p_taken = belief.day.on_days(slots, belief.slots.time)
         day = rng.choice(len(p_day), n, p=p_day)
-        level, slope = (
-            middle[day] + width * (rng.random(n) - 0.5)
-            for middle, width in zip(
-                (belief._days.level, belief._days.slope), belief._days.widths, strict=True
+        if not self._any_day:
+            level, slope = (
+                middle[day] + width * (rng.random(n) - 0.5)
+                for middle, width in zip(
+                    (belief._days.level, belief._days.slope), belief._days.widths, strict=True
+                )
             )
-        )
-        taken = rng.random((n, len(seen))) < p_taken.T[day]
+        taken = rng.random((n, len(slots))) < p_taken.T[day]
         keys, rows = rng.integers(2**64, size=n, dtype=np.uint64), np.tile(np.arange(n), copies)
         drawn = Simulations(belief._tables, n * copies)
         _sample_at(
             drawn.searches.address, keys[rows], belief.vertex, belief.arrival, belief.slots.time, belief.n_steps,
-            np.exp(level)[rows], slope[rows], seen, taken[rows], belief.last_taken[seen],
-            belief.slots.p_observed[seen], belief.slots.observed_at[seen],
+            np.exp(level)[rows], slope[rows], slots, taken[rows], n_observed, belief.last_taken[slots],
+            belief.slots.p_observed[slots], belief.slots.observed_at[slots],
         )  # fmt: skip
         return drawn
 
@@ -412,11 +423,12 @@ class Model:
             )
 
 
-def model(scenario: SearchProblem) -> Model:
+def model(scenario: SearchProblem, any_day: bool = False) -> Model:
     """Return the generative model of a search, on which planners are built; see the page "Write a planner".
 
     Args:
         scenario: the scenario, of which the model keeps the public part, or a problem.
+        any_day: see `Model`.
 
     Examples:
         >>> import gymnasium as gym
@@ -430,7 +442,7 @@ def model(scenario: SearchProblem) -> Model:
         >>> model.update(belief, 3, seen).vertex == seen.vertex
         True
     """
-    return Model(scenario)
+    return Model(scenario, any_day)
 
 
 def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
@@ -459,11 +471,15 @@ def _sample_at(
     day_slope: FloatArray,
     slots: IntArray,
     taken: BoolArray,
+    n_observed: int,
     last_taken: BoolArray,
     p_observed: FloatArray,
     observed_at: FloatArray,
 ) -> None:
-    """Put a search into the situation of a belief, in a world of which the day and the observed slots are given."""
+    """Put a search into the situation of a belief, in a world of which the day and some slots are given.
+
+    The first of these slots have been observed.
+    """
     for e in range(len(keys)):
         search = search_at(address, e)
         search.scenario, search.place = search.scenarios, 0
@@ -473,7 +489,8 @@ def _sample_at(
         search.time, search.n_steps = arrival + time, n_steps
         for i in range(len(slots)):
             column = column_of(search, slots[i])
-            set_belief_of(search, column, last_taken[i], p_observed[i], arrival + observed_at[i])
+            if i < n_observed:
+                set_belief_of(search, column, last_taken[i], p_observed[i], arrival + observed_at[i])
             record = slot_at(search.slots, column)
             if record.valid_until < np.inf:
                 # What comes does not depend on when the state began.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from typing import ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,6 +93,17 @@ class BeliefSearch:
     remaining_s: float = math.inf
     replans: int = 0  # number of times that the path ahead has changed
     expected_s: float = math.nan  # s, expected time of the search from here
+
+    def copy(self) -> Self:
+        """Return a copy that may be moved on without this one; the buffers are shared."""
+        other = copy.copy(self)
+        other.day, other.state, other.past = self.day.copy(), self.state.copy(), self.past.copy()
+        other.missed_rate = self.missed_rate.copy()
+        return other
+
+    def leave_path(self) -> None:
+        """Give up the path of the last decision: the car has taken another way."""
+        self.targets, self.heading, self.remaining_s = self.targets[:0], -1, math.inf
 
 
 class BeliefAgent(SearchAgent[BeliefSearch]):
@@ -333,8 +344,7 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     def plan_preview(self, observation: Observation, action: int, memory: BeliefSearch) -> PlanPreview:
         """Return the path that the agent would drive if it observed only taken slots."""
         belief = belief_for_decision(observation)
-        # The lot does not change, so it need not be copied.
-        imagined = copy.deepcopy(memory, {id(memory.near): memory.near})
+        imagined = memory.copy()
         problem, vertex, path = self.problem, int(observation["vertex"]), list[int]()
         end = belief.time + PREVIEW_S
         while action != PARK:

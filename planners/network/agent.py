@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,6 +41,12 @@ class NetworkSearch(BeliefSearch):
     by_cost: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))  # slots by arrival cost
     graph: PlanningGraph | None = None
     scratch: Scratch | None = None
+
+    def copy(self) -> Self:
+        """Return a copy that may be moved on without this one; the buffers are shared."""
+        other = super().copy()
+        other.visited_at, other.visits = self.visited_at.copy(), self.visits.copy()
+        return other
 
 
 class NetworkAgent(BeliefAgent):
