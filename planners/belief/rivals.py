@@ -1,15 +1,15 @@
 """`belief-rivals`: the planner in belief space, in a lot that other searching cars fill.
 
-**Herding.** Drivers who know the same and reason alike make the same tour, one behind the other: whoever follows finds
-what the car ahead has left, and nobody looks where cars leave meanwhile. So every driver has numbers of its own, drawn
-from its time of arrival: a taste for places that are nearly as good, and how many rivals it reckons with.
+**Herding.** Drivers with the same knowledge and the same rule make the same tour, one behind the other: each finds what
+the car ahead has left, and nobody sees slots that become free elsewhere. So each driver draws numbers of its own from
+its time of arrival: a taste for slots that are nearly as good, and the number of rivals that it expects.
 
-**How many** there are it is told, or infers from the cars that it meets. Slots do not tell: where all think that nobody
-else is searching, those behind the entry stay free, and everybody is the surer of it.
+**The number of rivals** is given, or inferred from the cars that the driver meets. Slots do not reveal it: if all
+drivers believe that nobody else is searching, the slots behind the entry stay free and confirm it.
 
-**Rivals.** Each passes the free slots in the order of the total time from the entry to the goal, and takes each with
-the same probability. So the best slots are taken most of the time, whatever the forecast says, and are gone soon where
-they are free; slots that are out of the way keep their forecast.
+**Model of rivals.** A rival passes the free slots in the order of the total time from the entry to the goal, and takes
+each with the same probability. So the best slots are expected to be taken, whatever the forecast says, and free ones
+there to be gone soon; slots far from the goal keep their forecast.
 """
 
 from __future__ import annotations
@@ -33,18 +33,19 @@ from planners.neighborhood import MOST_VERTICES
 
 PASSED = 3.0
 """Mean number of free slots that a rival passes, or drives on from to the next, before it takes one."""
-IN_VAIN_S = 90.0
-"""s of search after which the driver reckons with no rivals beside the usual cars.
+EXPECTS_RIVALS_S = 90.0
+"""s of search for which a driver expects rivals beside the usual cars.
 
-With rivals in mind a driver leaves the best slots to others. If all do so and the lot is full, nobody finds what is
-left there.
+A driver that expects rivals leaves the best slots to them. If all drivers do so in a full lot, nobody finds the free
+slots there.
 """
 MET_S = 20.0
-"""A driver that has met n cars reckons with n / `MET_S` rivals a second: of 160 an hour, 39 % meet one within 15 s."""
+"""A driver that has met n cars expects n / `MET_S` rivals a second: of 160 an hour, 39 % meet one within 15 s."""
 ROOM = 2.0
-"""All rivals are reckoned with if at least so many times as many arrive as can park in the slots free by forecast.
+"""A driver expects all rivals if their number is at least this many times what the slots free by forecast can take.
 
-The fewer there are, the smaller a part of them: with room for all, it helps nobody to leave the best slots to them.
+Of fewer rivals it expects a proportionally smaller part: with room for all, leaving the best slots to others helps
+nobody. With 3, 20 days on `campus` and on a real place at four demands change by -2.3 to +1.3 s, 0.0 s in the mean.
 """
 TASTE_S, TASTE_M = 8.0, 40.0
 """A driver's taste: s by which it finds a place better or worse than it is at most; m from one best place to the next.
@@ -56,14 +57,14 @@ With 16 s, cars on `campus` and Dragon Lake take as long as with 8.
 class BeliefRivalsAgent(BeliefAgent):
     """`belief-rivals`: `belief`, which expects that rivals take free slots, the best ones first.
 
-    A driver reckons with 0 to 2 times as many rivals as arrive, evenly: some head for the best slots, others stop soon.
-    After `IN_VAIN_S` of search it reckons with none.
+    A driver expects 0 to 2 times as many rivals as arrive (uniform): some head for the best slots, others stop soon.
+    After `EXPECTS_RIVALS_S` of search it expects none.
 
     Args:
         problem: lot, goal, speeds and costs.
-        arrivals_per_hour: rivals an hour; None: not known, then it learns them from the other cars in view, if they are
-            observed (`sees_cars` of `parkenv.engine.fleet.Fleet`), and else has its taste only. With 0 the agent is
-            `belief`, action for action.
+        arrivals_per_hour: rivals an hour; None: not known, then the driver infers them from the other cars in view, if
+            cars are observed (`sees_cars` of `parkenv.engine.fleet.Fleet`), else it has only its taste. With 0 the
+            agent is `belief`, action for action.
         budget_ms: see `belief`.
         day: see `belief`.
         most_vertices: see `belief`.
@@ -107,7 +108,7 @@ class BeliefRivalsAgent(BeliefAgent):
         crowd = memory.crowd.after(observation)
         learns = self.arrivals_per_hour is None and crowd.met != memory.crowd.met
         memory.crowd = crowd
-        if learns or memory.time <= IN_VAIN_S < belief.time:
+        if learns or memory.time <= EXPECTS_RIVALS_S < belief.time:
             memory.day = self._day_belief(memory.near, belief, crowd)
             for observations in memory.past:
                 memory.day.update(observations.take(memory.near.slots))
@@ -118,7 +119,7 @@ class BeliefRivalsAgent(BeliefAgent):
     def _rival_rates(self, belief: SlotBelief, crowd: Crowd) -> FloatArray:
         forecast = belief.forecast.astype(np.float64)
         leaving = belief.decay_rate.astype(np.float64) * (1.0 - forecast)
-        if belief.time > IN_VAIN_S:
+        if belief.time > EXPECTS_RIVALS_S:
             per_s = 0.0
         elif self.arrivals_per_hour is not None:
             per_s = self.arrivals_per_hour / 3600.0
