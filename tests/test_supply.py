@@ -15,7 +15,8 @@ from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import FACILITY_KINDS, KNOWN, Facility
 from parkenv.world.scenario import Drivers
-from parkenv.world.tariff import DAY_S, WEEK_S, Hours, Price, Tariff, Zone
+from parkenv.world.tariff import Hours, Price, Tariff, Zone
+from parkenv.world.week import DAY_S, WEEK_S
 
 GARAGE = Facility(
     "P1", "garage", "inner", capacity=40, xy=(30.0, 12.0), gate_s=10.0, inside_s=(30.0, 90.0), known="sign"

@@ -54,8 +54,9 @@ from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
-from parkenv.world.tariff import HOUR_S, NO_ZONE, VALUE_OF_TIME, Price, Zone, priced
+from parkenv.world.tariff import NO_ZONE, VALUE_OF_TIME, Price, Zone, priced
 from parkenv.world.tariff import Hours as ZoneHours
+from parkenv.world.week import HOUR_S
 
 Speed = Annotated[float, Field(ge=0.1, le=300.0)]
 """km/h."""

@@ -126,6 +126,3 @@ def facility_problem(facility: Facility, index: int, reason: str) -> GraphProble
     """Return what keeps cars from a counted facility, by its name."""
     assert facility.xy is not None
     return GraphProblem("facility", index, f"{facility.name!r:.40} {reason}", facility.xy)
-
-
-__all__ = ["FACILITY_KINDS", "KNOWN", "Facility"]

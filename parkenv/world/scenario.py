@@ -20,8 +20,9 @@ from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.process import Arrival, Forecast, OccupancyModel, PriorModel
 from parkenv.world.sensor_model import SensorModel, SensorRates
-from parkenv.world.tariff import HOUR_S, VALUE_OF_TIME, Hours, Tariff, Zone
+from parkenv.world.tariff import VALUE_OF_TIME, Hours, Tariff, Zone
 from parkenv.world.traffic import Traffic
+from parkenv.world.week import HOUR_S
 
 KMH = 1 / 3.6  # 1 km/h in m/s
 

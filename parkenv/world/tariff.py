@@ -16,6 +16,7 @@ from numpy.typing import ArrayLike
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError, nearest, require_number
 from parkenv.files.file_names import is_plain
+from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
 
 NO_ZONE = "other"
 """Zone of the slots for which a lot names none."""
@@ -27,9 +28,6 @@ VALUE_OF_TIME = 12.0
 The US Department of Transportation values local personal travel at half of the household income: 13.60 dollars of 2015,
 12.3 euros (Revised Departmental Guidance on Valuation of Travel Time in Economic Analysis, 2016).
 """
-HOUR_S = 3600.0
-DAY_S = 24 * HOUR_S
-WEEK_S = 7 * DAY_S
 DAYS = ("Mo", "Tu", "We", "Th", "Fr", "Sa", "Su")
 _RULE = re.compile(r"(?:(?P<days>[A-Z][a-z](?:[-,][A-Z][a-z])*) +)?(?P<times>off|\d?\d:\d\d-\d.*)")
 _SPAN = re.compile(r"(\d?\d):(\d\d)-(\d?\d):(\d\d)")

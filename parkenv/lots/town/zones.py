@@ -11,7 +11,8 @@ from dataclasses import dataclass, replace
 
 from parkenv.errors import InputError
 from parkenv.lots.osm.rows import Side
-from parkenv.world.tariff import DAY_S, HOUR_S, PUBLIC, Hours, Price, Zone
+from parkenv.world.tariff import PUBLIC, Hours, Price, Zone
+from parkenv.world.week import DAY_S, HOUR_S
 
 PRICE = 2.0  # assumed price of an hour where a fee is charged, in the currency of the town
 RESERVED = {

@@ -24,8 +24,8 @@ from parkenv.studies.fleet.tables import day_means
 from parkenv.studies.results import LongTable, Row
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
-from parkenv.world.tariff import HOUR_S, NO_ZONE
-from parkenv.world.week import DAY_S
+from parkenv.world.tariff import NO_ZONE
+from parkenv.world.week import DAY_S, HOUR_S
 
 if TYPE_CHECKING:
     from parkenv.studies.fleet.measures import Roads

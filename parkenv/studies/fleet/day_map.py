@@ -19,7 +19,8 @@ from parkenv.studies.report import Again, Recording
 from parkenv.studies.report_options import ReportOptions
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.scenario import Scenario
-from parkenv.world.tariff import HOUR_S, PUBLIC, Zone
+from parkenv.world.tariff import PUBLIC, Zone
+from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
     from parkenv.studies.fleet.study import FleetStudy

@@ -11,7 +11,7 @@ from parkenv.errors import InputError
 from parkenv.files.spec_file import Several, Spec
 from parkenv.scenarios.spec import Hours, Probability
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.tariff import HOUR_S
+from parkenv.world.week import HOUR_S
 
 Money = Annotated[float, Field(ge=0.0, le=1e6)]
 Stay = Annotated[float, Field(ge=0.0, le=1e7)]

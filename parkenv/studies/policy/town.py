@@ -20,8 +20,8 @@ from parkenv.studies.policy.spec import Aims, Levers, clock_hours
 from parkenv.studies.results import Row
 from parkenv.world.occupancy.recorded import RecordedOccupancy
 from parkenv.world.scenario import Scenario
-from parkenv.world.tariff import HOUR_S, PUBLIC
-from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S
+from parkenv.world.tariff import PUBLIC
+from parkenv.world.week import DAY_HOURS, DAY_PERIODS, DAY_S, HOUR_S
 
 LOOK_S = 300.0
 """Time between two looks at the slots, s."""
