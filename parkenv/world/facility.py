@@ -71,6 +71,8 @@ class Facility:
         require_one_of("known", self.known, KNOWN)
         require_number("delay_s", self.delay_s, least=0.0)
         if self.xy is not None:
+            if not isinstance(self.xy, Sequence | np.ndarray) or len(self.xy) != 2:
+                raise InputError(f"xy is {self.xy!r:.40}, want two numbers, in m")
             for coordinate in self.xy:
                 require_number("xy", coordinate)
             object.__setattr__(self, "xy", tuple(map(float, self.xy)))
