@@ -138,6 +138,25 @@ def test_a_price_is_what_counting_minutes_gives(price, begin, stay):
     np.testing.assert_allclose(amount, [total + 2.0 * price.per_kwh], atol=1e-9)
 
 
+def test_prices_by_hours_are_read_back_and_never_two_at_a_time(tmp_path):
+    price = Price.parse(
+        "2 @ Mo-Sa 08:00-12:00; 1234.5678 @ Mo-Sa 12:00-20:00; 3 @ Tu 20:00-21:00; 0 @ Su 09:00-12:00"
+    )
+    write_lot(
+        replace(grid_lot(2, 4), zone_rules={"a": Zone("a", price)}, slot_zone=["a"] * 8),
+        tmp_path / "a.geojson",
+    )
+    again = read_lot(tmp_path / "a.geojson").zone_rules["a"].price
+    begin = 3600.0 * np.arange(7 * 24)
+    np.testing.assert_allclose(again.amount(begin, 5400.0), price.amount(begin, 5400.0), rtol=1e-12)
+    assert price.amount(0.0, np.inf) == np.inf
+    assert Price.parse("0 @ 08:00-12:00").amount(0.0, np.inf) == 0.0
+    with pytest.raises(InputError, match="two prices at a time on Tu"):
+        Price.parse("1 @ 08:00-12:00; 3 @ Tu 11:00-15:00")
+    with pytest.raises(InputError, match="price has the day 'Xx'"):
+        Price.parse("1 @ Xx 08:00-12:00")
+
+
 def test_long_stays_are_paid_by_the_day():
     capped = Price(1.0, daily_cap=8.0)
     days = np.array([0.5, 1.0, 3.25, 7.0, 365.0, np.inf])

@@ -160,8 +160,8 @@ class Price:
             own.
         charged: hours when parking is charged; only they count as stay. None: always.
         per_kwh: price of each kWh charged into the car, on top.
-        hourly: pairs of hours and the price of an hour then, instead of `per_hour`, `steps`, `free_s` and `charged`;
-            other hours are free.
+        hourly: pairs of hours, which do not overlap, and the price of an hour then, instead of `per_hour`, `steps`,
+            `free_s` and `charged`; other hours are free.
 
     Raises:
         InputError: a value out of its range, or steps that fall; the message names the field.
@@ -187,6 +187,10 @@ class Price:
             raise InputError("hourly is given, want neither per_hour, steps, free_s nor charged beside it")
         for _, amount in self.hourly:
             require_number("hourly", amount, least=0.0)
+        for day, name in enumerate(DAYS):
+            spans = sorted(span for hours, _ in self.hourly for span in hours.days[day])
+            if any(end > begin for (_, end), (begin, _) in pairwise(spans)):
+                raise InputError(f"hourly has two prices at a time on {name}, want hours that do not overlap")
         if self.daily_cap is not None:
             require_number("daily_cap", self.daily_cap, least=0.0)
         object.__setattr__(self, "steps", tuple(map(tuple, self.steps)))
@@ -207,7 +211,7 @@ class Price:
         """Read prices by hours, as OpenStreetMap writes them: `1.5 @ 08:00-12:00; 3 @ Mo-Sa 12:00-15:00`.
 
         Raises:
-            InputError: another text, or a price below 0.
+            InputError: another text, a price below 0, or two prices at a time.
 
         Examples:
             >>> price = Price.parse("1 @ 08:00-12:00; 3 @ 12:00-15:00")
@@ -218,10 +222,17 @@ class Price:
         for part in text.split(";"):
             amount, _, hours = part.partition("@")
             try:
-                hourly.append((Hours.parse(hours.strip(), field), float(amount)))
+                price = float(amount)
             except ValueError:
                 raise InputError(f"{field} is {text!r:.60}, want prices such as 1.5 @ 08:00-12:00") from None
+            hourly.append((Hours.parse(hours.strip(), field), price))
         return cls(hourly=tuple(hourly))
+
+    @property
+    def rules(self) -> list[tuple[float, str]]:
+        """Prices of an hour, each with a rule of its hours, as `parse` reads them."""
+        rules = ((price, rule) for hours, price in self.hourly for rule in str(hours).split("; "))
+        return [(price, rule) for price, rule in rules if not rule.endswith(" off")]
 
     def __bool__(self) -> bool:
         """Whether any stay costs anything."""
@@ -257,7 +268,9 @@ class Price:
 
     def of_hours(self, seconds: Mapping[Hours, FloatArray]) -> FloatArray:
         """Return what stays cost of which so many seconds fall into the hours of `hourly`, (...) each."""
-        return np.asarray(sum(seconds[hours] * (price / HOUR_S) for hours, price in self.hourly))
+        # A stay for ever is free where an hour is.
+        known = ((np.where(price, seconds[hours], 0.0), price) for hours, price in self.hourly)
+        return np.asarray(sum(its * (price / HOUR_S) for its, price in known))
 
     def _of_days(self, begin: FloatArray, stay: FloatArray) -> FloatArray:
         """Return what stays of at most a week cost where each 24 hours are capped."""

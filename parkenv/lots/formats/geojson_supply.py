@@ -87,7 +87,7 @@ def zone_document(zone: Zone) -> dict[str, Any]:
     if zone.price.charged is not None:
         price["charged"] = str(zone.price.charged)
     if zone.price.hourly:
-        price["hourly"] = "; ".join(f"{amount:g} @ {hours}" for hours, amount in zone.price.hourly)
+        price["hourly"] = "; ".join(f"{amount:.12g} @ {hours}" for amount, hours in zone.price.rules)
     document: dict[str, Any] = {"price": price} if price else {}
     if zone.hours is not None:
         document["hours"] = str(zone.hours)

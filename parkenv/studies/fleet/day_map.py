@@ -107,7 +107,7 @@ def rules_text(zone: Zone) -> str:
     elif price.per_hour:
         said.append(f"{price.per_hour:g} an hour")
     elif price.hourly:
-        spans = (f"{amount:g} {str(hours).removeprefix('Mo-Su ')}" for hours, amount in price.hourly)
+        spans = (f"{amount:g} {hours.removeprefix('Mo-Su ')}" for amount, hours in price.rules)
         said.append(f"an hour: {', '.join(spans)}")
     if said:
         said[0] += f", {_time_text(price.free_s)} free" if price.free_s else ""
