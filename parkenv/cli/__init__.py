@@ -27,22 +27,26 @@ START, SEARCH, SENSE, DRIVE, DATA = (
     "Start here", "Search and compare", "Sensors and maps", "Drive", "Lots, logs and files",
 )  # fmt: skip
 COMMANDS = {
-    "demo": Entry("Survey a lot with simulated sensors, and search there on other days.", "demo:Demo", START),
+    "demo": Entry(
+        "Survey a lot with simulated sensors, then search in it on other days.", "demo:Demo", START
+    ),
     "compare": Entry(
         "Compare agents over costs and speeds, all in the same worlds.", "compare:Compare", SEARCH
     ),
-    "play": Entry("Search yourself, in the worlds of the agents.", "play:Play", SEARCH),
+    "play": Entry("Play the search in the same worlds as the agents.", "play:Play", SEARCH),
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", SEARCH),
-    "commute": Entry("Let drivers come day after day, with a map that learns.", "drivers:Commute", SEARCH),
-    "fleet": Entry("Let many cars search one lot, and compare what they know.", "drivers:Fleet", SEARCH),
+    "commute": Entry("Simulate daily commuters with a map that learns.", "drivers:Commute", SEARCH),
+    "fleet": Entry(
+        "Simulate many cars that search one lot; compare kinds of information.", "drivers:Fleet", SEARCH
+    ),
     "policy": Entry(
-        "Find what a town should do: prices, limits, permits, guidance, capacity.", "policy:Policy", SEARCH
+        "Search for a town's policy: prices, limits, permits, guidance, capacity.", "policy:Policy", SEARCH
     ),
     "curve": Entry(
-        "Fit what searches are like as a function of occupancy, for other models.", "drivers:Curve", SEARCH
+        "Fit search time and walk as functions of occupancy, for other models.", "drivers:Curve", SEARCH
     ),
     "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
-    "pomdp": Entry("Write the search in a small lot for POMDP solvers of others.", "compare:Pomdp", SEARCH),
+    "pomdp": Entry("Write the search in a small lot as a file for POMDP solvers.", "compare:Pomdp", SEARCH),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),
     "dataset": Entry("Record data sets for offline learning, in Minari's format.", "dataset:Dataset", SEARCH),
     "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", SEARCH),
@@ -58,9 +62,9 @@ COMMANDS = {
         "Drive past every slot, and write which slots are taken to a map file.", "survey:Survey", SENSE
     ),
     "map": Entry("Show the predictions of a map file: how often each slot is taken.", "survey:Map", SENSE),
-    "map-drive": Entry("Map a recorded drive of a car of your own.", "survey:MapDrive", SENSE),
+    "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "survey:MapDrive", SENSE),
     "sensors": Entry("Preview the simulated sensors.", heading=SENSE),
-    "sensors preview": Entry("Draw what the sensors measure on the way to the best slot.", "sensors:Preview"),
+    "sensors preview": Entry("Draw the sensor measurements on the way to the best slot.", "sensors:Preview"),
     "fit-sensor-model": Entry(
         "Measure how often slots are observed correctly.", "sensors:FitSensorModel", SENSE
     ),
@@ -87,18 +91,16 @@ COMMANDS = {
     "lot import": Entry(
         "Import a lot of a real place; report what was found, guessed and left out.", "lot:Import"
     ),
-    "lot census": Entry(
-        "Count lots: their size, kinds of slots, distances, and how sure they are.", "lot:Census"
-    ),
+    "lot census": Entry("Describe lots: size, kinds of slots, distances, error probability.", "lot:Census"),
     "lot convert": Entry("Write a lot as native GeoJSON.", "lot:Convert"),
     "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=DATA),
     "occupancy fit": Entry("Fit a model to recorded occupancy by maximum likelihood.", "occupancy:Fit"),
     "occupancy demand": Entry("Fit the demand of a town to counts of its car parks.", "occupancy:Demand"),
-    "occupancy evaluate": Entry("Score forecasts of occupancy beside simple ones.", "occupancy:Evaluate"),
+    "occupancy evaluate": Entry("Score forecasts of occupancy against simple ones.", "occupancy:Evaluate"),
     "occupancy record": Entry("Record days of a town's own demand as a log.", "occupancy:Record"),
     "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "checks:Schema", DATA),
     "verify": Entry("Compare closed forms of the literature with this package.", "checks:Verify", DATA),
-    "bench": Entry("Measure throughput, and that of other software for the same task.", "checks:Bench", DATA),
+    "bench": Entry("Measure throughput, also of other software for the same task.", "checks:Bench", DATA),
 }
 """Commands and groups of commands, as the help page lists them."""
 app = make_app(

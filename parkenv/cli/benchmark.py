@@ -63,10 +63,10 @@ class RunSuite(AgentStudyCommand):
 
 
 class Check(Command):
-    """Every episode must be present. Means, scores and the clairvoyant bounds of all episodes are recomputed.
+    """Every episode must be present. The command recomputes means, scores and the clairvoyant bounds of all episodes.
 
-    An agent that beats the bound of a search was in another world, or had other costs and speeds. The times of an agent
-    cannot be verified without running it.
+    A total time below the bound means another world, other costs or other speeds. The times of an agent cannot be
+    verified without running it.
     """
 
     examples = "parkenv benchmark check results/v2/result.json others.json"
@@ -87,9 +87,9 @@ class Check(Command):
 
 
 class Page(Command):
-    """The page needs no network and no other file. Its tables sort by a click on a heading.
+    """The page needs no network and no other file. Click a heading to sort its table.
 
-    A result that fails `parkenv benchmark check`, or whose agents do not come with parkenv and have no address of their
+    A result that fails `parkenv benchmark check`, or whose agents are not part of parkenv and have no address of their
     code, is refused, and no page is written.
     """
 
@@ -124,7 +124,7 @@ class Page(Command):
 
 
 class Show(Command):
-    """Of each task: scenario, slots, mean occupancy, day error, sensor model and walking speed."""
+    """For each task: scenario, slots, mean occupancy, day error, sensor model and walking speed."""
 
     examples = """
         parkenv benchmark show v2

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 
 class Verify(StudyCommand):
-    """A case without chance has to be found exactly. A simulated one agrees if theory is in an interval of the mean.
+    """A deterministic case must match exactly. A simulated one agrees if theory lies in an interval of the mean.
 
-    It is the 99.99 % interval: right rows then all agree with a probability of 0.995 and more. The exit code is 1 if
-    any row disagrees.
+    This is the 99.99 % interval, so all rows of a correct program agree with a probability of 0.995 and more. The exit
+    code is 1 if any row disagrees.
     """
 
     examples = """
@@ -98,10 +98,10 @@ IN_TIME = "pomdp"
 
 
 class Bench(Command):
-    """A ratio above 1 means that ours is faster. Timings are noisy: compare ratios, and use an idle machine.
+    """A ratio above 1 means that parkenv is faster. Timings are noisy: compare ratios, and use an idle machine.
 
-    The part pomdp compares planners, ours and those of pomdp-py, at several times for a decision in the same worlds. It
-    is a comparison in the folder OUT/pomdp, and goes on there when it is run again.
+    The part pomdp compares planners of parkenv and pomdp-py at several times per decision in the same worlds. It is a
+    comparison in the folder OUT/pomdp; running it again continues it.
     """
 
     examples = """
@@ -120,10 +120,10 @@ class Bench(Command):
         )
     )
     seconds: float = option(0.6, "How long each figure is measured.", ge=0.01, le=3600)
-    seed: Seed = Field(0, description="Of the lots and the noise.")
+    seed: Seed = Field(0, description="Seed of the lots and the noise.")
     lots: Several[str] = option(
         (),
-        "Lots whose day the part town compares with SUMO's, besides a made one.",
+        "Lots for which the part town compares a day with SUMO, besides a synthetic one.",
         name="--lot",
         takes="FILE[,...]",
     )

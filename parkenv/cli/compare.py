@@ -47,8 +47,8 @@ class Compare(AgentStudyCommand):
     """Episode i has the same seed for every agent, hence the same cars at the same times.
 
     The table gives the mean total time (drive + failed attempts + walk) with its 95 % interval, the paired difference
-    to the first agent, and the regret to the clairvoyant bound. Options are shortcuts for an experiment file, which
-    `parkenv run` takes.
+    to the first agent, and the regret to the clairvoyant bound. Options are shortcuts for an experiment file for
+    `parkenv run`.
     """
 
     examples = """
@@ -62,7 +62,7 @@ class Compare(AgentStudyCommand):
 
     study: Comparison = Comparison().changed(grid={"occupancy_levels": LEVELS})
     largest: int | None = option(
-        None, "Of the scenarios, only those with the N largest lots.", panel="World", default="all", ge=1
+        None, "Use only the scenarios with the N largest lots.", panel="World", default="all", ge=1
     )
     rerun: Rerun = None
     out: Path = option(
@@ -196,12 +196,12 @@ class Plan(Command):
 
 
 class Pomdp(Command):
-    """The file holds the model of the planner exact: while the car searches, slots stay as they are.
+    """The file holds the exact model of the planner, in which the states of slots do not change during the search.
 
-    They are observed without error, and the level and the slope of the day are on a grid. A move is a step; a reward is
+    Observations have no errors, and the level and the slope of the day are on a grid. A move is a step; a reward is
     minus its seconds.
 
-    Each slot doubles the number of states, so the lot has to be small: mini, of ten slots, has 12,289.
+    Each slot doubles the number of states, so the lot must be small: mini, with ten slots, has 12,289.
     """
 
     examples = """

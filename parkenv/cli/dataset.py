@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class Dataset(StudyCommand):
     """The folder is a root of Minari's data sets: `MINARI_DATASETS_PATH=DIR` lets `minari.load_dataset` find them.
 
-    Each search has a world of its own, that of its seed. The environment is recovered by `recover_environment`; with
-    the seed and the actions of an episode it repeats the episode. --resume goes on with more --steps.
+    Each search has the world of its seed. `recover_environment` returns the environment; with the seed and the actions
+    of an episode it repeats the episode. --resume continues with more --steps.
     """
 
     examples = """

@@ -38,11 +38,11 @@ NEXT = (
 class Demo(StudyCommand):
     """1. Survey: a car with a side camera and a laser passes every slot; parked cars are detected, located and mapped.
 
-    2. Map: the probability that each slot is taken at the hour of the search, from these sessions alone.
+    2. Map: the probability that each slot is taken at the hour of the search, from these sessions only.
 
     3. Searches on other days, with camera, laser and detector: the thesis's planner, the planner in belief space and
     two heuristic baselines, all with the same map, in the same worlds; and an oracle that knows every slot's future.
-    Many more follow without images, with the error rates of the sensors: enough to tell agents apart.
+    Many more searches follow without images, with the error rates of the sensors: enough to separate the agents.
 
     4. A report with replays, and a film of one search.
     """

@@ -35,9 +35,9 @@ if TYPE_CHECKING:
 
 
 class Detect(Command):
-    """With --out, pictures and films with the boxes drawn in are written, and all boxes with frame and time as a table.
+    """With --out, the command writes pictures and films with boxes, and a table of all boxes with frame and time.
 
-    View and visible fraction are those of the detector: HOG knows sides and ends alone, `net` all three views.
+    View and visible fraction depend on the detector: HOG distinguishes only sides and ends, `net` all three views.
     """
 
     examples = """
@@ -62,15 +62,15 @@ class Detect(Command):
     )
     detector: DetectorName | None = option(
         None,
-        "Instead of models: net, the packaged network, another (.onnx), or a class of your own.",
+        "Instead of models: net, the packaged network, another (.onnx), or your own MODULE:CLASS.",
         takes="NAME|FILE|MODULE:CLASS",
         default="none",
     )
-    threshold: float = option(0.5, "Least probability of a reported car.", takes="P", gt=0, lt=1)
+    threshold: float = option(0.5, "Smallest probability of a reported car.", takes="P", gt=0, lt=1)
     least_height: float | None = option(
         None, "Height of the smallest regions searched, px.", takes="PX", default="the model's", ge=8
     )
-    step: int = option(1, "Of a video, look at every N-th frame.", ge=1)
+    step: int = option(1, "Process every N-th frame of a video.", ge=1)
     out: Path | None = option(
         None,
         "Folder for NAME_cars.png, NAME_cars.mp4, boxes.csv and summary.json.",
@@ -128,11 +128,11 @@ class Detect(Command):
 class TrainDetector(Command, DetectorTraining):
     """A HOG model (.npz) learns from photographs with labelled boxes, or from aligned crops and images without cars.
 
-    A network like the packaged `net` (.onnx) learns from simulated pictures alone.
+    A network like the packaged `net` (.onnx) learns from simulated pictures only.
 
-    With --folds, 30 blocks of consecutive files are held out in turn: consecutive images often show the same car. The
-    cars that are held out are also searched in made photographs: pasted at 0.8 to 2.2 times their size into mosaics of
-    the images without cars that are held out.
+    With --folds, 30 blocks of consecutive files are held out in rotation: consecutive images often show the same car.
+    The held-out cars are also searched in composed photographs: pasted at 0.8 to 2.2 times their size into mosaics of
+    the held-out images without cars.
     """
 
     examples = """
@@ -186,15 +186,15 @@ _PICTURES, _DRIVES = "On drives", "On whole drives"
 class EvaluateDetector(Command, ExecutionSpec):
     """On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars.
 
-    Any other detector looks as it does in a survey; its boxes of other sizes, and of fronts and rears, are left out, as
-    the sets label neither, and a box more than twice as wide as high is a side. On crops, the fraction of cars found is
-    given at 1 % and 10 % false positives, with intervals over 30 blocks of consecutive files. On pictures of drives,
-    every detector reports so many boxes that it has equally many false positives; a car counts if it is within 20 m, 16
-    px high, and 30 % of it are visible.
+    Any other detector works as in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the
+    sets label neither, and a box more than twice as wide as high is a side. On crops, the output gives the fraction of
+    cars found at 1 % and 10 % false positives, with intervals over 30 blocks of consecutive files. On pictures of
+    drives, the threshold of every detector is set to the same number of false positives; a car counts if it is within
+    20 m, 16 px high, and 30 % visible.
 
-    With --sessions, whole survey drives are compared, as `parkenv survey` makes them: cars found, slots right, error of
-    the map, by weather, distance, and what makes a car hard to find. All detectors look at the same pictures. Each rig
-    and detector has a folder with its map. The same command goes on after an interruption.
+    With --sessions, the command compares whole survey drives like those of `parkenv survey`: cars found, slots right,
+    error of the map, by weather, distance, and cause of a miss. All detectors process the same pictures. Each rig and
+    detector has a folder with its map. The same command continues after an interruption.
     """
 
     examples = """
@@ -209,14 +209,13 @@ class EvaluateDetector(Command, ExecutionSpec):
     uiuc: Path | None = option(None, "UIUC's folder as published (CarData).", takes="DIR")
     model: str = option(
         "side",
-        "side, front, or an .npz of `parkenv train-detector`; any other detector is taken as with "
-        "--detector.",
+        "side, front, or an .npz of `parkenv train-detector`; for other detectors use --detector.",
         takes="NAME|FILE",
     )
     detectors: Axis[DetectorName] | None = option(
         None,
-        "Instead of a model: hog, net, a network (.onnx), or a class of your own; with --drives several, "
-        "separated by commas.",
+        "Instead of a model: hog, net, a network (.onnx), or your own MODULE:CLASS; with --drives "
+        "several, separated by commas.",
         name="--detector",
         takes="NAME|FILE|MODULE:CLASS",
         default="none",
@@ -236,7 +235,7 @@ class EvaluateDetector(Command, ExecutionSpec):
     false_positives: float = option(
         0.1, "Boxes without a car in a picture, on average.", panel=_PICTURES, ge=0, le=100
     )
-    seed: Annotated[Seed, Option(panel=_PICTURES)] = Field(0, description="Seed of cars, light and noise.")
+    seed: Annotated[Seed, Option(panel=_PICTURES)] = Field(0, description="Seed of cars, lighting and noise.")
     sessions: int = option(0, "Survey drives for each rig; 0: only pictures.", panel=_DRIVES, ge=0)
     rigs: Axis[RigName] | None = option(
         None,

@@ -43,9 +43,9 @@ SHOWN = (
 class Calibrate(StudyCommand):
     """A simulated car drives along the lanes and into slots, as the agent decides. Every seed is driven twice.
 
-    Once with the scenario's observations of slots, for the speed and the manoeuvre; and once without observations
-    before an attempt, for failed attempts. `parkenv compare --calibrated OUT/calibrated.json` then compares agents
-    under both costs.
+    The drive with the scenario's observations of slots gives the speed and the duration of the manoeuvre; the drive
+    without observations before an attempt gives the cost of failed attempts. `parkenv compare --calibrated
+    OUT/calibrated.json` then compares agents under both costs.
     """
 
     examples = """
@@ -151,11 +151,11 @@ def _all_or(text: str) -> object:
 class Park(StudyCommand):
     """On lots it writes pictures of one successful episode per kind of slot and orientation, and an animation of one.
 
-    Failures are also drawn, if any; with several agents, into one folder per agent.
+    It also draws failures, if any; with several agents, into one folder per agent.
 
-    With --cases or --levels every scene is planned, driven within the car's limits, and judged by its footprints, 2 cm
-    apart, against the exact obstacles: no contact, and an end within 0.05 m and 0.01 rad of the target. It writes
-    manoeuvres.csv, trajectories.csv (the middle of the rear axle every 0.05 s) and pictures of all scenes.
+    With --cases or --levels, every scene is planned, driven within the car's limits, and checked with footprints 2 cm
+    apart against the exact obstacles: no contact, and an end within 0.05 m and 0.01 rad of the target. The command
+    writes manoeuvres.csv, trajectories.csv (the middle of the rear axle every 0.05 s) and pictures of all scenes.
     """
 
     examples = """

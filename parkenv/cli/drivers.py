@@ -46,12 +46,12 @@ OF_DEMANDS = ("occupancy", "cruised_m", "walk_s", "failed_attempts", "balked_fra
 class Commute(AgentStudyCommand):
     """Each driver comes at the same time of day, on the next of the scenario's weekdays or recorded days.
 
-    What the car observes on a search goes into its map in the evening, with the sensor's error rates; the next day's
-    forecast is corrected by it. Nobody tells the map what else was free.
+    In the evening, the observations of the search update the driver's map, with the sensor's error rates, and correct
+    the next day's forecast. The map gets no other data.
 
-    The table and the picture show mean total time and forecast error (Brier score of P(taken) at the arrival, over
-    all slots) against the day. For comparison, each agent also drives with the right map that does not learn (fixed);
-    agents that use no map (first-free, greedy-drive, ...) have one level. All meet the same worlds.
+    The table and the figure show mean total time and forecast error (Brier score of P(taken) at the arrival, over all
+    slots) against the day. For comparison, each agent also drives with the right map without learning (fixed); agents
+    without a map (first-free, greedy-drive, ...) have one level. All run in the same worlds.
     """
 
     examples = """
@@ -94,11 +94,12 @@ class Fleet(AgentStudyCommand):
     """On a day, residents are parked when the hours of arrival begin, and leave after the rest of their stay.
 
     Cars arrive as a Poisson process. All settings have the same days: arrivals, stays, patience and residents. The
-    table gives the mean over cars and days with 95 % intervals over days. The price of anarchy is the total time over
-    that of a guidance system that reserves slots for all cars; it needs reserve among --knows, and 1 among --share.
+    table gives the mean over cars and days with 95 % intervals over days. The price of anarchy is the total time
+    divided by that of a guidance system that reserves slots for all cars; it needs reserve in --knows, and 1 in
+    --share.
 
-    Several scenarios, such as a lot before and after a change, are compared with the first one: the same cars come on
-    the same days. The second table says what changes for whom, with guidance as with scenarios.
+    Several scenarios, for example a lot before and after a change, are compared with the first one: the same cars
+    arrive on the same days. The second table lists the changes by group of cars, for guidance as for scenarios.
     """
 
     examples = """
@@ -150,12 +151,12 @@ class Fleet(AgentStudyCommand):
 
 
 class Curve(AgentStudyCommand):
-    """All cars of a town are driven at several demands, with the same random numbers.
+    """The command simulates all cars of a town at several demands, with the same random numbers.
 
-    For each zone (a goal and the spaces around), hour and purpose the time that the search takes beyond the direct
-    drive, the walk, failed attempts and the share that finds no space are fitted as monotone functions of occupancy and
-    demand, pooled over zones, with 95 % intervals over days and zones. The table says how far they are off in zones,
-    towns and demands that were held out, beside the usual forms. Other models read the files in --out.
+    For each zone (a goal and the spaces around), hour and purpose it fits the search time beyond the direct drive, the
+    walk, failed attempts and the share of cars that find no space, as monotone functions of occupancy and demand,
+    pooled over zones, with 95 % intervals over days and zones. The table gives the errors in held-out zones, towns and
+    demands, and those of the usual closed forms. Other models can read the files in --out.
     """
 
     examples = """

@@ -48,7 +48,7 @@ Place = Annotated[
 
 
 class Show(Command):
-    """Slots are coloured by their zone or parking cost. Guesses of an import are listed."""
+    """Slots are coloured by their zone or parking cost. The output lists the guesses of an import."""
 
     examples = """
         parkenv lot show campus --graph --out campus.png
@@ -78,12 +78,12 @@ class Show(Command):
 
 
 class Check(Command):
-    """The drivability of a lot is checked: can a car reach every slot, drive into it and get back, and are lanes clear?
+    """The check of drivability: can a car reach every slot, drive into it and get back, and are lanes clear?
 
-    The error probability, 0 to 1, sums up the reasons why an imported lot may differ from the place. A valid lot is
-    summarised.
+    The error probability, 0 to 1, summarises the reasons why an imported lot may differ from the place. The output
+    describes a valid lot.
 
-    The exit code is 2 if there are errors, else 0. Of a file to import it lists what an import would lack.
+    The exit code is 2 if there are errors, else 0. For a file to import, the command lists what an import would lack.
     """
 
     examples = """
@@ -152,12 +152,12 @@ def _point(text: str) -> str:
 
 
 class Import(Command):
-    """Outlines of parking spaces are enough: without roads in the file, rows, aisles and ways between are inferred.
+    """Outlines of parking spaces are enough: without roads in the file, the import infers rows, aisles and connections.
 
     With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`) and a contact sheet.
     With --town, a whole town becomes one lot: streets, kerbs, car parks and garages with prices and rules, entries at
-    its edge, and goals with weights of demand. A table of its facilities is written beside it (.csv): name, kind,
-    capacity, and whether the map says the capacity (tag, drawn) or a rule.
+    its edge, and goals with weights of demand. A table of its facilities (.csv) gives name, kind, capacity, and the
+    source of the capacity: the map (tag, drawn) or a rule.
 
     If something is missing, the picture is still drawn, but no lot is written and the exit code is 2.
     """
@@ -172,10 +172,10 @@ class Import(Command):
         """
 
     place: Place
-    picture: Path | None = option(None, "Picture to check the import by.", takes="FILE.png")
+    picture: Path | None = option(None, "Picture for checking the import.", takes="FILE.png")
     goal: Several[str] = option(
         (),
-        "Place that people walk to: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.",
+        "Goal of the walk: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.",
         takes="POINT",
         repeat=True,
         parse=_point,
@@ -183,7 +183,7 @@ class Import(Command):
     )
     entry: Several[str] = option(
         (),
-        "Place where cars enter: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.",
+        "Entry of cars: LAT,LON, or X,Y in metres, or auto: guess it. Repeatable.",
         takes="POINT",
         repeat=True,
         parse=_point,
@@ -191,41 +191,43 @@ class Import(Command):
     )
     bounds: Several[float] | None = option(
         None,
-        "Import only this: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres; with --town, latitudes and longitudes.",
+        "Import only this area: SOUTH,WEST,NORTH,EAST, or X0,Y0,X1,Y1 in metres; with --town, "
+        "latitudes and longitudes.",
         takes="BOX",
         parse=lambda text: tuple(numbers_in(text, 4)),
     )
     around: Several[float] | None = option(
         None,
-        "Import only a square around this point, so far to each side.",
+        "Import only a square around this point, METRES to each side.",
         takes="LAT,LON,METRES",
         default="all of the map",
         parse=lambda text: tuple(numbers_in(text, 3)),
     )
     disabled: bool = option(False, "Also import spaces for disabled drivers.")
-    left_hand: bool = option(False, "Traffic keeps to the left; no map says so.")
+    left_hand: bool = option(False, "Left-hand traffic, which map files do not state.")
     split: bool = option(
         False, "Find the car parks of a town and write a lot of each; entries and goals are guessed."
     )
     town: bool = option(False, "Import a whole town as one lot; entries and goals are those of the map.")
     car_parks: Path | None = option(
         None,
-        "Car parks that the city counts: name,capacity,lat,lon. With --town, the map's take these names and "
-        "capacities; those that it lacks are added.",
+        "List of counted car parks: name,capacity,lat,lon. With --town, they override names and "
+        "capacities of the map; missing ones are added.",
         takes="FILE.csv",
         default="none",
     )
     listed_only: bool = option(
         False,
-        "Leave out kerbs, car parks that are not in --car-parks, and streets on no shortest way to these.",
+        "Leave out kerbs, car parks that are not in --car-parks, and streets that are on no "
+        "shortest path to these.",
     )
     untagged_kerbs: float = option(
         1.0,
-        "Places of kerbs that the map says nothing of, as a multiple of the rule's, with --town.",
+        "Number of places at kerbs without tags, as a multiple of the rule's number, with --town.",
         ge=0.0,
         le=10.0,
     )
-    least: int = option(10, "Number of spaces of the smallest car park, with --split.", ge=2)
+    least: int = option(10, "Smallest number of spaces of a car park, with --split.", ge=2)
     out: Path = option(
         ..., "Lot file to write, or folder with --split.", short="-o", takes="FILE.geojson|DIR"
     )
@@ -387,11 +389,11 @@ def _table_of_lots(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> Ta
 class Census(Command):
     """A slot is perpendicular, oblique or kerbside by the angle between its lane and the parked car.
 
-    A lot is of the kind of nine in ten of its slots, else mixed. It is small below 80 slots, large from 200 on. The
-    drive time is that from an entry to the slot farthest from it, at 10 km/h. The error probability is that of
-    `parkenv lot check`.
+    The kind of a lot is that of at least nine in ten of its slots, else mixed. A lot is small below 80 slots, large
+    from 200. The drive time is that from an entry to the slot farthest from it, at 10 km/h. The error probability is
+    that of `parkenv lot check`.
 
-    The exit code is 2 if a file holds no lot; the others are counted all the same.
+    The exit code is 2 if a file holds no lot; the others are counted nevertheless.
     """
 
     examples = """

@@ -36,11 +36,11 @@ class Fit(Command):
 
     Its rates depend on the hour, separately for weekdays and weekends, and on a factor per slot. The log shows a slot
     only at single times; the likelihood covers all possible changes in between. Days differ from these rates by the day
-    error, which is estimated along. Use the result, process.json, as --occupancy of `parkenv compare`: unchanged on a
+    error, which is estimated, too. Use the result, process.json, as --occupancy of `parkenv compare`: unchanged on a
     lot with the same number of slots, on any other lot with the fullest slots nearest to the goal.
 
-    Counts of whole car parks: by how much days differ from their forecasts, which readings are faulty, and the week of
-    the car park of median level.
+    Counts of whole car parks: how much days differ from their forecasts, faulty readings, and the week of the car park
+    of median level.
     """
 
     examples = """
@@ -54,12 +54,12 @@ class Fit(Command):
         "hour_utc, time, time_utc), as .csv or .csv.gz."
     )
     max_gap_h: float = option(
-        2.0, "Observations of a log farther apart than this, h, are not linked.", takes="H", ge=0
+        2.0, "Observations of a log that are farther apart than this, h, are independent.", takes="H", ge=0
     )
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
+    timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
     out: Path = option(
         Path("results/occupancy"),
-        "Folder for summary.json and, of a log, process.json and rates.png.",
+        "Folder for summary.json and, for a log, process.json and rates.png.",
         short="-o",
     )
 
@@ -91,10 +91,10 @@ class Fit(Command):
 class Evaluate(Command):
     """Models: day-curves (ours); last-four-weekdays, the mean of the hour on the last four same weekdays; last-week.
 
-    Also hour-mean, of all weekdays or weekend days before; and gradient-boosting. The variances of ours are fitted to
-    the days before --from. Differences of log-losses are to ours, with 95 % intervals over car parks and weeks.
+    Also hour-mean, over all earlier weekdays or weekend days; and gradient-boosting. The variances of ours are fitted
+    to the days before --from. Differences of log-losses are to ours, with 95 % intervals over car parks and weeks.
 
-    Of a log of slots, every slot is forecast in each half-hour, by slot-days (ours), and all models are of the slots.
+    For a log of slots, every slot is forecast in each half-hour, by slot-days (ours) and the same baselines for slots.
     """
 
     examples = """
@@ -106,11 +106,9 @@ class Evaluate(Command):
         description="Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), or a log of slots, "
         "datetime,camera,slot_id,weather,occupied, as .csv or .csv.gz."
     )
-    from_day: Date | None = option(
-        None, "First day that is scored.", name="--from", takes="DATE", default="halfway"
-    )
+    from_day: Date | None = option(None, "First scored day.", name="--from", takes="DATE", default="halfway")
     car_parks: Axis[str] | None = option(None, "Car parks.", takes="NAME[,...]", default="all")
-    timezone: TimeZone = Field("Europe/Berlin", description="Local time of counts in UTC.")
+    timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
     seed: Seed = Field(0, description="Seed of the bootstrap.")
     out: Path = option(
         Path("results/forecasts"), "Folder for summary.json and a picture of each model.", short="-o"
@@ -152,14 +150,15 @@ class Evaluate(Command):
 
 
 class Demand(StudyCommand):
-    """Counts of car parks, and a town that has them: cars come and stay such that they become as full as counted.
+    """The fitted demand of a town reproduces the counted occupancy of its car parks.
 
-    Each car park gets a purpose of its own: arrivals by hour by least squares, and cars that are there at first. Their
-    drivers go where they like, so the town is driven, and what car parks lack is corrected, --rounds times. Counts do
-    not say how often cars change; of several mean stays the longest is taken that can follow them.
+    Each car park gets a purpose with the same name: arrivals by hour (least squares), and cars that are parked at the
+    start. Drivers choose freely, so the command simulates the town and corrects the excess or deficit of each car park,
+    --rounds times. Counts do not show how often cars change; of several mean stays, the longest that can follow the
+    counts is used.
 
-    The result, scenario.json, is the scenario with this demand, of weekdays; Saturdays and Sundays have files of their
-    own. Each day held out is driven with the demand of that day, which follows the forecast from the counts before it.
+    The result, scenario.json, is the scenario with this demand for weekdays; Saturdays and Sundays have separate files.
+    Each held-out day is simulated with its own demand, which follows the forecast from earlier counts.
     """
 
     examples = """
@@ -170,8 +169,8 @@ class Demand(StudyCommand):
     study: DemandStudy = DemandStudy()
     out: Path = option(
         Path("results/demand"),
-        "Folder for scenario.json, saturday.json, sunday.json, summary.json, predicted.csv, demand.png, and what is "
-        "finished: fitted.jsonl and days.jsonl.",
+        "Folder for scenario.json, saturday.json, sunday.json, summary.json, predicted.csv, "
+        "demand.png, and finished work: fitted.jsonl and days.jsonl.",
         short="-o",
     )
 
@@ -212,7 +211,7 @@ class Demand(StudyCommand):
 
 
 class Record(Command):
-    """Which slots are taken on days of a town whose scenario says who comes, as a log: the others in a single search.
+    """The log holds the states of slots on simulated days of a town with a demand: the other cars of a single search.
 
     Name the log in the scenario's table `occupancy`, as `log`, with `mapping = "same"`; then `parkenv compare` and
     environments replay its days. A garage is taken while it is full.
@@ -227,7 +226,7 @@ class Record(Command):
     days: int = option(6, "Days.", name="--episodes", short="-n", ge=2, le=1_000)
     rounds: int = option(
         4,
-        "How often the days are driven: from the second time on, drivers expect what the days before were like.",
+        "Number of simulation rounds: from the second, drivers expect the occupancy of the round before.",
         ge=1,
         le=100,
     )

@@ -19,9 +19,10 @@ from parkenv.studies.fields import TRAFFIC, Agents, OneScenario, Seed
 class Play(Command):
     """The page is one file for phones and desktops, and needs no network.
 
-    You see what the car has seen. After each search the page shows the drives of the agents in the same world, and
-    your regret: what you took beyond the clairvoyant bound. It saves your scores for `parkenv compare --agents
-    human:scores.json`. The worlds' future is in the file, so who reads its source can cheat.
+    The page shows only what the car has observed. After each search it shows the drives of the agents in the same
+    world, and your regret: your total time minus the clairvoyant bound. It saves your scores for `parkenv compare
+    --agents human:scores.json`. The file contains the future of the worlds, so a player can cheat by reading its
+    source.
     """
 
     examples = """
@@ -33,11 +34,12 @@ class Play(Command):
 
     scenario: Annotated[OneScenario, Inside(without=TRAFFIC)] = scenario_spec("campus")
     agents: Agents = Field(
-        (AgentSpec(name="belief"), AgentSpec(name="oracle")), description="Whom you are compared with."
+        (AgentSpec(name="belief"), AgentSpec(name="oracle")),
+        description="Agents to compare your searches with.",
     )
-    worlds: int = option(10, "Worlds to search in; world i has the seed seed + i.", ge=1, le=100)
+    worlds: int = option(10, "Number of worlds; world i has the seed seed + i.", ge=1, le=100)
     seed: Seed = Field(0, description="Seed of the first world.")
-    html: bool = option(False, "Only write the page, and do not open it in the browser.")
+    html: bool = option(False, "Only write the page, without opening it in the browser.")
     out: Path = option(Path("results/play.html"), "The page.", short="-o", takes="FILE.html")
 
     def run(self) -> None:

@@ -23,12 +23,12 @@ LOSERS = ("scenario", "purpose", "change_s", "better_off", "worse_off", "paid_ch
 
 
 class Policy(StudyCommand):
-    """A file says what is wanted (aims), what may change (levers), and how many days may be simulated (budget).
+    """A file gives the aims, the levers (what may change), and the budget (how many days may be simulated).
 
-    The town is driven as it is today, with SFpark's rule, with prices that follow the occupancy, and with what an
-    evolution strategy proposes, all on the same days. What is best is told beside today and SFpark's rule on days and
-    demands that it was not made for: what is reached, what it costs whom, and how sure that is. today.json,
-    SFpark.json and ours.json are scenarios for `parkenv fleet`.
+    The command simulates the town as it is today, with SFpark's rule, with prices that follow the occupancy, and with
+    the proposals of an evolution strategy, all on the same days. It evaluates the best policy, today's and SFpark's
+    rule on new days and other demands: the aims reached, the costs by group of drivers, and their uncertainty.
+    today.json, SFpark.json and ours.json are scenarios for `parkenv fleet`.
     """
 
     examples = """
@@ -38,11 +38,13 @@ class Policy(StudyCommand):
         """
 
     study: PolicyStudy = PolicyStudy()
-    spec: Path | None = option(None, "What is asked (.toml, .json).", takes="FILE", argument=True)
+    spec: Path | None = option(
+        None, "File with aims, levers and budget (.toml, .json).", takes="FILE", argument=True
+    )
     out: Path = option(
         Path("results/policy"),
-        "Folder for summary.json, the policies as scenarios, trials.jsonl, and what `parkenv fleet` writes of the "
-        "held-out days.",
+        "Folder for summary.json, the policies as scenarios, trials.jsonl, and the files of "
+        "`parkenv fleet` for the held-out days.",
         short="-o",
     )
 

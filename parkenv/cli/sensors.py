@@ -23,10 +23,10 @@ _OBSERVATIONS = ("--sensor-model", "--view-range", *PRICES)
 
 
 class Preview(Command):
-    """Writes one figure per weather, at the place with the most parked cars: what each sensor measures there.
+    """Each figure shows the measurements of all sensors in one weather, at the place with the most parked cars.
 
     It shows the side camera's image with the true boxes, its depth, the stereo camera's disparity, and the laser scan
-    from above. Also writes a short video of the side camera.
+    from above. The command also writes a short video of the side camera.
     """
 
     examples = """
@@ -47,7 +47,7 @@ class Preview(Command):
     drive: float = option(
         20.0, "Length of the video, m; 0 for none.", takes="0 <= M <= 10000", ge=0, le=10_000
     )
-    every: float = option(0.5, "Metres between its frames.", takes="M", ge=0.05)
+    every: float = option(0.5, "Metres between frames of the video.", takes="M", ge=0.05)
     seed: Seed = 0
     out: Path = option(Path("results/sensors"), "Folder for the pictures and drive.gif.", short="-o")
 
@@ -71,7 +71,7 @@ class Preview(Command):
 class FitSensorModel(Command, ExecutionSpec):
     """The rates define a sensor model for `parkenv compare --sensor-model FILE`.
 
-    It makes the same errors as the perception pipeline, a thousand times as fast.
+    The model has the same error rates as the perception pipeline, and is a thousand times as fast.
     """
 
     examples = """
@@ -87,7 +87,7 @@ class FitSensorModel(Command, ExecutionSpec):
         20, "Episodes of each of three agents in each scenario.", short="-n", ge=1, le=1_000_000
     )
     rig: RigName | None = option(
-        None, "Whose errors to measure.", panel="Sensors", default="the scenario's, laser"
+        None, "Detector whose errors are measured.", panel="Sensors", default="the scenario's, laser"
     )
     detector: Detector = None
     weather: WeatherName | None = option(

@@ -39,7 +39,8 @@ class RunCommand(Command):
     out: Annotated[Path | None, Option(short="-o")]
     resume: bool = option(
         False,
-        "Go on with the run in --out. Where finished results stay valid, options may change it, such as more episodes.",
+        "Continue the run in --out. Options may change it, for example to more episodes, if "
+        "finished results stay valid.",
         panel="Results",
     )
     overwrite: bool = option(False, "Replace the run in --out.", panel="Results")
@@ -156,7 +157,7 @@ COMMANDS = {
 
 
 class Run(RunCommand, ExecutionSpec):
-    """Settings that the file leaves out have the defaults of its command.
+    """Settings that the file omits have the defaults of its command.
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
     command: compare (the default), commute, fleet, curve, demand, policy, benchmark, survey, detectors, demo,

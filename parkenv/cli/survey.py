@@ -31,7 +31,7 @@ class Survey(StudyCommand):
     """Parked cars are detected in the camera images and located with the laser (or the stereo camera).
 
     A Bayes filter estimates the state of each slot. Every drive is one session of the map. Sessions are added to the
-    map in --out: the same command goes on with an interrupted survey, with or without --resume.
+    map in --out: the same command continues an interrupted survey, with or without --resume.
     """
 
     examples = """
@@ -88,9 +88,9 @@ class Survey(StudyCommand):
 
 
 class MapDrive(Command):
-    """A recording of `parkenv survey --record` says which sensors it has; for any other a calibration file says so.
+    """A recording of `parkenv survey --record` names its sensors; any other recording needs a calibration file.
 
-    Of photographs or a film, with poses beside, distances follow from the boxes: from the ground and a car's size.
+    For photographs or a film with poses, distances follow from the boxes: from the ground and a car's size.
     """
 
     examples = """
@@ -114,7 +114,7 @@ class MapDrive(Command):
     )
     every: float = option(0.0, "Least distance between captures, m.", takes="M", ge=0.0)
     detector: Detector = None
-    localise: LocaliserName = option("none", "scan-matching: the poses are odometry that drifts; correct it.")
+    localise: LocaliserName = option("none", "scan-matching: the poses are drifting odometry; correct them.")
     photos: PhotoOptions = PhotoOptions()
     out: Path = option(
         Path("results/drive"),
@@ -150,21 +150,21 @@ class MapDrive(Command):
 
 
 class Map(Command):
-    """Of a weekday and hour, or over all sessions."""
+    """The predictions are for a weekday and hour, or over all sessions."""
 
     examples = """
         parkenv map results/survey/map.sqlite --weekday tue --hour 9.5
         parkenv map results/survey/map.sqlite --slot A3 --out results/map
         """
 
-    map_file: Path = option(..., "A map file that `parkenv survey` wrote.", name="FILE", argument=True)
+    map_file: Path = option(..., "A map file of `parkenv survey`.", name="FILE", argument=True)
     scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
     weekday: Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"] | None = option(
         None, "mon, tue, ..., sun.", takes="DAY", default="the mean over all sessions"
     )
     hour: float = option(9.0, "Hour of the day, with --weekday.", takes="H", ge=0, le=24)
-    slot: str | None = option(None, "Only this slot.", takes="ID", default="all")
-    confidence: float = option(0.9, "Of the interval.", takes="P", gt=0, lt=1)
+    slot: str | None = option(None, "Show only this slot.", takes="ID", default="all")
+    confidence: float = option(0.9, "Probability of the interval.", takes="P", gt=0, lt=1)
     out: Path | None = option(
         None, "Folder for map.png, slots.csv, summary.json.", short="-o", default="none"
     )

@@ -36,8 +36,8 @@ class Train(StudyCommand):
     reward (ppo); their curriculum starts just outside the slot. All are evaluated in held-out worlds; each seed's best
     model is kept, and tested at the end. Hyperparameters are in parkenv/studies/training/configs.py.
 
-    With --resume, trainings continue from the checkpoints in --out; the models equal those of an unbroken training.
-    With more --steps, finished ones go on, too.
+    With --resume, trainings continue from the checkpoints in --out; the models equal those of an uninterrupted
+    training. With more --steps, finished trainings continue, too.
     """
 
     examples = """
@@ -83,10 +83,10 @@ class Train(StudyCommand):
 
 
 class Publish(Command, ExecutionSpec):
-    """Of a training, the best model is published, with its learning curve.
+    """The published model is the best one of a training, with its learning curve, or a model file.
 
-    The model is evaluated beside planners in the same worlds, by default in the scenarios that it was tested in, and if
-    it was trained in a fleet, in fleets with that demand; the model card gives results with 95 % intervals and the
+    The model and planners are evaluated in the same worlds, by default in the test scenarios of the training; a model
+    trained in a fleet is evaluated in fleets with that demand. The model card gives results with 95 % intervals and the
     command that repeats them.
     """
 

@@ -22,7 +22,8 @@ Trust = Annotated[
     bool,
     Option(panel="Code of others"),
     Field(
-        description="Run the classes (MODULE:CLASS), and use the cluster, that the file or the folder of the run names."
+        description="Run the classes (MODULE:CLASS) and use the cluster named by the file or the folder of "
+        "the run."
     ),
 ]
 TrustModel = Annotated[

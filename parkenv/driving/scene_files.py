@@ -75,7 +75,7 @@ class CrossingSpec(Spec):
     kind: Literal["pedestrian", "car"]
     way: Annotated[Several[_Point], Field(min_length=2, max_length=2, description="Start and end, m.")]
     speed_mps: float = Field(1.3, description="Its speed, m/s.")
-    begins_s: float = Field(0.0, description="When it sets off, s.")
+    begins_s: float = Field(0.0, description="Start time, s.")
 
 
 class SceneSpec(Spec):
@@ -85,9 +85,9 @@ class SceneSpec(Spec):
     target: _Pose
     vehicle: Any = Field(None, description="The car: a name, a file, or a table.")
     bounds: _Bounds | None = Field(
-        None, description="Least x and y and greatest x and y that the car may reach, m."
+        None, description="Smallest x and y and largest x and y that the car may reach, m."
     )
-    obstacles: Several[ObstacleSpec] = Field((), description="What the car must not touch.")
+    obstacles: Several[ObstacleSpec] = Field((), description="Obstacles that the car must not touch.")
     crossings: Several[CrossingSpec] = Field((), description="Road users.")
 
 

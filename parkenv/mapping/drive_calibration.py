@@ -59,7 +59,7 @@ class CameraSpec(Lens):
     """A camera and its topic."""
 
     name: Name
-    topic: Topic = Field("/pictures", description="Of its images; photographs and films have none.")
+    topic: Topic = Field("/pictures", description="Topic of its images; none for photographs and films.")
 
 
 class StereoSpec(Lens):

@@ -30,7 +30,7 @@ class PhotoOptions(Spec):
     )  # fmt: skip
     clock_offset: float = option(0.0, "Seconds to add to the pictures' times.", takes="S", **_PANEL)
     fps: float | None = option(
-        None, "Pictures a second, the first at the first pose.", takes="N", default="Exif times; a film's own",
+        None, "Pictures per second; the first is at the first pose.", takes="N", default="Exif times; a film's own",
         gt=0.0, le=1000.0, **_PANEL,
     )  # fmt: skip
     pose_error: float | None = option(

@@ -55,17 +55,18 @@ class OnnxSettings(Spec):
 
     layout: Layout | None = Field(
         None,
-        description="What the network puts out. yolo: (1, 4 + classes, n), box and class scores (YOLOv8 and later, "
-        "RT-DETR of ultralytics); yolo5: (1, n, 5 + classes), with an objectness (YOLOv5, v7, decoded YOLOX); boxes: "
-        "(1, n, 6), corners, score and class, after non-maximum suppression (YOLOv10, YOLO26, end to end); detr: "
-        "scores (1, n, classes) and boxes (1, n, 4) as two outputs; centers: (1, 9, rows, columns), for each cell "
-        "P(car), the box's sides from its centre in px, P(end), P(oblique), P(side) of the view, visible fraction.",
+        description="Output of the network. yolo: (1, 4 + classes, n), box and class scores (YOLOv8 and "
+        "later, RT-DETR of ultralytics); yolo5: (1, n, 5 + classes), with an objectness (YOLOv5, "
+        "v7, decoded YOLOX); boxes: (1, n, 6), corners, score and class, after non-maximum "
+        "suppression (YOLOv10, YOLO26, end to end); detr: scores (1, n, classes) and boxes (1, n, "
+        "4) as two outputs; centers: (1, 9, rows, columns), for each cell P(car), the box's sides "
+        "from its centre in px, P(end), P(oblique), P(side) of the view, visible fraction.",
     )
     outputs: Several[str] | None = Field(
-        None, max_length=2, description="Names of the outputs to read; of detr the scores first."
+        None, max_length=2, description="Names of the outputs to read; for detr, the scores first."
     )
     size: Annotated[tuple[Pixels, Pixels], Field(strict=False)] | None = Field(
-        None, description="Width and height of the input, px, where the file leaves them open."
+        None, description="Width and height of the input, px, if the file does not fix them."
     )
     resize: Literal["letterbox", "stretch"] | None = Field(
         None,
@@ -76,8 +77,8 @@ class OnnxSettings(Spec):
     )
     mirror: bool = Field(
         False,
-        description="Whether an image that even the largest magnification makes smaller than the input is looked at "
-        "mirrored, too, and the two averaged; of centers only.",
+        description="Whether to average the outputs for an image and its mirror image, if the image is "
+        "smaller than the input even at the largest magnification; for centers only.",
     )
     pad: int = Field(114, ge=0, le=255, description="Grey level of the borders of a letterbox.")
     channels: Literal["rgb", "bgr", "grey"] | None = Field(
@@ -104,8 +105,8 @@ class OnnxSettings(Spec):
     )
     scores: Scores | None = Field(
         None,
-        description="probabilities by default; of detr softmax (the last class is none) with 92 or 2 scores, else "
-        "logits, of which each is a probability of its own.",
+        description="probabilities by default; for detr, softmax (the last class is none) with 92 or 2 "
+        "scores, else logits, each an independent probability.",
     )
     cars: Several[Annotated[int, Field(ge=0, le=100_000)]] | None = Field(
         None,
@@ -115,7 +116,10 @@ class OnnxSettings(Spec):
         "or COCO's where it has 80 classes.",
     )
     threshold: float = Field(
-        LEAST_PROBABILITY, gt=0.0, lt=1.0, description="Least score of a box. The pipeline uses weak ones."
+        LEAST_PROBABILITY,
+        gt=0.0,
+        lt=1.0,
+        description="Smallest score of a box. The pipeline also uses weak boxes.",
     )
     overlap: float | None = Field(
         None,

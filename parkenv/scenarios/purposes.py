@@ -63,27 +63,26 @@ class PurposeSpec(Spec):
     )
     stay_s: float = Field(3600.0, ge=1.0, le=1e7, description="Mean stay.")
     stay_law: Literal["exponential", "log-normal", "constant"] = "exponential"
-    stay_cv: float = Field(
-        1.0, gt=0.0, le=10.0, description="Standard deviation of log-normal stays, over their mean."
-    )
+    stay_cv: float = Field(1.0, gt=0.0, le=10.0, description="Coefficient of variation of log-normal stays.")
     value_of_time: float | None = Field(
         None,
         gt=0.0,
         le=1e6,
-        description="Value of an hour of their time, in the currency of the prices; that of `costs` if absent.",
+        description="Value of an hour of the drivers' time, in the currency of the prices; that of `costs` if "
+        "absent.",
     )
     classes: dict[str, Annotated[float, Field(ge=0.0, le=1.0)]] = Field(
-        {}, description="Share of the drivers of each class, such as permit-a, disabled or charging."
+        {}, description="Share of the drivers of each class, for example permit-a, disabled or charging."
     )
     walks_back: bool = Field(False, description="Whether the walk back to the car counts, too.")
     patience_s: float = Field(
         600.0,
         gt=0.0,
         le=1e7,
-        description="Search time, without the way to their goal, after which cars go elsewhere.",
+        description="Search time, without the drive to the goal, after which cars go elsewhere.",
     )
     kwh: float = Field(0.0, ge=0.0, le=1e3, description="Energy that a car of the class charging takes, kWh.")
-    parked: int = Field(0, ge=0, le=MAX_CARS, description="Cars that stand in slots when the hours begin.")
+    parked: int = Field(0, ge=0, le=MAX_CARS, description="Cars that are parked when the hours begin.")
     goals: Weights = Field(
         (), description="Weight of each goal of the lot; those of the lot for this purpose if absent."
     )

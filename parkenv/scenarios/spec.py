@@ -80,7 +80,7 @@ class GridLot(Spec):
     """Rows of perpendicular slots along parallel two-way aisles."""
 
     rows: int = Field(ge=1, le=10_000)
-    columns: int = Field(ge=1, le=10_000, description="Slots a row.")
+    columns: int = Field(ge=1, le=10_000, description="Slots per row.")
     pitch: Size = Field(2.5, description="Width of a slot, m.")
     depth: Size = Field(5.0, description="Length of a slot, m.")
     aisle: Size = Field(6.0, description="Width of an aisle, m.")
@@ -134,10 +134,10 @@ class TypicalWeek(Spec):
     """A working week: full by day, empty by night, fuller near the goal."""
 
     pull: float = Field(
-        1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
+        1.6, ge=-20, le=20, description="Rise of demand from the middle of the lot to the goal, logits."
     )
     unevenness: float = Field(
-        0.6, ge=0, le=20, description="Standard deviation between equally near slots, logits."
+        0.6, ge=0, le=20, description="Standard deviation between slots equally near to the goal, logits."
     )
     demand: float = Field(0.0, ge=-50, le=50, description="Logits added at every hour.")
     mean_stay_s: float = Field(7200.0, ge=1.0, le=1e7)
@@ -154,10 +154,13 @@ class RealWeek(Spec):
         description="Fraction of real car parks that are less full; 0.5 for the typical one.",
     )
     pull: float = Field(
-        PULL, ge=-10, le=10, description="Logits by which demand rises from the middle to the goal."
+        PULL, ge=-10, le=10, description="Rise of demand from the middle of the lot to the goal, logits."
     )
     unevenness: float = Field(
-        UNEVENNESS, ge=0, le=5, description="Standard deviation between equally near slots, logits."
+        UNEVENNESS,
+        ge=0,
+        le=5,
+        description="Standard deviation between slots equally near to the goal, logits.",
     )
     mean_stay_s: float = Field(7200.0, ge=60.0, le=1e7)
 
@@ -166,7 +169,7 @@ class Event(Spec):
     """A day on which the slots nearest to the goal fill up."""
 
     share: Probability = Field(description="Fraction of the slots that the event fills, the nearest ones.")
-    factor: float = Field(gt=0, le=1e6, description="Of their arrival rates.")
+    factor: float = Field(gt=0, le=1e6, description="Factor of their arrival rates.")
 
 
 def _occupancy_tables(value: object) -> object:
@@ -224,8 +227,10 @@ Deviation = Annotated[float, Field(ge=0.0, le=MAX_LOGITS)]
 class DayErrorSpec(Spec):
     """How far whole days differ from the forecast: standard deviations over days, logits; or one number, the level."""
 
-    level: Deviation = Field(0.0, description="Of the shift of all slots at once.")
-    slope: Deviation = Field(0.0, description="Of the additional rise from the lot's middle to the goal.")
+    level: Deviation = Field(0.0, description="Standard deviation of the shift of all slots at once.")
+    slope: Deviation = Field(
+        0.0, description="Standard deviation of the additional rise from the lot's middle to the goal."
+    )
 
 
 class OrNumber:
@@ -241,23 +246,25 @@ class CountsSpec(Spec):
     """Days of a car park of which the number of free places was counted every hour, replayed on the lot."""
 
     file: FilePath = Field(
-        description="Counts: car_park,capacity,hour,free, each at its hour's end, or `time` for moments; .csv, .csv.gz."
+        description="Counts: car_park,capacity,hour,free, each at its hour's end, or `time` for points in "
+        "time; .csv, .csv.gz."
     )
     car_park: Annotated[
         str,
         Option(
             takes="NAME[,NAME...]|all",
             panel="World",
-            description="--occupancy is a file of hourly counts, car_park,capacity,hour,free; replay the days of these "
-            "car parks on the lot, each as a scenario of its own. all: those that show some use.",
+            description="With --occupancy as a file of hourly counts, car_park,capacity,hour,free: replay the "
+            "days of these car parks on the lot, each as a separate scenario. all: all car parks in "
+            "use.",
         ),
     ] = Field(description="Name of the car park in the file.")
-    timezone: str = Field("Europe/Berlin", description="Of `hour_utc` and `time_utc`.")
+    timezone: str = Field("Europe/Berlin", description="Local time zone, for `hour_utc` and `time_utc`.")
     pull: float = Field(
-        1.6, ge=-20, le=20, description="Logits by which demand rises from the middle to the goal."
+        1.6, ge=-20, le=20, description="Rise of demand from the middle of the lot to the goal, logits."
     )
     unevenness: float = Field(
-        0.6, ge=0, le=20, description="Standard deviation between equally near slots, logits."
+        0.6, ge=0, le=20, description="Standard deviation between slots equally near to the goal, logits."
     )
     mean_stay_s: float = Field(7200.0, ge=1.0, le=1e7)
 
@@ -267,7 +274,7 @@ class OccupancySpec(Spec):
 
     typical: TypicalWeek | None = None
     real_week: RealWeek | None = None
-    process: FilePath | None = Field(None, description="Rates that `parkenv occupancy fit` wrote (.json).")
+    process: FilePath | None = Field(None, description="Rates from `parkenv occupancy fit` (.json).")
     log: Annotated[Several[FilePath], BeforeValidator(_several), Field(min_length=1), OrText()] | None = (
         Field(
             None,
@@ -282,14 +289,14 @@ class OccupancySpec(Spec):
     )
     replay_from: Date | None = option(
         None,
-        "First day of the log or the counts that is replayed.",
+        "First replayed day of the log or the counts.",
         takes="DATE",
         panel="World",
         default="the scenario's, all",
     )
     forecast_from: ForecastFrom | None = option(
         None,
-        "Days that the forecast is made from. past: those before the first replayed day; rolling: those "
+        "Days used for the forecast. past: those before the first replayed day; rolling: those "
         "before the earliest that a world replays; others: all that it does not replay.",
         panel="World",
         default="the scenario's; others, with counts rolling",
@@ -304,8 +311,8 @@ class OccupancySpec(Spec):
     event: Event | None = None
     day_error: Annotated[DayErrorSpec, BeforeValidator(_day_error_tables), OrNumber()] | None = option(
         None,
-        "How far whole days differ from the forecast: standard deviations, logits, of their level and of "
-        "their slope to the goal; 0 for days that are as forecast.",
+        "Difference of whole days from the forecast: standard deviations, logits, of their level "
+        "and of their slope to the goal; 0: days are as forecast.",
         takes="X[,Y]",
         panel="World",
         parse=_day_error_text,
@@ -361,7 +368,7 @@ class ForecastSpec(Spec):
 
     typical: TypicalWeek | None = None
     process: FilePath | None = None
-    map: FilePath | None = Field(None, description="A map file that `parkenv survey` wrote (.sqlite).")
+    map: FilePath | None = Field(None, description="A map file of `parkenv survey` (.sqlite).")
     flat: Probability | None = Field(None, description="The same probability for every slot.")
 
     @model_validator(mode="after")
@@ -423,7 +430,7 @@ class Speeds(Spec):
 
 
 MAX_PRICE = 1e6
-"""Highest price of an hour."""
+"Highest price per hour."
 
 
 def _per_hour(text: str) -> float:
@@ -475,8 +482,10 @@ def _prices(value: object) -> object:
 class Costs(Spec):
     """Costs of a search, s, and the prices of parking."""
 
-    failure_s: Cost = Field(10.0, description="Failed attempt to park; planners know it.")
-    wait_s: float = Field(1.0, gt=0.0, le=86_400.0, description="Move that the drive graph does not have.")
+    failure_s: Cost = Field(10.0, description="Cost of a failed parking attempt; planners know it.")
+    wait_s: float = Field(
+        1.0, gt=0.0, le=86_400.0, description="Cost of a move that the drive graph does not have."
+    )
     give_up_s: Cost = Field(1800.0, description="Give-up penalty: park elsewhere and walk.")
     prices: Annotated[dict[str, _Amount], BeforeValidator(_prices)] = option(
         {},
@@ -492,7 +501,7 @@ class Costs(Spec):
     )
     value_of_time: float = option(
         VALUE_OF_TIME,
-        "Value of an hour of the driver's time, in the same currency: an amount that is paid costs as much time.",
+        "Value of an hour of the driver's time, in the same currency; converts payments to time.",
         takes="AMOUNT/h",
         panel="Prices",
         parse=_per_hour,
@@ -502,7 +511,7 @@ class Costs(Spec):
     )
     stay_s: float = option(
         HOUR_S,
-        "Expected stay, which the price is for; in a fleet each car knows its own.",
+        "Expected stay, for the price; in a fleet each car knows its own.",
         name="--stay-min",
         takes="MINUTES",
         panel="Prices",
@@ -529,14 +538,14 @@ class SensorModelSpec(Spec):
     """How slots are observed from the lane."""
 
     name: SensorModelName | None = Field(
-        None, description="perfect; blind: only by attempts; laser, stereo: as measured with that rig."
+        None, description="perfect; blind: only by attempts; laser, stereo: fitted to that rig."
     )
-    file: FilePath | None = Field(None, description="A sensor model that `parkenv fit-sensor-model` wrote.")
+    file: FilePath | None = Field(None, description="A sensor model of `parkenv fit-sensor-model`.")
     hit_rate: Probability | None = Field(None, description="P(observed taken | taken).")
     false_alarm_rate: Probability | None = Field(None, description="P(observed taken | free).")
     view_range: float | None = option(
         None,
-        "How far slots are observed from the car, m.",
+        "Range within which the car observes slots, m.",
         takes="M",
         panel="Sensors",
         default="the sensor model's",
@@ -557,7 +566,7 @@ class SensorModelSpec(Spec):
 class TrafficSpec(Spec):
     """Other road users."""
 
-    cars: Count = option(0, "Other cars that drive about.", panel="World", default="the scenario's")
+    cars: Count = option(0, "Other moving cars.", panel="World", default="the scenario's")
     pedestrians: Count = option(0, "Pedestrians.", panel="World", default="the scenario's")
 
 
@@ -584,16 +593,21 @@ def _name(value: str) -> str:
 class ZoneSpec(Spec):
     """Rules of a zone in place of the lot's, or of one that is cut out of it, such as the street of a market."""
 
-    of: str | None = Field(None, description="Zone that it is cut out of, whose rules it has else.")
+    of: str | None = Field(
+        None, description="Zone that it is cut out of; it inherits the rules that are not given."
+    )
     facilities: Several[str] = Field(
         (),
-        description="Facilities whose slots in that zone it takes; * stands for any letters. All if absent.",
+        description="Facilities of that zone whose slots it contains; * stands for any letters. All if "
+        "absent.",
     )
     price: Annotated[
         float | str | dict[str, Any] | None, WithJsonSchema({"type": ["number", "string", "object"]})
-    ] = Field(None, description="Price of an hour, prices by hours (1 @ 08:00-12:00), or as in a lot file.")
+    ] = Field(
+        None, description="Price per hour, prices by time of day (1 @ 08:00-12:00), or as in a lot file."
+    )
     hours: str | None = Field(
-        None, description="When one may park there: 'Mo,Tu,Th-Su 00:00-24:00; We 14:00-24:00', 24/7, off."
+        None, description="When parking is allowed: 'Mo,Tu,Th-Su 00:00-24:00; We 14:00-24:00', 24/7, off."
     )
     max_stay_s: float | None = Field(None, ge=0.0, le=1e7, description="Longest stay; 0: no limit.")
     users: Several[str] | None = Field(None, description="Classes of drivers who may park there.")
@@ -635,7 +649,9 @@ class ScenarioSpec(Spec):
 
     model_config = ConfigDict(json_schema_extra=_lot_or_base)
 
-    name: Annotated[str, AfterValidator(_name)] = Field("", description="In tables; the file's by default.")
+    name: Annotated[str, AfterValidator(_name)] = Field(
+        "", description="Name in tables; the file's name by default."
+    )
     lot: Annotated[LotSpec, BeforeValidator(_lot_tables), OrText()]
     goal: Annotated[int | tuple[float, float], BeforeValidator(_goal)] = option(
         0,
@@ -648,8 +664,8 @@ class ScenarioSpec(Spec):
     entry: int | None = Field(None, ge=0, description="Index of the entry; drawn for each search if absent.")
     occupancy: Annotated[OccupancySpec, BeforeValidator(_occupancy_tables), OrText()] = option(
         OccupancySpec(),
-        "Which slots are taken when: recorded logs (.csv, .csv.gz) of the same slots, replayed day by day; "
-        "a process that `parkenv occupancy fit` wrote (.json); or a world of your own, MODULE:CLASS.",
+        "States of the slots: recorded logs (.csv, .csv.gz) of the same slots, replayed day by "
+        "day; a process of `parkenv occupancy fit` (.json); or your own world, MODULE:CLASS.",
         takes="FILE[,FILE...]|MODULE:CLASS",
         panel="World",
         default="the scenario's",
@@ -658,33 +674,34 @@ class ScenarioSpec(Spec):
     forecast: Annotated[ForecastSpec, BeforeValidator(_forecast_tables), OrText()] = ForecastSpec()
     arrivals: Arrivals = Arrivals()
     demand: dict[PurposeName, PurposeSpec] = Field(
-        {}, description="What many cars come for, by the name of the purpose, in the hours of `arrivals`."
+        {}, description="Demand of many cars by purpose, in the hours of `arrivals`."
     )
     zones: dict[str, ZoneSpec] = Field(
         {},
-        description="Rules of zones in place of the lot's, by name; with `of`, new zones that are cut out of it.",
+        description="Rules of zones in place of the lot's, by name; with `of`, new zones cut out of existing "
+        "ones.",
     )
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
     sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = option(
         SensorModelSpec(name="perfect"),
-        "How slots are observed. perfect: without error; blind: by attempts alone; laser, stereo: as "
-        "measured with that rig; a file of `parkenv fit-sensor-model`.",
+        "How slots are observed. perfect: without error; blind: only by attempts; laser, stereo: "
+        "fitted to that rig; a file of `parkenv fit-sensor-model`.",
         takes="NAME|FILE",
         panel="Sensors",
         default="the scenario's; with --rig, the rig's",
     )
-    rig: RigName = Field("laser", description="The sensors of the car, where they are simulated.")
+    rig: RigName = Field("laser", description="The simulated sensors of the car.")
     detector: PackagedDetector = Field(
-        "hog", description="What looks at their images: hog, side, front, or a file (.npz, .onnx)."
+        "hog", description="Detector for their images: hog, side, front, or a file (.npz, .onnx)."
     )
     traffic: TrafficSpec | None = Field(
         None, description="Other road users; none if absent, some in surveys."
     )
     base: PackagedLot | None = Field(
         None,
-        description="A packaged scenario for what is left out, also single values of arrivals, costs, demand, speeds, "
-        "zones.",
+        description="A packaged scenario that supplies omitted keys, also single values of arrivals, costs, "
+        "demand, speeds, zones.",
     )
 
     @model_validator(mode="before")

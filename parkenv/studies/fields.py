@@ -186,9 +186,9 @@ Values = Annotated[Axis[T], BeforeValidator(listed)]  # an axis of the grid; a s
 Rig = Annotated[
     RigName | None,
     Field(
-        description="Observe slots through simulated sensors, detector and all, instead of the sensor model: about a "
-        "second a step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: a laser and a camera to "
-        "each side; camera: a camera alone."
+        description="Observe slots with simulated sensors and a detector instead of the sensor model: about a "
+        "second per step. laser: a camera and a 270° laser; stereo: a stereo camera; both_sides: "
+        "a laser and a camera to each side; camera: a camera alone."
     ),
     Option(panel="Sensors"),
 ]
@@ -227,8 +227,8 @@ Patience = Annotated[
         default="10",
         panel="Demand",
         parse=seconds_of_minutes,
-        description="Minutes after which a searching car goes elsewhere, at the give-up penalty; "
-        "in a town, its way there does not count.",
+        description="Minutes after which a searching car goes elsewhere, at the give-up penalty; in a town, "
+        "the drive to the goal does not count.",
     ),
 ]
 BUSY = TrafficSpec(cars=3, pedestrians=5)
@@ -241,7 +241,7 @@ def with_traffic(scenario: ScenarioSpec) -> ScenarioSpec:
 
 
 CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
-"""Distance between captures, m."""
+"Distance between captures, m."
 
 
 def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[ScenarioSpec, ...] = ()) -> None:

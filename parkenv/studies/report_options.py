@@ -36,7 +36,7 @@ class ReportOptions(Spec):
     sessions: int = option(1, "Survey drives to replay.", ge=0)
     frames: int = option(120, "Captures of them to keep, all drives together.", ge=2, le=250)
     drives: Sequence[dict[str, Any]] | None = Field(
-        None, description="Drives that are already recorded, instead of driving them again."
+        None, description="Recorded drives to use instead of driving again."
     )
 
     def chosen_agents(self, known: Sequence[str]) -> Sequence[str]:

@@ -85,7 +85,8 @@ class ExecutionSpec(Spec):
     )
     address: str | None = option(
         None,
-        "Of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, tcp://HOST:8786.",
+        "Address of the cluster: Ray's head, HOST:6379 or ray://HOST:10001; Dask's scheduler, "
+        "tcp://HOST:8786.",
         takes="HOST:PORT",
         panel="Machines",
         default="a cluster on this machine",

@@ -61,27 +61,27 @@ class Commute(Study):
     kind: Literal["commute"] = "commute"
     agents: Agents = Field(
         tuple(AgentSpec(name=name) for name in ("belief", "mdp", "first-free", "greedy-drive")),
-        description="Agents, with any options in brackets; differences in `weeks` of summary.json are to the first "
-        "that uses no map.",
+        description="Agents, with any options in brackets; differences in `weeks` of summary.json are to the "
+        "first agent without a map.",
     )
     scenarios: Scenarios = (scenario_spec("campus"),)
     maps: Annotated[Axis[MapName], BeforeValidator(listed)] = option(
         ("empty",),
-        "The map on the first day. empty: 50 % for every slot. right: the forecast of the scenario's "
-        "occupancy. wrong: the forecast of the scenario where it differs from that (jam), else the right one with near "
-        "and far slots exchanged.",
+        "The map on the first day. empty: 50 % for every slot. right: the forecast of the "
+        "scenario's occupancy. wrong: the scenario's own forecast if it differs from that (jam), "
+        "else the right one with near and far slots exchanged.",
         name="--map",
     )
     days: int = option(
-        30, "Days on which each driver comes, at most those of a recorded log.", ge=1, le=MAX_DAYS
+        30, "Number of days of each driver, at most those of a recorded log.", ge=1, le=MAX_DAYS
     )
     drivers: int = option(
         40,
-        "Drivers (or fleets), each with a map of their own: the more, the narrower the intervals.",
+        "Number of drivers (or fleets), each with a separate map; more drivers give narrower intervals.",
         ge=1,
         le=100_000,
     )
-    fleet: int = option(1, "Drivers who share a map, and come every day.", ge=1, le=1_000)
+    fleet: int = option(1, "Number of daily drivers who share a map.", ge=1, le=1_000)
     seed: Seed = Field(0, description="Seed of days and drivers.")
     figures: Figures = True
 

@@ -68,9 +68,9 @@ class Grid(Spec):
 
     failure_s: Values[Cost] | None = option(
         None,
-        "Seconds that the world charges for a failed attempt, and that planners expect unless their own "
-        "options say otherwise. sweep: 0 to 120 s, and again as scenario NAME-blind, in which no slot is "
-        "observed before an attempt, for agents that can do without.",
+        "Cost of a failed attempt, s: the world charges it, and planners assume it unless their "
+        "own options differ. sweep: 0 to 120 s, and again as scenario NAME-blind, in which no "
+        "slot is observed before an attempt, for agents that need no observations.",
         name="--failure-cost",
         takes="S[,S...]|sweep",
         default="the scenario's, 10",
@@ -85,8 +85,8 @@ class Grid(Spec):
     )
     occupancy_levels: Annotated[tuple[Level, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = option(
         (),
-        "Also set the lot's mean occupancy to these values, with a sixth of the episodes each, for the "
-        "figure of time against occupancy. Searches in a recorded log are binned instead.",
+        "Also run at these mean occupancies of the lot, with a sixth of the episodes each, for "
+        "the figure of time against occupancy. Searches in a recorded log are binned instead.",
         takes="P[,...]|none",
         default="0.5,0.7,0.8,0.9,0.95,0.99; none with --failure-cost sweep",
         panel="World",
@@ -96,8 +96,8 @@ class Grid(Spec):
     constant_forecast: Annotated[tuple[Probability, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = (
         option(
             (),
-            "Also with wrong forecasts that give every slot this probability of being taken; draws total "
-            "time against it.",
+            "Also run with wrong forecasts that give every slot this probability of being taken; "
+            "draws total time against it.",
             takes="P[,...]",
             panel="World",
             default="none",
@@ -107,8 +107,8 @@ class Grid(Spec):
     )
     budget_ms: Annotated[tuple[Milliseconds, ...], AfterValidator(lambda v: tuple(sorted(set(v))))] = option(
         (),
-        "Run agents that have the option budget_ms, time for a decision, with each of these, ms; draws total time "
-        "against the time of a decision. Use an idle machine.",
+        "Run agents with the option budget_ms at each of these times per decision, ms; draws "
+        "total time against the time of a decision. Use an idle machine.",
         takes="MS[,...]",
         default="none",
         strict=False,
@@ -116,7 +116,8 @@ class Grid(Spec):
     )
     blind: bool = Field(
         False,
-        description="Also without observations of slots before an attempt, for agents that can do without.",
+        description="Also run without observations of slots before an attempt, for agents that need no "
+        "observations.",
     )
     calibrated: FilePath | None = option(
         None,

@@ -64,16 +64,18 @@ class CurveStudy(FleetStudy):
     ] = Field(default_factory=lambda: (scenario_spec("town"),))
     arrivals_per_hour: Values[Demanded] | None = option(
         ("0.4x", "0.7x", "1x", "1.2x", "1.4x", "1.6x"),
-        "Demands to drive: multiples of the scenario's own, or else of the counted one; or cars an hour.",
+        "Demands to simulate: multiples of the scenario's own, or else of the counted one; or cars an hour.",
         takes="X|1.2x[,...]",
         panel="Demand",
         parse=words_in,
     )
     days: int = option(6, "Days of each demand.", name="--episodes", short="-n", ge=2, le=100_000)
     reach_m: float = option(
-        300.0, "Walk to a goal up to which spaces are around it, m.", name="--reach", ge=1.0, le=10_000.0
+        300.0, "Largest walk from a space to the goal of its zone, m.", name="--reach", ge=1.0, le=10_000.0
     )
-    bootstraps: int = option(20, "Draws of days and zones for intervals.", panel="Results", ge=2, le=10_000)
+    bootstraps: int = option(
+        20, "Number of bootstrap samples of days and zones, for intervals.", panel="Results", ge=2, le=10_000
+    )
 
     @property
     def knowledge(self) -> tuple[str, ...]:

@@ -84,14 +84,12 @@ class DatasetStudy(Study):
         ),
         Option("--policy", takes="NAME[,...]", parse=split_agents, default="mixed"),
     ] = (AgentSpec(name=MIXED),)
-    steps: int = option(
-        100_000, "Steps of each data set: as many whole searches as have so many.", ge=1, le=100_000_000
-    )
+    steps: int = option(100_000, "Steps of each data set, as whole searches.", ge=1, le=100_000_000)
     epsilon: float = option(
         0.0, "Take a random action with this probability, as off-policy evaluation needs.", ge=0.0, le=1.0
     )
     observation: Literal["local", "occupancy", "full"] = option(
-        "local", "What is recorded, as `parkenv/Search-v2` observes it; `local` has 86 numbers on any lot."
+        "local", "Recorded observation of `parkenv/Search-v2`; `local` has 86 numbers on any lot."
     )
     seed: Seed = 0
 

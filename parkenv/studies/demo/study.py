@@ -74,7 +74,8 @@ class Demo(CaseStudy):
     )
     more: int = option(
         200,
-        "Further searches of each agent, enough to tell agents apart: with the sensors' error rates, not images.",
+        "Further searches of each agent, enough to separate agents: with the sensors' error "
+        "rates, without images.",
         ge=0,
         le=MAX_EPISODES,
     )

@@ -104,17 +104,17 @@ class DemandStudy(Study):
     # A factory, since a default with the paths of its files would stand in the schema.
     scenario: OneScenario = Field(default_factory=lambda: scenario_spec("town"))
     from_day: Date | None = option(
-        None, "First day that is followed.", name="--from", takes="DATE", default="the first one counted"
+        None, "First day of the fit.", name="--from", takes="DATE", default="the first one counted"
     )
-    weeks: int = option(8, "Weeks that are followed.", ge=1, le=520)
-    held_out: int = option(4, "Weeks after these, which are predicted.", ge=1, le=520)
-    roll_outs: int = option(1, "How often, each time that many weeks later.", ge=1, le=520)
+    weeks: int = option(8, "Weeks of the fit.", ge=1, le=520)
+    held_out: int = option(4, "Predicted weeks after the fit.", ge=1, le=520)
+    roll_outs: int = option(1, "Number of fits, each --held-out weeks later.", ge=1, le=520)
     agent: OneAgent = AgentSpec(name="usual")
-    rounds: int = option(3, "How often the town is driven for a fit.", ge=1, le=100)
+    rounds: int = option(3, "Simulation rounds of the town for each fit.", ge=1, le=100)
     episodes: int = option(
-        3, "Days of the fleet in each round, and for each day predicted.", short="-n", ge=1, le=1_000
+        3, "Days of the fleet in each round, and for each predicted day.", short="-n", ge=1, le=1_000
     )
-    timezone: str = Field("Europe/Berlin", description="Local time of counts in UTC.")
+    timezone: str = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
     seed: Seed = Field(0, description="Seed of these days.")
 
     @cached_property

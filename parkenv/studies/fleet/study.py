@@ -100,8 +100,8 @@ class FleetStudy(Study):
     kind: Literal["fleet"] = "fleet"
     agents: Agents | None = option(
         None,
-        "Agents, each of which drives all cars in turn, with any options in brackets. The heuristics are compiled; any "
-        "other agent decides in Python.",
+        "Agents, with any options in brackets; in each setting one of them drives all cars. The "
+        "heuristics are compiled; any other agent decides in Python.",
         takes="NAME[,...]",
         parse=split_agents,
         default=f"{NEAREST}; where parking has a price, {MINDS_PRICES}; in towns, {IN_TOWNS}",
@@ -109,22 +109,23 @@ class FleetStudy(Study):
     scenarios: Scenarios = (scenario_spec("campus"),)
     knows: Annotated[Axis[KnowledgeName], BeforeValidator(listed)] | None = option(
         None,
-        "What members know. own: what they observe; shared: also a live map of what members observe; "
-        "reserve: the slot that a guidance system has reserved; full: the state of every slot.",
+        "Information of members. own: their observations; shared: also a live map of all members' "
+        "observations; reserve: the slot that a guidance system has reserved; full: the state of "
+        "every slot.",
         panel="Knowledge",
         default=f"{', '.join(KNOWLEDGE)}; in towns, {OWN}",
     )
     shares: Values[Probability] = option(
         (1.0,),
-        "Shares of the cars that are members, from 0 to 1; the others know what they observe.",
+        "Shares of the cars that are members, from 0 to 1; the others know only their own observations.",
         name="--share",
         panel="Knowledge",
     )
     arrivals_per_hour: Values[Demanded] | None = option(
         None,
-        "Cars an hour that arrive. given: those of the scenario's own demand; counted: as many as make the lot as full "
-        "as it is in the scenario's world, by its counts, log or process, hour by hour; 1.2x: 1.2 times as many as "
-        "given, or else counted.",
+        "Arriving cars per hour. given: the scenario's own demand; counted: the demand that "
+        "reproduces the occupancy of the scenario's world (its counts, log or process) hour by "
+        "hour; 1.2x: 1.2 times as many as given, or else counted.",
         takes="X|given|counted|1.2x[,...]",
         panel="Demand",
         default="given; without a demand of the scenario 60,120,240, of a car park that was counted, counted",
@@ -136,8 +137,8 @@ class FleetStudy(Study):
     delay_s: float = option(0.0, "Age of the live map, s.", name="--delay", panel="Knowledge", ge=0.0, le=1e5)
     manoeuvre_s: float | None = option(
         None,
-        "Seconds for which a car that parks or leaves blocks its lane; queues form behind it, and behind a "
-        "car that stands.",
+        "Seconds for which a car that parks or leaves blocks its lane; queues form behind it, and "
+        "behind a car that stands still.",
         name="--manoeuvre",
         panel="Interactions",
         default="as in --calibrated; else 0, cars pass through each other",
@@ -146,7 +147,8 @@ class FleetStudy(Study):
     )
     leaving_soon_s: float = option(
         0.0,
-        "Seconds for which cars show that they leave; a car that stands before such a slot holds it.",
+        "Seconds for which cars signal that they are about to leave; a car that waits at such a "
+        "slot holds it.",
         name="--leaving-soon",
         panel="Interactions",
         ge=0.0,
@@ -160,13 +162,13 @@ class FleetStudy(Study):
     )
     calibrated: FilePath | None = option(
         None,
-        "Take driving speed, failure cost and manoeuvre from a calibrated.json of `parkenv calibrate`.",
+        "Use driving speed, failure cost and manoeuvre of a calibrated.json of `parkenv calibrate`.",
         panel="Interactions",
     )
     decision_limit_s: float | None = option(
         None,
-        "Stop the run if an agent in Python takes longer for a decision, in seconds of wall time, "
-        "compiling included.",
+        "Stop the run if a decision of a Python agent takes longer, in seconds of wall time, "
+        "including compilation.",
         name="--decision-limit",
         panel="Agents",
         default="none",
@@ -175,7 +177,7 @@ class FleetStudy(Study):
     )
     most_balked: Probability = option(
         0.05,
-        "Share of the cars that may find no slot: of several demands, the largest with no more is told.",
+        "Largest acceptable share of cars that find no slot: the output names the largest demand within it.",
         panel="Demand",
     )
     seed: Seed = 0

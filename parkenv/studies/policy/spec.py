@@ -27,23 +27,24 @@ class Aims(Spec):
     """What is wanted; each aim is a number that must be reached, and what it lacks counts."""
 
     band: Annotated[Several[Probability], AfterValidator(_band)] = Field(
-        (0.6, 0.85), description="Occupancy that a block should have in each hour, in the mean over days."
+        (0.6, 0.85), description="Target range of a block's occupancy in each hour, as a mean over days."
     )
     in_band: Probability | None = Field(
-        0.8, description="Share of the block-hours that should be in the band; 0: it does not count."
+        0.8, description="Target share of the block-hours in the band; 0: no aim."
     )
     hours: Hours = Field("10:00-18:00", description="Hours that count for the band.")
     cruised: float | None = Field(
-        0.7, ge=0.0, le=10.0, description="Kilometres cruised, at most so often today's."
+        0.7, ge=0.0, le=10.0, description="Kilometres cruised, at most this multiple of today's."
     )
     time: float | None = Field(
         1.0,
         ge=0.0,
         le=10.0,
-        description="Time of a car (drive, failed attempts, walk, penalties; no price), likewise.",
+        description="Time of a car (drive, failed attempts, walk, penalties; without prices), at most this "
+        "multiple of today's.",
     )
     revenue: float | None = Field(
-        None, ge=0.0, le=1e3, description="Revenue, at least so many times today's."
+        None, ge=0.0, le=1e3, description="Revenue, at least this multiple of today's."
     )
     loss_s: float | None = Field(
         None,
@@ -84,19 +85,17 @@ class Levers(Spec):
     hours: Several[Hours] = Field(
         ("08:00-12:00", "12:00-15:00", "15:00-18:00", "18:00-20:00"),
         min_length=1,
-        description="Hours that have prices of their own; others are free.",
+        description="Hours with separate prices; other hours are free of charge.",
     )
     step: float = Field(
         0.01,
         gt=0.0,
         le=1e4,
-        description="Prices are multiples of this; fine ones reach more of the band, see docs/policy.md.",
+        description="Prices are multiples of this; small steps reach more of the band, see docs/policy.md.",
     )
     rule_step: Money = Field(0.25, description="Step of SFpark's rule, as in the city.")
-    most: float = Field(8.0, gt=0.0, le=1e6, description="Highest price of an hour.")
-    spread: float = Field(
-        0.5, gt=0.0, le=1e5, description="By how much the first prices tried differ, an hour."
-    )
+    most: float = Field(8.0, gt=0.0, le=1e6, description="Highest price per hour.")
+    spread: float = Field(0.5, gt=0.0, le=1e5, description="Spread of the first prices tried, per hour.")
     max_stay_s: dict[str, Several[Stay]] = Field(
         {}, description="Longest stays to choose from, s, by zone; 0: no limit."
     )
@@ -107,7 +106,9 @@ class Levers(Spec):
         {}, description="Opening hours to choose from, by facility: 24/7, off, 'We 14:00-24:00'."
     )
     guided: Several[Probability] = Field((), description="Shares of guided drivers to choose from.")
-    guidance: Literal["shared", "reserve", "full"] = Field("shared", description="What guided drivers know.")
+    guidance: Literal["shared", "reserve", "full"] = Field(
+        "shared", description="Information of guided drivers."
+    )
 
     @model_validator(mode="after")
     def _bands_apart(self) -> Self:

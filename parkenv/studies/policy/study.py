@@ -104,28 +104,28 @@ class PolicyStudy(Study):
     levers: Levers = Levers()
     arrivals_per_hour: Values[Demanded] = option(
         (GIVEN,),
-        "Demand of the days of the search, in turn: given, as the scenario has it, 1.2x, or cars an hour.",
+        "Demands of the search, on alternating days: given (the scenario's), 1.2x, or cars an hour.",
         takes="given|1.2x[,...]",
         panel="Demand",
         parse=words_in,
     )
     held_out: Values[Demanded] | None = option(
         None,
-        "Demands that the answer is told for.",
+        "Demands at which the answer is evaluated.",
         takes="1.1x[,...]",
         panel="Demand",
         parse=words_in,
         default="0.9, 1 and 1.1 times the first one of the search",
     )
     budget: int = option(400, "Days that the search may simulate.", ge=20, le=1_000_000)
-    days_each: int = option(2, "Days on which a policy is tried.", ge=1, le=1_000)
+    days_each: int = option(2, "Days for each trial of a policy.", ge=1, le=1_000)
     rounds: int = option(
         10, "Rounds of SFpark's rule; the city changed prices ten times in two years.", ge=1, le=1_000
     )
     learns: bool = option(
         True,
-        "Whether drivers learn how full a policy makes each block in each hour, if the scenario has a log; else they "
-        "expect what its days were like.",
+        "Whether drivers learn the occupancy of each block by hour under a policy, if the "
+        "scenario has a log; else they expect the occupancy of its days.",
     )
     episodes: int = option(6, "Held-out days of each demand.", short="-n", ge=1, le=10_000)
     seed: Seed = 0

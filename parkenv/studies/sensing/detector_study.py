@@ -46,7 +46,7 @@ class DetectorStudy(Study):
     )
     sessions: int = Field(6, ge=1, le=100_000, description="Survey drives for each rig.")
     every: CaptureDistance = Field(2.5, description="Distance between captures, m.")
-    seed: Seed = Field(0, description="Seed of cars, light and noise.")
+    seed: Seed = Field(0, description="Seed of cars, lighting and noise.")
     misses: int = Field(
         0,
         ge=0,

@@ -78,14 +78,15 @@ class DetectorTraining(Spec):
     )
     enlarged: float = option(
         2.0,
-        "Crops are also mined enlarged so many times, so that parts of large cars become negatives; 0: "
-        "none, if the crops are not aligned. With --labels, the photographs are mined instead.",
+        "Factor by which crops are enlarged for further mining, so that parts of large cars "
+        "become negatives; 0: none, if the crops are not aligned. With --labels, the photographs "
+        "are mined instead.",
         panel=_HOG,
     )
     steps: int = option(9_000, "Steps, each with 16 new examples.", panel=_NETWORK, ge=1)
     pictures: Path | None = option(
         None,
-        "Folder in which the simulated pictures are kept; those of an earlier training are read.",
+        "Folder for the simulated pictures; pictures of an earlier training are reused.",
         takes="DIR",
         panel=_NETWORK,
         default="none",

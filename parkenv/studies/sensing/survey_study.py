@@ -51,7 +51,7 @@ class SurveyStudy(Study):
     scenario: Annotated[
         OneScenario, AfterValidator(with_traffic), Inside(without=("--sensor-model", "--view-range", *PRICES))
     ] = Field(scenario_spec("campus"), validate_default=True)
-    sessions: int = option(6, "Survey drives; the thesis made 21.", ge=1, le=100_000)
+    sessions: int = option(6, "Survey drives; the thesis has 21.", ge=1, le=100_000)
     rig: RigName | None = option(
         None,
         "laser: a camera and a 270° laser; stereo: a stereo camera alone; both_sides: a laser and a camera "
@@ -69,14 +69,16 @@ class SurveyStudy(Study):
         min_length=1,
         max_length=1_000,
     )
-    weather: WeatherName | None = option(None, "Of all sessions.", panel="Sensors", default="drawn each time")
+    weather: WeatherName | None = option(
+        None, "Weather of all sessions.", panel="Sensors", default="drawn each time"
+    )
     every: CaptureDistance = option(1.25, "Metres between captures.", takes="M")
     pose_noise: float = option(
         0.0, "Localisation error of the car, m.", takes="M", panel="Sensors", ge=0.0, le=100.0
     )
     odometry_drift: float = option(
         0.0,
-        "Error of its odometry after 100 m, as a share of the distance: 0.02 is 2 m.",
+        "Error of the odometry after 100 m, as a share of the distance: 0.02 is 2 m.",
         takes="P",
         panel="Sensors",
         ge=0.0,

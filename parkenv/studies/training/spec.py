@@ -62,7 +62,7 @@ ObservedSlots = Annotated[
     Option(panel="Learning", default="5; with --observation scan, 4 scans"),
 ]
 TensorBoard = Annotated[
-    bool, Field(description="Keep logs for TensorBoard in the folder."), Option(panel="Results")
+    bool, Field(description="Write logs for TensorBoard to the folder."), Option(panel="Results")
 ]
 _DAYS = Inside(only=("--day-error",))
 TrainedOn = Annotated[
@@ -137,11 +137,11 @@ class TrainingSpec(Study):
     env: Literal["search", "fleet", "drive", "scenes"] = "search"
     algorithm: str
     scenarios: TrainedOn | None = None
-    trainings: int = option(5, "How many, one for each seed.", ge=1, le=10_000)
+    trainings: int = option(5, "Number of trainings, one for each seed.", ge=1, le=10_000)
     seed: Seed = Field(0, description="First seed of the trainings.")
     evaluation_episodes: Episodes
     agents: Annotated[Several[AgentItem] | None, _COMPARED] = Field(
-        None, max_length=1_000, description="Agents that are drawn for comparison."
+        None, max_length=1_000, description="Agents to draw for comparison."
     )
     beside: Several[str] = option(
         (),
@@ -346,15 +346,15 @@ class PlacesTrainingSpec(TestedTrainingSpec):
 
     held_out: Level | None = option(
         None,
-        "Train on other places than evaluations are in: hold out this share of the scenarios, by a hash of "
-        "each lot, whatever other places there are (search).",
+        "Hold out this share of the scenarios for evaluation, by a hash of each lot, independent "
+        "of the other lots (search).",
         takes="0 < X < 1",
         panel="Evaluation",
         default="none",
     )
     evaluate_on: Annotated[ScenarioList | None, _DAYS] = option(
         None,
-        "Hold out these places instead: evaluate on them, during training and in the end (search).",
+        "Hold out these places instead: evaluate on them during and after training (search).",
         takes=SCENARIOS_TAKE,
         panel="Evaluation",
         parse=words_in,
@@ -399,8 +399,8 @@ class SearchTrainingSpec(PlacesTrainingSpec):
     scenarios: TrainedOn = (scenario_spec("campus"),)
     observation: Literal["local"] = option(
         "local",
-        "What is observed (search; ppo, maskable-ppo). local: what is near the car, from belief and "
-        "forecast; scan: the last laser scans and poses alone, in one scenario.",
+        "Observation (search; ppo, maskable-ppo). local: surroundings of the car, from belief and "
+        "forecast; scan: only the last laser scans and poses, in one scenario.",
         takes="local|scan",
         panel="Learning",
         default="local",
@@ -408,8 +408,8 @@ class SearchTrainingSpec(PlacesTrainingSpec):
     k: ObservedSlots = 5
     curriculum: Literal["size"] | None = option(
         None,
-        "size: begin with the smallest tenth of the places, and add larger ones evenly until half of the "
-        "steps (search).",
+        "size: start with the smallest tenth of the places, and add larger ones evenly until half "
+        "of the steps (search).",
         panel="Learning",
         default="all places from the start",
     )
@@ -426,7 +426,7 @@ class SearchTrainingSpec(PlacesTrainingSpec):
         Steps,
         Option(
             default="2000000; in a fleet, 500000; for network, 10000; to drive, the training config's",
-            description="Decisions of a training; for network, those that belief labels.",
+            description="Decisions of a training; for network, decisions labelled by belief.",
         ),
     ] = 2_000_000
     evaluate_every: EvaluateEvery | None = option(
@@ -483,9 +483,10 @@ class NetworkTrainingSpec(PlacesTrainingSpec):
     env: Literal["search"] = "search"
     algorithm: Literal["network"] = "network"
     scenarios: Annotated[TrainedOn | None, _DAYS] = Field(
-        None, description="Trained on beside made lots; made lots alone if absent."
+        None,
+        description="Scenarios to train on in addition to synthetic lots; synthetic lots only if absent.",
     )
-    steps: Annotated[int, Field(ge=1, le=10**12, description="Decisions that belief labels.")] = 10_000
+    steps: Annotated[int, Field(ge=1, le=10**12, description="Decisions labelled by belief.")] = 10_000
     without: Several[Literal["lookahead", "tokens", "day", "memory"]] = option(
         (),
         "Parts of network to leave out: lookahead, tokens, day, memory.",
@@ -510,7 +511,7 @@ class FleetTrainingSpec(TrainingSpec):
     stay_s: MeanStay = 3600.0
     patience_s: Patience = 600.0
     knows: KnowledgeName = option(
-        "own", "What the learning cars know, as in parkenv fleet.", panel="Knowledge"
+        "own", "Information of the learning cars, as in parkenv fleet.", panel="Knowledge"
     )
     among: AgentItem | None = option(
         None,
@@ -535,11 +536,11 @@ class FleetTrainingSpec(TrainingSpec):
     agents: Several[AgentItem] = Field(
         (AgentSpec(name="greedy-drive"), AgentSpec(name="first-free")),
         max_length=1_000,
-        description="Drawn for comparison.",
+        description="Agents to draw for comparison.",
     )
     test_among: Several[AgentItem] = option(
         (AgentSpec(name="greedy-drive"),),
-        "Test also with the model as each tenth car among these (fleet).",
+        "Also test the model as each tenth car among these (fleet).",
         takes="NAME[,...]|none",
         panel="Evaluation",
         parse=agents_or_none,
@@ -573,7 +574,8 @@ class DriveTrainingSpec(TestedTrainingSpec):
     env: Literal["drive"] = "drive"
     algorithm: Literal["ppo", "sac", "tqc"] = "ppo"
     scenarios: TrainedOn = Field(
-        (scenario_spec("campus"), scenario_spec("street")), description="Their lots are trained on."
+        (scenario_spec("campus"), scenario_spec("street")),
+        description="Scenarios whose lots are used for training.",
     )
     steps: Steps | None = Field(None, description="The algorithm's own number if absent.")
     evaluate_every: EvaluateEvery | None = Field(None, description="A twentieth of the steps if absent.")
@@ -585,7 +587,7 @@ class DriveTrainingSpec(TestedTrainingSpec):
     agents: Several[Annotated[AgentItem, AfterValidator(_planner)]] = Field(
         (AgentSpec(name=PARKING_PLANNER),),
         max_length=1,
-        description="Drawn for comparison: planner, or none.",
+        description="Agents to draw for comparison: planner, or none.",
     )
     tensorboard: TensorBoard = False
 
@@ -614,7 +616,7 @@ class ScenesTrainingSpec(TrainingSpec):
     agents: Several[Annotated[AgentItem, AfterValidator(_planner)]] = Field(
         (AgentSpec(name=PARKING_PLANNER),),
         max_length=1,
-        description="Drawn for comparison: planner, or none.",
+        description="Agents to draw for comparison: planner, or none.",
     )
     tensorboard: TensorBoard = False
 

@@ -56,7 +56,7 @@ class DrivenTrips(Spec):
     seed: Seed = 0
     notice_m: float = option(
         2.0,
-        "Metres along its path at which the car notices at the latest that it would drive into a taken slot.",
+        "Distance along the path at which the car notices at the latest that its slot is taken, m.",
         name="--notice",
         takes="M",
         panel="Costs and speeds",

@@ -97,8 +97,8 @@ class ManoeuvreStudy(Study):
     )
     levels: SceneLevels | None = option(
         None,
-        "Levels of scenes to draw: perpendicular, oblique or parallel, and normal, complex or extreme, such as "
-        "parallel-extreme.",
+        "Levels of scenes to draw: perpendicular, oblique or parallel, and normal, complex or "
+        "extreme, for example parallel-extreme.",
         takes="NAME[,...]|all",
         default="none",
         panel="Scenes",
@@ -106,9 +106,10 @@ class ManoeuvreStudy(Study):
     )
     agents: Axis[str] = option(
         (PARKING_PLANNER,),
-        "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of `parkenv train --env "
-        "drive`; in scenes, learned, the network that comes with the package, hybrid, the same where the planner plans "
-        "what the network cannot, and maskable-ppo:FILE or hybrid:FILE for a model of `parkenv train --env scenes`.",
+        "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
+        "`parkenv train --env drive`; in scenes, learned, the packaged network, hybrid, which "
+        "falls back to the planner where the network fails, and maskable-ppo:FILE or hybrid:FILE "
+        "for a model of `parkenv train --env scenes`.",
         takes="NAME[,...]",
     )
     episodes: int = option(100, "Episodes per lot, or scenes per level.", short="-n", ge=1, le=1_000_000)
