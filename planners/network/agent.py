@@ -15,9 +15,17 @@ from parkenv.world.lot import MOVES
 from parkenv.world.scenario import SearchProblem
 from planners.agent import Observation
 from planners.belief.agent import BeliefAgent, BeliefSearch, Crowd, snapshot
-from planners.belief.planning_graph import MOST_HYPOTHESES, PlanningGraph
+from planners.belief.planning_graph import MOST_HYPOTHESES, BeliefSnapshot, PlanningGraph
 from planners.neighborhood import MOST_VERTICES, Neighborhood
-from planners.network.features import FAILURE_COSTS, PARKING, WAITING, Features, Situation, observe
+from planners.network.features import (
+    ACTION_COUNT,
+    FAILURE_COSTS,
+    PARKING,
+    WAITING,
+    Features,
+    Situation,
+    observe,
+)
 from planners.network.lookahead import Scratch
 from planners.network.policy import SHIPPED, NetworkPolicy
 
@@ -105,12 +113,6 @@ class NetworkAgent(BeliefAgent):
             scratch=Scratch.of(near.n_slots, MOST_HYPOTHESES),
         )
 
-    def begin(self, observation: Observation, belief: SlotBelief) -> NetworkSearch:
-        """Choose the part of the lot to search."""
-        memory = super().begin(observation, belief)
-        assert isinstance(memory, NetworkSearch)
-        return memory
-
     def decide(self, observation: Observation, belief: SlotBelief, memory: BeliefSearch) -> int:
         """Update the memory, score the actions and take the best."""
         self.last_features = self.last_scores = None
@@ -121,12 +123,12 @@ class NetworkAgent(BeliefAgent):
     ) -> int | None:
         """Return the action with the best score; that of `belief` where hardly a free slot is left to be found."""
         assert isinstance(memory, NetworkSearch)
-        if memory.near.whole and not (memory.state == OBSERVED_FREE).any():
-            p_free = 1.0 - memory.day.p_occupied(known.time)
-            if p_free[memory.state == UNOBSERVED].sum() < HARDLY_ANY:
-                memory.previous = vertex
-                return super()._follow_best_path(vertex, here, known, memory)
-        self.last_features = self.features(vertex, here, known, memory)
+        belief, state = snapshot(here, known, memory), memory.state
+        unobserved = belief.slots["p_free"][state == UNOBSERVED]
+        if memory.near.whole and not (state == OBSERVED_FREE).any() and unobserved.sum() < HARDLY_ANY:
+            memory.previous = vertex
+            return super()._follow_best_path(vertex, here, known, memory)
+        self.last_features = self._observed(vertex, here, known, belief, memory)
         self.last_scores = self.policy.scores(self.last_features) - self._circling(vertex, here, memory)
         memory.visited_at[here] = memory.time
         memory.visits[here] += 1.0
@@ -134,7 +136,9 @@ class NetworkAgent(BeliefAgent):
         choice = int(np.argmax(self.last_scores))
         return self.wait(vertex) if choice == WAITING else choice
 
-    def features(self, vertex: int, here: int, known: SlotBelief, memory: NetworkSearch) -> Features:
+    def _observed(
+        self, vertex: int, here: int, known: SlotBelief, belief: BeliefSnapshot, memory: NetworkSearch
+    ) -> Features:
         """Return the network's observation; the next call overwrites it."""
         near, out = memory.near, self._features
         assert memory.graph is not None
@@ -156,17 +160,16 @@ class NetworkAgent(BeliefAgent):
             known.forecast.astype(np.float64),
             known.observed_at.astype(np.float64),
         )
-        belief = snapshot(here, known, memory)
         observe(now, memory.by_cost, self._failure_costs, memory.graph, belief, memory.scratch, out)
         return out
 
     def _circling(self, vertex: int, here: int, memory: NetworkSearch) -> FloatArray:
         """Return a penalty of each action, (6,), for visits of its end since something new was observed."""
-        n_known = int((memory.state != 0).sum())
+        n_known = int((memory.state != UNOBSERVED).sum())
         if n_known != memory.n_known:
             memory.visits[:] = 0.0
             memory.n_known = n_known
-        cost = np.zeros(6)
+        cost = np.zeros(ACTION_COUNT)
         for a in range(len(MOVES)):
             end = int(self._neighbors[vertex, a])
             if end >= 0 and (i := memory.near.index(end)) >= 0:
