@@ -34,6 +34,12 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
             beside.unlink()
 
 
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write a text as UTF-8; see `atomic_write`."""
+    with atomic_write(path) as beside:
+        beside.write_text(text, encoding="utf-8")
+
+
 @contextmanager
 def write_together(folder: Path) -> Iterator[Path]:
     """Yield a temporary folder in `folder`, whose files move there at the end of the block, or are deleted on failure.

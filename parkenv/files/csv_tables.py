@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.limited_reading import MAX_BYTES, csv_records
 
 MAX_NUMBER = 1e12
@@ -183,5 +183,4 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, An
     Raises:
         InputError: the file cannot be written.
     """
-    with atomic_write(path) as beside:
-        beside.write_text(csv_text(columns, rows, header=True), encoding="utf-8")
+    write_text(path, csv_text(columns, rows, header=True))

@@ -23,7 +23,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema, ErrorDetails
 
 from parkenv.errors import InputError, nearest
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.known_names import DETECTOR_SUFFIXES, DETECTORS
 from parkenv.files.limited_reading import MAX_SPEC_BYTES, is_there, read_json, read_toml
 
@@ -182,8 +182,7 @@ class Spec(BaseModel):
 
     def write(self, path: Path) -> None:
         """Write the specification as JSON, atomically, including fields at their defaults."""
-        with atomic_write(path) as beside:
-            beside.write_text(json.dumps(self.tables(), indent=2) + "\n", encoding="utf-8")
+        write_text(path, json.dumps(self.tables(), indent=2) + "\n")
 
     def files(self) -> list[Path]:
         """Return every file named in the specification, at any depth."""

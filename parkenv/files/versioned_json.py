@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.limited_reading import read_json
 
 
@@ -51,5 +51,4 @@ class JsonFormat:
             InputError: the file cannot be written.
         """
         content = {"format": self.name, "version": self.version, **fields}
-        with atomic_write(path) as beside:
-            beside.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+        write_text(path, json.dumps(content, indent=1) + "\n")

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import append_text, atomic_write, make_folder
+from parkenv.files.atomic_write import append_text, make_folder, write_text
 from parkenv.files.csv_tables import (
     NUMBER,
     NUMBER_OR_NOTHING,
@@ -124,7 +124,7 @@ class Table(ABC):
     def write(self, folder: Path, rows: Sequence[Row]) -> None:
         """Replace the rows of the file in a folder, atomically."""
         for file, text in self.texts(rows, header=True):
-            _write_text(folder / file, text)
+            write_text(folder / file, text)
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +268,7 @@ EPISODES = CsvTable()
 
 def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY) -> None:
     """Write a command's summary as strict JSON; NaN becomes null."""
-    _write_text(folder / name, json.dumps(without_nan(summary), indent=2, allow_nan=False) + "\n")
+    write_text(folder / name, json.dumps(without_nan(summary), indent=2, allow_nan=False) + "\n")
 
 
 def read_settings(folder: Path) -> Row | None:
@@ -423,7 +423,7 @@ class Results:
         """
         (self.path / SUMMARY).unlink(missing_ok=True)
         write_summary(self.path, {"command": self.command, "complete": False}, SUMMARY_PARTIAL)
-        _write_text(self.path / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
+        write_text(self.path / SETTINGS, json.dumps(dict(settings), indent=2) + "\n")
         for table in self._tables:
             table.write(self.path, list(self._rows[table.file].values()))
 
@@ -470,11 +470,6 @@ def decision_s(row: Mapping[str, Any]) -> list[float]:
 def timed_row(record: SearchRecord) -> Row:
     """Return the row of a search with the wall times of its decisions."""
     return record.row | {DECISIONS: " ".join(str(round(1e6 * s)) for s in record.decision_s)}
-
-
-def _write_text(path: Path, text: str) -> None:
-    with atomic_write(path) as beside:
-        beside.write_text(text, encoding="utf-8")
 
 
 def without_nan(value: Any) -> Any:

@@ -36,7 +36,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write, check_writable
+from parkenv.files.atomic_write import check_writable, write_text
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.formats.contents import KINDS, LotContents, RawFeature, is_coordinate
@@ -83,8 +83,7 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
         head["zones"] = {name: zone_document(zone) for name, zone in lot.zone_rules.items()}
     features = ",\n".join(json.dumps(feature) for feature in _features(lot))
     text = f'{json.dumps(head)[:-1]},\n"features": [\n{features}\n]}}\n'
-    with atomic_write(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def check_lot_output(path: Path) -> None:

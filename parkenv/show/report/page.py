@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from PIL import Image as PillowImage
 
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.images import image_text, read_image
 from parkenv.show.figures.picture_files import CAPTION
 from parkenv.show.report.drive_recording import data_uri
@@ -157,8 +157,7 @@ def _write(path: Path, page: str, data: Mapping[str, Any], scripts: Iterable[str
         program="\n".join((_HERE / name).read_text(encoding="utf-8") for name in scripts),
         **parts,
     )
-    with atomic_write(path) as beside:
-        beside.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def _term_colors() -> str:

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
 from parkenv.studies.benchmark.suite import (
@@ -189,8 +189,7 @@ def write_result(folder: Path, content: Row, name: str) -> None:
     """Write a result file, with the numbers of a list in one line."""
     text = json.dumps(content, indent=1, allow_nan=False)
     text = re.sub(r"\[[-+.eE\d,\s]+\]", lambda found: " ".join(found[0].split()), text)
-    with atomic_write(folder / name) as beside:
-        beside.write_text(text + "\n", encoding="utf-8")
+    write_text(folder / name, text + "\n")
 
 
 def source_commit() -> str:

@@ -14,7 +14,7 @@ from scipy.interpolate import PchipInterpolator
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, nearest
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
 from parkenv.files.limited_reading import read_json
 from parkenv.studies.curve.fit import OUTCOMES, CurveTable, Paths, fit_form
@@ -142,7 +142,7 @@ def write_curves(paths: Paths, table: CurveTable, folder: Path) -> None:
         paths.multiples.tolist() * len(names),
         *([x for row in its for x in row] for its in columns.values()),
     ]
-    _write(
+    write_text(
         folder / "curve.csv",
         csv_text((*NAMES, "multiple", *columns), [], header=True) + csv_columns(repeated),
     )
@@ -151,7 +151,7 @@ def write_curves(paths: Paths, table: CurveTable, folder: Path) -> None:
         for k, its in enumerate(names)
     ]
     whole = without_nan({"multiples": paths.multiples.tolist(), "curves": curves})
-    _write(folder / JSON, json.dumps(whole, allow_nan=False) + "\n")
+    write_text(folder / JSON, json.dumps(whole, allow_nan=False) + "\n")
     terminal, links = zone_rows(paths, table)
     write_csv(folder / "activitysim.csv", tuple(terminal[0]), terminal)
     write_csv(folder / "matsim.csv", tuple(links[0]), links)
@@ -188,8 +188,3 @@ def zone_rows(paths: Paths, table: CurveTable) -> tuple[list[Row], list[Row]]:
             row |= dict(zip(("onstreet_spots", "offstreet_spots"), zones.own[at].tolist(), strict=True))
             links.append(row | {"alpha": round(float(alpha), _DIGITS), "beta": -b})
     return terminal, links
-
-
-def _write(path: Path, text: str) -> None:
-    with atomic_write(path) as beside:
-        beside.write_text(text, encoding="utf-8")

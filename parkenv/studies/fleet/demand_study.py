@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.files.csv_tables import csv_columns
 from parkenv.files.option import option
 from parkenv.files.spec_file import FilePath
@@ -342,8 +342,7 @@ def _write_predictions(days: Sequence[Row], folder: Path) -> None:
     columns = ("car_park", "hour", "counted", *PREDICTIONS)
     lines = [[line for day in days for line in day[column]] for column in columns]
     dates = [day["date"] for day in days for _ in day["hour"]]
-    with atomic_write(folder / "predicted.csv") as beside:
-        beside.write_text(f"{','.join(('date', *columns))}\n{csv_columns([dates, *lines])}", encoding="utf-8")
+    write_text(folder / "predicted.csv", f"{','.join(('date', *columns))}\n{csv_columns([dates, *lines])}")
 
 
 def kind_of(weekday: int) -> str:

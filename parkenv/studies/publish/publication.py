@@ -14,7 +14,7 @@ import numpy as np
 import yaml
 
 from parkenv.errors import InputError
-from parkenv.files.atomic_write import atomic_write
+from parkenv.files.atomic_write import write_text
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.figures.picture_files import save_film
@@ -198,8 +198,7 @@ gives the same numbers with parkenv {__version__}.
 {self.usage()}
 ```
 {extra}"""
-        with atomic_write(path) as beside:
-            beside.write_text(text, encoding="utf-8")
+        write_text(path, text)
 
 
 class SearchPublication(Publication):
