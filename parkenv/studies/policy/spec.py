@@ -61,15 +61,13 @@ class Aims(Spec):
     @property
     def clock(self) -> range:
         """The hours of the day that count for the band."""
-        return clock_hours(self.hours)
+        return clock_hours(ArrivalWindow.parse(self.hours))
 
 
-def clock_hours(text: str) -> range:
-    """Return the whole hours of the day in a span such as 08:00-12:00."""
-    window = ArrivalWindow.parse(text)
-    return range(
-        int(window.start_s // HOUR_S), max(-int(-window.end_s // HOUR_S), int(window.start_s // HOUR_S) + 1)
-    )
+def clock_hours(window: ArrivalWindow) -> range:
+    """Return the hours of the day that a window, such as 08:00-12:00, touches; at least one."""
+    first = int(window.start_s // HOUR_S)
+    return range(first, max(-int(-window.end_s // HOUR_S), first + 1))
 
 
 class Levers(Spec):
@@ -112,10 +110,15 @@ class Levers(Spec):
 
     @model_validator(mode="after")
     def _bands_apart(self) -> Self:
-        spans = sorted((its.start, its.stop) for its in map(clock_hours, self.hours))
+        spans = sorted((its.start, its.stop) for its in self.bands)
         if any(end > begin for (_, end), (begin, _) in pairwise(spans)):
             raise ValueError("hours of prices that do not overlap")
         return self
+
+    @property
+    def bands(self) -> list[range]:
+        """The hours of the day of each price."""
+        return [clock_hours(ArrivalWindow.parse(hours)) for hours in self.hours]
 
     @property
     def choices(self) -> dict[str, tuple[Any, ...]]:

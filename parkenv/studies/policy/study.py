@@ -448,15 +448,10 @@ class Search:
 
     def _occupancy(self, rows: Sequence[Row]) -> FloatArray:
         """Return the occupancy of each unit in each band, (n_units, n_bands), mean over its blocks and the days."""
-        from parkenv.studies.policy.spec import clock_hours
-
         town = self.town
         share = np.mean([row["occupancy"] for row in rows], axis=0)
         slots = town.blocks.slots[town.counted].astype(float)
-        hours = [
-            [k for k, hour in enumerate(town.hours) if hour in clock_hours(band)]
-            for band in self.study.levers.hours
-        ]
+        hours = [[k for k, hour in enumerate(town.hours) if hour in band] for band in self.study.levers.bands]
         by_band = np.stack(
             [share[:, its].mean(axis=1) if its else np.full(len(share), np.nan) for its in hours], axis=1
         )

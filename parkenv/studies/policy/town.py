@@ -54,18 +54,12 @@ class Policy(NamedTuple):
         return self._replace(expects=(1.0 - weight) * before + weight * taken)
 
 
-def hours_of(scenario: Scenario) -> range:
-    """Return the hours of the day in which cars arrive."""
-    window = scenario.arrival
-    return range(int(window.start_s // HOUR_S), int(-(-window.end_s // HOUR_S)))
-
-
 def expecting(scenario: Scenario, blocks: Blocks, expects: FloatArray | None) -> Scenario:
     """Return a scenario that has a log with drivers who expect what `Policy` says of the blocks."""
     if expects is None:
         return scenario
     taken, periods = np.full((scenario.lot.n_slots, DAY_PERIODS), np.nan), DAY_PERIODS // DAY_HOURS
-    hours = hours_of(scenario)
+    hours = clock_hours(scenario.arrival)
     taken[:, hours.start * periods : hours.stop * periods] = np.repeat(expects, periods, axis=1)[
         blocks.of_slot
     ]
@@ -126,7 +120,7 @@ class PolicyTown:
         self.unit_of_block = np.array(
             [unit[zone, name if by_block else ""] for zone, name in zip(its, self.facility, strict=True)]
         )
-        middle = [float(np.mean(clock_hours(band))) * HOUR_S + HOUR_S / 2 for band in levers.hours]
+        middle = [float(np.mean(band)) * HOUR_S + HOUR_S / 2 for band in levers.bands]
         weekday = scenario.arrival.weekdays[0] * DAY_S
         self.today = np.array(
             [[float(rules[zone].price.amount(weekday + s, HOUR_S)) for s in middle] for zone, _ in self.units]
@@ -198,7 +192,7 @@ class PolicyTown:
     @cached_property
     def hours(self) -> range:
         """Hours of the day in which cars arrive."""
-        return hours_of(self.scenario)
+        return clock_hours(self.scenario.arrival)
 
     def day(self, fleet: Fleet, agents: Sequence[Any]) -> Row:
         """Drive the day of a fleet that has been reset; return what it tells."""
