@@ -198,31 +198,21 @@ def headlines(summary: Row) -> list[Row]:
     rate = middle_of(row["arrivals_per_hour"] for row in rows)
     today, _, ours = (row for row in rows if row["arrivals_per_hour"] == rate)
     low, high = summary["aims"]["band"]
-    made = [
-        {
-            "label": f"of the block-hours {low:.0%} to {high:.0%} full",
-            "value": f"{ours['in_band']:.0%}",
-            "interval": f"today {today['in_band']:.0%}",
-        }
+    told = [
+        ("in_band", f"of the block-hours {low:.0%} to {high:.0%} full", ".0%", ""),
+        ("cruised_km", "cruised a day", ",.0f", " km"),
+        ("time_s", "a car, without prices", ",.0f", " s"),
     ]
-    for name, label, unit in (
-        ("cruised_km", "cruised a day", "km"),
-        ("time_s", "a car, without prices", "s"),
-    ):
-        value = {
-            "label": label,
-            "value": f"{ours[name]:,.0f} {unit}",
-            "interval": f"today {today[name]:,.0f} {unit}",
-        }
-        made.append(value)
     if today["revenue"] or ours["revenue"]:
-        paid = {
-            "label": "paid a day",
-            "value": f"{ours['revenue']:,.0f}",
-            "interval": f"today {today['revenue']:,.0f}",
+        told.append(("revenue", "paid a day", ",.0f", ""))
+    return [
+        {
+            "label": label,
+            "value": f"{ours[name]:{form}}{unit}",
+            "interval": f"today {today[name]:{form}}{unit}",
         }
-        made.append(paid)
-    return made
+        for name, label, form, unit in told
+    ]
 
 
 def middle_only(summary: Row) -> list[Row]:
@@ -232,15 +222,8 @@ def middle_only(summary: Row) -> list[Row]:
     rate = middle_of(row["arrivals_per_hour"] for row in summary["answer"])
     rows = [row for row in losers if row["arrivals_per_hour"] == rate]
     shown = (
-        "scenario",
-        "purpose",
-        "cars_a_day",
-        "change_s",
-        "change_s_ci95",
-        "paid_change",
-        "better_off",
-        "worse_off",
-    )
+        "scenario", "purpose", "cars_a_day", "change_s", "change_s_ci95", "paid_change", "better_off", "worse_off",
+    )  # fmt: skip
     return [{**{name: row[name] for name in shown}, "purpose": row["purpose"] or "all"} for row in rows]
 
 
