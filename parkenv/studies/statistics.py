@@ -54,6 +54,11 @@ def mean_interval(values: ArrayLike, confidence: float = 0.95) -> tuple[float, f
     return mean, float(interval.low), float(interval.high)
 
 
+def mean_or_nan(values: NDArray[Any]) -> float:
+    """Return the mean; NaN of no values."""
+    return float(values.mean()) if len(values) else float("nan")
+
+
 def trimmed_mean_interval(values: ArrayLike, cut: float) -> tuple[float, float, float]:
     """Compute a trimmed mean and its 95 % bootstrap interval (percentiles).
 

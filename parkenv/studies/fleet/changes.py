@@ -7,12 +7,12 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from parkenv.show.plurals import interval_text, number_text, plural
 from parkenv.studies.fleet.setting import CAR_LISTS, COUNTED, GIVEN, NOWHERE, OWN, SETTING_COLUMNS, rate_text
 from parkenv.studies.fleet.tables import day_means, paired_days
 from parkenv.studies.results import Row
+from parkenv.studies.statistics import mean_or_nan
 
 NOTICED_S = 1.0
 """A car is better or worse off if its total time differs by at least this, s."""
@@ -140,19 +140,15 @@ def _change(after: Row, before: Row, column: str, number: int | None) -> Row:
     if len(cents) or len(earlier_cents):
         free = np.zeros(len(times))  # in a lot without prices
         cents, earlier_cents = (known if len(known) else free for known in (cents, earlier_cents))
-        row["paid_change"] = _mean((cents - earlier_cents)[its] / 100.0)
+        row["paid_change"] = mean_or_nan((cents - earlier_cents)[its] / 100.0)
     if number is not None:
-        row |= {"cars_a_day": float(its.sum()), "change_s": _mean(gained[its])}
+        row |= {"cars_a_day": float(its.sum()), "change_s": mean_or_nan(gained[its])}
     return row | {
-        "members_change_s": _mean(gained[its & (member == 1.0)]),
-        "others_change_s": _mean(gained[its & (member == 0.0)]),
-        "better_off": _mean((gained <= -NOTICED_S)[its]),
-        "worse_off": _mean((gained >= NOTICED_S)[its]),
+        "members_change_s": mean_or_nan(gained[its & (member == 1.0)]),
+        "others_change_s": mean_or_nan(gained[its & (member == 0.0)]),
+        "better_off": mean_or_nan((gained <= -NOTICED_S)[its]),
+        "worse_off": mean_or_nan((gained >= NOTICED_S)[its]),
     }
-
-
-def _mean(values: NDArray[Any]) -> float:
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def _with_lists(day: Row) -> Row:

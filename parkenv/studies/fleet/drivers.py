@@ -7,8 +7,6 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-import numpy as np
-
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
@@ -16,6 +14,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.setting import COUNTED, GIVEN, times_demanded
 from parkenv.studies.fleet.tables import day_means
 from parkenv.studies.results import Row
+from parkenv.studies.statistics import mean_or_nan
 from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.demand import (
     ConstantTime,
@@ -226,10 +225,10 @@ class MixedFleet:
         cars, members = fleet.cars, fleet.cars["kind"] == 0
         return {
             "cars": int(members.sum()),
-            "total_s": _mean(cars["total_s"][members]),
-            "search_s": _mean((cars["ended_at"] - cars["arrival"])[members]),
-            "parked_fraction": _mean((cars["slot"] >= 0)[members]),
-            "others_s": _mean(cars["total_s"][~members]),
+            "total_s": mean_or_nan(cars["total_s"][members]),
+            "search_s": mean_or_nan((cars["ended_at"] - cars["arrival"])[members]),
+            "parked_fraction": mean_or_nan((cars["slot"] >= 0)[members]),
+            "others_s": mean_or_nan(cars["total_s"][~members]),
         }
 
     def row(self, member: AgentSpec | CompiledPolicy, seed: int, days: int, workers: Workers = SERIAL) -> Row:
@@ -242,7 +241,3 @@ class MixedFleet:
             "cars": sum(day["cars"] for day in done),
             **day_means(done, ("parked_fraction", *with_interval), with_interval),
         }
-
-
-def _mean(values: Any) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")

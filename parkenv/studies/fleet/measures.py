@@ -14,6 +14,7 @@ from parkenv.engine.fleet import Fleet, drive_metres
 from parkenv.studies.fleet.blocks import has_zones, paid
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
 from parkenv.studies.fleet.setting import BY_HOUR
+from parkenv.studies.statistics import mean_or_nan
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.scenario import SearchProblem
@@ -168,8 +169,8 @@ def day_measures(
         "cruising_share": float(cruised_m.sum()) / driven_m if driven_m else 0.0,
         "balked_fraction": float((~parked).mean()),
         **filled,
-        "members_s": _mean(times[members]),
-        "others_s": _mean(times[~members]),
+        "members_s": mean_or_nan(times[members]),
+        "others_s": mean_or_nan(times[~members]),
         "bound_s": float(roads.alone_s(fleet)[arrives].mean()),
         "clairvoyant_s": clairvoyant_s / len(cars),
         **{name: float(cars[name].mean()) for name in COST_FIELDS},
@@ -199,10 +200,6 @@ def filling(times: FloatArray, taken: FloatArray, counted: FloatArray) -> dict[s
     ]
     means = {"occupancy": float(np.mean(taken)), "counted_occupancy": float(np.mean(counted))}
     return means | dict(zip(BY_HOUR, by_hour, strict=True))
-
-
-def _mean(values: FloatArray) -> float:
-    return float(values.mean()) if len(values) else float("nan")
 
 
 def looks_s(problem: SearchProblem, occupancy: FloatArray) -> FloatArray:
