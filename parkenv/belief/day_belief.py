@@ -63,8 +63,8 @@ _LEAST, _MOST = 1e-6, 1.0 - 1e-6
 class DayBelief:
     """Belief about the day and the slots of (a part of) a lot: the exact posterior over hypotheses about the day.
 
-    Under each hypothesis a slot's state is a two-state Markov chain that is observed now and then: the second of two
-    observations at short intervals says nothing about the day.
+    Under each hypothesis a slot's state is a two-state Markov chain with observations at single times: a second
+    observation after a short time carries no information about the day.
 
     Args:
         belief: belief about these slots before any observation.
@@ -73,7 +73,7 @@ class DayBelief:
         rival_rates: (n_slots,) 1/s, rates at which cars beside those of the forecast take each slot while it is free;
             None: there are no such cars.
         hypotheses: about the day: prior weights, (k,), and P(taken) under each, (n_slots, k); None: those above.
-        doubt: probability that the forecast of a slot says nothing about it (`DOUBT`).
+        doubt: probability that the forecast of a slot carries no information (`DOUBT`).
         event: probability that an event has filled the slots near the goal (`EVENT`). This and `doubt` are without
             effect where the forecast is certain, among rivals, and with hypotheses of the caller.
 

@@ -60,9 +60,7 @@ class Policy(StudyCommand):
         if not summary.get("answer"):
             return
         print_rows(console, "The answer, on held-out days", summary["answer"], ANSWER, OF_POLICIES)
-        print_rows(
-            console, "Who wins and who loses, against today", middle_only(summary), LOSERS, OF_POLICIES
-        )
+        print_rows(console, "Gains and losses against today", middle_only(summary), LOSERS, OF_POLICIES)
         for line in PolicyStudy.findings(summary):
             console.print(line, soft_wrap=True)
         if self.study.episodes == 1:

@@ -145,7 +145,7 @@ class MapDrive(Command):
             console.print(text, style="yellow")
         if not row["seen"]:
             why = f": poses ± {row['pose_error_m']:.2g} m; see --pose-error" if "pose_error_m" in row else ""
-            console.print(f"No slot could be told apart{why}", style="yellow")
+            console.print(f"No slot could be identified{why}", style="yellow")
         console.print(f"Written: {self.out / 'map.sqlite'}, map.png, cars.csv, summary.json")
 
 

@@ -133,7 +133,7 @@ class CarPoses(NamedTuple):
 
 
 class Fleet:
-    """Many cars in one lot, decided by compiled policies, by agents in Python, or by both.
+    """Many cars in one lot, driven by compiled policies, by agents in Python, or by both.
 
     Every car is a search as in `parkenv/Search-v2`, with the same actions, observations and costs; its forecast is that
     of the scenario for its arrival. The slots are shared. Events happen in continuous time: at each moment, first
@@ -141,14 +141,14 @@ class Fleet:
     after another, in the order of these events. Of two cars before the same free slot, the first to decide gets it, and
     the other one has a failed attempt.
 
-    A car's search ends when it parks, when it has observed that every slot is taken (*gave up*), when its patience is
-    at an end (*balked*), or at the limit of steps (*truncated*); the last three cost `give_up_s`. A parked car leaves
+    A car's search ends when it parks, when it has observed that every slot is taken (*gave up*), when its patience
+    ends (*balked*), or at the limit of steps (*truncated*); the last three cost `give_up_s`. A parked car leaves
     after its stay. The world ends when all searches are over. Patience begins at the entry of a lot; in a town
     (`ParkingLot.is_town`), when the shortest way to the slot nearest to the goal would be over.
 
     Knowledge reaches a driver through its observations, so every agent uses it. The live map holds the last report of
-    each slot. The guidance system knows the true state of every slot, and reserves slots anew whenever a car with
-    `reserve` decides: those with the least total time to drive and walk (`scipy.optimize.linear_sum_assignment`). A car
+    each slot. The guidance system knows the true state of every slot, and assigns slots again whenever a car with
+    `reserve` decides, with the least total time to drive and walk (`scipy.optimize.linear_sum_assignment`). A car
     with `reserve` observes which slot is its own, and takes no other; others do not know of reservations and may be
     first. A car that knows every slot to be taken, or for which no slot is left, gives up, unless `leave_full_lot` is
     False.
@@ -156,9 +156,9 @@ class Fleet:
     Cars pass through each other, unless `manoeuvre_s` is above 0. Then a car that parks, or leaves its slot, blocks the
     lane before it for that time, and a car that stands there blocks it, too; cars that reach it wait in a queue, which
     may grow back to the entry. (Residents leave without blocking.) With `leaving_soon_s` above 0, cars of the fleet and
-    residents show for that time that they leave, and a car that stands before such a slot, in a failed attempt or a
-    wait, holds it until it drives on: the others' attempts fail. A car sees lights and other cars within the view range
-    of its sensor, in further keys of the observation:
+    residents signal for that time that they are about to leave; a car that stands at such a slot, in a failed attempt
+    or a wait, holds it until it drives on: attempts of other cars fail. A car observes lights and other cars within
+    the view range of its sensor, in further keys of the observation:
 
     | Key | Space | Meaning | with |
     |-----|-------|---------|------|
@@ -172,17 +172,17 @@ class Fleet:
     Args:
         scenario: see `parkenv.make_scenario`.
         demand: when cars arrive, how long they stay; by default one car.
-        background: who else takes slots: `residents`, cars that stand there when the world begins, drawn from the
-            scenario's occupancy, and leave once; `process`, the scenario's occupancy all day; `none`, nobody: the lot
-            is empty when the world begins. By default residents; nobody if cars of the demand are parked then.
+        background: other cars that take slots: `residents`, which are parked when the world begins, drawn from the
+            scenario's occupancy, and leave once; `process`, the scenario's occupancy all day; `none`: the lot is
+            empty when the world begins. By default residents; none if cars of the demand are parked then.
         drivers: the kinds of drivers.
         max_steps: limit of a car's decisions.
         tick_s: durations of steps, and arrivals, are rounded up to multiples of this, s; 0: continuous time.
         delay_s: time after which a report is on the live map, s.
         leave_full_lot: whether a car gives up once it knows every slot to be taken; otherwise it searches on until its
             patience is at an end. An informed car knows it at once, so compare kinds of knowledge with False.
-        manoeuvre_s: time for which a car that parks or leaves blocks its lane, s; 0: nobody blocks a lane.
-        leaving_soon_s: for how long before they leave cars show it, s.
+        manoeuvre_s: time for which a car that parks or leaves blocks its lane, s; 0: no car blocks a lane.
+        leaving_soon_s: time for which cars signal that they are about to leave, s.
         sees_cars: whether observations hold the other cars in view.
 
     Attributes:

@@ -71,7 +71,8 @@ class FleetVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[Any]])
         options: further options of `Fleet`: `background`, `delay_s`, `leave_full_lot`, `manoeuvre_s`, ...
 
     Attributes:
-        network: the compiled driver of the other learning cars; before `follow`, it chooses among all actions alike.
+        network: the compiled driver of the other learning cars; before `follow`, it chooses uniformly among all
+            actions.
         fleets: the worlds.
 
     Raises:

@@ -1,8 +1,9 @@
 """The last laser scans and poses of a search as a vector, for policies that learn from raw scans.
 
-No belief, forecast or map is in it: besides scans and poses only what a driver knows without sensors, the time and
-where the goal is. The vector has 30 + 77k numbers from -1 to 1 for the last k scans; those still to come are 0. A time
-of s seconds is encoded as s / (s + 60), a length of d metres as 1 / (1 + d / 5): 1 at the laser, nearly 0 far away.
+It contains no belief, forecast or map: besides scans and poses only what a driver knows without sensors, the time and
+the position of the goal. The vector has 30 + 77k numbers from -1 to 1 for the last k scans; those still to come are 0.
+A time of s seconds is encoded as s / (s + 60), a length of d metres as 1 / (1 + d / 5): 1 at the laser, about 0 far
+away.
 
 | Index | Meaning |
 |---|---|

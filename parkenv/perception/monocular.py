@@ -187,9 +187,9 @@ def localize_boxes(
 ) -> LocatedCars:
     """Locate the detected cars from their boxes alone, with the covariance of each.
 
-    Dropped are boxes that reach from the picture's left border to the right one, those of which nearer ones hide the
-    lower edge, those that end above the horizon, and those whose height and lower edge do not agree: no car on the
-    ground in front of the camera looks so.
+    The function drops boxes that reach from the picture's left border to the right one, boxes whose lower edge a
+    nearer one hides, those that end above the horizon, and those whose height and lower edge do not agree: a car on
+    the ground in front of the camera has no such box.
 
     Args:
         detections: detections in the camera's image.

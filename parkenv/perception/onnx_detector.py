@@ -47,10 +47,10 @@ Scale = Annotated[float, Field(gt=0.0, le=1_000.0)]
 
 
 class OnnxSettings(Spec):
-    """How a network is fed and read: the file `NAME.toml` (or `.json`) beside `NAME.onnx`.
+    """Input and output format of a network: the file `NAME.toml` (or `.json`) beside `NAME.onnx`.
 
-    Every key may be absent; what stands in its place is guessed from the network's shapes and metadata where these
-    leave no choice, else an error says what to write.
+    All keys are optional: missing ones follow from the network's shapes and metadata where these are unambiguous;
+    otherwise an error names the key to set.
     """
 
     layout: Layout | None = Field(

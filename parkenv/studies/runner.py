@@ -1,7 +1,7 @@
 """The one runner of all kinds of studies: workers, lock, progress, interruption, resume, tables and summary.
 
 `run` gives blocks of items to worker processes and appends the rows that come back to the tables in the folder, so that
-an interrupted run loses nothing that is finished and a resumed one equals an unbroken one.
+an interrupted run keeps all finished rows, and a resumed run equals an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ SYNC_S = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Result:
-    """What a study has found.
+    """The result of a study.
 
     Attributes:
         study: the study.
@@ -133,7 +133,7 @@ def run(
         progress: called as rows finish; see `Progress`.
         workers: where tasks run, if not as the study says; results do not depend on it.
         command: command line to record in the summary; by default the one that runs the specification in the folder.
-            A run that goes on with the same specification keeps its first one.
+            A run that is resumed with the same specification keeps its first one.
 
     Raises:
         InputError: the study cannot be run, or the folder cannot be used.

@@ -115,7 +115,7 @@ class Cell(NamedTuple):
 
 
 class Study(ExecutionSpec):
-    """A specification that can be run: subclasses say what is run and what is made of the rows.
+    """A specification that can be run: subclasses define the work and how its rows are summarised.
 
     Attributes:
         kind: name of the kind of study in files.

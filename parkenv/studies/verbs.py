@@ -46,7 +46,7 @@ def fleet(
     progress: Progress | None = None,
     **fields: Any,
 ) -> Result:
-    """Let many cars search a lot for days, and compare lots, and what the cars know.
+    """Simulate days of many cars that search a lot; compare lots and kinds of information.
 
     Args:
         folder: see `compare`.
@@ -70,7 +70,7 @@ def curve(
     progress: Progress | None = None,
     **fields: Any,
 ) -> Result:
-    """Fit what searches in a town are like as functions of occupancy and demand; `load_curves` reads them.
+    """Fit search time, walk and more in a town as functions of occupancy and demand; see `load_curves`.
 
     Args:
         folder: see `compare`.
@@ -122,7 +122,7 @@ def train(
 
     Args:
         folder: see `compare`.
-        resume: see `compare`; each training goes on from its checkpoint.
+        resume: see `compare`; each training continues from its checkpoint.
         overwrite: see `compare`.
         progress: see `compare`.
         fields: fields of the specification, as in a file of kind `train`: `env`, `algorithm`, `scenarios`, `steps`,

@@ -115,8 +115,8 @@ class ParkingLot(_ByValue):
     Units are metres in a local frame, x east and y north; yaw is counter-clockwise from x, in radians. The drive
     graph is derived from slots, lanes and entries on construction, so two lots with equal features have equal
     graphs. Vertex `i < n_slots` is the stop position on the lane before slot `i`, the planning state of the thesis
-    (T §3.4.1, Fig. 3.6 right); further vertices are junctions and lane ends, and for each lane whose cars may not turn
-    everywhere another one in the same place. `parkenv.lots` reads, writes and
+    (T §3.4.1, Fig. 3.6 right); further vertices are junctions and lane ends, and in a junction one more for each lane
+    with restricted turns. `parkenv.lots` reads, writes and
     generates lots.
 
     Args:
@@ -141,7 +141,7 @@ class ParkingLot(_ByValue):
         zone_rules: rules of zones, by name; empty: zones have none, and prices come from the scenario alone.
         goal_weights: how much demand each goal attracts, (n_goals,) float64 by purpose of the drivers; empty: unknown.
         entry_weights: how much demand comes from each entry, (n_entries,) float64 by purpose; empty: unknown.
-        turns: those that cars may not make at junctions, or that are the only ones.
+        turns: turn restrictions at junctions, prohibited or mandatory turns.
         left_hand: whether cars keep to the left of two-way lanes, not to the right.
 
     Attributes:
@@ -161,8 +161,8 @@ class ParkingLot(_ByValue):
         InputError: a wrong shape, a value that is not finite, a repeated id, no slot, entry or goal, a name of a
             facility or zone that the lot does not have.
         GraphError: slots, entries or facilities out of reach of all lanes, more than four lanes out of one junction, a
-            turn between lanes that there are not, or that leaves no way on, or a counted facility that no entry leads
-            to.
+            turn restriction of lanes that do not exist or without any turn left, or a counted facility that no entry
+            leads to.
 
     Examples:
         >>> from parkenv.lots import packaged_lot
@@ -458,7 +458,7 @@ class ParkingLot(_ByValue):
     def junction_of_vertex(self) -> IntArray:
         """(n_vertices,) int64, the first vertex in the same place.
 
-        That is the vertex itself, but at junctions that have one more for each lane whose cars may not turn everywhere.
+        That is the vertex itself, except at junctions with further vertices for lanes with restricted turns.
         """
         n = self.n_slots
         _, first, of = np.unique(self.vertex_xy[n:], axis=0, return_index=True, return_inverse=True)

@@ -123,7 +123,7 @@ class SearchProblem:
 
     @cached_property
     def finite_cost_s(self) -> FloatArray:
-        """`arrival_cost_s` for arithmetic: slots in which the driver may not park, believed taken, are the dearest."""
+        """`arrival_cost_s` for arithmetic: a forbidden slot, which counts as taken, has the largest cost."""
         allowed = np.isfinite(self.arrival_cost_s)
         if allowed.all():
             return self.arrival_cost_s
@@ -371,7 +371,7 @@ class Scenario(SearchProblem):
         prior: model of the initial forecast; None: `occupancy`. A prior that differs from the world models an outdated
             map.
         arrival: when searches start.
-        demand: the cars of a day with many; None: such a day needs a demand of its own.
+        demand: demand for days with many cars; None: none.
         entry: index into `lot.entries`; None draws one for each search.
         traffic: other road users in the lot, visible to simulated sensors and on driven trips.
         rig: name of the car's sensor rig, where sensors are simulated.

@@ -131,10 +131,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
     as close to the best path as this one. Allowing for forecast errors costs a little time on such days. If an event
     has filled a lot against the forecast, drivers who take the first free slot still do better. Each path is
     evaluated on its own, without the option to change to another path after an observation. Estimates depend on the
-    position of the car, so it could alternate between two paths for ever; until it observes something new, it
+    position of the car, so it could alternate between two paths forever; until it observes something new, it
     therefore keeps its path, and the slot that it drives to, unless another one is better than the time that this
-    path was expected to take, or that time is over. Another look at a slot that is still taken is not new: the path
-    counted on it. If a sensor misses slots, a slot that was in view and not detected is observed again only from
+    path was expected to take, or that time is over. Another observation of a slot that is still taken is not new: the
+    path expected it. If a sensor misses slots, a slot that was in view and not detected is observed again only from
     vertices where a detection is more likely than not. A slot that is not detected from its own vertex either is
     attempted.
 
@@ -142,10 +142,10 @@ class BeliefAgent(SearchAgent[BeliefSearch]):
         problem: lot, goal, speeds and costs.
         budget_ms: approximate time of a decision, ms. It limits the amount of work, not the wall time, so the same
             observations give the same actions on every machine.
-        day: whether to learn from observations how the day differs from its forecast; if not, the forecast is believed
-            to be right whatever is observed.
+        day: whether to learn from observations how the day differs from its forecast; if not, the forecast is assumed
+            to be right, whatever is observed.
         most_vertices: a larger lot is planned for in part (`Neighborhoods`).
-        doubt: probability that the forecast of a slot says nothing about it, if the day is learned; 0 to 1.
+        doubt: probability that the forecast of a slot carries no information, if the day is learned; 0 to 1.
         event: probability that an event has filled the slots near the goal, if the day is learned; 0 to 0.9. It is
             lower in small lots, and where the forecast has many of these slots free.
 

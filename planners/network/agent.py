@@ -60,9 +60,9 @@ class NetworkSearch(BeliefSearch):
 class NetworkAgent(BeliefAgent):
     """`network`: takes the action with the best score of a small neural network.
 
-    **Observation.** For each action that there is (a move along an edge, parking, waiting): the time that a quick
-    look-ahead expects (`planners.network.lookahead`), what comes into view, whether the car turns back; and tokens, the
-    slots that matter seen through that action: belief, age of the observation, drive, arrival cost
+    **Observation.** For each available action (a move along an edge, parking, waiting): the expected time of a quick
+    look-ahead (`planners.network.lookahead`), what comes into view, whether the car turns back; and tokens of the
+    most relevant slots as reached by that action: belief, age of the observation, drive, arrival cost
     (`planners.network.features`). The belief is that of `belief` without doubt of single slots: it learns from
     observations how the day differs from its forecast.
 
@@ -71,13 +71,13 @@ class NetworkAgent(BeliefAgent):
     relative, there are no coordinates, and actions have no order: the same weights serve lots of ten or two thousand
     slots, and turning the map changes nothing.
 
-    **Limits.** It cannot be better than its tokens: what happens beyond the eight best slots is known to it only
-    through the look-ahead. In a full lot it goes round in circles, or looks at the last slot and so proves the lot
-    full: where hardly a free slot is left to be found, `belief` drives. A network does not explain itself.
+    **Limits.** It knows slots beyond the eight best ones only through the look-ahead. In a full lot it would drive in
+    circles, or observe the last slot and so prove the lot full: where hardly any free slot is expected, `belief`
+    drives. The network gives no reasons for its decisions.
 
     Args:
         problem: lot, goal, speeds and costs.
-        weights: file of `parkenv train network`, or its content; by default the weights that come with the package.
+        weights: file of `parkenv train network`, or its content; by default the packaged weights.
         most_vertices: a larger lot is searched in parts (`Neighborhoods`).
 
     Raises:

@@ -16,7 +16,7 @@ prefers a parking aisle to another service road, and a service road to a street.
 Entries are the points where service roads meet a public street or, if streets are lanes, where the streets leave the
 map: at its edge, or otherwise at ends not tagged as dead ends. Goals are the building entrances (`entrance`) near the
 slots, main entrances first, or the centre of the nearest building. Buildings block the view. Traffic keeps to the
-right, unless the draft is taken `in_left_hand_traffic`.
+right, unless `in_left_hand_traffic` converts the draft.
 """
 
 from __future__ import annotations

@@ -83,9 +83,9 @@ class TownDraft:
             return ""
         share = f"{100 * guessed / total:.0f} %"
         return (
-            f"{guessed:,} of {total:,} spaces ({share}) are a guess that decides how easy parking "
-            "is: kerbs that the map says nothing of, by the class of their street, free unless it names a price. To "
-            "see what depends on it, import with --untagged-kerbs 0.5, or drive with --price 'kerb free=1/h'."
+            f"{guessed:,} of {total:,} spaces ({share}) are a guess that decides how easy parking is: kerbs without "
+            "tags in the map, by the class of their street, free of charge unless the map has a price. To measure "
+            "the effect, import with --untagged-kerbs 0.5, or drive with --price 'kerb free=1/h'."
         )
 
 
@@ -503,4 +503,4 @@ def _guesses(rows: Sequence[dict[str, Any]], draft: LotDraft) -> Iterator[str]:
     assumed = [zone for zone in draft.zone_rules if " paid" in zone]
     if assumed:
         price = draft.zone_rules[assumed[0]].price.per_hour
-        yield f"price where the map says only that there is a fee: {price:g} an hour"
+        yield f"price where the map has a fee without an amount: {price:g} an hour"

@@ -39,7 +39,7 @@ class Column(NamedTuple):
 _GIVEN = (*SETTING_AXES, "arrivals_per_hour")
 """Columns of numbers that somebody chose, which have all their digits."""
 _OPTIONAL = tuple(term.field for term in COST_TERMS if term.optional)
-_MINUS_OWN = "total time, minus that of all cars if nobody knows more than it observes, on the same days"
+_MINUS_OWN = "total time, minus that of all cars with own observations only, on the same days"
 _METHODS = (
     ("fitted", "rectangle fitted to the beams"), ("thesis", "middle of the beams, as in the thesis")
 )  # fmt: skip
@@ -149,11 +149,11 @@ _KNOWN = {
         Column("search_s", "search time", "s", help="From the entry to the end of the search"),
         Column("queued_s", "time in queues", "s", help="Behind cars that park, leave or stand; in the search time"),
         Column("failed_attempts", "failed attempts a car", digits=3),
-        Column("cruised_m", "detour driven", "m", 0, help="What the drive exceeds the shortest drive to the slot by"),
+        Column("cruised_m", "detour driven", "m", 0, help="Drive beyond the shortest drive to the slot"),
         Column("cruising_share", "traffic that cruises", share=True, digits=0, help="Detours in all metres driven"),
         Column("balked_fraction", "found no slot", share=True),
         Column("members_s", "time of members", "s", help="Total time of members"),
-        Column("others_s", "time of the others", "s", help="Total time of those who are no members"),
+        Column("others_s", "time of the others", "s", help="Total time of non-members"),
         Column("members_difference_s", "change by guidance, members", "s", signed=True, help=f"Members' {_MINUS_OWN}"),
         Column("others_difference_s", "change by guidance, others", "s", signed=True, help=f"The others' {_MINUS_OWN}"),
         Column("price_of_anarchy", "price of anarchy", digits=3, help="Total time over that with reservations for all"),

@@ -177,7 +177,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
     if pairs:
         errors = [row[f"error.{DESIGNS[3 if suite.tasks[0].strata else 1]}"] for row in pairs]
         findings.append(
-            f"Neighbours among the first {len(pairs) + 1} are told apart if their mean times differ by "
+            f"Neighbours among the first {len(pairs) + 1} are significantly different if their mean times differ by "
             f"{_WIDE * min(errors):.1f} to {_WIDE * max(errors):.1f} s."
         )
     times = [

@@ -31,7 +31,7 @@ _DIGITS = 5
 
 
 class CurveValue(NamedTuple):
-    """Values of a curve, and the ends of their 95 % intervals, in the shape of what was asked for."""
+    """Values of a curve, and the ends of their 95 % intervals, in the shape of the arguments."""
 
     value: FloatArray
     low: FloatArray
@@ -39,9 +39,9 @@ class CurveValue(NamedTuple):
 
 
 class Curves:
-    """What a search in each zone, for each purpose and at each hour, is like, as a function of occupancy or demand.
+    """Outcomes of a search by zone, purpose and hour, as functions of occupancy or demand.
 
-    A curve is known between the least and the most demand that was driven; beyond, it stays as it is there.
+    A curve is defined between the lowest and the highest simulated demand, and constant beyond these.
 
     Args:
         curves: by scenario, zone, purpose and hour, its columns: `occupancy`, `demand`, and value, low and high end of

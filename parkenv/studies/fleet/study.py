@@ -538,7 +538,7 @@ class FleetStudy(Study):
             if None not in (row["price_of_anarchy"], low, high) and row["knows"] == OWN:
                 finding += f"; the price of anarchy is {row['price_of_anarchy']:.3f} [{low:.3f}, {high:.3f}]"
                 finding += (
-                    f": everybody for himself takes {row['price_of_anarchy'] - 1.0:.0%} longer than with slots "
+                    f": uncoordinated search takes {row['price_of_anarchy'] - 1.0:.0%} longer than with slots "
                     "reserved for all"
                     if low > 1.0
                     else ": reservations would save nothing measurable"

@@ -169,7 +169,7 @@ def assumed_rows(study: PolicyStudy, held_out: HeldOut) -> list[Row]:
     demand = scenario.demand
     purposes = demand.purposes if demand is not None else ()
     names = (
-        f"{one.name} (an hour is worth {one.value_of_time or scenario.value_of_time:g})" for one in purposes
+        f"{one.name} (value of an hour: {one.value_of_time or scenario.value_of_time:g})" for one in purposes
     )
     log = "the days of its log say of today" if scenario.occupancy.recorded else "its forecast says of today"
     if study.learns and study.town.has_log:
@@ -181,7 +181,7 @@ def assumed_rows(study: PolicyStudy, held_out: HeldOut) -> list[Row]:
         "drivers": f"{study.agent.label}; they know all prices and rules, and expect what {log}",
         "demand of the search": ", ".join(rate_text(rate) for rate in study.arrivals_per_hour),
         "purposes": ", ".join(names),
-        "elasticity": "nobody stays at home, comes at another time or stays shorter because of a price",
+        "elasticity": "no driver cancels a trip, changes its time or shortens a stay because of a price",
         "prices": f"by {study.levers.by}, multiples of {study.levers.step:g} up to {study.levers.most:g}",
         "other levers": picked,
         "budget": f"{study.budget} days in the search",

@@ -89,10 +89,10 @@ class PolicyStudy(Study):
     block: ClassVar = 1
     doing: ClassVar = "Trying policies"
     unit: ClassVar = "days"
-    heading: ClassVar = "What the town should do"
+    heading: ClassVar = "Policy for a town"
     table_titles: ClassVar = {
         "answer": "The answer, on held-out days",
-        "losers": "Who wins and who loses, against today",
+        "losers": "Gains and losses against today",
         "policy_blocks": "Block by block: spaces taken and prices, today and with this policy",
         "assumed": "What was assumed",
     }

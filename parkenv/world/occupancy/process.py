@@ -163,10 +163,10 @@ class PriorModel(ABC):
 
 
 class OccupancyModel(PriorModel):
-    """A kind of world: says on which days searches can begin, makes worlds, and forecasts occupancy.
+    """Base class of world models: gives the days of searches, makes worlds, and forecasts occupancy.
 
-    A class needs `n_slots`, `forecast` and `world` to be a world everywhere: in environments and their batches, in
-    fleets and in studies.
+    A subclass needs `n_slots`, `forecast` and `world`; it then works in environments and their batches, in fleets and
+    in studies.
 
     Attributes:
         recorded: whether worlds replay dated days, see `days_in`.
