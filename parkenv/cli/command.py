@@ -93,7 +93,7 @@ COMPLETERS: dict[str, Completer] = {
 """How the values of an argument or option are completed."""
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 110}
-PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Code of others", "Machines")
+PANELS = ("Options", "Costs and speeds", "World", "Sensors", "Results", "Trust", "Machines")
 """Headings of options on help pages, in their order; others stand before World."""
 
 

@@ -106,7 +106,9 @@ class Evaluate(Command):
         description="Counts, car_park,capacity,hour,free (or hour_utc, time, time_utc), or a log of slots, "
         "datetime,camera,slot_id,weather,occupied, as .csv or .csv.gz."
     )
-    from_day: Date | None = option(None, "First scored day.", name="--from", takes="DATE", default="halfway")
+    from_day: Date | None = option(
+        None, "First scored day.", name="--from", takes="DATE", default="the middle of the file"
+    )
     car_parks: Axis[str] | None = option(None, "Car parks.", takes="NAME[,...]", default="all")
     timezone: TimeZone = Field("Europe/Berlin", description="Local time zone of counts in UTC.")
     seed: Seed = Field(0, description="Seed of the bootstrap.")

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 Trust = Annotated[
     bool,
-    Option(panel="Code of others"),
+    Option(panel="Trust"),
     Field(
         description="Run the classes (MODULE:CLASS) and use the cluster named by the file or the folder of "
         "the run."
@@ -28,7 +28,7 @@ Trust = Annotated[
 ]
 TrustModel = Annotated[
     bool,
-    Option(panel="Code of others"),
+    Option(panel="Trust"),
     Field(
         description="Convert archives of stable-baselines3 (ALGORITHM:FILE.zip) to model files; this runs the code in "
         "them."

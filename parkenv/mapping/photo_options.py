@@ -25,7 +25,7 @@ class PhotoOptions(Spec):
         takes="M,DEG,DEG", default="1.3,-90,0", parse=lambda text: tuple(numbers_in(text, 3)), strict=False, **_PANEL,
     )  # fmt: skip
     origin: tuple[float, float] | None = option(
-        None, "The lot's origin, for poses in degrees.", takes="LAT,LON", default="as the lot file's degrees say",
+        None, "The lot's origin, for poses in degrees.", takes="LAT,LON", default="that of a lot file in degrees",
         parse=lambda text: tuple(numbers_in(text, 2)), strict=False, **_PANEL,
     )  # fmt: skip
     clock_offset: float = option(0.0, "Seconds to add to the pictures' times.", takes="S", **_PANEL)
@@ -34,5 +34,5 @@ class PhotoOptions(Spec):
         gt=0.0, le=1000.0, **_PANEL,
     )  # fmt: skip
     pose_error: float | None = option(
-        None, "Standard deviation of poses, m.", takes="M", default="0; of degrees 3", ge=0.0, le=1e3, **_PANEL
+        None, "Standard deviation of poses, m.", takes="M", default="0; in degrees 3", ge=0.0, le=1e3, **_PANEL
     )  # fmt: skip

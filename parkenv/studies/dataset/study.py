@@ -79,8 +79,8 @@ class DatasetStudy(Study):
         Field(
             min_length=1,
             max_length=100,
-            description="Agents as `parkenv compare` takes them, a data set for each; greedy is greedy-total; in mixed "
-            f"the others take turns, or {', '.join(MIX)}.",
+            description="Agents as in `parkenv compare`, with a data set for each; greedy is greedy-total; mixed "
+            f"alternates between the others, or {', '.join(MIX)}.",
         ),
         Option("--policy", takes="NAME[,...]", parse=split_agents, default="mixed"),
     ] = (AgentSpec(name=MIXED),)

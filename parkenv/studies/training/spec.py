@@ -71,7 +71,7 @@ TrainedOn = Annotated[
         "--scenario",
         takes=SCENARIOS_TAKE,
         parse=words_in,
-        default="campus; to drive, campus,street; for network, made lots alone",
+        default="campus; to drive, campus,street; for network, synthetic lots only",
     ),
     _DAYS,
 ]
