@@ -137,15 +137,22 @@ def test_an_import_changes_no_settings_of_a_users_own_process(folder):
 
 def test_figures_have_one_style_whatever_the_users_settings_are(tmp_path):
     import matplotlib as mpl
-    from matplotlib.figure import Figure
+    import numpy as np
 
-    from parkenv.show.figures.picture_files import STYLE, save_picture
+    from parkenv import make_scenario
+    from parkenv.show.figures.counted_demand import CarParkDays, save_counted_demand
+    from parkenv.show.figures.lot import save_lot_picture
+    from parkenv.show.figures.rates import save_rates
 
+    scenario, days = (
+        make_scenario("mini"),
+        CarParkDays("a $ in a name", 10.0, *[np.ones(3)] * 2, np.ones((2, 3))),
+    )
     pictures = []
     for settings in ({"text.usetex": True, "savefig.facecolor": "red", "lines.linewidth": 9.0}, {}):
-        with mpl.rc_context(settings), mpl.rc_context(STYLE):
-            figure = Figure(figsize=(1, 1))
-            figure.add_subplot().plot([1, 2], label="a $ in a name")
-            save_picture(figure, tmp_path / "one.png")
-        pictures.append((tmp_path / "one.png").read_bytes())
+        with mpl.rc_context(settings):
+            save_rates(scenario.occupancy, tmp_path / "rates.png", title="mini")
+            save_counted_demand([days], np.arange(9.0, 12.0), tmp_path / "days.png")
+            save_lot_picture(scenario.lot, tmp_path / "lot.png")
+        pictures.append([path.read_bytes() for path in sorted(tmp_path.glob("*.png"))])
     assert pictures[0] == pictures[1]

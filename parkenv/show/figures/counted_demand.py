@@ -7,11 +7,12 @@ from math import ceil
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.show.figures.picture_files import save_picture
+from parkenv.show.figures.picture_files import STYLE, save_picture
 
 
 class CarParkDays(NamedTuple):
@@ -24,6 +25,7 @@ class CarParkDays(NamedTuple):
     held_out: FloatArray  # (d, n_hours) cars counted on later days; NaN: not counted
 
 
+@mpl.rc_context(STYLE)
 def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, path: Path) -> None:
     """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones.
 
@@ -45,13 +47,10 @@ def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, pat
         ax.plot(hours, its.simulated / its.capacity, color="#d55e00", label="simulated")
         ax.set_title(f"{its.name}, {its.capacity:.0f}", fontsize=8)
         ax.set(xlim=(hours[0] - 1, hours[-1]), ylim=(0, 1.02))
-        ax.grid(alpha=0.25)
-        ax.spines[["top", "right"]].set_visible(False)
+        ax.grid(visible=True)
     for ax in axes[len(car_parks) :]:
         ax.set_axis_off()
     figure.supxlabel("hour of the day", fontsize=9)
     figure.supylabel("share of the places taken", fontsize=9)
-    figure.legend(
-        *axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, frameon=False, fontsize=8
-    )
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, fontsize=8)
     save_picture(figure, path)

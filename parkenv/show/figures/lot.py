@@ -8,6 +8,7 @@ from pathlib import Path
 from textwrap import wrap
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
@@ -23,6 +24,7 @@ from parkenv.driving.drivable_area import JOINED_WHOLE
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
 from parkenv.show.colors import BELIEF_ANCHORS, hex_color
+from parkenv.show.figures.picture_files import STYLE
 from parkenv.show.painters.axes import draw_scale_bar, paint, points_per_m
 from parkenv.show.scene import ARROWHEAD, DISC, STAR, Layer, Lines, LotScene, Marks, posed
 from parkenv.world.lot import ParkingLot
@@ -153,6 +155,7 @@ def draw_discs(lot: ParkingLot, ax: Axes, outer: FloatArray, inner: FloatArray) 
         ax.add_collection(discs)
 
 
+@mpl.rc_context(STYLE)
 def save_lot_picture(
     lot: ParkingLot, path: str | Path, *, show_graph: bool = False, guesses: Sequence[str] = ()
 ) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from textwrap import wrap
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,7 +15,7 @@ from matplotlib.patches import Patch
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.draft import LotDraft
 from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
-from parkenv.show.figures.picture_files import save_picture
+from parkenv.show.figures.picture_files import STYLE, save_picture
 from parkenv.show.figures.schematic import schematic
 from parkenv.show.painters.axes import paint
 from parkenv.show.plurals import plural
@@ -25,6 +26,7 @@ SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
 
 
+@mpl.rc_context(STYLE)
 def save_import_picture(draft: LotDraft, path: str | Path) -> None:
     """Draw a draft, complete or not, to a PNG file.
 
@@ -66,7 +68,7 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
                 Line2D([], [], marker=marker, color=color, markeredgecolor=INK, linestyle="", label=name)
             )
     if handles:
-        figure.legend(handles=handles, loc="lower left", ncols=4, fontsize=7, frameon=False)
+        figure.legend(handles=handles, loc="lower left", ncols=4, fontsize=7)
     for k, text in enumerate(reversed(notes)):
         figure.text(0.01, (0.3 + 0.18 * k) / (height + room), text, fontsize=7, color="#bb2222")
     save_picture(figure, path)

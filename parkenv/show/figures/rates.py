@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
 
-from parkenv.show.figures.picture_files import save_picture
+from parkenv.show.figures.picture_files import STYLE, save_picture
 from parkenv.world.occupancy.process import OccupancyProcess
 from parkenv.world.week import DAY_S, HOUR_S
 
 _DAYS = (("weekday", 0, "#0072b2"), ("weekend", 5, "#e69f00"))
 
 
+@mpl.rc_context(STYLE)
 def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> None:
     """Draw the mean occupancy with its spread over slots, and the profiles of both rates, for each day class.
 
@@ -31,17 +33,12 @@ def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> Non
         full.fill_between(hours, low, high, color=color, alpha=0.18, linewidth=0)
         full.plot(hours, moments.mean(axis=1), color=color, label=f"{name}, mean")
         full.plot(hours, middle, color=color, linewidth=0.8, linestyle=":")
-        steps = np.arange(24)
         for profile, style in ((process.arrival_profile, "-"), (process.departure_profile, "--")):
             event = "arrivals" if style == "-" else "departures"
-            rates.step(
-                steps,
-                profile[24 * day : 24 * day + 24] * HOUR_S,
-                where="post",
-                color=color,
-                linestyle=style,
+            rates.stairs(
+                profile[24 * day : 24 * day + 24] * HOUR_S, baseline=None, color=color, linestyle=style, linewidth=1.5,
                 label=f"{event}, {name}",
-            )
+            )  # fmt: skip
     full.set(
         xlabel="hour of the day",
         ylabel="fraction occupied",
@@ -54,11 +51,11 @@ def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> Non
         yscale="log",
         title="Arrival and departure rates",
     )
+    rates.yaxis.set_major_formatter("{x:g}")
     for ax in (full, rates):
         ax.set(xlim=(0, 24), xticks=range(0, 25, 4))
-        ax.grid(alpha=0.25)
-        ax.spines[["top", "right"]].set_visible(False)
-        ax.legend(frameon=False, fontsize=8)
+        ax.grid(visible=True)
+        ax.legend(fontsize=8)
     if title:
         figure.suptitle(title)
     save_picture(figure, path)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PathCollection
@@ -11,7 +12,7 @@ from matplotlib.figure import Figure
 
 from parkenv.lots.town.draft import TownDraft
 from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
-from parkenv.show.figures.picture_files import save_picture
+from parkenv.show.figures.picture_files import STYLE, save_picture
 
 KERB_COLORS = {"tag": "#225588", "drawn": "#4477aa", "rule": "#8fb8d8"}
 """Colour of a slot by what its capacity is known from."""
@@ -20,6 +21,7 @@ STREET = "#8a8a84"
 SPACE_M2 = 60.0  # m² of a counted facility's disc for each place: twice the room of a parked car
 
 
+@mpl.rc_context(STYLE)
 def save_town_picture(town: TownDraft, path: str | Path) -> None:
     """Draw a town to a PNG file: slots are dots, counted facilities discs by capacity, hollow where a rule says it.
 
@@ -51,7 +53,7 @@ def save_town_picture(town: TownDraft, path: str | Path) -> None:
     )
     handles, labels = ax.get_legend_handles_labels()
     columns = max(min(len(labels), int(width / 1.3)), 1)
-    legend = figure.legend(handles, labels, loc="lower left", ncols=columns, fontsize=8, frameon=False)
+    legend = figure.legend(handles, labels, loc="lower left", ncols=columns, fontsize=8)
     for handle in legend.legend_handles:
         if isinstance(handle, PathCollection):
             handle.set_sizes([40.0])
