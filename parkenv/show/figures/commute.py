@@ -14,7 +14,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from parkenv.show.figures.picture_files import STYLE, save_picture
-from parkenv.show.figures.times import AGENT_COLORS, OTHER_AGENT
+from parkenv.show.figures.times import agent_color
 
 Row = Mapping[str, Any]
 FIXED, NONE = "fixed", "none"
@@ -130,7 +130,7 @@ def _level(rows: Sequence[Row], agent: str) -> float:
 
 
 def _color(agent: str) -> str:
-    return AGENT_COLORS.get(agent.partition("(")[0], OTHER_AGENT)
+    return agent_color(agent.partition("(")[0])
 
 
 def _dashes(agent: str, rows: Sequence[Row]) -> Any:

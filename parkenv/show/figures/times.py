@@ -46,8 +46,7 @@ AGENT_COLORS = {
     "maskable-ppo": "#aa4499",
 }
 """Each agent has one colour in all figures, distinguishable with any colour vision (Okabe-Ito and Tol)."""
-OTHER_AGENT = "#5c4a3d"
-_OTHERS = (OTHER_AGENT, "#a6761d", "#6a3d9a", "#1b7a8c", "#b15928")
+_OTHERS = ("#5c4a3d", "#a6761d", "#6a3d9a", "#1b7a8c", "#b15928")
 OFF_SCALE = 3.0
 """Totals above this multiple of the median are cut off, so that they do not compress the rest."""
 
