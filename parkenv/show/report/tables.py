@@ -204,43 +204,22 @@ _ORDER = (
 )  # fmt: skip
 """The first columns, in this order."""
 OF_FLEETS = {
-    column.key: column
-    for column in (
+    column.key: column for column in (
         Column("difference_s", "change by guidance, all cars", "s", signed=True, help=f"Mean {_MINUS_OWN}"),
         Column("median_s", "median time", "s", help="Median of the total times of a day's cars"),
-        Column(
-            "bound_s",
-            "time if alone",
-            "s",
-            help="Mean total time of a car alone in an empty lot that it knows",
-        ),
-        Column(
-            "occupancy",
-            "slots taken",
-            share=True,
-            digits=0,
-            help="Mean share of slots taken while cars arrive",
-        ),
+        Column("bound_s", "time if alone", "s", help="Mean total time of a car alone in an empty lot that it knows"),
+        Column("occupancy", "slots taken", share=True, digits=0, help="Mean share of slots taken while cars arrive"),
     )
-}
+}  # fmt: skip
 """Columns that mean something else in the table of `parkenv fleet`."""
 OF_POLICIES = {
-    column.key: column
-    for column in (
-        Column(
-            "in_band", "block-hours in the band", share=True, digits=0, help="Means over the days; jackknife"
-        ),
+    column.key: column for column in (
+        Column("in_band", "block-hours in the band", share=True, digits=0, help="Means over the days; jackknife"),
         Column("in_band_daily", "on single days", share=True, digits=0),
         Column("occupancy", "spaces taken", share=True, digits=0, help="Of the blocks and hours that count"),
         Column("cruised_km", "cruised a day", "km", 0),
         Column("cruised_km_of_today", "of today's", share=True, digits=0),
-        Column(
-            "time_s",
-            "time of a car",
-            "s",
-            0,
-            help="Drive, failed attempts, walk and penalties, without prices",
-        ),
+        Column("time_s", "time of a car", "s", 0, help="Drive, failed attempts, walk and penalties, without prices"),
         Column("time_s_of_today", "of today's", share=True, digits=0),
         Column("revenue", "paid a day", digits=0),
         Column("revenue_of_today", "of today's", share=True, digits=0),
@@ -253,7 +232,7 @@ OF_POLICIES = {
         Column("price_ours", "new price, mean", digits=2),
         Column("prices_ours", "new prices"),
     )
-}
+}  # fmt: skip
 """Columns of `parkenv policy`."""
 _OF_GIVING_UP = ("median_s", "gave_up_fraction")
 """Columns that are left out where no search gave up."""

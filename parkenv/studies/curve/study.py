@@ -197,11 +197,8 @@ class CurveStudy(FleetStudy):
 
         if "zones" not in result.summary:
             return []
-        curves, points, tasks = (
-            load_curves(result.folder).curves,
-            HELD_OUT.read(result.folder),
-            list[Task[object]](),
-        )
+        curves, points = load_curves(result.folder).curves, HELD_OUT.read(result.folder)
+        tasks: list[Task[object]] = []
         errors = [r for r in result.summary["errors"] if r["held_out"] == "zones"][:1]
         off = {key: row[key] for row in errors for key in (*PREDICTORS, "chance")}
         for name, zones in self.zones.items():

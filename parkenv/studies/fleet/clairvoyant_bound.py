@@ -28,15 +28,7 @@ from parkenv.compiled.arrays import FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 
 BIN_S = 300.0  # s, length of a bin of constant rent
-LEVELS = (
-    1,
-    2,
-    4,
-    8,
-    16,
-    32,
-    64,
-)  # numbers of parts of the lot with the same rents, before each slot has its own
+LEVELS = (1, 2, 4, 8, 16, 32, 64)  # parts of the lot with the same rents, before each slot has its own
 STEPS = 40  # subgradient steps at each level
 WORK = 10_000_000  # parking times looked at after which a level ends
 PATIENCE = 5  # steps without a better bound after which steps become shorter
@@ -93,9 +85,8 @@ def _bound_s(day: ParkingDay) -> float:
     begin = float(day.arrival.min())
     day = day._replace(
         arrival=day.arrival - begin,
-        cost_s=np.array(
-            day.cost_s
-        ),  # can be written to, as the others: compiled code for both takes twice the time
+        # It can be written to, as the others: code for both would take twice the time to compile.
+        cost_s=np.array(day.cost_s),
         free_from=np.maximum(day.free_from - begin, 0.0),
     )
     target_s = float(_schedule_in_order(day))

@@ -164,17 +164,8 @@ def _tracks(fleet: Fleet, scenario: Scenario) -> list[list[int]]:
     steps = fleet.steps
     steps = steps[np.argsort(steps["car"], kind="stable")]
     first = np.searchsorted(steps["car"], np.arange(len(cars) + 1))
-    return [
-        _track(
-            steps[first[i] : first[i + 1]],
-            xy,
-            begin,
-            int(car["entry"]),
-            float(car["arrival"]),
-            float(car["ended_at"]),
-        )
-        for i, car in enumerate(cars)
-    ]
+    ways = cars[["entry", "arrival", "ended_at"]].tolist()
+    return [_track(steps[first[i] : first[i + 1]], xy, begin, *way) for i, way in enumerate(ways)]
 
 
 def _track(
