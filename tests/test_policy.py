@@ -14,7 +14,7 @@ from parkenv import InputError, make_scenario
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.studies.policy.answer import sentences
 from parkenv.studies.policy.study import PolicyStudy
-from parkenv.studies.policy.town import Policy
+from parkenv.studies.policy.town import Policy, share_in_band
 from parkenv.studies.runner import Interrupted, run
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, ParkingLot
@@ -217,6 +217,9 @@ def test_a_policy_is_a_scenario(two_streets):
     assert (cut.max_stay_s, cut.part_of) == (1800.0, "near")
     assert rules["B, far"].admits(0.0, 60.0).tolist() is False
     assert (town.guided(policy), changed.lot.areas) == (0.5, ("far", "near"))
+    assert share_in_band(np.zeros((2, 0, 3)), [0, 2], town.aims) == 0.0, (
+        "of a town whose blocks are all closed"
+    )
     assert changed.lot.neighbors is town.scenario.lot.neighbors
 
 

@@ -153,7 +153,7 @@ class PolicyTown:
         if policy.prices is not None:
             for (zone, name), row in zip(self.units, self.posted(policy.prices).tolist(), strict=True):
                 spans = zip(row, self.levers.hours, strict=True)
-                text = "; ".join(f"{price:g} @ {hours}" for price, hours in spans)
+                text = "; ".join(f"{price:.12g} @ {hours}" for price, hours in spans)
                 cut = {"of": zone, "facilities": [name]} if name else {}
                 tables[f"{name}, {zone}" if name else zone] = cut | {"price": text}
         lot, blocks = self.scenario.lot, self.blocks
@@ -278,7 +278,7 @@ class PolicyTown:
 
 
 def share_in_band(occupancy: FloatArray, columns: Sequence[int], aims: Aims) -> float:
-    """Return the share of the block-hours whose mean over days lies in the band.
+    """Return the share of the block-hours whose mean over days lies in the band; 0 where no block is open.
 
     Args:
         occupancy: (n_days, n_blocks, n_hours).
@@ -286,4 +286,4 @@ def share_in_band(occupancy: FloatArray, columns: Sequence[int], aims: Aims) -> 
         aims: the band.
     """
     mean = occupancy[:, :, list(columns)].mean(axis=0)
-    return float(((mean >= aims.band[0]) & (mean <= aims.band[1])).mean())
+    return float(((mean >= aims.band[0]) & (mean <= aims.band[1])).sum() / max(mean.size, 1))
