@@ -81,7 +81,8 @@ class LoneSearches:
                 self._mean(taken[looks == k].mean(axis=0) / self._capacity),
             )
             if weights is None:
-                arrival = Arrival(fleet.begin + (k + 0.5) * HOUR_S, fleet.day.date)
+                middle = fleet.begin // HOUR_S * HOUR_S + (k + 0.5) * HOUR_S
+                arrival = Arrival(middle, fleet.day.date)
                 believed[k] = self._mean(np.asarray(fleet.scenario.occupancy.forecast(arrival).p_occupied))
         empty_s, full_s = self._inside_s
         return np.asarray(lone_searches(
