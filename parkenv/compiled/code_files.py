@@ -1,6 +1,6 @@
 """Files of compiled code: one for each function and combination of argument types, shared by all processes.
 
-A file is a pickle, and reading one can run code of whoever wrote it. So only files that nobody but this user and the
+A file is a pickle, and reading it can run code of its author. So only files that no one but this user and the
 administrator can have written are read, wherever `NUMBA_CACHE_DIR` is.
 """
 

@@ -2,7 +2,7 @@
 
 Which turns a car may make depends on the chain by which it reaches the junction. So a junction has one more vertex for
 each chain with a restriction, in the same place: the chain ends there, and the edges of that vertex are the permitted
-turns. All who drive on the graph keep to the restrictions, with no code of their own.
+turns. All cars on the graph obey the restrictions without further code.
 """
 
 from __future__ import annotations

@@ -1,12 +1,12 @@
-"""A search in a small lot as a file of Cassandra's format `.pomdp`, for the solvers of others.
+"""A search in a small lot as a file of Cassandra's format `.pomdp`, for other solvers.
 
 It is the model of `planners.bounds.exact`, with single moves: given the day, slots are taken independently of each
-other, and stay as they are; whatever is in view is observed without error. A state is the vertex of the car and the
-slots that are taken, or `done`. The day needs no states: it is in the chances of the states at the start.
+other, and do not change; slots in view are observed without error. A state is the vertex of the car and the
+slots that are taken, or `done`. The day needs no states: the probabilities of the initial states contain it.
 
-Three things keep the least expected cost to that of `exact`. Where the car starts it has not looked yet, and cannot
-park: a state of its own. Whoever gives up in a lot that is not full pays so much that it never pays before every slot
-was observed. Rewards are minus seconds, discounted only if asked for.
+Three things keep the least expected cost to that of `exact`. At the start, a separate state, the car has observed
+nothing yet and cannot park. Giving up in a lot that is not full costs so much that it is never optimal before every
+slot was observed. Rewards are minus seconds, discounted only if asked for.
 """
 
 from __future__ import annotations

@@ -1,18 +1,18 @@
 """A lower bound on the mean total time of every agent: information relaxation with penalties.
 
-The clairvoyant bound gives a car the future of all slots, so it is far below what anyone can reach. Here a car that
-knows too much pays for it (Brown, Smith and Sun, *Information relaxations and duality in stochastic dynamic
-programs*, Operations Research 58, 2010). The slots are divided into groups. A car that comes to see a slot of a group
-is told when each slot of the group is free first, and it is told the day: more than an agent gets. In return it is
-charged the *penalty* of the group, which may be negative:
+The clairvoyant bound gives a car the future of all slots, so it is far below the result of any agent. Here a car pays
+for additional information (Brown, Smith and Sun, *Information relaxations and duality in stochastic dynamic
+programs*, Operations Research 58, 2010). The slots are divided into groups. A car that observes a slot of a group
+learns when each slot of the group is free first, and it knows the day: more than an agent. In return it pays the
+*penalty* of the group, which may be negative:
 
-    mean over what the group may be of value(what it is told) - value(what it is told in this world).
+    mean over the possible states of the group of value(information) - value(information in this world).
 
-Given the day slots are independent, so whatever the car did before, the mean of the penalty is zero. Therefore no agent
+Given the day slots are independent, so whatever the car has done, the mean of the penalty is zero. Therefore no agent
 has a lower mean than the mean, over worlds, of the best that a car with all knowledge of its world can do, penalties
 included. That is a shortest path over the sets of groups that have been seen, and holds for any `value`. The bound is
-close where `value` is nearly the least expected time from there: it is that of a car that keeps the best slot it was
-told of in mind, by dynamic programming over (set of groups, where the last one came into view, that slot).
+close where `value` is nearly the least expected time from there: it is that of a car that remembers the best known
+slot, by dynamic programming over (set of groups, where the last one came into view, that slot).
 
 What is loose: the day is known; a whole group is seen at once; and when the taken slots of seen groups become free is
 known.
@@ -78,7 +78,7 @@ class _Start(NamedTuple):
 
 
 class _News(NamedTuple):
-    """What a car may be told when it sees a group: of each slot one thing, or nothing.
+    """Information that a car may get when it observes a group: for each slot one item, or none.
 
     That is: the slot is free on arrival; it becomes free in some period of waiting.
     """

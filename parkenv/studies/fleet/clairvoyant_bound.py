@@ -1,16 +1,16 @@
-"""A lower bound on the total time of a day with many cars, whoever drives them and whatever they know in advance.
+"""A lower bound on the total time of a day with many cars, for any drivers and any knowledge in advance.
 
 A schedule gives each car a slot and a time at which it parks there: not before its shortest drive, not before the
 resident of the slot has left, not after the car's patience has ended, and no two cars are in one slot at a time. A car
-without a slot goes elsewhere at the give-up penalty. Whatever drivers do is such a schedule, so the total time of the
-best one, which knows all arrivals and stays, bounds theirs.
+without a slot goes elsewhere at the give-up penalty. All behaviour of drivers is such a schedule, so the total time of
+the best one, which knows all arrivals and stays, bounds theirs.
 
 The best schedule is hard to find; its Lagrangian relaxation is not. If a second in slot j at time t has the rent
 π_j(t) ≥ 0, then
 
     Σ_i min(give-up penalty, min over j and p of p - a_i + cost_ij + ∫_p^{p+stay_i} π_j) - Σ_j ∫ π_j, where free
 
-is a lower bound whatever the rents (weak duality): in a schedule, cars pay at most the rents of all seconds. Here p is
+is a lower bound for any rents (weak duality): in a schedule, cars pay at most the rents of all seconds. Here p is
 the time at which car i, which arrived at a_i, parks. Rents are constant within bins, so each minimum is exact: it lies
 where the stay begins or ends at the edge of a bin, or at the earliest or latest time. Subgradient steps raise the
 bound. At first all slots have the same rents, then parts of them that become ever smaller, then each slot has its own.

@@ -1,1 +1,1 @@
-"""What a town should do: prices, limits, permits, guidance and capacity for an aim."""
+"""Search for a town's policy: prices, limits, permits, guidance and capacity for given aims."""

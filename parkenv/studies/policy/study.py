@@ -1,4 +1,4 @@
-"""What a town should do: a search for a policy that reaches its aims, beside SFpark's rule and nothing done."""
+"""Search for a policy that reaches a town's aims, compared with SFpark's rule and no change."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 PICTURE = "policy.png"
 TODAY, RULE, OURS = "today", "SFpark", "ours"
 POLICIES = (TODAY, RULE, OURS)
-"""The policies that are told."""
+"""The policies of the answer."""
 LEARNING = 4
 """Rounds in which drivers learn the policies that are compared."""
 HELD_OUT = (0.9, 1.0, 1.1)
@@ -76,13 +76,13 @@ TRIALS = JsonTable("trials.jsonl", ("method", "round", "number", "day"), _tried,
 
 
 class PolicyStudy(Study):
-    """What a town should do: the policy that is nearest to its aims, told on days and demands that it was not made for.
+    """Find the policy of a town that is nearest to its aims, and evaluate it on held-out days and demands.
 
-    All policies are tried on the same days. First the town as it is today, and SFpark's rule, round after round; then
-    prices that follow the occupancy with smaller and smaller steps (stochastic approximation; Robbins and Monro 1951,
-    averaged as by Polyak and Juditsky 1992); then an evolution strategy for functions that are noisy and cost much
-    (CMA-ES with margin; Hamano et al. 2022) moves the prices of each zone and hour, and every other lever. Of what
-    these found, the best on further days is ours.
+    All policies are simulated on the same days. First the town as it is today, and the rounds of SFpark's rule; then
+    prices that follow the occupancy in decreasing steps (stochastic approximation; Robbins and Monro 1951, averaged as
+    by Polyak and Juditsky 1992); then an evolution strategy for noisy and expensive functions (CMA-ES with margin;
+    Hamano et al. 2022), which changes the prices of each zone and hour, and every other lever. The candidate that is
+    best on further days is ours.
     """
 
     table: ClassVar[Table] = TRIALS

@@ -1,1 +1,1 @@
-"""What theory says of parking searches, against what the package's planners and worlds do."""
+"""Closed forms for parking searches, compared with the package's planners and worlds."""

@@ -1,7 +1,7 @@
 """The parking game of Kokolaki, Karaliopoulos and Stavrakakis (2012): cheap places on the street, or a garage.
 
 N drivers choose at once, between R places on the street at cost 1 and a garage at cost beta. Of those who compete for
-the street, R get a place; the others have searched in vain and pay gamma > beta. If n >= R compete, each expects
+the street, R get a place; the others search without success and pay gamma > beta. If n >= R compete, each expects
 (R + gamma(n - R))/n, which is at most beta if and only if n <= N0 = R(gamma - 1)/(gamma - beta). So all compete up to
 N = N0, and N0 of them beyond; the best is that R compete. The price of anarchy is (R + gamma(N - R))/(R + beta(N - R))
 up to N0; beyond, everybody expects beta in equilibrium, and it is beta N/(R + beta(N - R)).

@@ -43,7 +43,7 @@ _MOST_DECISIONS = round(60.0 / DECISION_S)  # a minute, as in the environment
 
 
 class Outcome(NamedTuple):
-    """Held-out tasks of one kind: (n,) bool, which succeeded; (n,) what is told of them; and `more` of the training."""
+    """Held-out tasks of one kind: (n,) bool, which succeeded; (n,) a result of each; and `more` of the training."""
 
     parked: NDArray[np.bool_]
     value: NDArray[np.float64]
@@ -55,7 +55,7 @@ class ParkingTraining(RLTraining):
 
     spec: DriveTrainingSpec | ScenesTrainingSpec
     value: ClassVar[str] = "time_s"
-    """What the mean over successes is told of, which breaks ties: less is better."""
+    """Result whose mean over successes breaks ties: less is better."""
     more: ClassVar[tuple[str, ...]] = ()
     """Further results for each kind."""
 
