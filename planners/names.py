@@ -46,7 +46,5 @@ SMALL_LOTS_ONLY = ("exact",)
 """Agents for small lots and sensors without errors only."""
 BOUND = "bound"
 """What no agent can beat in the mean; it drives no car."""
-UNBEATEN = ("oracle", BOUND)
-"""Names that compete with no agent: they know what agents do not."""
 AGENT_NAMES = tuple(name for name in AGENTS if name not in (*SMALL_LOTS_ONLY, BOUND))
 """Agents for all lots."""

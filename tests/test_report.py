@@ -13,6 +13,7 @@ from command_line import parkenv
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.cli.report import make_report
+from parkenv.files.known_names import UNBEATEN
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.show.plurals import LEAST_SEARCHES
 from parkenv.show.report.page import SCHEMA
@@ -58,6 +59,7 @@ def test_the_tables_hold_every_number_of_the_summary(run):
     same = {column["key"]: column["value"] for column in table["same"]}
     assert len(table["rows"]) == len(rows)
     assert table["leads"] == [i for i, row in enumerate(rows) if row.pop("leads")]
+    assert table["unbeaten"] == [i for i, row in enumerate(rows) if row["agent"] in UNBEATEN]
     for row, cells in zip(rows, table["rows"], strict=True):
         shown = same | dict(zip(keys, cells, strict=True))
         for key, value in row.items():

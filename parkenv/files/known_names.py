@@ -26,6 +26,8 @@ MapName = Literal["empty", "right", "wrong"]
 KnowledgeName = Literal["own", "shared", "reserve", "full"]
 """What the cars of a fleet know; see `parkenv.engine.fleet.DriverKind`."""
 KNOWLEDGE: tuple[KnowledgeName, ...] = get_args(KnowledgeName)
+UNBEATEN = ("oracle", "bound")
+"""Agents that compete with no other: they know what others do not."""
 SCENE_LEVELS = tuple(
     f"{kind}-{level}"
     for level in ("normal", "complex", "extreme", "moving")

@@ -16,6 +16,7 @@ from matplotlib.ticker import NullFormatter
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError
+from parkenv.files.known_names import UNBEATEN
 from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.picture_files import INK, STYLE, legend_columns
 from parkenv.show.plurals import LEAST_SEARCHES, plural
@@ -23,7 +24,6 @@ from parkenv.world.cost_terms import COST_TERMS
 
 Row = Mapping[str, Any]
 
-_UNBEATEN = ("oracle", "bound")
 AGENT_COLORS = {
     "mdp": "#0072b2",
     "mdp-static": "#56b4e9",
@@ -195,7 +195,7 @@ def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figu
     Raises:
         InputError: there are no rows.
     """
-    panels = {name: [row for row in rows if row["agent"] not in _UNBEATEN] for name, rows in panels.items()}
+    panels = {name: [row for row in rows if row["agent"] not in UNBEATEN] for name, rows in panels.items()}
     _require_rows([row for rows in panels.values() for row in rows])
     columns = min(len(panels), 4)
     lines = -(-len(panels) // columns)
@@ -320,7 +320,7 @@ def _draw_lines(ax: Axes, rows: Sequence[Row], limit: float, along: Callable[[Ro
         total = np.array([row["total_s"] for row in own])
         # NaN where there is no interval, e.g. of a single search: no band there.
         low, high = np.array([row["total_s_ci95"] for row in own], dtype=np.float64).T
-        dashes = (0, (4, 2)) if agent in _UNBEATEN else "-"
+        dashes = (0, (4, 2)) if agent in UNBEATEN else "-"
         # The interval of a line beyond the limit would only cover the others.
         ax.fill_between(x, low, high, where=total <= limit, color=color, alpha=0.07, linewidth=0)
         ax.plot(x, total, color=color, linestyle=dashes, linewidth=1.8, marker="o", markersize=3.5)

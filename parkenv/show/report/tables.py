@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from parkenv.files.known_names import UNBEATEN
 from parkenv.show.columns import SETTING_AXES
 from parkenv.show.plurals import LEAST_SEARCHES, number_text
 from parkenv.world.cost_terms import COST_FIELDS, COST_TERMS
@@ -274,7 +275,8 @@ def table_of(
     """Build a table of the page's data.
 
     Intervals (`NAME_ci95`) are merged into the column of their value. Columns that are equal in all rows go to `same`,
-    which is printed above the table. `leads` holds the numbers of the rows whose agent leads.
+    which is printed above the table. `leads` holds the numbers of the rows whose agent leads, `unbeaten` those of
+    `UNBEATEN`.
 
     Args:
         name: identifier of the table in the page.
@@ -317,6 +319,7 @@ def table_of(
         "columns": [written(key) for key in shown],
         "rows": [[values[key][i] for key in shown] for i in range(len(rows))],
         "leads": [i for i, row in enumerate(flat) if row.get("leads")],
+        "unbeaten": [i for i, row in enumerate(flat) if row.get("agent") in UNBEATEN],
         "same": [{**written(key), "value": values[key][0]} for key in same if values[key][0] is not None],
     }
 

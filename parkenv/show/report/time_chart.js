@@ -52,7 +52,7 @@ function timePanel(rows, end, width) {
 
 /** Draw the chart of a table that has the parts of the total time; returns whether it does. */
 function showTimeChart(root, table) {
-  const named = (row, i) => Object.fromEntries([["leads", table.leads?.includes(i)], ...table.same.map((column) => [column.key, column.value]), ...table.columns.map((column, i) => [column.key, row[i]])]);
+  const named = (row, i) => Object.fromEntries([["leads", table.leads?.includes(i)], ["unbeaten", table.unbeaten?.includes(i)], ...table.same.map((column) => [column.key, column.value]), ...table.columns.map((column, i) => [column.key, row[i]])]);
   const rows = table.rows.map(named);
   if (!rows.length || !rows.every((row) => Array.isArray(row.total_s) && "drive_s" in row && "agent" in row)) return false;
   const columns = [...table.same, ...table.columns].filter((column) => SETTING.includes(column.key)).sort((a, b) => SETTING.indexOf(a.key) - SETTING.indexOf(b.key));
@@ -66,7 +66,7 @@ function showTimeChart(root, table) {
   if (groups.size > 12) return false;
   // A few agents far off must not squash the others of their panel.
   const shown = [...groups.values()].flatMap((its) => {
-    const shortest = Math.min(...its.filter((row) => !["oracle", "bound"].includes(row.agent)).map((row) => row.total_s[0]));
+    const shortest = Math.min(...its.filter((row) => !row.unbeaten).map((row) => row.total_s[0]));
     return its.map((row) => row.total_s[2] ?? row.total_s[0]).filter((seconds) => seconds <= CUT * shortest);
   });
   const longest = Math.max(...rows.map((row) => row.total_s[2] ?? row.total_s[0]));

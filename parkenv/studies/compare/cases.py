@@ -14,6 +14,7 @@ import numpy as np
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.compiled.keyed_random import world_key
 from parkenv.errors import InputError
+from parkenv.files.known_names import UNBEATEN
 from parkenv.scenarios.selection import seeds_by_scenario
 from parkenv.studies.agent_spec import AgentSpec, label_of
 from parkenv.studies.episodes import EpisodeRunner
@@ -27,7 +28,7 @@ from parkenv.world.week import DAY_S
 from planners.agent import make_agent, shown_name
 from planners.belief.agent import BeliefAgent
 from planners.belief.best_path import is_compiled
-from planners.names import BOUND, UNBEATEN
+from planners.names import BOUND
 
 BUDGET = "budget_ms"
 """The option of agents that plan for a time, ms a decision."""

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from parkenv.errors import InputError
+from parkenv.files.known_names import UNBEATEN
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
@@ -35,7 +36,7 @@ from parkenv.studies.fields import (
 from parkenv.studies.results import Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.studies.workers import Task
-from planners.names import BOUND, HUMAN, UNBEATEN
+from planners.names import BOUND, HUMAN
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration

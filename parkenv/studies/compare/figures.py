@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.files.file_names import file_name
+from parkenv.files.known_names import UNBEATEN
 from parkenv.scenarios.blind import BLIND
 from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.picture_files import save_picture
@@ -29,7 +30,6 @@ from parkenv.show.figures.times import (
     draw_time_split,
 )
 from parkenv.studies.compare.cases import Case, against_occupancy
-from planners.names import UNBEATEN
 
 Row = Mapping[str, Any]
 Setting = tuple[float, float, float]
