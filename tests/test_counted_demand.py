@@ -165,6 +165,9 @@ def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path)
     assert summary["simulated_error"] < 1.5 * summary["forecast_error"] + 0.02
     for name in ("scenario", "saturday", "sunday"):
         assert set(json.loads((folder / f"{name}.json").read_text())["demand"]) >= {"P1", "Parkhaus P0"}
+    words = ("--weeks", "2", "--held-out", "1", "--roll-outs", "4", "--out", tmp_path / "c")
+    result = parkenv("occupancy", "demand", tmp_path / "a.csv", "--scenario", town / "town.toml", *words)
+    assert (result.returncode, "roll_outs is 4" in result.stderr) == (2, True), result.stderr
     # A run that was stopped goes on there, to the same end.
     names = ("fitted.jsonl", "days.jsonl", "predicted.csv", "scenario.json", "summary.json")
     whole = {name: (folder / name).read_text() for name in names}

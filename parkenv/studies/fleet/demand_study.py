@@ -156,6 +156,11 @@ class DemandStudy(Study):
                 f"--from is {self._first}: {counts.source} has counts from {counts.days[0]} to {counts.days[-1]}, "
                 f"want {plural(self.weeks, 'week')} and days after these among them"
             )
+        if not len(self.days(self.roll_outs - 1)[1]):
+            raise InputError(
+                f"roll_outs is {self.roll_outs}, want no more than have days held out by {counts.days[-1]}, the last "
+                f"one of {counts.source}"
+            )
 
     def settings(self) -> Row:
         """See `Study`: further roll-outs may be added."""
@@ -273,6 +278,9 @@ class DemandStudy(Study):
         town, found, fits = self.town, self._found(result.results), result.results.rows(FITTED)
         fitted = {kind: fits[self.roll_outs - 1, kind]["car_parks"] for kind in KINDS}
         tasks: list[Task[object]] = [
+            partial(_write_predictions, list(result.results.rows(DAYS).values()), result.folder)
+        ]
+        tasks += [
             partial(
                 self.scenario.changed(
                     demand=self.scenario.demand | {name: its["purpose"] for name, its in car_parks.items()}
@@ -282,9 +290,10 @@ class DemandStudy(Study):
             for kind, car_parks in fitted.items()
             if car_parks
         ]
-        kind = next(kind for kind, car_parks in fitted.items() if car_parks)
+        if not (kinds := [kind for kind, car_parks in fitted.items() if car_parks]):
+            return tasks  # nothing was counted in the last weeks
         shown = np.isin(found.days, self.days(self.roll_outs - 1)[1])
-        shown &= np.isin(town.counts.weekday[found.days], KINDS[kind])
+        shown &= np.isin(town.counts.weekday[found.days], KINDS[kinds[0]])
         cars = {name: its[:, shown] * town.capacity[:, None, None] for name, its in found.shares.items()}
         its = [
             CarParkDays(
@@ -297,11 +306,7 @@ class DemandStudy(Study):
             for k in np.flatnonzero(np.isfinite(cars["counted"]).any(axis=(1, 2)))
         ]
         hours = town.hours.astype(np.float64) + 1.0
-        return [
-            *tasks,
-            partial(_write_predictions, list(result.results.rows(DAYS).values()), result.folder),
-            partial(save_counted_demand, its, hours, result.folder / "demand.png"),
-        ]
+        return [*tasks, partial(save_counted_demand, its, hours, result.folder / "demand.png")]
 
 
 class _Found(NamedTuple):
