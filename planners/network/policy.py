@@ -44,7 +44,7 @@ from planners.network.features import (
     Features,
 )
 
-FloatArray = NDArray[np.float32]
+Float32Array = NDArray[np.float32]
 
 FORMAT = "parkenv-network-1"
 SHIPPED = Path(__file__).with_name("models") / "network.safetensors"
@@ -99,15 +99,15 @@ def feature_masks(without: tuple[Part, ...]) -> tuple[NDArray[np.float32], NDArr
 class Layer(NamedTuple):
     """A linear layer."""
 
-    weight: FloatArray  # (n_inputs, n_outputs) float32
-    bias: FloatArray  # (n_outputs,) float32
+    weight: Float32Array  # (n_inputs, n_outputs) float32
+    bias: Float32Array  # (n_outputs,) float32
 
 
 class NetworkPolicy(NamedTuple):
     """The network: its card, and its weights by name, float32."""
 
     card: NetworkCard
-    weights: dict[str, NDArray[np.float32]]
+    weights: dict[str, Float32Array]
 
     @classmethod
     def load(cls, path: str | os.PathLike[str] = SHIPPED) -> Self:
@@ -143,7 +143,7 @@ class NetworkPolicy(NamedTuple):
             body = b"".join(np.ascontiguousarray(v, "<f4").tobytes() for v in self.weights.values())
             beside.write_bytes(len(text).to_bytes(8, "little") + text + body)
 
-    def scores(self, features: Features) -> NDArray[np.float32]:
+    def scores(self, features: Features) -> Float32Array:
         """Score the actions, (..., 6): minus expected times, in time scales, up to a constant; -inf if not allowed.
 
         Args:
@@ -167,7 +167,7 @@ class NetworkPolicy(NamedTuple):
 
 
 @compiled(error_model="numpy")
-def _linear(x: FloatArray, layer: Layer, out: FloatArray) -> None:
+def _linear(x: Float32Array, layer: Layer, out: Float32Array) -> None:
     """Write the outputs, (n_outputs,), of a layer; sums are in the order of the inputs on every machine."""
     weight, bias = layer
     for j in range(len(out)):
@@ -179,7 +179,7 @@ def _linear(x: FloatArray, layer: Layer, out: FloatArray) -> None:
 
 
 @compiled(error_model="numpy")
-def _rectified(x: FloatArray, layer: Layer, out: FloatArray) -> None:
+def _rectified(x: Float32Array, layer: Layer, out: Float32Array) -> None:
     """Write the outputs of a layer followed by a ReLU."""
     _linear(x, layer, out)
     for j in range(len(out)):
@@ -188,12 +188,12 @@ def _rectified(x: FloatArray, layer: Layer, out: FloatArray) -> None:
 
 @compiled(error_model="numpy")
 def _score(
-    actions: FloatArray,
-    tokens: FloatArray,
+    actions: Float32Array,
+    tokens: Float32Array,
     allowed: NDArray[np.bool_],
     layers: tuple[Layer, ...],
     ahead: bool,
-    scores: FloatArray,
+    scores: Float32Array,
 ) -> None:
     """Write the scores, (n, 6), of n decisions; with `ahead`, the look-ahead's regret is subtracted."""
     token_1, token_2, attention, action_1, action_2, score_1, score_2 = layers
