@@ -81,12 +81,10 @@ class Neighborhood:
 
     def planning_graph(self, problem: SearchProblem, failure_s: float) -> PlanningGraph:
         """Return the data of a path search, given the whole problem and the cost, s, of finding a slot taken."""
-        drive_s, following, views = self.table.seconds, self.table.following, self.views
-        wait_s, give_up_s, whole = problem.wait_s, problem.give_up_s, self.whole
-        starts, rate, cost_s = self.view_starts, self.own_rate, self.cost_s
         return PlanningGraph(
-            drive_s, following, starts, views, rate, cost_s, wait_s, give_up_s, failure_s, whole
-        )
+            self.table.seconds, self.table.following, self.view_starts, self.views, self.own_rate, self.cost_s,
+            problem.wait_s, problem.give_up_s, failure_s, self.whole,
+        )  # fmt: skip
 
 
 class Neighborhoods:

@@ -277,15 +277,12 @@ def headlines(rows: Sequence[Row], changes: Sequence[Row], most: int = 4) -> lis
         if len(rows) != 1:
             return totals
         (row,) = rows
-        return [
-            *totals,
-            {
-                "label": "from the entry to a space, or to giving up",
-                "value": f"{row['search_s'] / 60.0:.1f} min",
-            },
-            {"label": "of the cars find no slot", "value": f"{row['balked_fraction']:.1%}"},
-            {"label": "of all metres are cruised", "value": f"{row['cruising_share']:.0%}"},
-        ]
+        told = {
+            "from the entry to a space, or to giving up": f"{row['search_s'] / 60.0:.1f} min",
+            "of the cars find no slot": f"{row['balked_fraction']:.1%}",
+            "of all metres are cruised": f"{row['cruising_share']:.0%}",
+        }
+        return [*totals, *({"label": label, "value": value} for label, value in told.items())]
     made = []
     for row in chosen[:most]:
         value = "no clear difference on average" if row["days"] >= LEAST_DAYS else "too few days to tell"

@@ -149,17 +149,14 @@ def block_rows(
         table = policies["ours"]["zones"].get(f"{unit[1]}, {zone}" if unit[1] else zone, {})
         spans = [part.split(" @ ") for part in table.get("price", "").split("; ") if part]
         today = town.today[town.unit_of_block[k]]
-        row = {"block": town.blocks.names[i], "zone": zone, "slots": int(town.blocks.slots[i])}
-        row["cars_a_day"] = cars[town.blocks.names[i]]
-        row |= {f"taken_{name}": float(share[k]) for name, share in shares.items()}
-        row |= {
+        rows.append({
+            "block": town.blocks.names[i], "zone": zone, "slots": int(town.blocks.slots[i]),
+            "cars_a_day": cars[town.blocks.names[i]],
+            **{f"taken_{name}": float(share[k]) for name, share in shares.items()},
             "price_today": float(today.mean()),
             "price_ours": float(np.mean([float(a) for a, _ in spans] or today)),
-        }
-        rows.append(
-            row
-            | {"prices_ours": ", ".join(f"{hours.replace(':00', '')}: {amount}" for amount, hours in spans)}
-        )
+            "prices_ours": ", ".join(f"{hours.replace(':00', '')}: {amount}" for amount, hours in spans),
+        })  # fmt: skip
     return rows
 
 
