@@ -53,6 +53,17 @@ def test_few_days_make_a_wide_forecast_and_many_a_narrow_one():
     assert widths[2] == pytest.approx(0.3, abs=0.1)
 
 
+@pytest.mark.parametrize("n_days", [1, 2, 10])
+def test_no_slot_is_surer_than_the_days_allow(n_days):
+    """Slots that never changed: what n days show is a tenth of a day short of certain."""
+    data, _ = simulated(n_days, 0.3)
+    data.taken[: N_SLOTS // 2], data.taken[N_SLOTS // 2 :] = 1.0, 0.0
+    p = fit_slot_days(data).forecast(next_day(data.days)).p_taken[0]
+    least = 0.05 / (n_days + 0.1)
+    assert least <= p.min() < p[N_SLOTS // 2 :].max() < 0.3
+    assert 0.7 < p[: N_SLOTS // 2].min() < p.max() <= 1.0 - least
+
+
 def test_recent_days_count_more_where_the_lot_drifts():
     data, p = simulated(40, 0.3, seed=3, drift=0.05)
     found = fit_slot_days(data).forecast(next_day(data.days)).p_taken[0][:, SHOWN].mean()

@@ -49,6 +49,13 @@ _DISPERSION, _DISPERSION_PRIOR = 3.0, 10.0  # before any data, and its weight as
 _ROUNDS, _LEVEL_STEPS, _HABIT_STEPS, _TUNING_STEPS, _CORRECTION_STEPS = 5, 4, 3, 8, 8
 _MAX_STEP, _MAX_LEVEL = 2.0, 12.0  # logits
 _JITTER = 1e-6
+_PSEUDO_DAYS = 0.1
+"""Days, half of them with the slot taken, that count beside the fitted ones.
+
+Slots differ from the model in more ways than their habits: without these days, a forecast from few days is too certain
+of single slots. On the 15 days of CNRPark-EXT, each forecast from two, three, five or all days before it, 0.1 has the
+least log-loss (compared with 0, 0.02, 0.05, 0.2, 0.5, 1 and 2), or with five and more within 0.0004 of that of 0.2.
+"""
 
 
 class Days(NamedTuple):
@@ -130,7 +137,7 @@ class FittedSlotDays:
         mean = (design @ found.mean + self.correction)[:, None] + self.habits @ parts.T
         variance = covariance[:, each, each].T[:, None] + _variance(parts, self.habit_covariance)
         at = np.clip(np.arange(n), first, last) - first
-        p = _FINE.expit(mean, np.sqrt(variance))[0]
+        p = _with_pseudo_days(_FINE.expit(mean, np.sqrt(variance))[0], len(self.days.number))
         return SlotForecast(p[:, :, at], covariance[at], curve[:, at][:, :, at])
 
 
@@ -193,7 +200,7 @@ def fit_slot_days(data: SlotDays) -> FittedSlotDays:
     correction = np.zeros(len(parts))
     for _ in range(_CORRECTION_STEPS):
         p, slope = _COARSE.expit(mean + correction, sd)
-        score = (taken - seen * p).sum(axis=(0, 1))
+        score = (taken - seen * _with_pseudo_days(p, len(data.days.number))).sum(axis=(0, 1))
         correction += np.clip(score / (1.0 + (seen * slope).sum(axis=(0, 1))), -1.0, 1.0)
     return FittedSlotDays(
         data.days, periods, response, information, hyper, correction, habits, covariance, dispersion
@@ -349,3 +356,8 @@ class _Curves:
             loss, start, jac=True, method="L-BFGS-B", bounds=bounds, options={"maxiter": _TUNING_STEPS}
         )
         return np.asarray(found.x, float)
+
+
+def _with_pseudo_days(p_taken: FloatArray, n_days: int) -> FloatArray:
+    """Return the forecast from a number of days, and `_PSEUDO_DAYS` more."""
+    return np.asarray((n_days * p_taken + 0.5 * _PSEUDO_DAYS) / (n_days + _PSEUDO_DAYS))
