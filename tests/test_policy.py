@@ -223,6 +223,22 @@ def test_a_policy_is_a_scenario(two_streets):
     assert changed.lot.neighbors is town.scenario.lot.neighbors
 
 
+@pytest.mark.parametrize(
+    ("levers", "wanted"),
+    [
+        (
+            {"max_stay_s": {"near": [3600, 1800]}},
+            "max_stay_s.near begins with 3600.0, want what is so today, 0.0",
+        ),
+        ({"users": {"near": [["permit-a"], ["public"]]}}, "users.near begins with"),
+        ({"zones": ["near"], "step": 3.0, "most": 2.0}, "step is 3, want at most"),
+    ],
+)
+def test_levers_begin_with_what_is_so_today(two_streets, levers, wanted):
+    with pytest.raises(InputError, match=wanted):
+        _ = asked(two_streets, levers=levers).town
+
+
 def test_zones_of_a_scenario():
     table = {"of": "ring", "facilities": ["7th street*"], "price": "1 @ 08:00-12:00; 3 @ 12:00-20:00"}
     market = table | {"hours": "Mo,We-Su 00:00-24:00; Tu 14:00-24:00", "users": ["public", "permit-a"]}

@@ -97,6 +97,14 @@ class PolicyTown:
                 raise InputError(
                     f"levers: lot {lot.name!r:.40} has no zone {name!r:.40}; {nearest(name, rules)}"
                 )
+        for name, rule in rules.items():
+            for field, its in {"max_stay_s": rule.max_stay_s or 0.0, "users": rule.users}.items():
+                if (first := next(iter(getattr(levers, field).get(name, ())), its)) != its:
+                    raise InputError(
+                        f"levers.{field}.{name} begins with {first}, want what is so today, {its}, first"
+                    )
+        if levers.step > levers.most:
+            raise InputError(f"levers.step is {levers.step:g}, want at most levers.most, {levers.most:g}")
         facilities = [facility.name for facility in lot.facilities]
         for name in levers.open:
             if name not in facilities:
