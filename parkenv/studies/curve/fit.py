@@ -90,19 +90,12 @@ def fitted_forms(points: Sequence[Row]) -> dict[str, Callable[[FloatArray], Floa
 
 
 class Town(NamedTuple):
-    """The days of a scenario.
-
-    Attributes:
-        zones: its zones.
-        purposes: names of its purposes.
-        days: rows of `ZONES` by multiple and day.
-        usual: the multiple that is its own demand.
-    """
+    """The days of a scenario."""
 
     zones: Zones
-    purposes: Sequence[str]
-    days: Sequence[Sequence[Row]]
-    usual: float = 1.0
+    purposes: Sequence[str]  # their names
+    days: Sequence[Sequence[Row]]  # rows of `ZONES` by multiple and day
+    usual: float = 1.0  # the multiple that is its own demand
 
 
 @dataclass(frozen=True, eq=False)

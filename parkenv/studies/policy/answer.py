@@ -22,17 +22,11 @@ if TYPE_CHECKING:
 
 
 class Driven(NamedTuple):
-    """Held-out days of a policy.
+    """Held-out days of a policy."""
 
-    Attributes:
-        setting: the policy and the demand.
-        days: rows of the days.
-        blocks: rows of `BLOCKS` of the days.
-    """
-
-    setting: Setting
+    setting: Setting  # the policy and the demand
     days: list[Row]
-    blocks: list[Row]
+    blocks: list[Row]  # rows of `BLOCKS` of the days
 
 
 def driven(held_out: HeldOut, results: Results) -> list[Driven]:

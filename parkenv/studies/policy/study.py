@@ -42,18 +42,11 @@ HELD_OUT = (0.9, 1.0, 1.1)
 
 
 class Trial(NamedTuple):
-    """A policy that is tried.
+    """A policy that is tried."""
 
-    Attributes:
-        method: what proposed it.
-        round: in which round.
-        number: which of the round.
-        policy: what it is.
-    """
-
-    method: str
+    method: str  # what proposed it
     round: int
-    number: int
+    number: int  # in the round
     policy: Policy
 
     @property
