@@ -28,7 +28,7 @@ from planners.belief.agent import BeliefAgent, BeliefSearch
 from planners.heuristics.policies import POLICIES
 
 _BATCH = 32  # worlds between two looks at the clock
-_SURE = 2.0  # standard errors by which an action must be better than that of the heuristic
+_SURE = 2.0  # standard errors by which an action must be better than that of the base
 _SURELY_TAKEN = 0.999  # P(taken) from which on an attempt to park is left out
 BELIEF = "belief"  # the base that is no heuristic
 
