@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import parkenv
 from parkenv import InputError, SensorBand, SensorModel
+from parkenv.belief.slot_belief import SlotBelief
 from parkenv.world.lot import PARK
 from planners import make_agent
 from planners.heuristics.policies import POLICIES
@@ -47,6 +48,9 @@ def test_its_beliefs_are_those_of_the_environment(sensor, seed):
         assert belief.vertex == observation["vertex"]
         np.testing.assert_allclose(belief.slots.p_occupied, observation["p_occupied"], atol=1e-6)
         np.testing.assert_allclose(belief.slots.parts, observation["belief"], atol=1e-5)
+        seen, theirs = belief.slots.observations, SlotBelief.of_observation(observation).observations
+        np.testing.assert_array_equal(seen.slots, theirs.slots)
+        np.testing.assert_array_equal(seen.taken, theirs.taken)
         if over:
             return
 

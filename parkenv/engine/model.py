@@ -250,8 +250,8 @@ class Model:
     Args:
         problem: lot, goal, speeds, costs and sensor model; of a whole scenario the public part is kept.
         any_day: whether days may be unlike their forecast, with the probabilities of `belief` (`DayBelief`): an event
-            has filled the slots near the goal, the forecast is worthless, or that of single slots is. Such a day has
-            its slots from then; those that change later follow the forecast.
+            has filled the slots near the goal, or the forecast carries no information, of the day or of single slots.
+            `sample` draws all slots from such a day; their later changes follow the forecast.
 
     Attributes:
         problem: the public part.
@@ -388,7 +388,9 @@ class Model:
         after = attempted.decay(time - attempted.time).update(*on_arrival)
         last_taken, day = belief.last_taken.copy(), belief.day.copy()
         last_taken[slots] = taken
-        day.update(Observations(slots, times, taken, *rates))
+        # Of the whole step, as in the environment: `decay` has dropped that of an attempt.
+        after.observations = Observations(slots, times, taken, *rates)
+        day.update(after.observations)
         return replace(
             belief, vertex=vertex, slots=after, day=day, last_taken=last_taken, n_steps=belief.n_steps + 1
         )
