@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from planners.thesis.label_setting import label_setting
     from planners.thesis.mdp import CirclingWarning, ParkingMDP
     from planners.thesis.policy_iteration import Solution, policy_iteration
-    from planners.thesis.value_iteration import value_iteration
 
 _MODULES = {
     "AGENT_NAMES": "names",
@@ -26,7 +25,6 @@ _MODULES = {
     "label_setting": "thesis.label_setting",
     "make_agent": "agent",
     "policy_iteration": "thesis.policy_iteration",
-    "value_iteration": "thesis.value_iteration",
 }
 
 __all__ = [
@@ -39,7 +37,6 @@ __all__ = [
     "label_setting",
     "make_agent",
     "policy_iteration",
-    "value_iteration",
 ]
 
 

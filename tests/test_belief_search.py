@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from expected_time import expected_time
 from small_lots import cut_in_two, features, full_lot, small_lot
 
 from parkenv import InputError, OccupancyProcess, ParkingLot, Scenario, SensorModel, make_scenario
@@ -16,7 +17,6 @@ from planners.belief.agent import WORK_PER_MS
 from planners.belief.best_path import best_path
 from planners.belief.planning_graph import MOST_STOPS, detects_missed
 from planners.bounds.exact import ExactSolution
-from planners.bounds.expected_time import expected_time
 
 
 def gap(seed, **options):

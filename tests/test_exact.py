@@ -6,6 +6,7 @@ from functools import cache
 import gymnasium as gym
 import numpy as np
 import pytest
+from expected_time import expected_time
 from small_lots import small_lot
 
 from parkenv import (
@@ -24,7 +25,6 @@ from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
-from planners.bounds.expected_time import expected_time
 
 BLIND = SensorModel(view_range=0.0)
 

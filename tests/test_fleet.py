@@ -370,42 +370,6 @@ def test_another_process_gives_the_same_run():
     assert len(runs) == 1
 
 
-def test_demand_fitted_to_a_log_gives_its_occupancy():
-    scenario = parkenv.make_scenario("campus")
-    n = scenario.lot.n_slots
-    rates = tuple(np.interp(range(24), [0, 6, 9, 14, 20, 23], [0.5, 3.0, 75.0, 36.0, 9.0, 1.5]))
-    truth = Demand(PoissonArrivals(rates, 0.0, 86400.0), ExponentialTime(2 * 3600.0))
-    log = recorded(scenario, truth, days=20)
-    fitted = Demand.fitted_to(log, n)
-    again = recorded(scenario, fitted, days=20)
-    hours = range(7, 21)
-    before, after = (occupancy_by_hour(one)[hours] for one in (log, again))
-    assert before.max() > 0.5
-    np.testing.assert_allclose(after, before, atol=0.06)
-
-
-def recorded(scenario, demand, days):
-    """A log of days, observed every ten minutes, of a lot that starts empty and that cars enter without a drive."""
-    from parkenv import OccupancyLog
-
-    n, seconds = scenario.lot.n_slots, np.arange(0.0, 86400.0, 600.0)
-    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=ORDERED_ENTRY)])
-    taken = np.zeros((days, n, len(seconds)), bool)
-    for day in range(days):
-        fleet.reset(day)
-        for i, second in enumerate(seconds):
-            fleet.run(until=float(fleet.records["midnight"][0]) + second)
-            taken[day, :, i] = fleet.taken()
-    dates = tuple(str(np.datetime64("2024-01-01") + 7 * day) for day in range(days))
-    day, slot, second = (a.ravel() for a in np.meshgrid(range(days), range(n), seconds, indexing="ij"))
-    return OccupancyLog(tuple(map(str, range(n))), dates, slot, day, second, taken.ravel())
-
-
-def occupancy_by_hour(log):
-    hour = (log.second // 3600).astype(int)
-    return np.bincount(hour, log.occupied, 24) / np.bincount(hour, minlength=24)
-
-
 def test_a_copy_is_a_fleet_before_its_first_reset():
     fleet = Fleet("mini", Demand(Headways(3)), background="none", tick_s=0.5)
     fleet.reset(0)

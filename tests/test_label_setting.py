@@ -7,12 +7,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.sparse.csgraph import dijkstra
 from small_lots import CAR_PARKS
+from value_iteration import value_iteration
 
 from parkenv import InputError, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot
 from parkenv.world.lot import PARK
-from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
+from planners import ParkingMDP, label_setting, make_agent, policy_iteration
 from planners.thesis.label_repair import repair
 from planners.thesis.label_setting import TIE_S, StoppingGraph, best_moves, set_labels
 

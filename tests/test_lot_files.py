@@ -17,7 +17,6 @@ from parkenv.errors import InputError
 from parkenv.files.file_names import is_plain
 from parkenv.files.known_names import PACKAGED_LOTS
 from parkenv.lots import city_lot, grid_lot, import_lot, packaged_lot, read_lot, write_lot
-from parkenv.lots.builders.packaged import LOTS, build
 from parkenv.lots.checks import check_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
@@ -72,16 +71,6 @@ def with_exact(slot, **changes):
 
 
 # ---- round trip ----
-
-
-@pytest.mark.parametrize("name", PACKAGED_LOTS)
-def test_packaged_lots_are_what_their_script_makes(name, tmp_path):
-    lot = packaged_lot(name)
-    assert lot == LOTS[name]()
-    build(tmp_path)
-    committed = Path(__file__).parents[1] / "parkenv" / "lots" / "packaged" / f"{name}.geojson"
-    assert (tmp_path / committed.name).read_text() == committed.read_text()
-    assert check_lot(committed) == []
 
 
 def test_unknown_packaged_lot_lists_the_known_ones():

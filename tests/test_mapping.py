@@ -116,7 +116,6 @@ def test_a_slot_that_nobody_saw_stays_unknown(mini):
     states = slots.states()
     assert not states.in_view.any()
     assert (states.p_occupied == 0.5).all()
-    assert slots.thesis_states().in_view.all()  # the thesis calls them free
 
 
 def test_a_detection_goes_to_its_slot_and_one_elsewhere_to_none(mini):

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from command_line import parkenv as command
 from small_lots import features
+from value_iteration import value_iteration
 
 from parkenv import OccupancyProcess, ParkingLot, Scenario
 from parkenv.lots import packaged_lot, write_lot
-from planners import ParkingMDP, label_setting, make_agent, policy_iteration, value_iteration
+from planners import ParkingMDP, label_setting, make_agent, policy_iteration
 from planners.agent import ClairvoyantAgent
 from planners.bounds.oracle import best_slot
 from planners.routes import DriveRoutes

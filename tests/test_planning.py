@@ -6,18 +6,12 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from value_iteration import value_iteration
 
 from parkenv import InputError, make_scenario
 from parkenv.lots import grid_lot
 from parkenv.world.lot import PARK
-from planners import (
-    CirclingWarning,
-    ParkingMDP,
-    label_setting,
-    make_agent,
-    policy_iteration,
-    value_iteration,
-)
+from planners import CirclingWarning, ParkingMDP, label_setting, make_agent, policy_iteration
 from planners.thesis.mdp import discount
 
 

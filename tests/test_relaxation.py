@@ -16,7 +16,6 @@ from parkenv.world.occupancy.slot_law import SlotLaw
 from parkenv.world.scenario import SearchProblem
 from parkenv.world.tariff import Zone
 from planners.bounds.exact import ExactSolution
-from planners.bounds.exact_changing import ChangingSolution
 from planners.bounds.oracle import best_slot
 from planners.bounds.relaxation import SearchBound
 from planners.routes import DriveRoutes
@@ -85,23 +84,6 @@ def test_coarser_groups_give_a_lower_bound_that_still_holds():
 def process(p_taken, rate):
     profile = np.ones(168)
     return OccupancyProcess(p_taken * rate, profile, (1.0 - p_taken) * rate, profile)
-
-
-def test_it_holds_where_slots_change():
-    problem = SearchProblem(lot=grid_lot(1, 3), give_up_s=100.0)
-    p_taken, entry = np.array([0.9, 0.7, 0.8]), int(problem.lot.entry_vertices[0])
-    model, bound, routes = process(p_taken, 0.002), SearchBound(problem), DriveRoutes(problem)
-    exact = ChangingSolution(problem, p_taken, np.full(3, 0.002), 1.0, 40).expected_s(entry)
-    totals, clairvoyant = np.empty(1_000), np.empty(1_000)
-    arrival = Arrival(36_000.0)
-    for seed in range(1_000):
-        world = model.world(world_key(seed, 0), arrival)
-        totals[seed] = bound.of_world(world, entry, arrival.time)
-        best = best_slot(problem, routes, world, entry, arrival.time).total_s
-        clairvoyant[seed] = min(best, problem.give_up_s)
-    error = 3.0 * np.std(totals) / np.sqrt(len(totals))
-    assert clairvoyant.mean() - error <= totals.mean() <= exact + error
-    assert exact - totals.mean() < 0.5 * (exact - clairvoyant.mean())
 
 
 def test_the_law_of_a_world_is_that_of_its_slots_on_its_day():

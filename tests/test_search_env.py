@@ -19,7 +19,6 @@ import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel, make_scenario
 from parkenv.belief.slot_belief import bayes_update, decay_to_prior
 from parkenv.engine.kernel import STEP_RESULT, step_exact_at
-from parkenv.envs.wrappers import ThesisReward
 from parkenv.lots import grid_lot
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import PARK
@@ -159,23 +158,6 @@ def test_reward_terms_add_up_and_the_return_is_minus_the_total_time(scenario):
         assert info["total_s"] == pytest.approx(
             info["drive_s"] + info["failed_s"] + info["walk_s"] + info["gave_up_s"]
         )
-
-
-def test_the_thesis_reward_differs_by_r_max_on_success():
-    env = ThesisReward(gym.make("parkenv/Search-v2", scenario="mini"))
-    observation, _ = env.reset(seed=1)
-    rng = np.random.default_rng(0)
-    done = False
-    while not done:
-        observation, reward, terminated, truncated, info = env.step(
-            rng.choice(np.flatnonzero(observation["action_mask"]))
-        )
-        done = terminated or truncated
-        assert reward == pytest.approx(sum(info["reward_terms"].values()))
-        assert info["reward_terms"]["r_max"] == (env.r_max if info["parked"] else 0.0)
-    scenario = env.unwrapped.scenario
-    # eq. 3.24: the slot farthest from the goal earns nothing, nearer ones the walk that they save.
-    assert env.r_max == pytest.approx(scenario.lot.walk_m().max() / scenario.v_walk)
 
 
 def two_slots(taken):

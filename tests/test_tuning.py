@@ -3,6 +3,7 @@
 import gymnasium as gym
 import numpy as np
 import pytest
+from expected_time import expected_time
 from small_lots import small_lot
 
 from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
@@ -11,7 +12,6 @@ from parkenv.lots import packaged_lot
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.world.occupancy.day_error import DayError
 from planners import make_agent
-from planners.bounds.expected_time import expected_time
 from planners.thesis.tuning import tune_failure_cost
 
 COSTS = (1.0, 4.0, 16.0, 64.0)

@@ -74,7 +74,7 @@ class SlotFilter:
     """Log-odds that each slot is taken, from located cars and from the beams of range scans.
 
     The thesis uses only detections: a car is assigned to the nearest slot, and slots without a car at the end of a
-    session are free (`thesis_states`). Here a slot that was never in view stays unknown. A car counts only inside a
+    session are free. Here a slot that was never in view stays unknown. A car counts only inside a
     slot, so traffic and pedestrians are not mistaken for parked cars. Beams that end within a slot are evidence that
     it is taken; beams that cross its core are evidence that it is free.
 
@@ -96,7 +96,6 @@ class SlotFilter:
         self.log_odds = np.zeros(lot.n_slots)
         self.in_view = np.zeros(lot.n_slots, dtype=np.bool_)
         self.updated = np.zeros(lot.n_slots, dtype=np.bool_)
-        self._visual = np.zeros(lot.n_slots)
 
     def slots_of(self, cars: LocatedCars) -> IntArray:
         """Return the slot of each car, (n,) int64; -1 for cars outside all slots, or likely so."""
@@ -135,9 +134,6 @@ class SlotFilter:
         A car that stands in its slot with a probability only is that much less evidence.
         """
         slots, likely = self._attributed(cars)
-        if len(cars):
-            _, nearest = self._tree.query(cars.xy)
-            np.add.at(self._visual, nearest, _logit(P_OCCUPIED))
         there = slots[slots >= 0]
         # One image is one observation, even if a car has several boxes.
         sure = np.zeros(self.lot.n_slots)
@@ -239,11 +235,6 @@ class SlotFilter:
         """Return the slots with evidence for one of the states, and that state."""
         slots = np.flatnonzero(self.in_view & (self.log_odds != 0.0))
         return SlotObservation(slots, self.log_odds[slots] > 0.0)
-
-    def thesis_states(self) -> SlotStates:
-        """Return the estimate by the thesis's rule: slots with an assigned detection are taken, all others free."""
-        evidence = np.where(self._visual > 0.0, self._visual, _logit(P_FREE))
-        return SlotStates(1.0 / (1.0 + np.exp(-evidence)), np.ones(self.lot.n_slots, dtype=np.bool_))
 
     def _clip(self) -> None:
         np.clip(self.log_odds, -MOST_LOG_ODDS, MOST_LOG_ODDS, out=self.log_odds)

@@ -43,9 +43,7 @@ from parkenv.world.durations import (
     numbers_of,
     rest_of_stay,
 )
-from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import ArrivalDay
-from parkenv.world.recorded_demand import recorded_demand
 from parkenv.world.week import HOUR_S
 
 __all__ = [
@@ -227,26 +225,6 @@ class Demand:
             np.full(n, self.kwh) * charges,
             np.full(n, parked),
         )
-
-    @classmethod
-    def fitted_to(cls, log: OccupancyLog, n_slots: int, kind: str = "weekday") -> Demand:
-        """Fit arrivals and stays to a log, such that occupancy comes out as recorded.
-
-        The cars of a slot are the periods in which it was observed taken. A car that was there at a day's first
-        observation is a resident, and no arrival. Stays are estimated with regard to those that are cut off by the end
-        of a day's observations; then the arrivals of each hour are those with which the expected number of arrived cars
-        comes closest to the recorded one, half-hour by half-hour (least squares, no rate below 0). A car that takes
-        the place of another one between two observations is not seen: the two count as one that stays longer.
-
-        Args:
-            log: the log.
-            n_slots: number of slots of the lot to fill; the arrivals of the log's slots are scaled to it.
-            kind: class of the days, `weekday` or `weekend`.
-
-        Raises:
-            InputError: no such days, or no car came and left on them.
-        """
-        return cls(*recorded_demand(log, n_slots, kind))
 
 
 @dataclass(frozen=True)

@@ -236,6 +236,3 @@ def _entry_weights() -> dict[str, FloatArray]:
         "visitors": np.array(far),
         "deliveries": np.array(even),
     }
-
-
-__all__ = ["town"]

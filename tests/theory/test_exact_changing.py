@@ -2,15 +2,21 @@
 
 import numpy as np
 import pytest
+from exact_changing import WAIT, ChangingSolution
 
-from parkenv import InputError, OccupancyProcess, Scenario, SensorModel
+from parkenv import OccupancyProcess, Scenario, SensorModel
+from parkenv.compiled.keyed_random import world_key
 from parkenv.lots import grid_lot
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.statistics import mean_interval
+from parkenv.world.occupancy.process import Arrival
+from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.agent import SearchAgent
 from planners.bounds.exact import ExactSolution
-from planners.bounds.exact_changing import WAIT, ChangingSolution
+from planners.bounds.oracle import best_slot
+from planners.bounds.relaxation import SearchBound
+from planners.routes import DriveRoutes
 
 
 class ChangingAgent(SearchAgent[None]):
@@ -27,7 +33,7 @@ class ChangingAgent(SearchAgent[None]):
 
     def decide(self, observation, belief, memory):
         vertex = int(observation["vertex"])
-        action = self.solution.decide(vertex, self.solution.code(belief))
+        action = self.solution.decide(vertex, belief)
         return self.wait(vertex) if action == WAIT else action
 
 
@@ -91,16 +97,19 @@ def test_searches_take_as_long_as_it_says_and_belief_hardly_longer():
     assert theirs.mean() > 3.0 * mean
 
 
-def test_what_it_cannot_solve_is_refused():
-    scenario = busy()
-    with pytest.raises(InputError, match="belief states"):
-        solved(scenario, 20.0, (0.7, 0.85, 0.8), memory_steps=200)
-    with pytest.raises(InputError, match="want 3 probabilities"):
-        ChangingSolution(scenario.public(), np.full(2, 0.5), np.ones(3), 2.0, 4)
-    with pytest.raises(InputError, match="want 3 finite rates"):
-        ChangingSolution(scenario.public(), np.full(3, 0.5), np.zeros(3), 2.0, 4)
-    with pytest.raises(InputError, match="memory_steps 1"):
-        ChangingSolution(scenario.public(), np.full(3, 0.5), np.ones(3), 2.0, 1)
-    blind = scenario.replace(sensor_model=SensorModel(hit_rate=0.9))
-    with pytest.raises(InputError, match="without errors"):
-        ChangingSolution(blind.public(), np.full(3, 0.5), np.ones(3), 2.0, 4)
+def test_the_relaxation_stays_below_it_where_slots_change():
+    problem = SearchProblem(lot=grid_lot(1, 3), give_up_s=100.0)
+    p_taken, entry = np.array([0.9, 0.7, 0.8]), int(problem.lot.entry_vertices[0])
+    model = OccupancyProcess(p_taken * 0.002, np.ones(168), (1.0 - p_taken) * 0.002, np.ones(168))
+    bound, routes = SearchBound(problem), DriveRoutes(problem)
+    exact = ChangingSolution(problem, p_taken, np.full(3, 0.002), 1.0, 40).expected_s(entry)
+    totals, clairvoyant = np.empty(1_000), np.empty(1_000)
+    arrival = Arrival(36_000.0)
+    for seed in range(1_000):
+        world = model.world(world_key(seed, 0), arrival)
+        totals[seed] = bound.of_world(world, entry, arrival.time)
+        best = best_slot(problem, routes, world, entry, arrival.time).total_s
+        clairvoyant[seed] = min(best, problem.give_up_s)
+    error = 3.0 * np.std(totals) / np.sqrt(len(totals))
+    assert clairvoyant.mean() - error <= totals.mean() <= exact + error
+    assert exact - totals.mean() < 0.5 * (exact - clairvoyant.mean())

@@ -1,4 +1,4 @@
-"""Build the packaged lots: `python -m parkenv.lots.builders.packaged [FOLDER]`.
+"""Build the packaged lots: `python tests/builders/packaged.py [FOLDER]`.
 
 Sizes are in metres. Positions are rounded to a millimetre and angles to a nanoradian, so that the files do not
 depend on the math library.
@@ -14,13 +14,14 @@ from pathlib import Path
 import numpy as np
 import shapely
 from numpy.typing import ArrayLike
+from packaged_town import town
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.builders.town import town
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
 from parkenv.world.lot import Lane, ParkingLot
 
+PACKAGED = Path(__file__).parents[2] / "parkenv" / "lots" / "packaged"
 PITCH = BAY_SIZE[1]
 AISLE = 6.0
 EAST, WEST = 0.0, np.pi
@@ -217,4 +218,4 @@ def build(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    build(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1] / "packaged")
+    build(Path(sys.argv[1]) if len(sys.argv) > 1 else PACKAGED)

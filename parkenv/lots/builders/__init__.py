@@ -1,1 +1,0 @@
-"""Programs that developers run to make the packaged data."""
