@@ -28,10 +28,17 @@ PAGES = {
     "lot": ("`parkenv.lot_v0`", "lot_v0:LotEnv", "fleet_campus.gif", "python examples/09_many_cars.py fleet.gif"),
 }  # fmt: skip
 """Of each page: title, class, film, and the command that made the film."""
-MORE = {
-    "search": ("The local observation", "engine.local_observation"),
-    "lot": ("The parallel form", "lot_v0:LotParallelEnv"),
-}
+MORE = {"lot": ("The parallel form", "lot_v0:LotParallelEnv")}
+LINKED = (
+    "action-space",
+    "observation-space",
+    "rewards",
+    "starting-state",
+    "episode-end",
+    "places",
+    "arguments",
+)
+"""Anchors of the page of `parkenv/Search-v2` to which the other pages link."""
 FLAGS = re.DOTALL | re.MULTILINE
 
 
@@ -40,7 +47,7 @@ def page(name):
     title, path, film, command = PAGES[name]
     summary, rest = markdown(path).split("\n\n", 1)
     if title != BASE:
-        rest = with_base(rest)
+        rest = with_links(rest)
     parts = [
         f"# {title}",
         summary,
@@ -55,24 +62,15 @@ def page(name):
     return "\n\n".join(parts) + f"\n\n{BY_HAND}{kept.rstrip()}\n"
 
 
-def with_base(text):
-    """Add to the sections that refer to `parkenv/Search-v2` what stands there."""
-    base = dict(re.findall(r"^## (.*?)\n(.*?)(?=^## |\Z)", markdown(PAGES["search"][1]), FLAGS))
+def with_links(text):
+    """Link what the text takes from `parkenv/Search-v2` to the section of the same heading there."""
 
-    def add(found):
-        heading, body = found.groups()
-        refers = re.search(f"[aA]s in {BASE}|[oO]f {BASE}", body)
-        if not refers or heading not in (
-            "Action space",
-            "Observation space",
-            "Rewards",
-            "Starting state",
-            "Episode end",
-        ):
-            return found[0]
-        return f"## {heading}\n{body.rstrip()}\n\nFrom [{BASE}](search.md):\n\n{base[heading].strip()}\n\n"
+    def link(section):
+        anchor = section[1].lower().replace(" ", "-")
+        target = f"search.md#{anchor}" if anchor in LINKED else "search.md"
+        return re.sub(f"([aA]s in|of|with) {BASE}", rf"\1 [{BASE}]({target})", section[0], count=1)
 
-    return re.sub(r"^## (.*?)\n(.*?)(?=^## |\Z)", add, text, flags=FLAGS).rstrip()
+    return re.sub(r"^## (.*?)\n.*?(?=^## |\Z)", link, text, flags=FLAGS)
 
 
 def markdown(path):

@@ -191,19 +191,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
 
     ```
 
-    ## Training
-    On this observation, plain PPO learns nothing in 20,000 steps. What learns: the compact observation, `local`, the
-    action mask, and rewards near one, on the compiled batch:
-
-    ```python
-    from sb3_contrib import MaskablePPO
-    from parkenv.envs.sb3 import SearchVecEnv
-
-    envs = SearchVecEnv(64, "campus", reward_scale=0.01)
-    model = MaskablePPO("MultiInputPolicy", envs, 1e-3, n_steps=64, batch_size=1024, gamma=0.999)
-    model.learn(300_000)
-    ```
-
     ## Version history
     - v2: observations gain `day_error` and `step_observed`; packaged scenarios have days that differ from their
       forecast.
