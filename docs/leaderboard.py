@@ -6,6 +6,7 @@ from parkenv.cli.compare import with_short_labels
 from parkenv.show.plurals import interval_text
 from parkenv.studies.benchmark.page import DESIGNS, entries_of, neighbours, ranking, result_files
 from parkenv.studies.benchmark.result_file import check_result
+from parkenv.studies.benchmark.suite import Suite
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "docs" / "leaderboard"
@@ -15,7 +16,10 @@ START, END = "<!-- {}: made by docs/leaderboard.py -->\n", "<!-- end -->\n"
 
 def tables():
     """Make the tables of the page, by name."""
-    suite, entries = entries_of([check_result(file) for file in result_files(FOLDER / "results")])
+    suite, entries = (
+        Suite.packaged(),
+        entries_of([check_result(file) for file in result_files(FOLDER / "results")]),
+    )
     lines = [
         "| | agent | score, % | mean time, s | behind the best, s | ms a decision | submitted by | code | commit |",
         "|---|---|---|---|---|---|---|---|---|",

@@ -132,7 +132,7 @@ COMPLETIONS = {
     "parkenv compare --agents mdp,be": ["mdp,belief", "mdp,belief-rivals"],
     "parkenv compare --figu": ["--figures"],
     "parkenv compare --rig st": ["stereo"],
-    "parkenv benchmark run v1 --agents be": ["belief", "belief-rivals"],
+    "parkenv benchmark run v3 --agents be": ["belief", "belief-rivals"],
     "parkenv plan --sensor-model las": ["laser"],
     "parkenv survey --weather r": ["rain"],
     "parkenv run examples/courtyard/s": ["examples/courtyard/sweep.toml"],

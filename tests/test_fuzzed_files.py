@@ -187,10 +187,10 @@ NETWORK = Tiny("yolo", names=("car",)).model().SerializeToString()
 MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text())
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
-SUITE = Suite.named("v1")
+SUITE = Suite.packaged()
 SEARCHES = {"total_s": [100.0] * 3}
 RESULT = {
-    "format": "parkenv-benchmark-result", "version": 2, "suite": "v1", "suite_sha256": SUITE.fingerprint,
+    "format": "parkenv-benchmark-result", "version": 2, "suite": "v3", "suite_sha256": SUITE.fingerprint,
     "commit": "", "by": "", "code": "", "date": "2026-01-01", "sha256": "0" * 64,
     "parkenv": "0.1.0", "command": ["parkenv", "benchmark"], "scores": {"mdp": 0.9},
     "rows": [

@@ -51,13 +51,13 @@ COMMANDS = {
     "dataset": Entry("Record data sets for offline learning, in Minari's format.", "dataset:Dataset", SEARCH),
     "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", SEARCH),
     "run": Entry("Run an experiment file.", "study_command:Run", SEARCH),
-    "benchmark": Entry("Run a fixed benchmark suite, and check the results of others.", heading=SEARCH),
-    "benchmark run": Entry("Run agents through all episodes of a suite.", "benchmark:RunSuite"),
-    "benchmark check": Entry("Check results of a suite, and print them side by side.", "benchmark:Check"),
+    "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=SEARCH),
+    "benchmark run": Entry("Run agents through all episodes of the suite.", "benchmark:RunSuite"),
+    "benchmark check": Entry("Check results of the suite, and print them side by side.", "benchmark:Check"),
     "benchmark page": Entry(
-        "Check results of a suite, and write a page that compares them.", "benchmark:Page"
+        "Check results of the suite, and write a page that compares them.", "benchmark:Page"
     ),
-    "benchmark show": Entry("Show the tasks and settings of a suite.", "benchmark:Show"),
+    "benchmark show": Entry("Show the tasks and settings of the suite.", "benchmark:Show"),
     "survey": Entry(
         "Drive past every slot, and write which slots are taken to a map file.", "survey:Survey", SENSE
     ),

@@ -1,14 +1,13 @@
-"""`parkenv benchmark`: fixed suites with comparable, checkable results."""
+"""`parkenv benchmark`: a fixed suite with comparable, checkable results."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal
 
-from parkenv.cli.options import Command, Given
+from parkenv.cli.options import Command
 from parkenv.cli.study_command import AgentStudyCommand
 from parkenv.cli.tables import command_line, make_console, make_table
-from parkenv.errors import InputError
 from parkenv.files.option import option
 from parkenv.files.spec_file import Several
 from parkenv.show.plurals import plural
@@ -19,9 +18,6 @@ if TYPE_CHECKING:
 
     from parkenv.studies.runner import Result
 
-PLACES = "-places"
-"""End of the name of a suite of places."""
-
 
 class RunSuite(AgentStudyCommand):
     """The suite defines scenarios, costs, speeds and seeds.
@@ -31,28 +27,12 @@ class RunSuite(AgentStudyCommand):
     """
 
     examples = """
-        parkenv benchmark run v2 --agents belief,mdp --out results/v2
-        parkenv benchmark run v2 --places --agents belief,mdp --out results/v2-places
-        parkenv benchmark check results/v2/result.json
+        parkenv benchmark run v3 --agents belief,mdp --out results/v3
+        parkenv benchmark check results/v3/result.json
         """
 
-    suite: str = option("v2", "The suite.", name="SUITE", argument=True)
-    places: bool = option(
-        False,
-        "Run the places of the suite instead of its packaged scenarios: 24 real car parks that agents are "
-        "never trained on (the suite v2-places).",
-    )
     study: Benchmark = Benchmark()
-    out: Path | None = option(
-        None, "Folder for result.json and the episodes.", short="-o", default="results/SUITE"
-    )
-
-    @classmethod
-    def of(cls, given: Given) -> Self:
-        """See `StudyCommand`."""
-        suite = f"{given.get('SUITE', 'v2')}{PLACES if '--places' in given else ''}"
-        command = super().of({"--out": f"results/{suite}", **given})
-        return command.changed(study=command.study.changed(suite=suite))
+    out: Path | None = option(Path("results/v3"), "Folder for result.json and the episodes.", short="-o")
 
     def show(self, console: Console, result: Result) -> None:
         """Print the scores of a finished suite."""
@@ -69,7 +49,7 @@ class Check(Command):
     verified without running it.
     """
 
-    examples = "parkenv benchmark check results/v2/result.json others.json"
+    examples = "parkenv benchmark check results/v3/result.json others.json"
 
     results: Several[Path] = option(..., "Result files.", takes="FILE", argument=True)
 
@@ -80,8 +60,6 @@ class Check(Command):
         console = make_console()
         with console.status("Checking"):
             checked = [check_result(file) for file in self.results]
-        if len({result["suite"] for result in checked}) > 1:
-            raise InputError("the results are of different suites; check those of one at a time")
         _print(console, checked)
         console.print(f"{'Complete and consistent' if len(checked) == 1 else 'All complete and consistent'}.")
 
@@ -94,7 +72,7 @@ class Page(Command):
     """
 
     examples = """
-        parkenv benchmark page results/v2 yours/result.json --out v2.html
+        parkenv benchmark page results/v3 yours/result.json --out v3.html
         parkenv benchmark page docs/leaderboard/results --out leaderboard.html
         """
 
@@ -126,31 +104,27 @@ class Page(Command):
 class Show(Command):
     """For each task: scenario, slots, mean occupancy, day error, sensor model and walking speed."""
 
-    examples = """
-        parkenv benchmark show v2
-        parkenv benchmark show v2 --places
-        """
+    examples = "parkenv benchmark show"
 
-    suite: str = option("v2", "The suite.", name="SUITE", argument=True)
-    places: bool = option(False, "Show the places of the suite instead of its packaged scenarios.")
+    suite: Literal["v3"] = option("v3", "The suite.", argument=True)
 
     def run(self) -> None:
         """See `Command`."""
-        from parkenv.studies.benchmark.suite import SUITES, Suite
+        from parkenv.studies.benchmark.suite import Suite
 
-        its = Suite.named(self.suite + PLACES if self.places else self.suite)
+        suite = Suite.packaged()
         console = make_console()
-        console.print(f"{its.name}: {its.description}")
+        console.print(f"{suite.name}: {suite.description}")
         cells = []
-        for task in its.tasks:
-            made = task.made(its.arrival)
+        for task in suite.tasks:
+            made = task.made(suite.arrival)
             level = "as it comes" if task.occupancy_level is None else f"{task.occupancy_level:.0%}"
             walk = f"{made.v_walk * 3.6:g} km/h"
             days = ", ".join(f"{size:g}" for size in task.day_error)
             cells.append(
                 (
                     task.name,
-                    task.group or task.scenario,
+                    task.scenario,
                     str(made.lot.n_slots),
                     level,
                     days,
@@ -158,29 +132,20 @@ class Show(Command):
                     walk,
                 )
             )
-        scenario = "scenario" if its.tasks[0].group is None else "kind of place"
-        headings = ["task", scenario, "slots", "mean occupancy", "day error", "sensor model", "walking"]
+        headings = ["task", "scenario", "slots", "mean occupancy", "day error", "sensor model", "walking"]
         console.print(make_table(None, headings, cells))
-        counts = [len(its.seeds_of(task)) for task in its.tasks]
-        if its.seeds:
-            drawn = f"{counts[0]} episodes a task, seeds {its.seeds[0]} to {its.seeds[-1]}"
-        else:
-            drawn = (
-                f"{min(counts)} to {max(counts)} episodes a task, {sum(counts):,} in all, weighted by stratum"
-            )
-        console.print(f"{drawn}; suite {its.fingerprint[:16]}")
-        if its.name + PLACES in SUITES:
-            console.print(f"Its places, real car parks: parkenv benchmark show {its.name} --places")
+        counts = [len(task.seeds) for task in suite.tasks]
+        console.print(
+            f"{min(counts)} to {max(counts)} episodes a task, {sum(counts):,} in all, weighted by stratum; "
+            f"suite {suite.fingerprint[:16]}"
+        )
 
 
 def _print(console: Console, results: list[dict[str, Any]]) -> None:
-    from parkenv.studies.benchmark.result_file import by_group
-
     lines = []
     columns: list[str] = []
     for result in results:
-        mean = {(agent, group): time for agent, group, time, _ in by_group(result)}
-        mean = mean or {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
+        mean = {(row["agent"], row["task"]): row["total_s"] for row in result["rows"]}
         columns = list(dict.fromkeys(column for _, column in mean))
         for agent, score in result["scores"].items():
             lines.append((score, agent, [f"{mean[agent, column]:.1f}" for column in columns]))

@@ -77,7 +77,7 @@ def load_lot(name_or_path: str | Path) -> ParkingLot:
 
 
 PLACES = Path(__file__).parent / "places"
-"""Folder with the places of benchmark suites: real car parks, © OpenStreetMap contributors, ODbL (see its README)."""
+"""Folder with 24 real car parks, © OpenStreetMap contributors, ODbL (see its README)."""
 
 
 def packaged_lot(name: str) -> ParkingLot:

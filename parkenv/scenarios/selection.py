@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Container, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -49,9 +49,7 @@ def lot_share(lot: ParkingLot) -> float:
     return int.from_bytes(digest[:8], "little") / 2.0**64
 
 
-def split_by_lot(
-    scenarios: Sequence[Scenario], held_out: float, kept: Container[float] = ()
-) -> tuple[list[Scenario], list[Scenario]]:
+def split_by_lot(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[Scenario], list[Scenario]]:
     """Split scenarios by their lots: those to train on, and those held out.
 
     A lot is held out if its `lot_share` is below `held_out`. So scenarios on one lot are on one side, and lots that are
@@ -60,15 +58,13 @@ def split_by_lot(
     Args:
         scenarios: the scenarios.
         held_out: share that is held out.
-        kept: further lots that are held out, by their `lot_share`, such as those of a benchmark suite.
 
     Raises:
         InputError: all are on one side.
     """
     sides: tuple[list[Scenario], list[Scenario]] = ([], [])
     for scenario in scenarios:
-        share = lot_share(scenario.lot)
-        sides[share < held_out or share in kept].append(scenario)
+        sides[lot_share(scenario.lot) < held_out].append(scenario)
     for side, what in zip(sides, ("leaves none to train on", "holds out none"), strict=True):
         if not side:
             raise InputError(

@@ -1,4 +1,4 @@
-"""A page of the results that were submitted for a benchmark suite: the leaderboard."""
+"""A page of the results that were submitted for the benchmark suite: the leaderboard."""
 
 from __future__ import annotations
 
@@ -68,23 +68,20 @@ class Entry(NamedTuple):
         return {task: its - other.times[task] for task, its in self.times.items()}
 
 
-def entries_of(results: Sequence[Row]) -> tuple[Suite, list[Entry]]:
-    """Return the suite of results, and their agents, the best score first.
+def entries_of(results: Sequence[Row]) -> list[Entry]:
+    """Return the agents of results, the best score first.
 
     Raises:
-        InputError: the results are of different suites, or an agent that does not come with parkenv has no address.
+        InputError: an agent that does not come with parkenv has no address.
     """
-    names = list(dict.fromkeys(result["suite"] for result in results))
-    if len(names) != 1:
-        raise InputError(f"a page is about one suite, the results are of {', '.join(names) or 'none'}")
-    suite, entries = Suite.named(names[0]), []
+    entries = []
     for result in results:
         for agent, tasks in result["episodes"].items():
             if agent.partition("(")[0] not in AGENTS and not result["code"].startswith(ADDRESSES):
                 raise InputError(f"code is {result['code']!r}, want the address of the code of {agent}")
             times = {task: np.array(its["total_s"]) for task, its in tasks.items()}
             entries.append(Entry(agent, result, times))
-    return suite, sorted(entries, key=lambda entry: -entry.result["scores"][entry.agent])
+    return sorted(entries, key=lambda entry: -entry.result["scores"][entry.agent])
 
 
 def ranking(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
@@ -116,8 +113,8 @@ def precision(suite: Suite, one: Entry, other: Entry) -> Row:
     """Return how precisely a run of a suite tells two agents apart, and how precisely other designs would.
 
     With as many searches as the suite has, spread evenly over the tasks: in worlds of their own (`independent`), in the
-    same worlds (`paired`), and with control variates; and, if the suite has strata, as it is. Standard errors are of
-    the mean difference over the tasks, s; `searches` are those of each agent for an interval of ±1 s at 95 %.
+    same worlds (`paired`), and with control variates; and as it is, stratified. Standard errors are of the mean
+    difference over the tasks, s; `searches` are those of each agent for an interval of ±1 s at 95 %.
     """
     difference, count = one.minus(other), sum(len(times) for times in one.times.values())
     variances = np.zeros(3)
@@ -128,9 +125,8 @@ def precision(suite: Suite, one: Entry, other: Entry) -> Row:
         )
         variances += (mine[0] + theirs[0], paired[0], paired[1])
     errors = dict(zip(DESIGNS, np.sqrt(variances / (len(suite.tasks) * count)).tolist(), strict=False))
-    if suite.tasks[0].strata:
-        plain = [mean_time(suite, difference, controls=used).error for used in (False, True)]
-        errors |= dict(zip(DESIGNS[3:], plain, strict=True))
+    stratified = [mean_time(suite, difference, controls=used).error for used in (False, True)]
+    errors |= dict(zip(DESIGNS[3:], stratified, strict=True))
     return {
         "agents": f"{one.agent}, {other.agent}",
         **columns_of("behind_s", mean_time(suite, difference, controls=False).interval()),
@@ -147,8 +143,7 @@ def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
 
 def _variances(task: Task, values: ArrayLike, worlds: FloatArray) -> tuple[float, float]:
     """Estimate a number's variance over a task's worlds, and what control variates leave of it."""
-    parts = [part.share / len(part.seeds) for part in task.strata for _ in part.seeds]
-    weights = np.array(parts) if parts else np.full(len(worlds), 1.0 / len(worlds))
+    weights = np.array([part.share / len(part.seeds) for part in task.strata for _ in part.seeds])
     sample = np.asarray(values) - weights @ np.asarray(values)
     scale = np.sqrt(weights)
     controls = scale[:, None] * (worlds - weights @ worlds)
@@ -167,7 +162,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
     Raises:
         InputError: see `entries_of`.
     """
-    suite, entries = entries_of(results)
+    suite, entries = Suite.packaged(), entries_of(results)
     pairs, searches = neighbours(suite, entries), sum(map(len, entries[0].times.values()))
     findings = [
         suite.description,
@@ -175,7 +170,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
         "mean time of the clairvoyant lower bound over the agent's, averaged over the tasks.",
     ]
     if pairs:
-        errors = [row[f"error.{DESIGNS[3 if suite.tasks[0].strata else 1]}"] for row in pairs]
+        errors = [row["error.stratified"] for row in pairs]
         findings.append(
             f"Neighbours among the first {len(pairs) + 1} are significantly different if their mean times differ by "
             f"{_WIDE * min(errors):.1f} to {_WIDE * max(errors):.1f} s."

@@ -1,4 +1,4 @@
-"""Result files of benchmark suites: what a run writes, and the check that anybody can repeat."""
+"""Result files of the benchmark suite: what a run writes, and the check that anybody can repeat."""
 
 from __future__ import annotations
 
@@ -21,7 +21,6 @@ from parkenv.files.limited_reading import read_json
 from parkenv.files.spec_file import Several, Spec
 from parkenv.studies.benchmark.suite import (
     CONTROLS,
-    SUITES,
     Suite,
     Task,
     estimate,
@@ -29,7 +28,7 @@ from parkenv.studies.benchmark.suite import (
     sha256_of,
     worlds_of,
 )
-from parkenv.studies.compare.cases import Case, table
+from parkenv.studies.compare.cases import Case
 from parkenv.studies.results import Key, Row, decision_s, without_nan
 from parkenv.studies.statistics import columns_of, decision_columns
 from parkenv.version import __version__
@@ -72,11 +71,11 @@ class _Searches(Spec):
 
 
 class ResultFile(Spec):
-    """Result of a benchmark suite: scores by agent, and searches by agent and task."""
+    """Result of the benchmark suite: scores by agent, and searches by agent and task."""
 
     format: Literal["parkenv-benchmark-result"]
     version: Literal[2]
-    suite: str
+    suite: Literal["v3"]
     suite_sha256: str = Field(pattern="^[0-9a-f]{64}$")
     parkenv: str
     commit: str = Field(max_length=60)
@@ -93,22 +92,19 @@ class ResultFile(Spec):
 def score_rows(
     suite: Suite, cells: Iterable[tuple[Case, Sequence[int]]], finished: Mapping[Key, Row]
 ) -> list[Row]:
-    """Return a row for each task and agent with finished episodes: its metrics, where known, and its score.
+    """Return a row for each task and agent whose episodes are all finished: its metrics, where known, and its score.
 
-    Where a task has strata, the means are estimates for its population; until all of its searches are finished, its
-    rows have none.
+    The means are estimates for the population of the task.
     """
-    cells, tasks, rows = list(cells), {task.name: task for task in suite.tasks}, []
-    plain = table(cells, finished) if suite.seeds else []
-    summaries = {(row["scenario"], row["agent"]): row for row in plain}
+    tasks, rows = {task.name: task for task in suite.tasks}, []
     for case, seeds in cells:
         task = tasks[case.scenario.name]
         its = [finished[key] for seed in seeds if (key := case.key(seed)) in finished]
-        if len(its) < (len(seeds) if task.strata else 1):
+        if len(its) < len(seeds):
             continue
         total = np.array([search["total_s"] for search in its])
         worlds = np.array([[search[name] for name in CONTROLS] for search in its])
-        row = summaries.get((task.name, case.label)) or _stratified(task, its, total, worlds)
+        row = _metrics(task, its, total, worlds)
         metrics = {metric: row.get(metric) for metric in METRICS}
         rows.append(
             {"task": task.name, "agent": case.label, **metrics, "score": score_of(task, total, worlds)}
@@ -116,7 +112,7 @@ def score_rows(
     return rows
 
 
-def _stratified(task: Task, searches: Sequence[Row], total: FloatArray, worlds: FloatArray) -> Row:
+def _metrics(task: Task, searches: Sequence[Row], total: FloatArray, worlds: FloatArray) -> Row:
     parked, failed = (
         estimate(task, [float(search[name]) for search in searches], worlds, controls=False).mean
         for name in ("parked", "failed_parks")
@@ -217,9 +213,7 @@ def check_result(path: Path) -> Row:
     """
     result: Row = read_json(path)
     ResultFile.parse(result, str(path))
-    if result["suite"] not in SUITES:
-        raise InputError(f"{path}: suite is {result['suite']!r}, want one of {', '.join(SUITES)}")
-    suite = Suite.named(result["suite"])
+    suite = Suite.packaged()
     _require(path, "suite_sha256", result["suite_sha256"], suite.fingerprint, f"that of suite {suite.name}")
     rows = {(row["agent"], row["task"]): (i, row) for i, row in enumerate(result["rows"])}
     for agent, tasks in result["episodes"].items():
@@ -254,9 +248,9 @@ def _check_task(
             f"{path}: {where}.total_s[{i}] is {total[i]:g}, want at least the clairvoyant bound, {worlds[i, 0]:.3f}"
         )
     wanted = {**_estimates(task, total, worlds), "score": score_of(task, total, worlds)}
-    for name in wanted if task.strata else ("total_s", "regret_s", "score"):
+    for name, value in wanted.items():
         of = f"of the searches of {agent} in {task.name}"
-        _require(path, f"rows[{number}].{name}", row[name], wanted[name], of)
+        _require(path, f"rows[{number}].{name}", row[name], value, of)
 
 
 def _estimates(task: Task, total: FloatArray, worlds: FloatArray) -> Row:
@@ -280,17 +274,3 @@ def _require(path: Path, field: str, value: Any, wanted: Any, why: str, unit: st
 def fingerprint(content: Row) -> str:
     """Return the SHA-256 of a result, without its own entry."""
     return sha256_of({key: value for key, value in content.items() if key != "sha256"})
-
-
-def by_group(result: Row) -> list[tuple[str, str, float, float]]:
-    """Return a suite's result by kind of place: agent, kind, mean total time, s, and mean score, over its places."""
-    groups: dict[str, list[str]] = {}
-    for task in Suite.named(result["suite"]).tasks:
-        if task.group is not None:
-            groups.setdefault(task.group, []).append(task.name)
-    rows = {(row["agent"], row["task"]): row for row in result["rows"]}
-    return [
-        (agent, group, *(float(np.mean([rows[agent, name][key] for name in names])) for key in ("total_s", "score")))
-        for agent in result["scores"]
-        for group, names in groups.items()
-    ]  # fmt: skip

@@ -1,11 +1,9 @@
-"""Run agents through all episodes of a benchmark suite."""
+"""Run agents through all episodes of the benchmark suite."""
 
 from __future__ import annotations
 
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Literal
-
-from pydantic import Field
 
 from parkenv.files.option import option
 from parkenv.studies.agent_spec import AgentSpec
@@ -25,10 +23,10 @@ AGENTS = ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-go
 
 
 class Benchmark(CaseStudy):
-    """A run of a benchmark suite, which defines scenarios, costs, speeds and seeds."""
+    """A run of the benchmark suite, which defines scenarios, costs, speeds and seeds."""
 
     kind: Literal["benchmark"] = "benchmark"
-    suite: str = Field("v2", description="The suite.")
+    suite: Literal["v3"] = option("v3", "The suite.", name="SUITE", argument=True)
     by: str = option("", "Who submits the result.", default="nobody", max_length=200)
     code: str = option(
         "",
@@ -45,7 +43,7 @@ class Benchmark(CaseStudy):
         """The suite."""
         from parkenv.studies.benchmark.suite import Suite
 
-        return Suite.named(self.suite)
+        return Suite.packaged()
 
     def check(self) -> None:
         """See `Study`."""

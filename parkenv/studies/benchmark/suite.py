@@ -1,12 +1,13 @@
-"""Benchmark suites: fixed scenarios, seeds and metrics that make results of different groups comparable.
+"""The benchmark suite: fixed scenarios, seeds and metrics that make results of different groups comparable.
 
-A suite is a JSON file in the folder `suites`. The places of a suite, real car parks, are a suite of their own
-(`v2-places`), so that a result of either part can be complete. A published suite never changes; improvements go into a
-new suite. A result file names its suite, contains the total time of every search, and can be checked by anybody.
+A suite is a JSON file in the folder `suites`. A published suite never changes; improvements go into a new suite. A
+result file names its suite, contains the total time of every search, and can be checked by anybody.
 
-The searches of `v3` are a stratified sample of a population of worlds for each task: more of them where the times of
-agents differ most, such as on full days, each with its weight. The means of the clairvoyant bound and of the occupancy
-at arrival are known for the whole population, and serve as control variates (`choose_searches` made it).
+The searches of `v3` are a stratified sample of a population of 5,000 worlds for each task. Six strata divide it by the
+occupancy at arrival, at shares 0.3, 0.55, 0.75, 0.87 and 0.95 of the population. `mdp`, `mdp-tuned` and `first-free`
+searched in its last 400 worlds; from the standard deviations of their paired differences in each stratum follows how
+many of the 3,000 searches it gets (Neyman 1934), at least 8. The means of the clairvoyant bound and of the occupancy at
+arrival are known for the whole population, and serve as control variates.
 """
 
 from __future__ import annotations
@@ -23,9 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
 from parkenv.files.limited_reading import read_json
-from parkenv.lots.lot_files import PLACES
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.compare.cases import Case, at_occupancy, require_distinct
@@ -38,10 +37,9 @@ from parkenv.world.scenario import KMH, Scenario
 from parkenv.world.sensor_model import SensorModel
 from planners.agent import make_agent
 
-SUITES = ("v1", "v2", "v2-places", "v3")
 CONTROLS = ("bound_s", "occupancy")
 """Columns of an episode that its world alone determines: the control variates."""
-SUITE_FOLDER = Path(__file__).parent / "suites"
+_FILE = Path(__file__).parent / "suites" / "v3.json"
 
 
 @dataclass(frozen=True)
@@ -58,21 +56,23 @@ class Task:
     """One scenario of a suite."""
 
     name: str  # name of the task
-    scenario: str  # a packaged scenario, or the name of a file in `parkenv.lots.lot_files.PLACES`
+    scenario: str  # a packaged scenario
+    day_error: tuple[float, ...]  # how far days differ from the forecast, logits: (level,) or (level, slope)
+    strata: tuple[Stratum, ...]  # parts of the population
     occupancy_level: float | None = None  # mean occupancy of the world; None for the scenario's own
     # `perfect`, or the rig whose fitted sensor model is used; `sight` in the suite's file
     sensor_model: str = "perfect"
     v_walk_kmh: float | None = None  # walking speed; None for the scenario's own
-    # how far days differ from the forecast, logits: (level,) or (level, slope)
-    day_error: tuple[float, ...] = (0.0,)
-    group: str | None = None  # kind of place, for tables; None in suites of packaged scenarios
-    strata: tuple[Stratum, ...] = ()  # parts of the population; none if the searches are a plain sample
+
+    @property
+    def seeds(self) -> tuple[int, ...]:
+        """The seeds of the searches."""
+        return tuple(seed for part in self.strata for seed in part.seeds)
 
     def made(self, arrival: ArrivalWindow) -> Scenario:
         """Make the scenario, named after the task."""
         days = DayError(*self.day_error)
-        source = self.scenario if self.group is None else PLACES / f"{self.scenario}.geojson"
-        made = make_scenario(source, name=self.name, arrival=arrival, day_error=days)
+        made = make_scenario(self.scenario, name=self.name, arrival=arrival, day_error=days)
         if self.sensor_model != "perfect":
             made = made.replace(sensor_model=SensorModel.named(self.sensor_model))
         if self.v_walk_kmh is not None:
@@ -84,41 +84,29 @@ class Task:
 class Suite:
     """A benchmark suite."""
 
-    name: str  # name, such as v1
+    name: str  # name, such as v3
     description: str  # one sentence
     arrival: ArrivalWindow  # when searches begin
-    seeds: range  # seeds; every task without strata has one search per seed
     tasks: tuple[Task, ...]
     fingerprint: str  # SHA-256 of the suite's file, as JSON without white space
 
     @classmethod
-    def named(cls, name: str) -> Self:
-        """Load a packaged suite.
-
-        Raises:
-            InputError: an unknown name; the message lists the known ones.
+    def packaged(cls) -> Self:
+        """Load the suite.
 
         Examples:
-            >>> suite = Suite.named("v1")
-            >>> suite.tasks[0].name, len(suite.seeds)
-            ('campus', 1000)
+            >>> suite = Suite.packaged()
+            >>> suite.name, suite.tasks[0].name, sum(len(task.seeds) for task in suite.tasks)
+            ('v3', 'campus', 3000)
         """
-        if name not in SUITES:
-            raise InputError(f"there is no benchmark suite {name!r}; known: {', '.join(SUITES)}")
-        content = _packaged(name)
-        first = content.get("first_seed", 0)
+        content = read_json(_FILE)
         return cls(
-            name,
+            content["name"],
             content["description"],
             ArrivalWindow.parse(content["arrival"], content["days"]),
-            range(first, first + content.get("episodes", 0)),
             tuple(_task(**task) for task in content["tasks"]),
             sha256_of(content),
         )
-
-    def seeds_of(self, task: Task) -> Sequence[int]:
-        """Return the seeds of the searches of a task."""
-        return tuple(seed for part in task.strata for seed in part.seeds) if task.strata else self.seeds
 
     def cases(self, agents: Sequence[AgentSpec]) -> list[Cell]:
         """Return the cases: every agent in every task.
@@ -131,7 +119,7 @@ class Suite:
             for agent in agents:
                 make_agent(agent.name, world, **agent.options)
         cells = [
-            Cell(Case(world, agent.name, options=agent.options), self.seeds_of(task))
+            Cell(Case(world, agent.name, options=agent.options), task.seeds)
             for task, world in zip(self.tasks, worlds, strict=True)
             for agent in agents
         ]
@@ -140,14 +128,9 @@ class Suite:
 
 
 def _task(
-    sight: str = "perfect",
-    day_error: Sequence[float] = (0.0,),
-    lot_share: float | None = None,
-    strata: Sequence[Mapping[str, Any]] = (),
-    **fields: Any,
+    strata: Sequence[Mapping[str, Any]], day_error: Sequence[float], sight: str = "perfect", **fields: Any
 ) -> Task:
-    """Return a task of a suite's file; v1 is older than days that differ from their forecast."""
-    del lot_share  # see `suite_lots`
+    """Return a task of a suite's file."""
     parts = tuple(Stratum(each["share"], tuple(each["seeds"]), tuple(each["means"])) for each in strata)
     return Task(sensor_model=sight, day_error=tuple(day_error), strata=parts, **fields)
 
@@ -157,12 +140,10 @@ def estimate(task: Task, values: ArrayLike, worlds: FloatArray, *, controls: boo
 
     Args:
         task: the task.
-        values: (n,) the number in each search, in the order of `Suite.seeds_of`.
+        values: (n,) the number in each search, in the order of the task's seeds.
         worlds: (n, 2) `CONTROLS` of each search.
-        controls: whether to use them as control variates; a task without strata does not, as their means are unknown.
+        controls: whether to use them as control variates.
     """
-    if not task.strata:
-        return stratified_estimate(values, np.zeros(len(worlds)), [1.0])
     numbers = np.repeat(np.arange(len(task.strata)), [len(part.seeds) for part in task.strata])
     shares, means = [part.share for part in task.strata], [part.means for part in task.strata]
     if not controls:
@@ -178,12 +159,8 @@ def mean_time(suite: Suite, times: Mapping[str, ArrayLike], *, controls: bool = 
         times: (n,) s, those of each search, by task.
         controls: see `estimate`.
     """
-    share = 1.0 / len(suite.tasks)
-    if suite.seeds:  # the tasks share their seeds: their searches are not independent
-        means = np.mean([np.asarray(times[task.name]) for task in suite.tasks], axis=0)
-        return stratified_estimate(means, np.zeros(len(means)), [1.0])
     return Estimate.combined(
-        (share, estimate(task, times[task.name], worlds_of(task, suite), controls=controls))
+        (1.0 / len(suite.tasks), estimate(task, times[task.name], worlds_of(task, suite), controls=controls))
         for task in suite.tasks
     )
 
@@ -191,15 +168,15 @@ def mean_time(suite: Suite, times: Mapping[str, ArrayLike], *, controls: bool = 
 def score_of(task: Task, total: FloatArray, worlds: FloatArray) -> float:
     """Return an agent's score in a task: the mean of the clairvoyant bound over that of its total times.
 
+    The former is known for the whole population.
+
     Args:
         task: the task.
         total: (n,) total time of each search, s.
         worlds: (n, 2) `CONTROLS` of each search.
     """
-    if task.strata:  # the bound's mean over the whole population is known
-        bound = sum(part.share * part.means[0] for part in task.strata)
-        return min(1.0, bound / estimate(task, total, worlds).mean)
-    return float(np.round(worlds[:, 0], 6).mean() / np.round(total, 6).mean())
+    bound = sum(part.share * part.means[0] for part in task.strata)
+    return min(1.0, bound / estimate(task, total, worlds).mean)
 
 
 def score_interval(suite: Suite, times: Mapping[str, FloatArray]) -> tuple[float, float, float]:
@@ -213,15 +190,14 @@ def score_interval(suite: Suite, times: Mapping[str, FloatArray]) -> tuple[float
     for task in suite.tasks:
         total, worlds = times[task.name], worlds_of(task, suite)
         scores.append(score_of(task, total, worlds))
-        bound = 0.0 if task.strata else worlds[:, 0]
-        slopes[task.name] = (bound - scores[-1] * total) / estimate(task, total, worlds).mean
+        slopes[task.name] = -scores[-1] * total / estimate(task, total, worlds).mean
     return mean_time(suite, slopes)._replace(mean=float(np.mean(scores))).interval()
 
 
 @functools.cache
 def worlds_of(task: Task, suite: Suite) -> FloatArray:
     """Return the `CONTROLS` of a task's searches, (n, 2)."""
-    return controls_of(task.made(suite.arrival), suite.seeds_of(task))
+    return controls_of(task.made(suite.arrival), task.seeds)
 
 
 def controls_of(scenario: Scenario, seeds: Sequence[int]) -> FloatArray:
@@ -230,19 +206,6 @@ def controls_of(scenario: Scenario, seeds: Sequence[int]) -> FloatArray:
     return np.array([(runner.bound_s(seed), runner.occupancy) for seed in seeds])
 
 
-@functools.cache
-def suite_lots() -> Mapping[float, str]:
-    """Return the places of all suites, which no agent is trained on: names by the `lot_share` of their lots."""
-    suites = (_packaged(name) for name in SUITES)
-    return {
-        task["lot_share"]: task["name"] for suite in suites for task in suite["tasks"] if "lot_share" in task
-    }
-
-
 def sha256_of(content: Any) -> str:
     """Return the SHA-256 of a content, as JSON without white space."""
     return hashlib.sha256(json.dumps(content, sort_keys=True, separators=(",", ":")).encode()).hexdigest()
-
-
-def _packaged(name: str) -> Any:
-    return read_json(SUITE_FOLDER / f"{name}.json")

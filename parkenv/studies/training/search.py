@@ -27,7 +27,6 @@ from parkenv.scenarios.selection import (
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.benchmark.suite import suite_lots
 from parkenv.studies.compare.cases import Case, rows_of
 from parkenv.studies.compare.search_replay import SearchReplay
 from parkenv.studies.report import Replay
@@ -100,11 +99,10 @@ class SearchTraining(RLTraining):
         """Scenarios to train in, and places to evaluate in and not to train in."""
         given = [build(scenario) for scenario in self.scenarios]
         if self.spec.held_out is not None:
-            sides = split_by_lot(given, self.spec.held_out, suite_lots())
+            sides = split_by_lot(given, self.spec.held_out)
         else:
             sides = given, [build(scenario) for scenario in self.spec.evaluate_on or ()]
         require_apart(*sides)
-        require_trainable(sides[0])
         return sides
 
     @cached_property
@@ -315,21 +313,6 @@ def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> 
         if (same := shares.get(lot_share(scenario.lot))) is not None:
             raise InputError(
                 f"evaluate_on has {scenario.name!r}, whose lot is that of {same!r}, which is trained on"
-            )
-
-
-def require_trainable(learned: Sequence[Scenario]) -> None:
-    """Check that none of the places to train on is one of a benchmark suite.
-
-    Raises:
-        InputError: one is.
-    """
-    kept = suite_lots()
-    for scenario in learned:
-        if (name := kept.get(lot_share(scenario.lot))) is not None:
-            raise InputError(
-                f"scenario {scenario.name!r} is {name} of benchmark suite v2, which no agent is trained on: leave it "
-                "out, or add --held-out"
             )
 
 
