@@ -1,8 +1,7 @@
 """Learning from raw sensors: a policy that observes its last laser scans and poses, and no map, forecast or belief.
 
 `python examples/12_scans_alone.py` shows in seconds that it runs. Scenario, decisions and seed can be given:
-`python examples/12_scans_alone.py mini 200000 0`. `parkenv train --observation scan` does the same with several seeds,
-learning curves and models kept.
+`python examples/12_scans_alone.py mini 200000 0`.
 """
 
 import sys

@@ -9,11 +9,10 @@ from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.drive.training import DriveTraining
 from parkenv.studies.training.fleet import FleetTraining
 from parkenv.studies.training.scenes import ScenesTraining
-from parkenv.studies.training.search import ScanTraining, SearchTraining
+from parkenv.studies.training.search import SearchTraining
 from parkenv.studies.training.spec import (
     DriveTrainingSpec,
     FleetTrainingSpec,
-    ScanTrainingSpec,
     ScenesTrainingSpec,
     SearchTrainingSpec,
 )
@@ -35,9 +34,6 @@ def make_small(patch):
         replay = {"learning_starts": 200, "buffer_size": 1_000}
         sizes = {"batch_size": 256, **(replay if name == "dqn" else {"n_steps": 32})}
         _change(patch, configs.SEARCH_CONFIGS, name, 16, sizes)
-    for name in configs.SCAN_CONFIGS:
-        sizes = {"batch_size": 128, "n_steps": 16, "policy_kwargs": {"net_arch": [32]}}
-        _change(patch, configs.SCAN_CONFIGS, name, 8, sizes)
     for name in configs.FLEET_CONFIGS:
         _change(patch, configs.FLEET_CONFIGS, name, 8, {"n_steps": 32, "batch_size": 256})
     for name in configs.DRIVE_CONFIGS:
@@ -63,11 +59,6 @@ def search_training(algorithm, steps, every, places, held_out=(), episodes=4, **
     training = SearchTraining(spec)
     training.sides = places, held_out
     return training
-
-
-def scan_training(steps, episodes):
-    spec = ScanTrainingSpec(steps=steps, evaluate_every=128, evaluation_episodes=episodes)
-    return ScanTraining(spec.changed(scenarios=["mini"]))
 
 
 def fleet_training(fleet, steps=2_048, every=1_024):

@@ -5,7 +5,6 @@ from small_trainings import (
     drive_training,
     fleet_training,
     make_small,
-    scan_training,
     scenes_training,
     search_training,
     stop_training,
@@ -29,7 +28,6 @@ LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]
 TRAININGS = {
     **{name: lambda name=name: search_training(name, 1_500, 400, PLACES) for name in sorted(SEARCH_CONFIGS)},
     "curriculum": lambda: search_training("ppo", 1_536, 512, LOTS, episodes=8, curriculum="size"),
-    "scans": lambda: scan_training(384, 6),
     "fleet": lambda: fleet_training(MixedFleet(PLACES[0], DEMAND), 768, 256),
     "drive, ppo": lambda: drive_training("ppo", 2_000, 600, (packaged_lot("mini"),)),
     "scenes": lambda: scenes_training(512, 128, ("parallel-complex", "oblique-normal")),

@@ -43,7 +43,6 @@ from parkenv.studies.training.spec import (
     DriveTrainingSpec,
     FleetTrainingSpec,
     NetworkTrainingSpec,
-    ScanTrainingSpec,
     ScenesTrainingSpec,
     SearchTrainingSpec,
     TrainingSpec,
@@ -491,16 +490,14 @@ def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
         assert shows_color(tmp_path / name, COLORS[0])
 
 
-# One on-policy algorithm, one with a replay buffer, and one on scans; `test_resumed_trainings` stops each kind.
+# One on-policy algorithm and one with a replay buffer; `test_resumed_trainings` stops each kind.
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("algorithm", "options"), [("maskable-ppo", ()), ("dqn", ()), ("maskable-ppo", ("--observation", "scan"))]
-)
-def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch, algorithm, options):
+@pytest.mark.parametrize("algorithm", ["maskable-ppo", "dqn"])
+def test_the_command_trains_and_its_models_can_be_compared(tmp_path, monkeypatch, algorithm):
     make_small(monkeypatch)
     out, steps = tmp_path / "out", 1_100  # two rollouts or more
     command = [
-        "train", algorithm, *options, "--scenario", "mini", "--steps", steps, "--trainings", 1,
+        "train", algorithm, "--scenario", "mini", "--steps", steps, "--trainings", 1,
         "--evaluate-every", 500, "--evaluation-episodes", 4, "--agents", "mdp", "--jobs", 1, "--out",
     ]  # fmt: skip
     assert parkenv(*command, out).returncode == 0
@@ -564,7 +561,6 @@ def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
     [
         ({}, SearchTrainingSpec),
         ({"algorithm": "network", "scenarios": ["mini"]}, NetworkTrainingSpec),
-        ({"observation": "scan", "k": 3}, ScanTrainingSpec),
         ({"env": "fleet", "arrivals_per_hour": 120}, FleetTrainingSpec),
         ({"env": "drive", "algorithm": "sac", "agents": ["planner"]}, DriveTrainingSpec),
         ({"env": "scenes", "levels": ["parallel-extreme"]}, ScenesTrainingSpec),
@@ -580,14 +576,13 @@ def test_a_file_chooses_the_kind_of_training_and_its_copy_is_the_same(tables, ki
         TrainingSpec.parse({**tables, "step": 3}, "file")
 
 
-OF_FLEET, OF_DRIVES, OF_SCANS = {"env": "fleet"}, {"env": "drive"}, {"observation": "scan"}
+OF_FLEET, OF_DRIVES = {"env": "fleet"}, {"env": "drive"}
 
 
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
         ({"env": "fly"}, "env is 'fly', want one of search, fleet, drive"),
-        ({"observation": "smell"}, "observation is 'smell', want one of local, scan"),
         ({"algorithm": "sarsa"}, "algorithm is 'sarsa', want one of"),
         ({"algorithm": "sac"}, "algorithm is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn with env search"),
         ({"agents": ["mdp", "belif"]}, "unknown agent 'belif'"),
@@ -602,13 +597,6 @@ OF_FLEET, OF_DRIVES, OF_SCANS = {"env": "fleet"}, {"env": "drive"}, {"observatio
         ({"algorithm": "network", "evaluate_every": 9}, "evaluate_every requires env search or"),
         ({"algorithm": "network", "tensorboard": True}, "not algorithm network"),
         ({"algorithm": "network", "without": ["legs"]}, "without.0 is 'legs', want 'lookahead'"),
-        (OF_SCANS | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with observation scan"),
-        (OF_SCANS | {"algorithm": "network"}, "observation requires .* not algorithm network"),
-        (OF_SCANS | {"clone": "mdp"}, "clone requires env search, not observation scan"),
-        (OF_SCANS | {"held_out": 0.5}, "held_out requires env search or algorithm network, not observation scan"),
-        (OF_SCANS | {"scenarios": ["mini", "campus"]}, "2 scenarios, want one for searches that observe scans"),
-        (OF_SCANS | {"k": 101}, "k is 101, want a whole number of scans from 1 to 100"),
-        (OF_FLEET | OF_SCANS, "observation requires env search"),
         (OF_FLEET | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with env fleet"),
         (OF_FLEET | {"clone": "mdp"}, "clone requires env search"),
         (OF_FLEET | {"learners": 0.5}, "learners requires among"),
@@ -621,7 +609,7 @@ OF_FLEET, OF_DRIVES, OF_SCANS = {"env": "fleet"}, {"env": "drive"}, {"observatio
         (OF_DRIVES | {"held_out": 0.2}, "held_out requires env search or algorithm network, not"),
         (OF_DRIVES | {"agents": ["mdp"]}, "agents has 'mdp', want planner or none with env drive"),
         ({"env": "scenes", "levels": ["parallel-tight"]}, "levels is 'parallel-tight'"),
-        (OF_DRIVES | {"k": 3}, "k requires env search or observation scan or env fleet, not env drive"),
+        (OF_DRIVES | {"k": 3}, "k requires env search or env fleet, not env drive"),
     ],
 )  # fmt: skip
 def test_trainings_that_make_no_sense_are_refused(fields, message):
@@ -703,7 +691,6 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
     ("arguments", "wanted"),
     [
         ("ppo --env fly", "env is 'fly', want one of search, fleet, drive"),
-        ("ppo --observation smell", "observation is 'smell', want one of local, scan"),
         ("ppo --curriculum age", "--curriculum is 'age', want 'size'"),
         ("ppo --evaluate-on nowhere", "unknown scenario 'nowhere'"),
         ("ppo --resume", "to resume"),

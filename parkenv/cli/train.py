@@ -31,7 +31,7 @@ SHOWN = (
 class Train(StudyCommand):
     """The reward of search agents is minus the time in seconds. They observe the surroundings of the car.
 
-    So they run on any lot; or they observe raw laser scans, on one lot. In a fleet, one network drives all cars, or a
+    So they run on any lot. In a fleet, one network drives all cars, or a
     share of them. Driving agents park the car in a slot, with hindsight experience replay (sac, tqc) or the dense
     reward (ppo); their curriculum starts just outside the slot. All are evaluated in held-out worlds; each seed's best
     model is kept, and tested at the end. Hyperparameters are in parkenv/studies/training/configs.py.
@@ -48,7 +48,6 @@ class Train(StudyCommand):
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
         parkenv train network --scenario my-lots --evaluate-on other-lots
         parkenv train ppo --beside results/maskable-ppo,results/dqn
-        parkenv train maskable-ppo --scenario mini --observation scan --trainings 3
         parkenv train --env fleet --arrivals-per-hour 120 --trainings 3
         parkenv train sac --env drive --scenario campus,street --trainings 3
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
@@ -59,7 +58,7 @@ class Train(StudyCommand):
         None,
         "Folder for models, curves and figures.",
         short="-o",
-        default="results/ALGORITHM, results/scan-ALGORITHM, results/drive-ALGORITHM, results/fleet-ALGORITHM",
+        default="results/ALGORITHM, results/drive-ALGORITHM, results/fleet-ALGORITHM",
     )
 
     @classmethod

@@ -81,10 +81,6 @@ SEARCH_CONFIGS: dict[str, TrainingConfig] = {
 }
 """Config of each algorithm for search."""
 
-_ON_SCANS = {**_ON_POLICY, "n_epochs": 4, "policy_kwargs": {"net_arch": [256, 128]}}
-SCAN_CONFIGS = dict.fromkeys(_WITH_MASKS, TrainingConfig(256, "MultiInputPolicy", _ON_SCANS, 0.05))
-"""Config of each algorithm for searches that observe raw scans."""
-
 # Shorter rollouts than for single searches: the other cars follow the network only from rollout to rollout.
 _IN_FLEET = {**_ON_POLICY, "n_steps": 128, "batch_size": 1024}
 FLEET_CONFIGS = dict.fromkeys(_WITH_MASKS, TrainingConfig(32, "MultiInputPolicy", _IN_FLEET, 0.05))

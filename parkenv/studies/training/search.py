@@ -37,19 +37,18 @@ from parkenv.studies.training.cloning import Demonstrations, clone, require_clon
 from parkenv.studies.training.configs import (
     MAX_STEPS,
     REWARD_SCALE,
-    SCAN_CONFIGS,
     SEARCH_CONFIGS,
     TrainingConfig,
 )
 from parkenv.studies.training.curve_file import Row
 from parkenv.studies.training.learning import RLTraining
-from parkenv.studies.training.spec import ScanTrainingSpec, SearchTrainingSpec
+from parkenv.studies.training.spec import SearchTrainingSpec
 from parkenv.studies.training.training import MODEL, TEST_SEED, Tested, name_of
 from parkenv.studies.workers import Workers
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.learned import LearnedAgent
-from planners.model_file import SEARCH_OBSERVATIONS, observation_of
+from planners.model_file import observation_of
 
 Times = tuple[NDArray[np.float64], NDArray[np.bool_]]
 """Total time of each episode, s, and whether its car parked."""
@@ -71,7 +70,7 @@ PLANNERS_OF_PLACES = tuple(spec for spec in PLANNERS if spec.name not in ("mdp-t
 class SearchTraining(RLTraining):
     """Training of a search agent in one scenario or several; the score is the mean total time."""
 
-    spec: SearchTrainingSpec | ScanTrainingSpec
+    spec: SearchTrainingSpec
     most_between = 100_000
     evaluated_by = ("scenario", "held_out", "evaluation_episodes")
     configs: ClassVar[Mapping[str, TrainingConfig]] = SEARCH_CONFIGS
@@ -165,9 +164,7 @@ class SearchTraining(RLTraining):
     def make_env(self) -> SearchVecEnv:
         """Make a batch of search environments over all scenarios."""
         places = self.sides[0] if self.spec.curriculum is None else by_size(self.sides[0])
-        env = SearchVecEnv(
-            self.config.n_envs, places, REWARD_SCALE, self.spec.k, self.spec.observation, MAX_STEPS
-        )
+        env = SearchVecEnv(self.config.n_envs, places, REWARD_SCALE, self.spec.k, "local", MAX_STEPS)
         self._open_places(env, 0.0)
         return env
 
@@ -279,26 +276,6 @@ class SearchTraining(RLTraining):
         ]
 
 
-class ScanTraining(SearchTraining):
-    """Training of a search agent that observes raw laser scans, in one scenario."""
-
-    spec: ScanTrainingSpec
-    configs = SCAN_CONFIGS
-
-    @property
-    def folder(self) -> str:
-        """See `Training`."""
-        return f"scan-{self.algorithm}"
-
-    def check(self) -> None:
-        """See `Training`."""
-        super().check()
-        # What gives no scans in a batch is refused before training, not at the tests in the end.
-        learned = self.sides[0]
-        for place in (*learned, *itertools.chain(*self.tests.values())):
-            ParkSearchVectorEnv(1, learned if place in learned else place, "scan", self.spec.k)
-
-
 def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
     """Check that no place is on both sides.
 
@@ -337,14 +314,13 @@ def episode_times(model: Any, places: Scenario | Sequence[Scenario], seeds: Sequ
     An episode that has not ended after `MAX_STEPS` decisions is charged `give_up_s`, as in `parkenv compare`.
 
     Args:
-        model: a stable-baselines3 or sb3-contrib model of the `local` or the `scan` observation.
+        model: a stable-baselines3 or sb3-contrib model of the `local` observation.
         places: scenario to search in; or several, of which each seed draws one.
         seeds: one episode each.
     """
     n = len(seeds)
-    _, version, k = observation_of(model.observation_space)
-    observation = SEARCH_OBSERVATIONS[version][0]
-    batch = ParkSearchVectorEnv(n, places, observation, k, MAX_STEPS)
+    _, _, k = observation_of(model.observation_space)
+    batch = ParkSearchVectorEnv(n, places, "local", k, MAX_STEPS)
     seen, _ = batch.reset(seed=list(seeds))
     give_up_s = np.array([scenario.give_up_s for scenario in batch.scenarios])[batch.place_of]
     times, parked = np.full(n, np.nan), np.zeros(n, dtype=np.bool_)

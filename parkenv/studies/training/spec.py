@@ -1,4 +1,4 @@
-"""Specifications of trainings, one for each kind: of search agents, on scans, of `network`, in fleets, and to drive."""
+"""Specifications of trainings, one for each kind: of search agents, of `network`, in fleets, and to drive."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ Episodes = Annotated[
 ObservedSlots = Annotated[
     int,
     Field(ge=1, le=1_000, description="Slots in an observation (search, fleet)."),
-    Option(panel="Learning", default="5; with --observation scan, 4 scans"),
+    Option(panel="Learning"),
 ]
 TensorBoard = Annotated[
     bool, Field(description="Write logs for TensorBoard to the folder."), Option(panel="Results")
@@ -113,7 +113,7 @@ class _Seeds(NamedTuple):
 class TrainingSpec(Study):
     """Training by reinforcement learning, one model per seed: what all kinds of training have.
 
-    `TrainingSpec.parse` and `read` return the specification of the kind that `env`, `algorithm` and `observation`
+    `TrainingSpec.parse` and `read` return the specification of the kind that `env` and `algorithm`
     choose.
     """
 
@@ -181,7 +181,7 @@ class TrainingSpec(Study):
                 )
         return tables
 
-    @field_validator("env", "observation", "algorithm", mode="before", check_fields=False)
+    @field_validator("env", "algorithm", mode="before", check_fields=False)
     @classmethod
     def _known_choice(cls, value: object, info: ValidationInfo) -> object:
         name = str(info.field_name)
@@ -397,14 +397,6 @@ class SearchTrainingSpec(PlacesTrainingSpec):
         default="maskable-ppo; to drive, ppo",
     )
     scenarios: TrainedOn = (scenario_spec("campus"),)
-    observation: Literal["local"] = option(
-        "local",
-        "Observation (search; ppo, maskable-ppo). local: surroundings of the car, from belief and "
-        "forecast; scan: only the last laser scans and poses, in one scenario.",
-        takes="local|scan",
-        panel="Learning",
-        default="local",
-    )
     k: ObservedSlots = 5
     curriculum: Literal["size"] | None = option(
         None,
@@ -444,40 +436,12 @@ class SearchTrainingSpec(PlacesTrainingSpec):
         return self
 
 
-class ScanTrainingSpec(TestedTrainingSpec):
-    """Training to search in one scenario, from raw laser scans and poses alone."""
-
-    chosen_by: ClassVar[str] = "observation scan"
-    trained_by: ClassVar[str] = "search:ScanTraining"
-    # What other trainings to search may choose.
-    held_out: ClassVar[None] = None
-    evaluate_on: ClassVar[None] = None
-    curriculum: ClassVar[None] = None
-    clone: ClassVar[None] = None
-    demonstrations: ClassVar[None] = None
-
-    env: Literal["search"] = "search"
-    algorithm: Literal["ppo", "maskable-ppo"] = "maskable-ppo"
-    scenarios: TrainedOn = (scenario_spec("campus"),)
-    observation: Literal["scan"] = "scan"
-    k: int = Field(4, ge=1, le=1_000, description="Scans in an observation.")
-    steps: Steps = 2_000_000
-    evaluate_every: EvaluateEvery | None = Field(
-        None, description="A tenth of the steps, at most 100000, if absent."
-    )
-    evaluation_episodes: Episodes = Field(
-        256, description="Episodes of an evaluation; the test in the end has twice as many."
-    )
-    tensorboard: TensorBoard = False
-
-
 class NetworkTrainingSpec(PlacesTrainingSpec):
     """Training of `network`, which clones `belief`, observes its own features and is evaluated after each stage."""
 
     chosen_by: ClassVar[str] = "algorithm network"
     trained_by: ClassVar[str] = "network.training:NetworkTraining"
     # What other trainings to search may choose.
-    observation: ClassVar[str] = "local"
     clone: ClassVar[None] = None
 
     env: Literal["search"] = "search"
@@ -621,9 +585,7 @@ class ScenesTrainingSpec(TrainingSpec):
     tensorboard: TensorBoard = False
 
 
-RLTrainingSpec = (
-    SearchTrainingSpec | ScanTrainingSpec | FleetTrainingSpec | DriveTrainingSpec | ScenesTrainingSpec
-)
+RLTrainingSpec = SearchTrainingSpec | FleetTrainingSpec | DriveTrainingSpec | ScenesTrainingSpec
 """The kinds of training with stable-baselines3."""
 AnyTrainingSpec = RLTrainingSpec | NetworkTrainingSpec
 """The kinds of training."""
@@ -639,8 +601,8 @@ def kind_of(tables: Mapping[str, Any]) -> type[AnyTrainingSpec]:
     """Return the kind of training that the content of a file chooses.
 
     Examples:
-        >>> kind_of({"env": "search", "observation": "scan"}).__name__
-        'ScanTrainingSpec'
+        >>> kind_of({"env": "fleet"}).__name__
+        'FleetTrainingSpec'
     """
     env = tables.get("env", "search")
     if env == "fleet":
@@ -651,4 +613,4 @@ def kind_of(tables: Mapping[str, Any]) -> type[AnyTrainingSpec]:
         return ScenesTrainingSpec
     if tables.get("algorithm") == "network":
         return NetworkTrainingSpec
-    return ScanTrainingSpec if tables.get("observation") == "scan" else SearchTrainingSpec
+    return SearchTrainingSpec

@@ -292,7 +292,6 @@ class _Naming(Spec, extra="ignore"):
     algorithm: str
     scenario: Several[str] | None = None
     clone: str | None = None
-    observation: str = "local"
 
 
 def name_of(settings: Row, source: str = "settings") -> str:
@@ -303,8 +302,7 @@ def name_of(settings: Row, source: str = "settings") -> str:
     """
     its = _Naming.parse(settings, source)
     scenarios = its.scenario or ()
-    name = f"{its.algorithm}{' on scans' if its.observation == 'scan' else ''}"
-    name += f" on {', '.join(scenarios)}" if len(scenarios) > 1 else ""
+    name = its.algorithm + (f" on {', '.join(scenarios)}" if len(scenarios) > 1 else "")
     return f"{name} after cloning {its.clone}" if its.clone else name
 
 
