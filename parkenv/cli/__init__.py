@@ -46,9 +46,7 @@ COMMANDS = {
         "Fit search time and walk as functions of occupancy, for other models.", "drivers:Curve", SEARCH
     ),
     "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
-    "pomdp": Entry("Write the search in a small lot as a file for POMDP solvers.", "compare:Pomdp", SEARCH),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),
-    "dataset": Entry("Record data sets for offline learning, in Minari's format.", "dataset:Dataset", SEARCH),
     "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", SEARCH),
     "run": Entry("Run an experiment file.", "study_command:Run", SEARCH),
     "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=SEARCH),

@@ -151,7 +151,6 @@ COMMANDS = {
     "verify": "checks:Verify",
     "train": "train:Train",
     "park": "drive:Park",
-    "dataset": "dataset:Dataset",
 }
 """The command of each kind of study."""
 
@@ -161,7 +160,7 @@ class Run(RunCommand, ExecutionSpec):
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
     command: compare (the default), commute, fleet, curve, demand, policy, benchmark, survey, detectors, demo,
-    calibrate, verify, train, park (scenes) or dataset.
+    calibrate, verify, train or park (scenes).
     """
 
     examples = """

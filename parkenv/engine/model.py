@@ -23,7 +23,7 @@ from scipy.special import ndtr
 from parkenv.belief.day_belief import DOUBT, DayBelief
 from parkenv.belief.slot_belief import Observations, SlotBelief
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.memory import call_at
+from parkenv.compiled.memory import address_of, call_at
 from parkenv.engine.batch import first_wrong
 from parkenv.engine.kernel import (
     column_of,
@@ -40,9 +40,12 @@ from parkenv.engine.kernel import (
     write_clock,
 )
 from parkenv.engine.policy import CompiledPolicy, car_of
-from parkenv.engine.policy_batch import PolicyBatch
 from parkenv.engine.records import (
+    CAR,
+    FLEET,
     N_ACTIONS,
+    NO_SLOT,
+    SEARCH,
     ScenarioRecords,
     Searches,
     most_observed_in,
@@ -240,7 +243,7 @@ class Simulations:
             raise InputError(
                 f"policy is {policy!r:.60}, want a CompiledPolicy, such as one of planners.heuristics.policies.POLICIES"
             )
-        cars = PolicyBatch(self.searches, policy)
+        cars = _PolicyBatch(self.searches, policy)
         _run_at(cars.address, policy.address, max_steps, cost_s, actions)
 
 
@@ -459,6 +462,31 @@ def _last_observations(slots: SlotBelief, forecast: FloatArray) -> Observations:
 
 
 # ---- compiled
+
+
+class _PolicyBatch:
+    """A car for each of some searches in one scenario, with its memory of the search.
+
+    Args:
+        searches: the searches; their `moves` are the cars' from now on.
+        policy: what drives the cars.
+
+    Attributes:
+        address: address of the FLEET record of the cars.
+    """
+
+    def __init__(self, searches: Searches, policy: CompiledPolicy) -> None:
+        n, problem = len(searches.records), searches.scenarios.scenarios[0]
+        self._cars, self._fleet = np.zeros(n, CAR), np.zeros(1, FLEET)
+        self._moves = np.zeros((n, 2 * problem.lot.n_vertices), np.uint8)
+        searches.records["moves"] = address_of(self._moves, np.uint8) + np.arange(n) * self._moves.shape[1]
+        self._cars["search"] = searches.address + np.arange(n) * SEARCH.itemsize
+        self._cars["target"] = NO_SLOT
+        self._data = policy.data_for([problem])
+        self._at = np.array([0 if self._data is None else self._data.address], np.int64)
+        self._fleet["cars"] = address_of(self._cars, CAR)
+        self._fleet["policy_data"] = address_of(self._at, np.int64)
+        self.address = address_of(self._fleet, FLEET)
 
 
 @kernel

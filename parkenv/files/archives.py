@@ -23,15 +23,6 @@ MAX_MEMBERS = 10_000
 _HEADER_ERRORS = (tokenize.TokenError, OverflowError, RecursionError, MemoryError)
 
 
-def read_zip(path: str | Path, most: int = MAX_BYTES) -> dict[str, bytes]:
-    """Return the files of a zip archive, by name; see `parse_zip`.
-
-    Raises:
-        InputError: the file cannot be read, or see `parse_zip`.
-    """
-    return parse_zip(read_bytes(path, most), str(path), most)
-
-
 def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]:
     """Return the files of a zip archive, by name, at most `most` bytes in all when unpacked.
 
@@ -57,16 +48,16 @@ def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]
         raise InputError(f"{name}: not a zip archive that can be read: {error}") from error
 
 
-def read_arrays(path: str | Path, most: int = MAX_BYTES) -> dict[str, NDArray[Any]]:
+def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
     """Return the arrays of an `.npz` file; see `parse_arrays`.
 
     Raises:
         InputError: the file cannot be read, or see `parse_arrays`.
     """
-    return parse_arrays(read_bytes(path, most), str(path), most)
+    return parse_arrays(read_bytes(path), str(path))
 
 
-def parse_arrays(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, NDArray[Any]]:
+def parse_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
     """Return the arrays of `.npz` data, without pickle; sizes are checked before memory is taken.
 
     Raises:
@@ -74,7 +65,7 @@ def parse_arrays(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, NDA
             says; the message starts with `name`.
     """
     arrays = {}
-    for member, content in parse_zip(data, name, most).items():
+    for member, content in parse_zip(data, name).items():
         stream = io.BytesIO(content)
         try:
             version = np.lib.format.read_magic(stream)

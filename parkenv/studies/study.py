@@ -50,7 +50,6 @@ STUDIES: Mapping[str, str] = {
     "verify": "parkenv.studies.verify.study:Verification",
     "train": "parkenv.studies.training.spec:TrainingSpec",
     "park": "parkenv.studies.trips.manoeuvre_study:ManoeuvreStudy",
-    "dataset": "parkenv.studies.dataset.study:DatasetStudy",
 }
 """`MODULE:CLASS` of each kind of study, by the key `kind` of its files."""
 

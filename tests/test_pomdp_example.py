@@ -1,26 +1,25 @@
-"""Searches as files of other solvers: read back, their optimum is that of `exact`."""
+"""The file that an example writes for solvers of others: read back, its optimum is that of `exact`."""
 
+import runpy
 from collections import defaultdict
+from pathlib import Path
 
 import numpy as np
 import pytest
-from small_lots import features, small_lot
-from test_exact import one_way_line
+from small_lots import small_lot
 
-from parkenv import InputError, ParkingLot, SensorModel
-from parkenv.lots import grid_lot, packaged_lot
 from parkenv.world.occupancy.day_error import EXACT, DayError
-from parkenv.world.scenario import SearchProblem
 from planners.bounds.exact import ExactSolution
-from planners.bounds.pomdp_file import write_pomdp
+
+EXAMPLE = runpy.run_path(str(Path(__file__).parents[1] / "examples" / "write_pomdp.py"))
 
 
 class Read:
     """A `.pomdp` file with sure transitions and observations, as ours are."""
 
-    def __init__(self, path):
+    def __init__(self, lines):
         after, reward, seen = {}, {}, {}
-        for line in path.read_text(encoding="utf-8").splitlines():
+        for line in lines:
             key, *rest = [part.strip() for part in line.split("#")[0].split(":")]
             words = [part.split() for part in rest]
             if key == "T":
@@ -88,62 +87,8 @@ def few_slots(seed):
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("day_error", [EXACT, DayError(0.9, 0.4)])
-def test_value_iteration_on_the_file_finds_the_exact_optimum(tmp_path, seed, day_error):
+def test_value_iteration_on_the_file_finds_the_exact_optimum(seed, day_error):
     problem, p_occupied, vertex = few_slots(seed)
-    file = tmp_path / "lot.pomdp"
-    size = write_pomdp(file, problem, p_occupied, vertex, day_error)
-    read = Read(file)
-    assert (len(read.states), len(read.actions), len(read.observations)) == size
+    read = Read(EXAMPLE["pomdp_lines"](problem, p_occupied, vertex, day_error))
     expected_s = ExactSolution(problem, p_occupied, vertex, day_error=day_error).expected_s
     assert -read.value() == pytest.approx(expected_s, abs=1e-6)
-
-
-def test_pomdp_pys_value_iteration_on_the_file_finds_the_exact_optimum(tmp_path):
-    pomdp_py = pytest.importorskip("pomdp_py", reason="needs the extra pomdp: pomdp-py")
-    problem = SearchProblem(lot=grid_lot(1, 2), sensor_model=SensorModel(view_range=0.0), give_up_s=200.0)
-    vertex, p_occupied, file = int(problem.lot.entry_vertices[0]), np.array([0.5, 0.8]), tmp_path / "x.pomdp"
-    write_pomdp(file, problem, p_occupied, vertex)
-    read, bonus = Read(file), 1e4
-
-    class Transitions(pomdp_py.TransitionModel):
-        def probability(self, next_state, state, action):
-            return float(read.after[action, state] == next_state)
-
-    class Observations(pomdp_py.ObservationModel):
-        def probability(self, observation, next_state, action):
-            return float(read.seen[next_state] == observation)
-
-    class Rewards(pomdp_py.RewardModel):
-        def sample(self, state, action, next_state):
-            # Its horizon is finite: who has not parked by then goes without a prize.
-            return read.reward[action, state] + bonus * (next_state == "done" != state)
-
-    value = pomdp_py.value(
-        read.chances, read.states, read.actions, read.observations, Transitions(), Observations(), Rewards(), 1.0,
-        horizon=4,
-    )  # fmt: skip
-    assert bonus - value == pytest.approx(ExactSolution(problem, p_occupied, vertex).expected_s, abs=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"lot": packaged_lot("campus")}, "189 slots"),
-        ({"lot": grid_lot(2, 8)}, "states, want at most"),
-        ({"sensor_model": SensorModel(view_range=6.0, hit_rate=0.9)}, "without errors"),
-    ],
-)
-def test_what_no_file_can_hold_is_refused_and_nothing_is_written(tmp_path, changes, message):
-    problem = SearchProblem(**{"lot": grid_lot(1, 3), **changes})
-    with pytest.raises(InputError, match=message):
-        write_pomdp(tmp_path / "x.pomdp", problem, np.full(problem.lot.n_slots, 0.5), 0)
-    assert not list(tmp_path.iterdir())
-
-
-def test_a_slot_that_is_never_seen_is_refused(tmp_path):
-    lot = ParkingLot(**{**features(one_way_line(2, 30.0)), "entries": np.array([[15.0, 0.0]])})
-    with pytest.raises(InputError, match="never in view"):
-        write_pomdp(
-            tmp_path / "x.pomdp", SearchProblem(lot=lot, sensor_model=SensorModel(view_range=0.0)), [0.5, 0.5],
-            int(lot.entry_vertices[0]),
-        )  # fmt: skip

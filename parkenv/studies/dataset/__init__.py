@@ -1,1 +1,0 @@
-"""Data sets of recorded searches, for offline reinforcement learning."""
