@@ -72,7 +72,7 @@ def test_pages_of_environments_are_their_docstrings():
 
 def test_every_picture_and_table_of_results_names_its_command():
     found = list(script("figures").figures())
-    assert len(found) > 60
+    assert len(found) > 30
     assert not [figure for figure in found if not figure.command]
     shown = {figure.what for figure in found}
     pictures = {f"pictures/{path.name}" for path in (ROOT / "docs" / "pictures").glob("[!.]*")}
