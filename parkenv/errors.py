@@ -23,6 +23,19 @@ def needs_extra(what: str, extra: str) -> str:
 
 
 @contextmanager
+def with_extra(what: str, extra: str) -> Iterator[None]:
+    """Import packages of an extra in the block.
+
+    Raises:
+        InputError: one is not installed; the message says what needs the extra, and how to install it.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise InputError(needs_extra(what, extra)) from error
+
+
+@contextmanager
 def naming(source: object) -> Iterator[None]:
     """Let the messages of InputErrors in the block begin with the source that they are about, such as a file."""
     try:

@@ -19,7 +19,7 @@ from gymnasium import spaces
 from pydantic import Field, JsonValue
 from pydantic_core import to_jsonable_python
 
-from parkenv.errors import InputError, needs_extra
+from parkenv.errors import InputError, with_extra
 from parkenv.files.atomic_write import atomic_write
 from parkenv.files.limited_reading import read_bytes
 from parkenv.files.spec_file import Several, Spec
@@ -178,10 +178,8 @@ def algorithm_class(name: str) -> Any:
     if name not in ALGORITHMS:
         raise InputError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
     module, class_name = ALGORITHMS[name]
-    try:
+    with with_extra(name, "rl"):
         return getattr(import_module(module), class_name)
-    except ImportError as error:
-        raise InputError(needs_extra(name, "rl")) from error
 
 
 def save_model(

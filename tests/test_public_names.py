@@ -3,13 +3,16 @@
 import re
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
 
 import parkenv
+from parkenv.lots.local_frame import LocalFrame
 
-PAGE = (Path(__file__).parents[1] / "docs" / "api" / "index.md").read_text(encoding="utf-8")
+ROOT = Path(__file__).parents[1]
+PAGE = (ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
 
 
 def test_public_names_are_those_of_the_page_and_exist():
@@ -55,3 +58,22 @@ def test_the_command_lets_ctrl_c_end_it_before_it_imports_its_modules():
         [sys.executable, "-c", program], capture_output=True, text=True, check=False, timeout=60
     )
     assert (done.returncode, done.stderr) == (130, "")
+
+
+def test_what_needs_an_extra_says_so_in_a_line(monkeypatch, tmp_path):
+    for module in ("pyproj", "yaml", "sklearn.cluster", "osmium"):
+        monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / "map.yml").write_text("PARKING_AREAS:\n")
+    (tmp_path / "map.osm.pbf").write_bytes(b"")
+    for needs in (
+        lambda: LocalFrame(7.85, 48.0).to_xy([[7.85, 48.0]]),
+        lambda: parkenv.load_lot(tmp_path / "map.yml"),
+        lambda: parkenv.import_lot(tmp_path / "map.osm.pbf"),
+    ):
+        with pytest.raises(parkenv.InputError, match=r"needs the extra osm: pip install 'parkenv\[osm\]'$"):
+            needs()
+
+
+def test_the_two_commands_of_the_readme_need_at_most_sixteen_packages():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert len(project["dependencies"]) <= 16

@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 
 from pydantic_core import from_json
 
-from parkenv.errors import InputError, naming
+from parkenv.errors import InputError, naming, with_extra
 
 MAX_BYTES = 64_000_000
 """Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory."""
@@ -202,7 +202,8 @@ def read_yaml(path: str | Path) -> Any:
         InputError: the file cannot be read, is too large, is not YAML, has an alias (which could stand for
             gigabytes), a date or another special type, or is nested deeper than `MAX_DEPTH`.
     """
-    import yaml
+    with with_extra(f"{path}: YAML", "osm"):
+        import yaml
 
     class PlainLoader(yaml.SafeLoader):
         depth = 0

@@ -18,7 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from parkenv.compiled.arrays import Image
-from parkenv.errors import InputError, needs_extra
+from parkenv.errors import InputError, with_extra
 from parkenv.files.images import decode_image
 from parkenv.files.limited_reading import Counted, read_yaml, require_file
 from parkenv.files.videos import USUAL_FPS, VideoFrame
@@ -52,10 +52,8 @@ def require_rosbags() -> None:
     Raises:
         InputError: it is not; the message says how to install it.
     """
-    try:
+    with with_extra("a recorded drive", "bags"):
         import rosbags.rosbag2  # noqa: F401
-    except ImportError as error:
-        raise InputError(needs_extra("a recorded drive", "bags")) from error
 
 
 @contextmanager

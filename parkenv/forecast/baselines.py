@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import logit
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import with_extra
 from parkenv.forecast.calibration import calibrated
 from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import DIAGONAL, DayForecast, logits
@@ -64,7 +65,8 @@ def gradient_boosting(counts: Counts, first: int) -> FloatArray:
     eight weeks and the day before, the means of the last day and the day a week before, and how much the day before
     differed from its last four weeks.
     """
-    from sklearn.ensemble import HistGradientBoostingRegressor
+    with with_extra("gradient boosting", "fit"):
+        from sklearn.ensemble import HistGradientBoostingRegressor
 
     y = counts.seen
     c = len(y)

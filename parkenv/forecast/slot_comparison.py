@@ -9,6 +9,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.errors import with_extra
 from parkenv.forecast.day_forecast import INTERVAL
 from parkenv.forecast.scores import Scores, crps_of_equally_likely
 from parkenv.forecast.slot_days import Days, SlotDays, fit_slot_days
@@ -114,7 +115,8 @@ def _shrunk_mean(past: SlotDays, days: IntArray) -> FloatArray:
 
 
 def _boosted(past: SlotDays) -> FloatArray:
-    from sklearn.ensemble import HistGradientBoostingClassifier
+    with with_extra("gradient boosting", "fit"):
+        from sklearn.ensemble import HistGradientBoostingClassifier
 
     taken, n = past.taken * past.seen, past.seen
     period = np.arange(n.shape[2])

@@ -11,7 +11,6 @@ from datetime import date
 from typing import Any
 
 import numpy as np
-from dateutil.easter import easter
 from numpy.typing import NDArray
 from scipy.special import expit, logit
 
@@ -27,8 +26,24 @@ def key_of(day: date) -> Hashable:
     >>> key_of(date(2024, 5, 9)) == key_of(date(2023, 5, 18)), key_of(date(2024, 10, 3))
     (True, (10, 3))
     """
-    after_easter = (day - easter(day.year)).days
+    after_easter = (day - _easter(day.year)).days
     return after_easter if after_easter in _MOVING else (day.month, day.day)
+
+
+def _easter(year: int) -> date:
+    """Return Easter Sunday of a year of the Gregorian calendar.
+
+    The algorithm of J. Meeus, Astronomical Algorithms, 1991, chapter 8.
+
+    >>> _easter(2024)
+    datetime.date(2024, 3, 31)
+    """
+    golden, (century, rest) = year % 19, divmod(year, 100)
+    epact = (19 * golden + century - century // 4 - (century - (century + 8) // 25 + 1) // 3 + 15) % 30
+    weekday = (32 + 2 * (century % 4) + 2 * (rest // 4) - epact - rest % 4) % 7
+    late = (golden + 11 * epact + 22 * weekday) // 451
+    month, day = divmod(epact + weekday - 7 * late + 114, 31)
+    return date(year, month, day + 1)
 
 
 class SpecialDays:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, with_extra
 
 if TYPE_CHECKING:
     from pyproj import Proj
@@ -65,6 +65,7 @@ class LocalFrame:
 
     @cached_property
     def _projection(self) -> Proj:
-        from pyproj import Proj
+        with with_extra("longitude and latitude", "osm"):
+            from pyproj import Proj
 
         return Proj(proj="aeqd", lon_0=self.lon, lat_0=self.lat, ellps="WGS84")

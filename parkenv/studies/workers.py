@@ -25,7 +25,7 @@ from joblib import Parallel, cpu_count, delayed
 from joblib.externals.loky import process_executor, reusable_executor
 from joblib.externals.loky.backend import resource_tracker
 
-from parkenv.errors import InputError, needs_extra, require_one_of
+from parkenv.errors import InputError, require_one_of, with_extra
 from parkenv.files.known_names import BackendName
 
 BACKENDS = get_args(BackendName)
@@ -339,7 +339,5 @@ def _require_listener(address: str) -> None:
 
 
 def _required(module: str, extra: str) -> Any:
-    try:
+    with with_extra(f"--backend {extra}", extra):
         return importlib.import_module(module)
-    except ImportError as error:
-        raise InputError(needs_extra(f"--backend {extra}", extra)) from error

@@ -19,7 +19,7 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.scene import Scene
 from parkenv.driving.vehicle import PHYSICS_S, SPEED, VehicleParameters, advance, placed
-from parkenv.errors import InputError, needs_extra
+from parkenv.errors import with_extra
 from planners.driving.manoeuvre import Manoeuvre
 
 _SPEED, _ACCELERATION, _INTERVAL_S = 1.5, 0.7, 0.25  # m/s, m/s², s, of the first reference
@@ -230,7 +230,5 @@ def require_casadi() -> Any:
     Raises:
         InputError: it is not installed.
     """
-    try:
+    with with_extra("shortening drives", "optimal"):
         return import_module("casadi")
-    except ImportError as error:
-        raise InputError(needs_extra("shortening drives", "optimal")) from error

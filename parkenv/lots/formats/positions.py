@@ -13,7 +13,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError
+from parkenv.errors import InputError, with_extra
 from parkenv.lots.local_frame import LocalFrame
 
 if TYPE_CHECKING:
@@ -169,8 +169,9 @@ def _crs_name(crs: object) -> str | None:
 
 def _grid(name: str) -> tuple[Transformer, str] | None:
     """Return the transformation of a named system to WGS 84, and its title; None for longitude and latitude itself."""
-    from pyproj import CRS, Transformer
-    from pyproj.exceptions import CRSError
+    with with_extra(f"crs {name:.80}", "osm"):
+        from pyproj import CRS, Transformer
+        from pyproj.exceptions import CRSError
 
     match = _CRS.fullmatch(name)
     try:

@@ -31,7 +31,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.errors import InputError, naming, needs_extra
+from parkenv.errors import InputError, naming, with_extra
 from parkenv.files.limited_reading import is_there, open_limited, read_json, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.positions import Positions
@@ -652,10 +652,8 @@ def _is_object(holder: Mapping[str, Any], key: str) -> bool:
 
 def _read_pbf(path: Path) -> OsmMap:
     """Read the parking, roads, buildings and entrances of an extract."""
-    try:
+    with naming(path), with_extra(".osm.pbf", "osm"):
         import osmium
-    except ImportError as error:
-        raise InputError(f"{path}: {needs_extra('.osm.pbf', 'osm')}") from error
     if not is_there(path):
         raise InputError(f"{path}: No such file or directory")
     raw = RawElements()

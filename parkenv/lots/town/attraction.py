@@ -14,6 +14,7 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import with_extra
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.buildings import Area
 from parkenv.lots.osm.elements import OsmElement
@@ -111,7 +112,8 @@ def find_goals(
 
 
 def _clusters(xy: FloatArray, share: FloatArray, count: int) -> np.ndarray[tuple[int], np.dtype[np.int64]]:
-    from sklearn.cluster import KMeans
+    with with_extra("a town", "osm"):
+        from sklearn.cluster import KMeans
 
     found = KMeans(count, n_init=1, max_iter=30, random_state=0).fit(xy, sample_weight=share)
     return np.asarray(found.labels_, np.int64)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Image
-from parkenv.errors import InputError, require_number, require_whole
+from parkenv.errors import InputError, require_number, require_whole, with_extra
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import overlaps
 from parkenv.perception.hog import Descriptor
@@ -180,8 +180,9 @@ def _fitted(model: CarModel, yes: Float32Array, no: Float32Array, settings: Trai
 
 
 def _svm(yes: Float32Array, no: Float32Array, settings: TrainingSettings) -> tuple[Float32Array, float]:
-    from sklearn.svm import LinearSVC
-    from threadpoolctl import threadpool_limits
+    with with_extra("training a car model", "fit"):
+        from sklearn.svm import LinearSVC
+        from threadpoolctl import threadpool_limits
 
     machine = LinearSVC(
         C=settings.penalty,

@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from scipy.sparse import csr_matrix, vstack
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.errors import with_extra
 from parkenv.show.report.tables import Column
 from parkenv.studies.curve.zones import INDEX, LONE, OF_CARS, STATE, SUMS, Zones
 from parkenv.studies.results import Row
@@ -202,8 +203,9 @@ def fit_curve(
         train: weights of the cells to fit to, which broadcast to (n, m).
         days: how often each day counts; once by default.
     """
-    from sklearn.ensemble import HistGradientBoostingRegressor
-    from threadpoolctl import threadpool_limits
+    with with_extra("a fit of curves", "fit"):
+        from sklearn.ensemble import HistGradientBoostingRegressor
+        from threadpoolctl import threadpool_limits
 
     of_days, cars_of_days = paths.totals(name)
     share = np.ones(len(of_days)) / len(of_days) if days is None else days / days.sum()
