@@ -33,6 +33,17 @@ def halves(name="mini"):
     return make_scenario(name, occupancy=world, traffic=BUSY), taken
 
 
+def test_who_watches_a_session_changes_nothing_and_sees_the_truth():
+    scenario, frames = make_scenario("mini"), []
+    survey = Survey(scenario, SurveySettings(every=8.0, weather="overcast"))
+    watched, alone = survey.drive(0, on_frame=frames.append), survey.drive(0)
+    assert np.array_equal(watched.states.p_occupied, alone.states.p_occupied)
+    assert np.array_equal(watched.truth, alone.truth)
+    times = [frame.result.captured.time for frame in frames]
+    assert times == sorted(times)
+    assert frames[0].truth.shape == (scenario.lot.n_slots,)
+
+
 @pytest.mark.parametrize(
     ("rig", "every"), [("laser", 4.0), pytest.param("stereo", 1.25, marks=pytest.mark.slow)]
 )

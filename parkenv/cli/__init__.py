@@ -71,9 +71,6 @@ COMMANDS = {
     "evaluate-detector": Entry(
         "Measure a detector on images, or on drives.", "detect:EvaluateDetector", SENSE
     ),
-    "trip": Entry(
-        "Drive one trip into a slot, and film it from above at five times real speed.", "drive:Trip", DRIVE
-    ),
     "calibrate": Entry(
         "Measure the costs of the drive graph on whole driven trips.", "drive:Calibrate", DRIVE
     ),

@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import Field
 
 from parkenv.cli.options import Command, Given
-from parkenv.cli.study_command import AgentStudyCommand, Rerun
-from parkenv.cli.tables import make_console, make_table, print_recorded, print_rows, save_summary
-from parkenv.errors import InputError
+from parkenv.cli.study_command import AgentStudyCommand
+from parkenv.cli.tables import make_console, make_table, print_rows, save_summary
 from parkenv.files.option import Inside, option
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.show.columns import SETTING_AXES
@@ -28,7 +27,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-    from parkenv.studies.compare.cases import Case
     from parkenv.studies.runner import Result
 
 LEVELS = (0.5, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -64,7 +62,6 @@ class Compare(AgentStudyCommand):
     largest: int | None = option(
         None, "Use only the scenarios with the N largest lots.", panel="World", default="all", ge=1
     )
-    rerun: Rerun = None
     out: Path = option(
         Path("results/compare"),
         "Folder for experiment.json, episodes.csv, summary.json and the figures.",
@@ -86,21 +83,6 @@ class Compare(AgentStudyCommand):
             study = study.changed(scenarios=tuple(largest_lots(study.scenarios, command.largest)))
         return command.changed(study=study)
 
-    def run(self) -> None:
-        """See `Command`; also record the first episode on request."""
-        if self.rerun is not None:
-            from parkenv.studies.trips.sensor_log import require_viewer
-
-            if self.study.rig is None:
-                raise InputError("--rerun records what sensors measure: add --rig laser")
-            require_viewer()
-        super().run()
-        if self.rerun is not None:
-            console = make_console()
-            with console.status(f"Running the first episode once more for {self.rerun}"):
-                _record(*self.study.cases[0], self.rerun)
-            print_recorded(console, self.rerun)
-
     def show(self, console: Console, result: Result) -> None:
         """Print the tables of a comparison."""
         from parkenv.world.scenario import KMH
@@ -120,17 +102,6 @@ class Compare(AgentStudyCommand):
                 f"drive {measured['v_drive'] / KMH:.4g} km/h. Parking takes {measured['manoeuvre_s']:.1f} s more for "
                 "the manoeuvre into the slot, under either cost; the tables leave that out."
             )
-
-
-def _record(case: Case, seeds: Sequence[int], path: Path) -> None:
-    """Record the first episode of a case with its sensors."""
-    from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.studies.trips.sensor_log import record_search, sensor_log
-    from planners.agent import make_agent
-
-    env = SearchPerceptionEnv(case.scenario, rig=str(case.rig), detector=case.detector)
-    with sensor_log(path, case.scenario.lot, env.rig) as log:
-        record_search(env, make_agent(case.agent, env.scenario, **case.options), seeds[0], log)
 
 
 def cost_tables(rows: list[Row]) -> list[Table]:

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from parkenv.cli.compare import SHOWN as OF_SEARCHES
 from parkenv.cli.report import make_report
-from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, print_recorded, print_rows
+from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.tables import make_console, print_rows
 from parkenv.files.option import option
 from parkenv.studies.demo.study import FILM, QUICK
 from parkenv.studies.demo.study import Demo as DemoStudy
@@ -25,10 +25,6 @@ NEXT = (
     (
         "parkenv compare --scenario jam --agents mdp,belief,oracle --episodes 40 --report",
         "another lot, where the forecast is wrong; many more searches, without images",
-    ),
-    (
-        "parkenv trip --scenario campus --out results/trip.gif",
-        "a trip with steering and manoeuvres, as a film",
     ),
     ("parkenv plan --scenario jam --failure-cost 10,90", "what the thesis's planner intends, in a picture"),
 )
@@ -58,22 +54,12 @@ class Demo(StudyCommand):
         sets={"study": DemoStudy().changed(**QUICK)},
     )
     study: DemoStudy = DemoStudy()
-    rerun: Rerun = None
     report: bool = option(True, "Write report.html.", panel="Results")
     out: Path = option(Path("results/demo"), "Folder for everything.", short="-o")
 
     def run(self) -> None:
         """See `Command`; also write the report, and say what to look at."""
-        from parkenv.studies.trips.sensor_log import require_viewer
-
-        if self.rerun is not None:
-            require_viewer()
         self.run_study()
-        console = make_console()
-        if self.rerun is not None:
-            with console.status(f"Running the first session and the first search again for {self.rerun}"):
-                _record(self.study, self.out, self.rerun)
-            print_recorded(console, self.rerun)
         console = make_console(soft_wrap=True)
         console.print("\nOpen")
         if self.report:
@@ -97,18 +83,3 @@ class Demo(StudyCommand):
                 f"(raw counts for that hour: {surveyed['occupancy_mae_expected']:.2f})."
             )
         print_rows(console, "Searches", result.rows, OF_SEARCHES)
-
-
-def _record(study: DemoStudy, out: Path, path: Path) -> None:
-    """Record the first session and the first search on one timeline."""
-    from parkenv.envs.perception import SearchPerceptionEnv
-    from parkenv.mapping.survey import Survey
-    from parkenv.studies.trips.sensor_log import record_search, record_session, sensor_log
-    from planners.agent import make_agent
-
-    case, seeds = study.cases_in(out)[0]
-    settings = study.survey.drive_settings
-    env = SearchPerceptionEnv(case.scenario, rig="laser", detector=settings.detector)
-    with sensor_log(path, case.scenario.lot, env.rig) as log:
-        record_session(Survey(case.scenario, settings), 0, log)
-        record_search(env, make_agent("mdp", env.scenario), seeds[0], log)

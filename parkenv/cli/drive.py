@@ -1,31 +1,25 @@
-"""`parkenv trip`, `parkenv calibrate` and `parkenv park`: a car that steers."""
+"""`parkenv calibrate` and `parkenv park`: a car that steers."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
-from pydantic import Field
-
-from parkenv.cli.options import Command
-from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, print_recorded, print_rows, save_summary, stages, writing_into
+from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
 from parkenv.cli.trust import TrustModel, readable_models
-from parkenv.errors import InputError
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Probability, scenario_spec
 from parkenv.show.plurals import plural
-from parkenv.studies.fields import Scenarios, Seed
-from parkenv.studies.trips.calibration_study import CalibrationStudy, DrivenTrips
-from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
+from parkenv.studies.fields import Scenarios
+from parkenv.studies.trips.calibration_study import CalibrationStudy
 from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy
 
 if TYPE_CHECKING:
     from rich.console import Console
 
     from parkenv.studies.runner import Result
-    from parkenv.studies.trips.driven_search import Trip as DrivenTrip
 
 SHOWN_ROWS, SHOWN_SCENES = 20, 60
 SHOWN_LEVELS = (
@@ -72,73 +66,6 @@ class Calibrate(StudyCommand):
                 f"{made['failure_s']:.1f} s, and parking takes {made['manoeuvre_s']:.1f} s that the drive graph leaves "
                 f"out. In {trips} trips: {touched} contacts, {stuck} times stuck."
             )
-
-
-class Trip(Command, DrivenTrips):
-    """The film shows the car's surroundings, with the whole lot in a corner."""
-
-    examples = """
-        parkenv trip --scenario campus --seed 7 --blind --out trip.gif
-        parkenv trip --scenario campus --rig laser --rerun trip.rrd
-        parkenv trip --scenario campus --cars 6 --pedestrians 8
-        """
-
-    seed: Seed = Field(0, description="Seed of the world.")
-    blind: bool = option(False, "Observe no slot before an attempt to park there, so that attempts fail.")
-    rerun: Rerun = None
-    out: Path = option(Path("results/trip.gif"), "The film.", short="-o", takes="FILE.gif")
-
-    def run(self) -> None:
-        """See `Command`."""
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.show.figures.picture_files import save_film
-        from parkenv.studies.trips.sensor_log import record_trip, require_viewer, sensor_log
-        from parkenv.studies.trips.trip_film import COLORS, FPS, film_trip
-
-        if self.out.suffix.lower() != ".gif":
-            raise InputError(f"--out is {self.out}, want a file that ends in .gif")
-        if self.blind and self.rig is not None:
-            raise InputError(
-                "--blind and --rig: without observations no sensors are needed; name one of the two"
-            )
-        if self.rerun is not None:
-            if self.rig is None:
-                raise InputError("--rerun records what sensors measure: add --rig laser")
-            require_viewer()
-        search = self.search(UNOBSERVED if self.blind else OBSERVED)
-        make_folder(self.out.parent)
-        console = make_console()
-        with console.status("Driving and drawing"):
-            driven, frames = film_trip(search, self.seed)
-            save_film(frames, self.out, fps=FPS, colors=COLORS)
-        _show_trip(console, driven)
-        console.print(f"The film is {self.out}")
-        if self.rerun is not None:
-            assert search.env.perception is not None
-            with (
-                console.status(f"Driving once more for {self.rerun}"),
-                sensor_log(self.rerun, self.built.lot, search.env.perception.sampler.rig) as recording,
-            ):
-                record_trip(search, self.seed, recording)
-            print_recorded(console, self.rerun)
-
-
-def _show_trip(console: Console, driven: DrivenTrip) -> None:
-    from parkenv.world.cost_terms import COST_TERMS
-
-    end = f"parked in {driven.slot}" if driven.parked else "not parked"
-    parts = (
-        (driven.lanes_s, "on the lanes", False), (driven.manoeuvre_s, "manoeuvre", False),
-        *((driven.costs[t.field], t.label, t.optional) for t in COST_TERMS if t.field in driven.costs),
-    )  # fmt: skip
-    terms = " + ".join(f"{s:.1f} s {what}" for s, what, optional in parts if s or not optional)
-    console.print(f"{end}: {driven.total_s:.1f} s = {terms}")
-    if driven.waited_s or driven.contacts:
-        console.print(f"  {driven.waited_s:.1f} s of it behind and before others; {driven.contacts} contacts")
-    for t in driven.attempts:
-        console.print(
-            f"  {t.slot} ({t.kind}{', ' + t.way if t.way else ''}): {t.seconds:.1f} s, {t.reason or 'parked'}"
-        )
 
 
 _TASKS = "Parking tasks"

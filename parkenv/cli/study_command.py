@@ -6,8 +6,6 @@ from abc import abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Self
 
-from pydantic import Field
-
 from parkenv.cli.options import Command, Given, command_class, field_options, made
 from parkenv.cli.report import make_report
 from parkenv.cli.tables import command_line, make_console, stages
@@ -22,15 +20,6 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from parkenv.studies.runner import Result
-
-Rerun = Annotated[
-    Path | None,
-    Option(takes="FILE.rrd", panel="Results"),
-    Field(
-        description="Also record images, boxes, scans, grid, slots and path for the Rerun viewer (extra viewer; then: "
-        "rerun FILE.rrd)."
-    ),
-]
 
 
 class RunCommand(Command):

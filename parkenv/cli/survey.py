@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from parkenv.cli.options import Command
-from parkenv.cli.study_command import Rerun, StudyCommand
-from parkenv.cli.tables import make_console, print_recorded, print_rows, print_table, save_summary, stages
+from parkenv.cli.study_command import StudyCommand
+from parkenv.cli.tables import make_console, print_rows, print_table, save_summary, stages
 from parkenv.errors import InputError, nearest
 from parkenv.files.known_names import SCENARIO_NAMES, LocaliserName
 from parkenv.files.option import Inside, option
@@ -39,11 +39,9 @@ class Survey(StudyCommand):
         parkenv survey --scenario street --rig stereo --weather rain
         parkenv survey --hours 12:00-13:00 --days weekend
         parkenv survey --odometry-drift 0.02 --localise scan-matching
-        parkenv survey --scenario mini --sessions 1 --rerun drive.rrd
         """
 
     study: SurveyStudy = SurveyStudy()
-    rerun: Rerun = None
     record: Path | None = option(
         None,
         "Also record images, scans and poses of the first session (extra bags), for `parkenv map-drive`.",
@@ -58,21 +56,11 @@ class Survey(StudyCommand):
     def run(self) -> None:
         """See `Command`; also record the first session on request."""
         from parkenv.mapping.recorded_drive import record_drive, require_recordable
-        from parkenv.studies.trips.sensor_log import record_session, require_viewer, sensor_log
 
-        if self.rerun is not None:
-            require_viewer()
         if self.record is not None:
             require_recordable(self.record)
         super().run()
         console, study = make_console(), self.study
-        if self.rerun is not None:
-            with (
-                console.status(f"Driving the first session once more for {self.rerun}"),
-                sensor_log(self.rerun, study.built.lot, study.survey.pipeline.rig) as recording,
-            ):
-                record_session(study.survey, 0, recording)
-            print_recorded(console, self.rerun)
         if self.record is not None:
             with console.status(f"Driving the first session once more for {self.record}"):
                 record_drive(study.survey, 0, self.record)

@@ -204,8 +204,3 @@ def save_summary(folder: Path, seed: int | None, rows: Any, **more: Any) -> None
 
     head = {"command": command_line(), "version": __version__, "seed": seed}
     write_summary(folder, head | more | {"rows": rows})
-
-
-def print_recorded(console: Console, path: Path) -> None:
-    """Print the recording's path and the command that opens it."""
-    console.print(f"Recorded: {path}; look at it with: rerun {path}")

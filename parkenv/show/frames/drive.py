@@ -91,14 +91,14 @@ class DriveRenderer:
         image = self._ground.copy()
         layers = [
             *trail(task.vehicle, np.array(state.trail)),
-            *movers(state.movers, outlines),
+            *_movers(state.movers, outlines),
             *steered_car(task.vehicle, state.vehicle),
         ]
         paint(image, self._shown, layers)
         return np.vstack([image, _line(state)])
 
 
-def movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
+def _movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
     """Return the layers of moving cars and people, distinguished by their size."""
     layers: list[Layer] = []
     for outline, pose in zip(outlines, poses, strict=False):

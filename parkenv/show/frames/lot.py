@@ -92,14 +92,12 @@ class LotFrames:
 
     Ground, slots and cars are drawn once at high resolution; a picture then only mixes colours, so its cost does not
     grow with the number of slots. If slots would be less than `smallest_slot` px wide, a picture shows a window around
-    a place, which moves in steps of a part of its size.
+    a place, which moves in steps of half its size.
 
     Args:
         lot: the lot.
         size: width and height of the pictures, px.
-        smallest_slot: px; 0: always the whole lot; inf: always a window.
-        window_slot: width of a slot in a window, px.
-        parts: steps of a window in its size.
+        smallest_slot: px; 0: always the whole lot.
 
     Attributes:
         whole: view of the whole lot; None if pictures show a window.
@@ -111,14 +109,12 @@ class LotFrames:
         size: tuple[int, int] = (WIDTH, HEIGHT - HUD),
         *,
         smallest_slot: float = SMALLEST_SLOT,
-        window_slot: float = WINDOW_SLOT,
-        parts: int = 2,
     ) -> None:
         self.size, self._scene = size, LotScene.of(lot)
         self._still: StillLayer | None = None
         self._window_at: tuple[int, int] | None = None
         slot_width = float(np.median(np.minimum(lot.slot_width, lot.slot_length)))
-        self._scale, self._parts = window_slot / slot_width, parts
+        self._scale = WINDOW_SLOT / slot_width
         fitted = MapView.fit(lot_corners(lot), size, LARGEST_SCALE, MARGIN)
         self.whole = fitted if fitted.scale * slot_width >= smallest_slot else None
 
@@ -129,7 +125,7 @@ class LotFrames:
                 self._still = draw_still_layer(self._scene, self.whole, self.size)
             return self._still
         # The window depends only on the place: equal states give equal frames.
-        stride = np.array(self.size) / self._scale / self._parts
+        stride = np.array(self.size) / self._scale / 2
         column, row = np.round(place / stride).astype(int)
         if self._still is None or self._window_at != (column, row):
             self._window_at = column, row

@@ -28,7 +28,7 @@ from parkenv.show.scene import DISC, Layer, Lines, cars
 from parkenv.world.lot import ParkingLot
 from parkenv.world.scenario import Scenario
 
-KEY_WIDTH = 158  # width, px, of the colour key at the right of the line of text
+_KEY_WIDTH = 158  # width, px, of the colour key at the right of the line of text
 
 TEXT_WIDTH, TEXT_ROWS = 78, 17
 """Rows of the text map: with the lines above and below, it fits an 80 × 24 terminal."""
@@ -50,7 +50,7 @@ class SearchRenderer:
     def __init__(self, scenario: Scenario) -> None:
         self.scenario = scenario
         self.frames = LotFrames(scenario.lot)
-        self._key = strip_with_key()
+        self._key = _strip_with_key()
         self.window = Window(f"parkenv: {scenario.name}")
 
     def frame(self, state: SearchState, occupied: NDArray[np.bool_] | None = None) -> Image:
@@ -95,9 +95,9 @@ class SearchRenderer:
                 place,
                 "parked",
             )
-            write_line(image, parts, verdicts, room=KEY_WIDTH)
+            write_line(image, parts, verdicts, room=_KEY_WIDTH)
         else:
-            write_line(image, parts, ("lot is full",) * bool(state.over), "warning", KEY_WIDTH)
+            write_line(image, parts, ("lot is full",) * bool(state.over), "warning", _KEY_WIDTH)
         return image
 
     def text(self, state: SearchState) -> str:
@@ -161,8 +161,8 @@ def _price_and_walk(state: SearchState) -> str:
     return f"{price}{state.walk_s:.0f} s to walk"
 
 
-def strip_with_key() -> Image:
-    """Return an empty line of text with the key of the colours of beliefs at the right, `KEY_WIDTH` px wide."""
+def _strip_with_key() -> Image:
+    """Return an empty line of text with the key of the colours of beliefs at the right, `_KEY_WIDTH` px wide."""
     image = strip()
     top, right = HUD // 2 - 6, image.shape[1] - HUD_MARGIN
     write_label(image, "taken", (right - 18.0, top + 6.0), "white", 13, 400)

@@ -12,7 +12,6 @@ from pydantic import model_validator
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.files.option import option
-from parkenv.files.spec_file import Spec
 from parkenv.scenarios.spec import Speed, scenario_spec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
@@ -48,9 +47,19 @@ def _trip(row: Row) -> Row:
     return trip_of_row(row)
 
 
-class DrivenTrips(Spec):
-    """Trips that a simulated car drives along the lanes and into slots, as an agent decides."""
+class CalibrationStudy(Study):
+    """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
 
+    Agents that observe slots hardly ever attempt a taken one, so every seed is driven twice: trips without observations
+    provide failed attempts.
+    """
+
+    table: ClassVar = JsonTable("trips.jsonl", ("slots", "seed"), _trip, "trip")
+    block: ClassVar = 5
+    doing: ClassVar = "Driving"
+    unit: ClassVar = "trips"
+
+    kind: Literal["calibrate"] = "calibrate"
     scenario: OneScenario = scenario_spec("campus")
     agent: OneAgent = AgentSpec(name="mdp")
     seed: Seed = 0
@@ -73,6 +82,9 @@ class DrivenTrips(Spec):
     vehicle: Vehicle = None
     rig: Rig = None
     detector: Detector = None
+    episodes: int = option(
+        100, "Trips with observations, and as many without.", short="-n", ge=1, le=1_000_000
+    )
 
     @model_validator(mode="after")
     def _seen(self) -> Self:
@@ -113,24 +125,6 @@ class DrivenTrips(Spec):
         return DrivenSearch(
             scenario, self.agent, style=self.style, rig=rig, detector=self.detector, vehicle=self.vehicle
         )
-
-
-class CalibrationStudy(DrivenTrips, Study):
-    """Driven trips that measure the driving speed and the cost of a failed attempt of the drive graph.
-
-    Agents that observe slots hardly ever attempt a taken one, so every seed is driven twice: trips without observations
-    provide failed attempts.
-    """
-
-    table: ClassVar = JsonTable("trips.jsonl", ("slots", "seed"), _trip, "trip")
-    block: ClassVar = 5
-    doing: ClassVar = "Driving"
-    unit: ClassVar = "trips"
-
-    kind: Literal["calibrate"] = "calibrate"
-    episodes: int = option(
-        100, "Trips with observations, and as many without.", short="-n", ge=1, le=1_000_000
-    )
 
     def check(self) -> None:
         """See `Study`."""

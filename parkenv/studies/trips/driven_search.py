@@ -188,22 +188,18 @@ class DrivenSearch:
         self.env = DrivenSearchEnv(self.scenario, self.driver, perception)
         self._limited = adapt_to_agent(TimeLimit(self.env, STEP_LIMIT), self._agent)
 
-    def run(
-        self, seed: int, observers: Sequence[Observer] = (), on_control: Callable[[], None] = lambda: None
-    ) -> Trip:
+    def run(self, seed: int, observers: Sequence[Observer] = ()) -> Trip:
         """Drive one trip in the world of a seed.
 
         Args:
             seed: seed of the world, at least 0.
             observers: observers of the decisions.
-            on_control: called after every 0.1 s of driving; `driver` and `env` hold the current state.
 
         Raises:
             InputError: the seed is not an integer of at least 0.
         """
         require_whole("seed", seed)
         env, driver = self.env, self.driver
-        driver.on_control = on_control
         result = simulate(self._limited, self._agent, int(seed), observers)
         info = result.info
         parked = env.manoeuvre

@@ -130,10 +130,8 @@ class VehicleController:
         log: record of the drive since `begin`.
         state: (6,) state of the vehicle, see `parkenv.driving.vehicle`.
         time: current time, s.
-        doing: current activity, for displays.
         track: positions of the car since the last decision, every 0.1 s.
         others: moving road users; None without traffic.
-        on_control: called after every control step, 0.1 s.
     """
 
     def __init__(
@@ -160,11 +158,9 @@ class VehicleController:
             speed=speed, acceleration=self.style.acceleration, blend_m=2.0, firmness=0.5
         )
         self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
-        self.on_control: Callable[[], None] = lambda: None
         self.log = DriveLog()
         self.track: list[TrackPoint] = []
         self.others: RoadUsers | None = None
-        self.doing = ""
         self.state = np.zeros(STATE_SIZE)
         self.time = 0.0
 
@@ -196,7 +192,6 @@ class VehicleController:
         began, self.track = self.time, []
         if not self._placed:
             self._place(edge)
-        self.doing = "searching"
         kind = executor.ACROSS
         if not edge.across:
             kind = self._plan_edge(edge)
@@ -217,7 +212,6 @@ class VehicleController:
         """
         lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
         self.track = []
-        self.doing = f"parking in {lot.slot_ids[slot]}"
         self._halt(self.style.braking)
         center = 0.5 * (lot.slot_xy[slot] + self.state[:2])
         there = self._standing(center, slot)
@@ -232,7 +226,6 @@ class VehicleController:
         if lot.slot_length[slot] >= vehicle.length and lot.slot_width[slot] >= vehicle.width:
             way, reason = self._drive_in(targets, there, inside)
         if reason:
-            self.doing = f"{lot.slot_ids[slot]}: {reason}"
             onward = self._back(slot)
         result = ParkingAttempt(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
         self.log.attempts.append(result)
@@ -566,7 +559,6 @@ class VehicleController:
         self.track.append(
             TrackPoint(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks)
         )
-        self.on_control()
         if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
             self._refresh()
 
