@@ -154,7 +154,7 @@ def _point(text: str) -> str:
 class Import(Command):
     """Outlines of parking spaces are enough: without roads in the file, the import infers rows, aisles and connections.
 
-    With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`) and a contact sheet.
+    With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`).
     With --town, a whole town becomes one lot: streets, kerbs, car parks and garages with prices and rules, entries at
     its edge, and goals with weights of demand. A table of its facilities (.csv) gives name, kind, capacity, and the
     source of the capacity: the map (tag, drawn) or a rule.
@@ -355,8 +355,8 @@ class Import(Command):
 
         console = make_console(soft_wrap=True)
         with stages(console) as progress, write_together(self.out) as folder:
-            town = import_town_lots(self.place, folder, self._options, self.least, progress)
-            save_summary(folder, None, town.rows)
+            rows = import_town_lots(self.place, folder, self._options, self.least, progress)
+            save_summary(folder, None, rows)
         headings = ("car park", "spaces", "slots", "lanes", "p(error)", "result", "reason")
         cells = (
             (
@@ -364,17 +364,14 @@ class Import(Command):
                 "" if row["error_probability"] is None else f"{row['error_probability']:.2f}", row["result"],
                 row["reason"],
             )
-            for row in town.rows
+            for row in rows
         )  # fmt: skip
         make_console().print(_table_of_lots(headings, cells))
-        results = Counter(row["result"] for row in town.rows)
+        results = Counter(row["result"] for row in rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
-        lots = plural(len(town.rows) - results["refused"], "lot")
-        pictures = (
-            f" Pictures: {', '.join(str(self.out / p.name) for p in town.pictures)}" if town.pictures else ""
-        )
+        lots = plural(len(rows) - results["refused"], "lot")
         console.print(
-            f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}.{pictures}"
+            f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}."
         )
 
 
@@ -406,11 +403,7 @@ class Census(Command):
         ..., "Lots (.geojson, .yml), and folders of lots (.geojson).", takes="FILE|DIR", argument=True
     )
     drive: bool = option(True, "Plan how the car drives into each kind of slot, as `parkenv lot check` does.")
-    out: Path = option(
-        Path("results/census"),
-        "Folder for census.csv, summary.json, census.png and contact sheets.",
-        short="-o",
-    )
+    out: Path = option(Path("results/census"), "Folder for census.csv and summary.json.", short="-o")
 
     def run(self) -> None:
         """See `Command`."""
@@ -429,7 +422,7 @@ class Census(Command):
         )
         slots = sum(row.get("slots", 0) for row in rows)
         make_console(soft_wrap=True).print(
-            f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
+            f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. The table is in {self.out}"
         )
         if results["invalid"]:
             raise Exit(2)
