@@ -4,7 +4,7 @@ from pathlib import Path
 
 from parkenv.cli.compare import with_short_labels
 from parkenv.show.plurals import interval_text
-from parkenv.studies.benchmark.page import DESIGNS, entries_of, neighbours, ranking, result_files
+from parkenv.studies.benchmark.page import entries_of, neighbours, ranking, result_files
 from parkenv.studies.benchmark.result_file import check_result
 from parkenv.studies.benchmark.suite import Suite
 
@@ -32,13 +32,11 @@ def tables():
             f"| {place} | {row['agent']} | {score} [{low}, {high}] | {interval(row, 'mean_s')} | "
             f"{interval(row, 'behind_s', '+')} | {row['decision_ms']:.2f} | {row['by']} | {code} | {row['commit']} |"
         )
-    pairs = [
-        "| agents | difference, s | " + " | ".join(DESIGNS) + " |",
-        "|---|---|" + "---|" * len(DESIGNS),
+    pairs = ["| agents | difference, s | searches |", "|---|---|---|"]
+    pairs += [
+        f"| {row['agents']} | {interval(row, 'behind_s', '+')} | {row['searches_for_1_s']:,.0f} |"
+        for row in neighbours(suite, entries)
     ]
-    for row in neighbours(suite, entries):
-        cells = [f"{row[f'searches.{d}']:,.0f}" for d in DESIGNS if f"searches.{d}" in row]
-        pairs.append(f"| {row['agents']} | {interval(row, 'behind_s', '+')} | " + " | ".join(cells) + " |")
     made = {"ranking": "\n".join(lines), "pairs": "\n".join(pairs)}
     for row, brief in zip(rows, with_short_labels(rows), strict=True):
         made = {name: table.replace(row["agent"], brief["agent"]) for name, table in made.items()}

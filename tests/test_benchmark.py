@@ -144,23 +144,19 @@ def test_a_task_weights_its_searches_and_uses_their_known_means(small, tmp_path,
         checked(content, suite, tmp_path, monkeypatch)
 
 
-def test_control_variates_leave_the_share_of_the_error_that_they_should(small):
-    """Of a time that follows the bound but for noise, a control variate leaves the noise."""
+def test_precision_is_the_error_of_the_mean_difference_by_strata(small):
     mini = next(task for task in small.tasks if task.name == "mini")
-    parts = tuple(Stratum(0.5, tuple(range(first, first + 100)), (30.0, 0.5)) for first in (0, 100))
+    parts = (Stratum(0.25, (0, 1, 2), (30.0, 0.5)), Stratum(0.75, (3, 4), (30.0, 0.5)))
     suite = replace(small, tasks=(replace(mini, strata=parts),))
-    worlds = worlds_of(suite.tasks[0], suite)
-    rng = np.random.default_rng(0)
-    noise, spread = rng.normal(0.0, 0.1, 200), worlds[:, 0].std()
+    others = np.array([20.0, 20.0, 20.0, 40.0, 40.0])
     one, other = (
-        Entry(name, {}, {"mini": k * worlds[:, 0] + noise * k}) for name, k in (("a", 3.0), ("b", 2.0))
+        Entry("a", {}, {"mini": others + np.array([1, 2, 3, 4, 8])}),
+        Entry("b", {}, {"mini": others}),
     )
     row = precision(suite, one, other)
-    assert row["error.independent"] == pytest.approx(np.sqrt(9 + 4) * spread / np.sqrt(200), rel=0.01)
-    assert row["error.paired"] == pytest.approx(spread / np.sqrt(200), rel=0.01)
-    assert row["error.paired, controls"] == pytest.approx(0.1 / np.sqrt(200), rel=0.2)
-    assert row["error.stratified, controls"] == pytest.approx(0.1 / np.sqrt(200), rel=0.2)
-    assert row["searches.paired"] == pytest.approx(200 * (1.96 * row["error.paired"]) ** 2, rel=1e-3)
+    assert row["behind_s"] == pytest.approx(0.25 * 2.0 + 0.75 * 6.0)
+    assert row["error"] == pytest.approx(np.sqrt(0.25**2 * 1.0 / 3 + 0.75**2 * 8.0 / 2))
+    assert row["searches_for_1_s"] == pytest.approx(5 * (1.96 * row["error"]) ** 2, rel=1e-3)
 
 
 def test_results_are_compared_on_a_page_and_a_bad_one_is_refused(result, small, tmp_path, monkeypatch):

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.special import ndtri
 
 from parkenv.compiled.arrays import FloatArray
@@ -17,7 +16,7 @@ from parkenv.errors import InputError
 from parkenv.show.report.page import Page, page_data
 from parkenv.show.report.tables import Column, table_of
 from parkenv.studies.benchmark.study import RESULT
-from parkenv.studies.benchmark.suite import Suite, Task, mean_time, score_interval, worlds_of
+from parkenv.studies.benchmark.suite import Suite, mean_time, score_interval
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of
 from parkenv.version import __version__
@@ -27,8 +26,6 @@ ADDRESSES = ("http", "examples/", "docs/leaderboard/")
 """What the address of an agent's code begins with: elsewhere, or a path in the repository of parkenv."""
 PAIRS = 5
 """Pairs of neighbours whose precision is shown."""
-DESIGNS = ("independent", "paired", "paired, controls", "stratified", "stratified, controls")
-"""Ways to measure the difference of two agents with the same number of searches, see `precision`."""
 _WIDE = float(ndtri(0.975))
 _WHO = (
     Column("by", "submitted by"),
@@ -110,28 +107,17 @@ def _origin(result: Row) -> Row:
 
 
 def precision(suite: Suite, one: Entry, other: Entry) -> Row:
-    """Return how precisely a run of a suite tells two agents apart, and how precisely other designs would.
+    """Return how precisely a run of the suite tells two agents apart.
 
-    With as many searches as the suite has, spread evenly over the tasks: in worlds of their own (`independent`), in the
-    same worlds (`paired`), and with control variates; and as it is, stratified. Standard errors are of the mean
-    difference over the tasks, s; `searches` are those of each agent for an interval of ±1 s at 95 %.
+    `error` is the standard error of the mean difference over the tasks, s; `searches_for_1_s` are those of each agent
+    for an interval of ±1 s at 95 %.
     """
-    difference, count = one.minus(other), sum(len(times) for times in one.times.values())
-    variances = np.zeros(3)
-    for task in suite.tasks:
-        worlds = worlds_of(task, suite)
-        mine, theirs, paired = (
-            _variances(task, times[task.name], worlds) for times in (one.times, other.times, difference)
-        )
-        variances += (mine[0] + theirs[0], paired[0], paired[1])
-    errors = dict(zip(DESIGNS, np.sqrt(variances / (len(suite.tasks) * count)).tolist(), strict=False))
-    stratified = [mean_time(suite, difference, controls=used).error for used in (False, True)]
-    errors |= dict(zip(DESIGNS[3:], stratified, strict=True))
+    difference = mean_time(suite, one.minus(other), controls=False)
     return {
         "agents": f"{one.agent}, {other.agent}",
-        **columns_of("behind_s", mean_time(suite, difference, controls=False).interval()),
-        **{f"error.{design}": error for design, error in errors.items()},
-        **{f"searches.{design}": count * (_WIDE * error) ** 2 for design, error in errors.items()},
+        **columns_of("behind_s", difference.interval()),
+        "error": difference.error,
+        "searches_for_1_s": sum(map(len, one.times.values())) * (_WIDE * difference.error) ** 2,
     }
 
 
@@ -139,17 +125,6 @@ def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
     """Return the `precision` of neighbours in the ranking, of the first `PAIRS`, the oracle apart."""
     rivals = [entry for entry in entries if entry.agent != "oracle"][: PAIRS + 1]
     return [precision(suite, worse, better) for better, worse in itertools.pairwise(rivals)]
-
-
-def _variances(task: Task, values: ArrayLike, worlds: FloatArray) -> tuple[float, float]:
-    """Estimate a number's variance over a task's worlds, and what control variates leave of it."""
-    weights = np.array([part.share / len(part.seeds) for part in task.strata for _ in part.seeds])
-    sample = np.asarray(values) - weights @ np.asarray(values)
-    scale = np.sqrt(weights)
-    controls = scale[:, None] * (worlds - weights @ worlds)
-    slopes = np.linalg.lstsq(controls, scale * sample)[0]
-    left = scale * sample - controls @ slopes
-    return float(weights @ sample**2), float(left @ left)
 
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
@@ -170,7 +145,7 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
         "mean time of the clairvoyant lower bound over the agent's, averaged over the tasks.",
     ]
     if pairs:
-        errors = [row["error.stratified"] for row in pairs]
+        errors = [row["error"] for row in pairs]
         findings.append(
             f"Neighbours among the first {len(pairs) + 1} are significantly different if their mean times differ by "
             f"{_WIDE * min(errors):.1f} to {_WIDE * max(errors):.1f} s."
@@ -206,8 +181,8 @@ _COLUMNS = {
         Column("mean_s", "mean time", "s", help="Over the tasks, each with the same weight; 95 % interval"),
         Column("behind_s", "behind", "s", 2, signed=True, help=_BEHIND),
         Column("searches", "searches", digits=0),
-        *(Column(f"error.{d}", f"standard error, {d}", "s", 2) for d in DESIGNS),
-        *(Column(f"searches.{d}", f"searches for ±1 s, {d}", digits=0, help="At 95 %") for d in DESIGNS),
+        Column("error", "standard error", "s", 2),
+        Column("searches_for_1_s", "searches for ±1 s", digits=0, help="At 95 %"),
         *_WHO,
     )
 }
