@@ -32,6 +32,7 @@ class Figure(NamedTuple):
     line: int
     what: str  # the file in docs, or "table"
     command: str  # that made it, "" if the page does not say
+    commit: str = ""  # that the section states
 
 
 def figures():
@@ -50,9 +51,9 @@ def figures():
                 after = commands(text[found.end() : end if end > 0 else None])
                 command = [*after, *commands(text[start : found.start()])[::-1], ""][0]
                 what = found[1].removeprefix("../").removeprefix("docs/") if found[1] else "table"
-                yield Figure(
-                    str(page.relative_to(ROOT)), text.count("\n", 0, found.start()) + 1, what, command
-                )
+                stated = re.findall(r"[Cc]ommit ([0-9a-f]{8})", text[start : end if end > 0 else None])
+                line = text.count("\n", 0, found.start()) + 1
+                yield Figure(str(page.relative_to(ROOT)), line, what, command, *stated[:1])
 
 
 def commands(text):
@@ -73,7 +74,9 @@ def git(*arguments):
 
 
 def made(figure):
-    """Return commit and date at which a picture's file, or the newest line of a table's first row, was written."""
+    """Return commit and date: as stated, or of a picture's file, or of the newest line of a table's first row."""
+    if figure.commit:
+        return git("show", "-s", "--format=%h %cs", figure.commit).split()
     if figure.what != "table":
         return git("log", "-1", "--format=%h %cs", "--", f"docs/{figure.what}").split()
     line = git("blame", "-s", f"-L{figure.line + 2},+1", figure.page).split()[0].lstrip("^")
