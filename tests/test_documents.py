@@ -1,7 +1,6 @@
 """Commands, code and numbers in README, documentation and contributing guide are correct; examples run."""
 
 import importlib.util
-import json
 import re
 import shlex
 import subprocess
@@ -14,7 +13,6 @@ import pytest
 import typer
 from car_park_counts import write_counts
 from command_line import parkenv
-from test_manoeuvres import KERB, parkbench_content
 
 from parkenv.cli import app
 
@@ -137,8 +135,6 @@ def test_the_code_of_a_page_and_an_example_run_from_top_to_bottom(name, tmp_path
         pytest.importorskip(NEEDS[name])
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     write_counts(tmp_path / "car_parks.csv.gz", first=date(2023, 12, 1))
-    (tmp_path / "parkbench").mkdir()
-    (tmp_path / "parkbench" / "scene.json").write_text(json.dumps(parkbench_content([KERB])))
     monkeypatch.chdir(tmp_path)
     monkeypatch.syspath_prepend(tmp_path)
     # Each core has a test process already: commands work in this one.
