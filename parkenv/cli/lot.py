@@ -4,32 +4,43 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 from typer import Exit
 
 from parkenv.cli.options import Command
-from parkenv.cli.tables import make_console, make_table, save_summary, stages, writing_into
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
 from parkenv.errors import InputError
 from parkenv.files.file_names import file_name
 from parkenv.files.known_names import SCENARIO_NAMES
 from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import Several
 from parkenv.show.plurals import plural
-from parkenv.studies.results import Row
+from parkenv.show.report.tables import Column
 from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from parkenv.lots.draft import ImportOptions
     from parkenv.lots.quality import Provenance
     from parkenv.world.lot import ParkingLot
 
+CENSUS = (
+    "lot", "slots", "kind", "perpendicular", "oblique", "kerbside", "extent_x_m", "extent_y_m",
+    "error_probability", "result", "reason",
+)  # fmt: skip
+"""Columns of a census that are printed."""
+_LOT_COLUMNS = {
+    column.key: column
+    for column in (
+        Column("error_probability", "p(error)", digits=2),
+        Column("extent_x_m", "east", "m", 0),
+        Column("extent_y_m", "north", "m", 0),
+    )
+}
 AUTO = "auto"
 """Value of `--entry` and `--goal` that allows a guess."""
 LotName = Annotated[
@@ -357,30 +368,13 @@ class Import(Command):
         with stages(console) as progress, write_together(self.out) as folder:
             rows = import_town_lots(self.place, folder, self._options, self.least, progress)
             save_summary(folder, None, rows)
-        headings = ("car park", "spaces", "slots", "lanes", "p(error)", "result", "reason")
-        cells = (
-            (
-                row["lot"], row["spaces"], row["slots"], row["lanes"],
-                "" if row["error_probability"] is None else f"{row['error_probability']:.2f}", row["result"],
-                row["reason"],
-            )
-            for row in rows
-        )  # fmt: skip
-        make_console().print(_table_of_lots(headings, cells))
+        print_rows(make_console(), "Car parks", rows, rows[0], _LOT_COLUMNS)
         results = Counter(row["result"] for row in rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
         lots = plural(len(rows) - results["refused"], "lot")
         console.print(
             f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}."
         )
-
-
-def _table_of_lots(headings: Sequence[str], rows: Iterable[Sequence[Any]]) -> Table:
-    """Make a table whose last two columns are text: result and reason."""
-    table = make_table(None, headings, ([str(cell) for cell in row] for row in rows))
-    for column in table.columns[-2:]:
-        column.justify, column.no_wrap = "left", False
-    return table
 
 
 class Census(Command):
@@ -412,10 +406,7 @@ class Census(Command):
         with stages(make_console(soft_wrap=True), "lots") as progress:
             rows = take_census(self.places, self.out, drive=self.drive, progress=progress)
         save_summary(self.out, None, rows)
-        headings = (
-            "lot", "slots", "kind", "perp.", "obl.", "kerb", "m", "drive s", "p(error)", "result", "reason",
-        )  # fmt: skip
-        make_console().print(_table_of_lots(headings, map(_census_cells, rows)))
+        print_rows(make_console(), "Lots", rows, CENSUS, _LOT_COLUMNS)
         results = Counter(row["result"] for row in rows)
         listed = ", ".join(
             f"{results[name]} {name}" for name in ("clean", "warnings", "invalid") if results[name]
@@ -426,13 +417,6 @@ class Census(Command):
         )
         if results["invalid"]:
             raise Exit(2)
-
-
-def _census_cells(row: Row) -> list[Any]:
-    extent = f"{row['extent_x_m']:.0f} × {row['extent_y_m']:.0f}" if "slots" in row else ""
-    counts = [row.get(name, "") for name in ("lot", "slots", "kind", "perpendicular", "oblique", "kerbside")]
-    rest = [row.get(name, "") for name in ("drive_s", "error_probability", "result", "reason")]
-    return [*counts, extent, *rest]
 
 
 class Convert(Command):

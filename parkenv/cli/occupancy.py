@@ -9,16 +9,16 @@ from pydantic import Field
 
 from parkenv.cli.options import Command
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, make_table, print_rows, save_summary, stages
+from parkenv.cli.tables import make_console, print_rows, save_summary, stages
 from parkenv.files.option import Option, option
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Date, scenario_spec
 from parkenv.show.plurals import plural
-from parkenv.show.report.tables import OF_FLEETS
+from parkenv.show.report.tables import OF_FLEETS, Column
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import OneAgent, OneScenario, Seed
 from parkenv.studies.fleet.demand_study import PREDICTIONS, DemandStudy
-from parkenv.studies.results import Row
+from parkenv.studies.results import Row, without_nan
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -27,6 +27,24 @@ if TYPE_CHECKING:
 
 FAR_OFF = 0.15
 """Mean difference from the counts, share of the places, above which a car park is said not to be followed."""
+SCORE_COLUMNS = (
+    Column("log_loss", "log-loss", digits=4),
+    Column("brier", "Brier", digits=4),
+    Column("crps", "CRPS", digits=4),
+    Column("coverage_90", "days within their 90 % interval", share=True),
+    Column("coverage_90_hours", "hours within theirs", share=True),
+    Column("difference", "log-loss more than ours", digits=4, signed=True),
+)
+SCORES = ("model", *(column.key for column in SCORE_COLUMNS))
+DEMAND_COLUMNS = (
+    Column("car_park", "car park"),
+    Column("capacity", "places", digits=0),
+    Column("arrivals_a_day", "cars a day", digits=0),
+    Column("stay_h", "stay", "h"),
+    Column("days_held_out", "days", digits=0),
+    Column("fit_error", "fit", share=True),
+    *(Column(f"{name}_error", name.replace("_", " "), share=True) for name in PREDICTIONS),
+)
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
 
@@ -136,16 +154,8 @@ class Evaluate(Command):
                 title, summary = evaluate_log(
                     self.log, self.out, from_day=self.from_day, seed=self.seed, progress=progress
                 )
-        rows = summary["rows"]
-        bands = rows[0]["coverage_90_by_band"] if of_counts else []
-        names = ["hours", *(f"{band['from']:.0%}-{band['to']:.0%}" for band in bands)] if of_counts else []
-        headings = ("model", "log-loss", "Brier", "CRPS", "90 %: days", *names, "log-loss more than ours")
-        console.print(make_table(title, headings, [_cells(row, of_counts) for row in rows]))
+        print_rows(console, title, summary["rows"], SCORES, {column.key: column for column in SCORE_COLUMNS})
         if of_counts:
-            console.print(
-                "90 %: days whose mean lies in its 90 % interval, in all and by forecast fullness.",
-                soft_wrap=True,
-            )
             _print_notes(console, summary)
         save_summary(self.out, self.seed, **summary)
         console.print(f"Pictures and summary are in {self.out}")
@@ -180,23 +190,15 @@ class Demand(StudyCommand):
         """Print how far the town, and simpler predictions, are from the counts of the days held out that are done."""
         if not result.rows:
             return
-        headings = ("car park", "places", "cars a day", "stay, h", "days", "fit", *PREDICTIONS)
-        cells = [
-            [
-                row["car_park"], str(row["capacity"]), f"{row['arrivals_a_day']:,.0f}", f"{row['stay_h']:.1f}",
-                str(row["days_held_out"]), f"{100 * row['fit_error']:.1f}", *_points_of(row),
-            ]
-            for row in result.rows
-        ]  # fmt: skip
         summary = result.summary
-        mean = ["all", "", "", "", "", f"{100 * summary['fit_error']:.1f}", *_points_of(summary)]
-        what = f"{plural(len(cells), 'car park')}, {plural(summary['days_held_out'], 'day')} held out"
-        names = [name.replace("_", " ") for name in headings]
-        console.print(make_table(f"{self.study.scenario.title}: {what}", names, [*cells, mean]))
+        what = f"{plural(len(result.rows), 'car park')}, {plural(summary['days_held_out'], 'day')} held out"
+        rows = without_nan([*result.rows, {**summary, "car_park": "all"}])
+        columns = {column.key: column for column in DEMAND_COLUMNS}
+        print_rows(console, f"{self.study.scenario.title}: {what}", rows, columns, columns)
         console.print(
-            "Mean absolute differences from the counts by car park and hour, points of 100 %: of the fit on the weeks "
-            "followed, and on each day held out of the town driven with the day's demand, of the forecast that it "
-            "follows, of the same hour a week before, and of the mean of the weeks followed",
+            "Mean absolute differences from the counts by car park and hour: of the fit on the weeks followed, and on "
+            "each day held out of the town driven with the day's demand, of the forecast that it follows, of the same "
+            "hour a week before, and of the mean of the weeks followed",
             soft_wrap=True,
         )
         for row in result.rows:
@@ -248,26 +250,6 @@ class Record(Command):
                 progress=progress,
             )  # fmt: skip
         console.print(f"{self.out}: {lines:,} observations of {plural(self.days, 'day')}", soft_wrap=True)
-
-
-def _points_of(row: Row) -> list[str]:
-    errors = [(row[f"{name}_error"], *row[f"{name}_error_ci95"]) for name in PREDICTIONS]
-    return [
-        f"{100 * mean:.1f}" + (f" [{100 * low:.1f}, {100 * high:.1f}]" if low == low else "")
-        for mean, low, high in errors
-    ]
-
-
-def _cells(row: Row, of_counts: bool) -> list[str]:
-    """Return the row as the table shows it."""
-    low, high = row["difference_ci95"]
-    losses = [f"{row[key]:.4f}" for key in ("log_loss", "brier", "crps")]
-    coverage = [f"{row['coverage_90']:.0%}"]
-    if of_counts:
-        coverage = [f"{row[key]:.1%}" for key in ("coverage_90", "coverage_90_hours")]
-        bands = row["coverage_90_by_band"]
-        coverage += [f"{band['coverage_90']:.1%}" if band["days"] else "-" for band in bands]
-    return [row["model"], *losses, *coverage, f"{row['difference']:+.4f} [{low:+.4f}, {high:+.4f}]"]
 
 
 def _print_notes(console: Console, summary: Row) -> None:
