@@ -122,7 +122,7 @@ for _name, _entry_point, _vector_entry_point in (
     (
         "parkenv/SearchSensors-v2",
         "parkenv.envs.sensors:SearchSensorsEnv",
-        "parkenv.envs.search_vector:ScanSearchVectorEnv",
+        None,
     ),
     ("parkenv/SearchPerception-v2", "parkenv.envs.perception:SearchPerceptionEnv", None),
 ):

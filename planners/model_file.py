@@ -36,15 +36,6 @@ OBSERVATION = "local-1"
 """Version of the layout of `parkenv.engine.local_observation`, which search models observe."""
 FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
 """Size of that observation: for k slots, 46 + 8k numbers."""
-SCANS_OBSERVATION = "scan-1"
-"""Version of the layout of `parkenv.envs.scan_observation`, which search models observe instead of `local`."""
-FIXED_OF_SCANS, NUMBERS_PER_SCAN = 30, 77
-"""Size of that observation: for k scans, 30 + 77k numbers."""
-SEARCH_OBSERVATIONS = {
-    OBSERVATION: ("local", FIXED_NUMBERS, NUMBERS_PER_SLOT),
-    SCANS_OBSERVATION: ("scan", FIXED_OF_SCANS, NUMBERS_PER_SCAN),
-}
-"""What a search model may observe: key of the vector, its fixed numbers, and those for each of k slots or scans."""
 COMMANDS = {"search": "parkenv compare", "drive": "parkenv park", "scenes": "parkenv park --levels"}
 """Commands that run the models of each task."""
 _MAX_BYTES = 500_000_000
@@ -125,7 +116,7 @@ class ModelCard(Spec):
     algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo", "sac", "tqc"]
     task: Literal["search", "drive", "scenes"]
     observation: str = Field(description="Version of the observation's layout.")
-    k: int = Field(ge=0, le=1_000, description="Slots, or scans, in the observation; 0 for driving.")
+    k: int = Field(ge=0, le=1_000, description="Slots in the observation; 0 for driving.")
     policy: Literal["MultiInputPolicy", "MultiInputLstmPolicy"]
     policy_options: PolicyOptions
     observation_space: Annotated[dict[str, BoxSpace], Field(max_length=16)]
@@ -196,7 +187,7 @@ def save_model(
     """Write a model of stable-baselines3 or sb3-contrib to a model file, atomically.
 
     Args:
-        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local` or the `scan`
+        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local`
             observation; or on the driving observation of `planners.driving.policy_interface`.
         path: file to write; its name should end in `.safetensors`.
         scenarios: names of the training scenarios; for driving, of the lots.
@@ -252,20 +243,19 @@ def observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
     Raises:
         InputError: it is of no task.
     """
-    for version, (key, fixed, each) in SEARCH_OBSERVATIONS.items():
-        if isinstance(space, spaces.Dict) and key in space.spaces and (shape := space[key].shape):
-            return "search", version, (shape[0] - fixed) // each
+    if isinstance(space, spaces.Dict) and "local" in space.spaces and (shape := space["local"].shape):
+        return "search", OBSERVATION, (shape[0] - FIXED_NUMBERS) // NUMBERS_PER_SLOT
     if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
         return "drive", import_module("planners.driving.policy_interface").INTERFACE, 0
     if isinstance(space, spaces.Dict) and "moves" in space.spaces:
         return "scenes", import_module("planners.driving.learned_moves").INTERFACE, 0
     raise InputError(
-        "the model observes neither `local` or `scan` (to search), `achieved_goal` (to drive) nor `moves` (in scenes)"
+        "the model observes neither `local` (to search), `achieved_goal` (to drive) nor `moves` (in scenes)"
     )
 
 
 def load_model(
-    algorithm: str, path: str | os.PathLike[str], task: str, *observations: str
+    algorithm: str, path: str | os.PathLike[str], task: str, observation: str
 ) -> tuple[ModelCard, Any]:
     """Load a model's card and policy; no code from the file is run.
 
@@ -273,7 +263,7 @@ def load_model(
         algorithm: algorithm that it was trained with.
         path: the model file.
         task: `search`, `drive` or `scenes`.
-        observations: versions of the layouts that the environment can give.
+        observation: version of the layout that the environment gives.
 
     Raises:
         InputError: the file is not a model, or is one of another algorithm, task or observation.
@@ -286,10 +276,9 @@ def load_model(
         raise InputError(
             f"{path}: was trained to {card.task}, not to {task}; `{COMMANDS[card.task]}` runs it"
         )
-    if card.observation not in observations:
+    if card.observation != observation:
         raise InputError(
-            f"{path}: observes {card.observation!r}, this version of parkenv gives "
-            f"{' or '.join(map(repr, observations))}; "
+            f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
             f"it was trained with parkenv {card.parkenv}"
         )
     _require_spaces(card, path)
@@ -312,8 +301,7 @@ def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
     observed = {name: space.shape for name, space in card.observation_space.items()}
     acted = card.action_space if isinstance(card.action_space, int) else card.action_space.shape
     if card.task == "search":
-        key, fixed, each = SEARCH_OBSERVATIONS[card.observation]
-        wanted = {key: (fixed + each * card.k,), "action_mask": (len(ACTIONS),)}
+        wanted = {"local": (FIXED_NUMBERS + NUMBERS_PER_SLOT * card.k,), "action_mask": (len(ACTIONS),)}
         act: int | tuple[int, ...] = len(ACTIONS)
     elif card.task == "scenes":
         moves = import_module("planners.driving.learned_moves")

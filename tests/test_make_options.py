@@ -1,4 +1,4 @@
-"""Options of `gymnasium.make` for other people's learners, and the twins of what is observed."""
+"""Options of `gymnasium.make` for other people's learners."""
 
 import gymnasium as gym
 import numpy as np
@@ -7,9 +7,8 @@ from gymnasium.spaces import flatdim
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
 
-from parkenv import InputError, SensorModel
+from parkenv import InputError
 from parkenv.envs.flat_ids import OPTIONS
-from planners.model_file import observation_of
 
 SCALE = 0.01
 
@@ -32,30 +31,7 @@ def together(env, others, seed):
             return
 
 
-@pytest.mark.parametrize("sensor", [{}, {"sensor_model": SensorModel.named("laser")}])
-def test_twins_meet_the_same_worlds_and_observe_what_they_say(sensor):
-    full, truth, step = (make(name, **sensor) for name in ("full", "truth", "step"))
-    assert truth.observation_space == step.observation_space == make("occupancy").observation_space
-    n_steps = 0
-    for seed in range(4):
-        for (seen, *results), (true, *as_true), (last, *as_step) in together(full, (truth, step), seed):
-            assert results == as_true == as_step
-            n = full.unwrapped.scenario.lot.n_slots
-            state = truth.unwrapped.state
-            taken = state.world.occupied(np.arange(n), state.time)
-            np.testing.assert_array_equal(true["p_occupied"][:n], taken)
-            slots, observed, _, _ = seen["step_observed"].reshape(4, -1)
-            expected = np.full(n, 0.5)
-            for slot, one in zip(slots.astype(int), observed, strict=True):
-                if slot >= 0:
-                    expected[slot] = one
-            np.testing.assert_array_equal(last["p_occupied"][:n], expected)
-            assert (true["p_occupied"][n:] == 1.0).all()
-            n_steps += 1
-    assert n_steps > 50
-
-
-@pytest.mark.parametrize("observation", ["local", "occupancy", "truth", "step"])
+@pytest.mark.parametrize("observation", ["local", "occupancy"])
 def test_flat_vectors_and_scaled_rewards_say_the_same(observation):
     options = {"observation": observation, "flat": True, "reward_scale": SCALE}
     one, plain = make(**options), make(observation)
@@ -81,7 +57,7 @@ def test_flat_vectors_and_scaled_rewards_say_the_same(observation):
 
 
 def test_a_flat_batch_hands_out_the_end_of_its_searches():
-    options = {"scenario": "mini", "observation": "step", "flat": True, "reward_scale": SCALE}
+    options = {"scenario": "mini", "observation": "occupancy", "flat": True, "reward_scale": SCALE}
     batch = gym.make_vec(
         "parkenv/Search-v2", 16, "vector_entry_point", autoreset_mode=AutoresetMode.SAME_STEP, **options
     )
@@ -121,16 +97,10 @@ def make_flat(scenario):
     [
         ({"flat": True}, "flat is True, want an observation other than full"),
         ({"reward_scale": 0.0}, "reward_scale is 0.0, want a finite number above 0"),
-        ({"observation": "hidden"}, "want one of full, occupancy, local, truth, step"),
+        ({"observation": "hidden"}, "want one of full, occupancy, local"),
     ],
 )
 def test_wrong_options_are_refused(options, message):
     for maker in (make, lambda **k: gym.make_vec("parkenv/Search-v2", 2, "vector_entry_point", **k)):
         with pytest.raises(InputError, match=message):
             maker(**options)
-
-
-@pytest.mark.parametrize("observation", ["truth", "step"])
-def test_no_model_of_a_twin_is_compared_with_agents_that_do_not_know_the_truth(observation):
-    with pytest.raises(InputError, match="observes neither"):
-        observation_of(make(observation).observation_space)

@@ -73,7 +73,7 @@ def test_the_local_observation_by_name_is_that_of_the_wrapper(name):
 
 
 @pytest.mark.parametrize("mode", ["sync", "async", "vector_entry_point"])
-@pytest.mark.parametrize("observation", ["full", "occupancy", "local", "truth", "step"])
+@pytest.mark.parametrize("observation", ["full", "occupancy", "local"])
 def test_batches_of_every_kind_have_the_observations(mode, observation):
     envs = gym.make_vec("parkenv/Search-v2", 2, mode, scenario="mini", observation=observation)
     one = gym.make("parkenv/Search-v2", scenario="mini", observation=observation)

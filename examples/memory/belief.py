@@ -1,9 +1,9 @@
 """The belief as memory: a network without one that observes P(taken) of each slot.
 
-`--observation` makes it the reactive network of the other twins: `truth`, `no-map`, `step`, `scan`.
+`--observation` makes it the reactive network of the other twins: `no-map`, `step`.
 """
 
 from ppo import Reactive, main
 
 if __name__ == "__main__":
-    main("reactive", Reactive, "occupancy")
+    main("reactive", Reactive, "belief")

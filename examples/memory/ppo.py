@@ -20,13 +20,14 @@ from torch import nn
 from torch.distributions import Categorical
 
 import parkenv
+from parkenv.engine.spaces import FlatLayout
 from parkenv.world.occupancy.constant_map import FlatMap
 
 ENVS, STEPS, EPOCHS, PARTS = 64, 16, 4, 2
 GAMMA, LAMBDA, CLIP, ENTROPY, LEARNING_RATE = 0.999, 0.95, 0.2, 0.01, 2e-3
 MAX_STEPS = 200
 TEST_SEED, TEST_WORLDS = 1_000_000, 256
-OBSERVATIONS = ("truth", "occupancy", "no-map", "step", "scan")
+OBSERVATIONS = ("belief", "no-map", "step")
 
 
 class Reactive(nn.Module):
@@ -66,30 +67,43 @@ class Policy(nn.Module):
 
 def make_batch(observation, scenario, n):
     """Return n searches in a compiled batch; `no-map` is the belief of a driver whose map says 1/2 for every slot."""
-    world, options = parkenv.make_scenario(scenario), {"observation": observation, "flat": True}
+    world = parkenv.make_scenario(scenario)
     if observation == "no-map":
-        world, options["observation"] = world.replace(prior=FlatMap(0.5, world.occupancy)), "occupancy"
-    if observation == "scan":
-        del options["flat"]
+        world = world.replace(prior=FlatMap(0.5, world.occupancy))
     return gym.make_vec(
         "parkenv/Search-v2", n, "vector_entry_point", scenario=world, reward_scale=0.01, max_episode_steps=MAX_STEPS,
-        autoreset_mode=AutoresetMode.SAME_STEP, **options,
+        autoreset_mode=AutoresetMode.SAME_STEP,
     )  # fmt: skip
 
 
-def vector(observation):
-    """Return observations as a tensor, (1, n, d), that ends with the action mask."""
-    if isinstance(observation, dict):
-        observation = np.concatenate(
-            [observation["scan"], observation["action_mask"]], axis=-1, dtype=np.float32
-        )
-    return torch.as_tensor(np.atleast_2d(observation))[None]
+class Vectors:
+    """Observations of a batch as tensors, (1, n, d), that end with the action mask.
+
+    In those of the last step alone, P(taken) is 1 or 0 for the slots that it observed, and 1/2 for all others.
+    """
+
+    def __init__(self, envs, observation):
+        self.last_step_alone = observation == "step"
+        space = envs.single_observation_space
+        kept = [name for name in space if name not in ("belief", "step_observed")]
+        self.layout = FlatLayout(gym.spaces.Dict({name: space[name] for name in kept}))
+
+    def __call__(self, observation):
+        """Return the tensor of a batch."""
+        if self.last_step_alone:
+            occupied = np.full_like(observation["p_occupied"], 0.5)
+            slots, taken = observation["step_observed"].reshape(len(occupied), 4, -1)[:, :2].swapaxes(0, 1)
+            row, at = np.nonzero(slots >= 0)
+            occupied[row, slots[row, at].astype(int)] = taken[row, at]
+            observation = {**observation, "p_occupied": occupied}
+        return torch.as_tensor(self.layout(observation))[None]
 
 
 def train(make_memory, observation, scenario, decisions, seed, tell):
     """Train a policy; `tell` gets the number of decisions and the total times, s, of the searches that ended."""
     torch.manual_seed(seed)
     envs = make_batch(observation, scenario, ENVS)
+    vector = Vectors(envs, observation)
     inputs, begins = vector(envs.reset(seed=seed * 10_000)[0]), torch.ones(1, ENVS)
     policy = Policy(make_memory(inputs.shape[-1]))
     optimizer = torch.optim.Adam(policy.parameters(), LEARNING_RATE, eps=1e-5)
@@ -105,7 +119,9 @@ def train(make_memory, observation, scenario, decisions, seed, tell):
                 for i in np.flatnonzero(
                     truncated & ~terminated
                 ):  # the limit is no end: add the value of what follows
-                    rest = vector(info["final_obs"][i])
+                    rest = vector(
+                        {name: np.array(value)[None] for name, value in info["final_obs"][i].items()}
+                    )
                     reward[i] += GAMMA * policy(rest, state[i : i + 1], torch.zeros(1, 1))[1].item()
             done = terminated | truncated
             if done.any():
@@ -151,6 +167,7 @@ def learn(policy, optimizer, rollout, state, following):
 def evaluate(policy, observation, scenario):
     """Return the total times, (TEST_WORLDS,) s, of searches in worlds that had no say, actions drawn as in training."""
     envs = make_batch(observation, scenario, TEST_WORLDS)
+    vector = Vectors(envs, observation)
     inputs, begins = vector(envs.reset(seed=TEST_SEED)[0]), torch.ones(1, TEST_WORLDS)
     state, totals = policy.memory.begin(TEST_WORLDS), np.full(TEST_WORLDS, np.nan)
     torch.manual_seed(0)

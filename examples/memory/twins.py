@@ -19,18 +19,16 @@ from parkenv.show.plurals import interval_text
 
 HERE = Path(__file__).resolve().parent
 TWINS = {
-    ("reactive", "truth"): "truth of all slots",
-    ("reactive", "occupancy"): "belief",
+    ("reactive", "belief"): "belief",
     ("reactive", "no-map"): "belief, no map",
     ("reactive", "step"): "last step alone",
     ("frame-stacking", "step"): "last step, frame stacking",
     ("gru", "step"): "last step, GRU",
     ("transformer", "step"): "last step, transformer",
     ("lru", "step"): "last step, LRU",
-    ("reactive", "scan"): "scans",
 }
 """Titles of what is trained, by memory and observation."""
-BESIDE = ("reactive", "occupancy")
+BESIDE = ("reactive", "belief")
 SMOOTHED = 15
 """Updates over which curves are means."""
 

@@ -15,13 +15,11 @@ from gymnasium.vector.utils import create_empty_array
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
-from parkenv.compiled.memory import LINE, float32s, int32s, int64s, prefetch, uint8s
+from parkenv.compiled.memory import LINE, int32s, int64s, prefetch, uint8s
 from parkenv.engine.belief_memory import BeliefMemory
 from parkenv.engine.kernel import (
     arrive,
-    column_of,
     init_prior,
-    is_taken,
     observe_live,
     refresh_belief,
     step_cost_s,
@@ -180,27 +178,6 @@ class BeliefObserver(Observer):
         self._moved = False
 
 
-class TwinObserver(BeliefObserver):
-    """The observations `truth` and `step`: those of `occupancy`, with other numbers in `p_occupied`.
-
-    Args:
-        tables, n: see `Observer`.
-        observe: `observe_truth` or `observe_last_step`.
-    """
-
-    def __init__(self, tables: ScenarioRecords, n: int, observe: Any) -> None:
-        super().__init__(tables, n, without=("belief",))
-        self._observe, self._beliefs = observe, ()
-        self.seen = {name: array for name, array in self.seen.items() if name != "step_observed"}
-        self.seen["p_occupied"] = np.ones_like(self.seen["p_occupied"])
-        self.space = spaces.Dict({name: self.space[name] for name in self.space if name in self.seen})
-
-    def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
-        """See `Observer`."""
-        super().step(actions, fresh, idle, limit, steps)
-        self._observe(self.address, self.seen["p_occupied"])
-
-
 class LocalObserver(Observer):
     """The observations of `parkenv.engine.local_observation`, of k slots."""
 
@@ -281,27 +258,6 @@ def step_with_belief(
         else:
             refresh_belief(search)
         vertex[e], time[e, 0], time[e, 1] = search.vertex, search.clock[0], search.clock[1]
-
-
-@kernel
-def observe_truth(address: int, taken: NDArray[np.float32]) -> None:
-    """Write which slots are taken now, (n, m), 1 or 0: the hidden state, for studies of what observations lack."""
-    for e in range(len(taken)):
-        search = search_at(address, e)
-        for slot in range(scenario_at(search.scenario, 0).n_slots):
-            taken[e, slot] = 1.0 if is_taken(search, column_of(search, slot), search.time) else 0.0
-
-
-@kernel
-def observe_last_step(address: int, taken: NDArray[np.float32]) -> None:
-    """Write what the last step observed, (n, m): 1 taken, 0 free, 0.5 for slots that it did not observe."""
-    for e in range(len(taken)):
-        search = search_at(address, e)
-        observed = float32s(search.step_observed)
-        for slot in range(scenario_at(search.scenario, 0).n_slots):
-            taken[e, slot] = 0.5
-        for i in range(search.n_step_observed):
-            taken[e, int(observed[i])] = observed[search.most_observed + i]
 
 
 @kernel

@@ -18,10 +18,10 @@ from parkenv.world.scenario import SearchProblem
 from parkenv.world.week import DAY_S
 
 LATEST = 1e8  # bound, s, of the observed times: Gymnasium requires one, and no search takes three years
-OBSERVATIONS = ("full", "occupancy", "local", "truth", "step")
+OBSERVATIONS = ("full", "occupancy", "local")
 """What a search may observe; see `parkenv.envs.search.SearchEnv`."""
 BELIEF_PARTS = ("belief", "step_observed")
-"""What `occupancy` and its twins leave out of `full`."""
+"""What `occupancy` leaves out of `full`."""
 MAX_DECAY_RATE = 1e6  # bound, 1/s, of `decay_rate`
 _FLAT = ("p_occupied", "day_error", "action_mask")
 
@@ -54,7 +54,7 @@ def search_space(n_slots: int, n_vertices: int, most_observed: int) -> spaces.Di
 class FlatLayout:
     """Turns observations into one vector each, for learners that take no `Dict`.
 
-    A vector is `local` or `scan`, if the observation has it: they tell which moves there are. Else it has these parts:
+    A vector is `local`, if the observation has it: it tells which moves there are. Else it has these parts:
 
     | Part | Size | Meaning |
     |---|---|---|
@@ -75,9 +75,9 @@ class FlatLayout:
     """
 
     def __init__(self, space: spaces.Dict) -> None:
-        self._whole = next((name for name in ("local", "scan") if name in space.spaces), None)
-        if self._whole is not None:
-            self.space = space[self._whole]
+        self._is_local = "local" in space.spaces
+        if self._is_local:
+            self.space = space["local"]
             return
         if "p_occupied" not in space.spaces or "belief" in space.spaces:
             raise InputError("flat is True, want an observation other than full, such as local or occupancy")
@@ -90,9 +90,9 @@ class FlatLayout:
 
     def __call__(self, observation: Mapping[str, Any]) -> NDArray[np.float32]:
         """Return the vector of an observation, or those of a batch, (n, size) float32."""
-        if self._whole is not None:
-            whole: NDArray[np.float32] = observation[self._whole]
-            return whole
+        if self._is_local:
+            local: NDArray[np.float32] = observation["local"]
+            return local
         now, elapsed = np.moveaxis(observation["time"], -1, 0)
         angle = now * (2.0 * np.pi / DAY_S)
         times = np.stack([elapsed / (elapsed + 60.0), np.sin(angle), np.cos(angle)], axis=-1)

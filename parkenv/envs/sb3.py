@@ -143,9 +143,8 @@ class SearchVecEnv(BatchVecEnv):
         scenario: a scenario, its name, a file, a folder of files, or a sequence of these; if there are several, one is
             drawn for each episode, and `info["place"]` names it at the end.
         reward_scale: factor of the rewards in seconds; returns near one are easiest to learn.
-        k: number of slots in the `local` observation, 5 if None; or of scans in `scan`, 4 if None.
-        observation: `local`; for a single lot also `full`, or `scan`, as from
-            `parkenv.envs.scan_observation.ScanObservation`.
+        k: number of slots in the `local` observation, 5 if None.
+        observation: `local`; for a single lot also `full`.
         max_episode_steps: steps after which a search is truncated.
 
     Raises:

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import seed_state
-from parkenv.engine.batch import observe_last_step, observe_truth
 from parkenv.engine.kernel import (
     begin_search_at,
     init_external_forecast_at,
@@ -40,8 +39,6 @@ from parkenv.world.scenario import Scenario
 if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
 
-TWINS = {"truth": observe_truth, "step": observe_last_step}
-"""Twins of `occupancy` by name: the functions of the address of searches that write `p_occupied`, (n, n_slots)."""
 _REBUILT = {
     "searches", "scenario", "_state", "_address", "_copiers", "_place", "_step", "_copy_mask", "_copy_masks",
     "_seeded_with", "_begun", "_over",
@@ -169,9 +166,6 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
       slots are truly taken, hidden from the agent, and as colours the agent's belief.
     - `observation`: `full`, as above; `occupancy`, the same without `belief` and `step_observed`; or `local`, a `Dict`
       of `local` and `action_mask` that describes the car's surroundings, see `parkenv.engine.local_observation`.
-      For studies of the value of information, two variants of `occupancy` put other numbers in `p_occupied`: `step`
-      has what the last step observed, 1 taken, 0 free and 0.5 for all other slots, and `truth` has the hidden state
-      of all slots, which no driver knows. `parkenv compare` gives neither to any agent.
     - `k`: number of slots that `local` describes, 5 if None.
     - `flat`: whether the observation is one vector, see `parkenv.engine.spaces.FlatLayout`; not with `full`.
     - `reward_scale`: factor of the rewards and of `reward_terms`; times and metrics in `info` remain in seconds.
@@ -227,8 +221,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
         self.observation_space = space_of(self.scenarios)
         self._is_full = observation == "full"
         self._around: Surroundings | None = None
-        self._twin = observation if observation in TWINS else None
-        if observation == "occupancy" or self._twin:
+        if observation == "occupancy":
             self.observation_space = spaces.Dict(
                 {name: one for name, one in self.observation_space.items() if name not in BELIEF_PARTS}
             )
@@ -421,11 +414,7 @@ class SearchEnv(gym.Env[dict[str, Any], np.int64]):
             observe_surroundings_at(self._address, self._around, local)
             return {"local": local, "action_mask": mask}
         time, p_occupied, _, _, day_error = self._copiers
-        occupied = p_occupied()
-        if self._twin is not None:
-            occupied[:] = 1.0
-            TWINS[self._twin](self._address, occupied[None])
-        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": occupied}
+        observation = {"vertex": self._vertices[vertex], "time": time(), "p_occupied": p_occupied()}
         return {**observation, "day_error": day_error(), "action_mask": mask}
 
 

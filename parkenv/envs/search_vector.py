@@ -1,9 +1,8 @@
-"""Compiled batches of searches: the `vector_entry_point` of `parkenv/Search-v2` and `parkenv/SearchSensors-v2`."""
+"""Compiled batches of searches: the `vector_entry_point` of `parkenv/Search-v2`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -20,7 +19,6 @@ from parkenv.engine.batch import (
     LocalObserver,
     Observer,
     Steps,
-    TwinObserver,
     arrive_all,
     copy_fields,
     first_wrong,
@@ -30,9 +28,8 @@ from parkenv.engine.records import N_ACTIONS, SEARCH, STEP_FIELDS, ScenarioRecor
 from parkenv.engine.spaces import BELIEF_PARTS, OBSERVATIONS, FlatLayout
 from parkenv.engine.starts import START_OPTIONS, choose_start
 from parkenv.engine.state import SearchState
-from parkenv.envs.search import TWINS
 from parkenv.errors import InputError, require_number, require_one_of, require_whole, reset_options
-from parkenv.scenarios.build import ScenarioSource, ScenarioSources, make_scenarios, require_changes
+from parkenv.scenarios.build import ScenarioSources, make_scenarios, require_changes
 from parkenv.show.plurals import plural
 from parkenv.world.cost_terms import METRICS, REWARD_TERMS
 from parkenv.world.lot import ACTIONS, PARK
@@ -40,7 +37,6 @@ from parkenv.world.occupancy.python_functions import raise_error
 
 if TYPE_CHECKING:
     from parkenv.show.frames.search import SearchRenderer
-    from sim_sensors.rig import SensorRig
 
 MAX_ENVS = 1_000_000
 """Maximum number of environments."""
@@ -69,9 +65,6 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     - `observation="occupancy"`: the same without `belief` and `step_observed`, which saves copying them.
     - `observation="local"`: a `Dict` of `local` and `action_mask`; see `parkenv.engine.local_observation`. Its size and
       cost are the same on every lot.
-    - `observation="truth"` and `"step"`: variants of `occupancy` with other numbers in `p_occupied`.
-    - `observation="scan"`: a `Dict` of `scan` and `action_mask`, in one scenario; see
-      `parkenv.envs.scan_observation`.
 
     ## Rewards
     As in `parkenv/Search-v2`, float64. `reward_terms` holds the last step's terms.
@@ -102,10 +95,10 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
     ## Arguments
     - `num_envs`: number of environments.
     - `scenario`: as in `parkenv/Search-v2`: a scenario, its name, a file, a folder of files, or a sequence of these.
-    - `observation`: full, occupancy, local, truth, step or scan; or a function of `ScenarioRecords` and `num_envs` that
+    - `observation`: full, occupancy or local; or a function of `ScenarioRecords` and `num_envs` that
       returns a `parkenv.engine.batch.Observer`.
-    - `k`: number of slots that `local` describes, 5 if None; or of scans in `scan`, 4 if None.
-    - `flat`, `reward_scale`: as in `parkenv/Search-v2`; `flat` takes `scan`, too.
+    - `k`: number of slots that `local` describes, 5 if None.
+    - `flat`, `reward_scale`: as in `parkenv/Search-v2`.
     - `max_episode_steps`: 2000 from `make_vec`.
     - `autoreset_mode`: NEXT_STEP, SAME_STEP or DISABLED of `gymnasium.vector.AutoresetMode`, or its value.
     - `copy`: False returns arrays that the next step overwrites, which saves copying them.
@@ -159,8 +152,8 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
             known = ", ".join(m.value for m in AutoresetMode)
             raise InputError(f"autoreset_mode is {autoreset_mode!r}, want one of {known}") from None
         require_changes((type(self), ParkSearchVectorEnv), changes)
-        if k is not None and observation not in ("local", "scan"):
-            raise InputError(f"k is {k!r}, want None unless observation is local or scan")
+        if k is not None and observation != "local":
+            raise InputError(f"k is {k!r}, want None unless observation is local")
         require_number("reward_scale", reward_scale, above=0.0)
         observer = _observer(observation, k) if isinstance(observation, str) else observation
         self.scenarios = tuple(make_scenarios(scenario, **changes))
@@ -412,74 +405,12 @@ class ParkSearchVectorEnv(VectorEnv[dict[str, NDArray[Any]], IntArray, NDArray[A
         return mask
 
 
-class ScanSearchVectorEnv(ParkSearchVectorEnv):
-    """A batch of `parkenv/SearchSensors-v2` environments with `observation="scan"` in one compiled step.
-
-    ## Description
-    Search i of a batch reset with `seed=s` equals the single environment reset with `seed=s + i`, in this and all later
-    episodes: the same worlds, cars, poses and noise, to the rounding of float32 in the ranges. Rewards, ends and
-    automatic resets are those of `ParkSearchVectorEnv`.
-
-    ## Action space
-    `MultiDiscrete([5, ...])`: up, down, left, right, park.
-
-    ## Observation space
-    The `Dict` of `parkenv/SearchSensors-v2` with `observation="scan"`, with a row for each search.
-
-    ## Arguments
-    - `num_envs`, `max_episode_steps`, `autoreset_mode`, `copy`: as in `ParkSearchVectorEnv`.
-    - `scenario`: one scenario without traffic.
-    - `rig`, `captures`, `every`: as in `parkenv/SearchSensors-v2`; the rig needs one laser.
-    - `observation`: only `scan`, since a batch draws no pictures.
-    - further keywords replace fields of the scenario.
-
-    ```python
-    >>> import gymnasium as gym
-    >>> import parkenv
-    >>> envs = gym.make_vec(
-    ...     "parkenv/SearchSensors-v2", 3, "vector_entry_point", scenario="mini", observation="scan"
-    ... )
-    >>> observations, infos = envs.reset(seed=0)
-    >>> observations["scan.laser"].shape, observations["count"]
-    ((3, 4, 1081), array([1, 1, 1]))
-
-    ```
-
-    Raises:
-        InputError: an argument out of its range; the message names it.
-    """
-
-    def __init__(
-        self,
-        num_envs: int = 1,
-        scenario: ScenarioSource = "campus",
-        rig: str | SensorRig | None = None,
-        captures: int = 4,
-        every: float = 1.0,
-        observation: str = "scan",
-        **options: Any,
-    ) -> None:
-        if observation != "scan":
-            raise InputError(f'observation is {observation!r}, want "scan": a batch draws no pictures')
-        from parkenv.envs.scan_observer import LaserObserver
-
-        laser = partial(LaserObserver, rig=rig, captures=captures, every=every)
-        super().__init__(num_envs, scenario, laser, **options)
-
-
 def _observer(observation: str, k: int | None) -> Callable[[ScenarioRecords, int], Observer]:
     """Return the constructor of an observer by its name."""
     if observation == "full":
         return BeliefObserver
     if observation == "occupancy":
         return lambda tables, n: BeliefObserver(tables, n, without=BELIEF_PARTS)
-    if observation in TWINS:
-        return partial(TwinObserver, observe=TWINS[observation])
     if observation == "local":
         return lambda tables, n: LocalObserver(tables, n, NEAR_SLOTS if k is None else k)
-    if observation == "scan":
-        from parkenv.envs.scan_observation import SCANS
-        from parkenv.envs.scan_observer import ScansObserver
-
-        return lambda tables, n: ScansObserver(tables, n, SCANS if k is None else k)
-    raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}, scan")
+    raise InputError(f"observation is {observation!r}, want one of {', '.join(OBSERVATIONS)}")

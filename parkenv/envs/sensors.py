@@ -86,8 +86,6 @@ class SearchSensorsEnv(SensingSearchEnv):
     | `scan.<laser>` | `Box(0, max_range, (K, n_beams), float32)` | m; `max_range` for no return |
 
     With `observation="scan"` there are no images, and a step takes a fraction of a millisecond instead of dozens.
-    Batches of such searches are compiled:
-    `gym.make_vec("parkenv/SearchSensors-v2", 256, "vector_entry_point", observation="scan")`.
 
     Beam n points along -3π/4 + n·0.25° from forward, counter-clockwise, in the laser's frame. `env.unwrapped.rig` has
     the poses and models of the sensors. The thesis's rig has `image.right` and `scan.laser`.

@@ -115,7 +115,7 @@ class EpisodeRunner:
         self.name = name
         self.agent = agent
         options: dict[str, Any] = {}
-        if rig is not None and getattr(agent, "scans_k", None) is None:
+        if rig is not None:
             options = {"detector": detector} | ({} if every is None else {"every": every})
         self.env = make_search(scenario, agent, rig, **options)
         self._routes = DriveRoutes(scenario)

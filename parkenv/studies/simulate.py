@@ -11,7 +11,6 @@ import gymnasium as gym
 
 from parkenv.compiled.clock import seconds_spent
 from parkenv.envs.local_observation import LocalObservation
-from parkenv.errors import InputError
 from parkenv.world.scenario import Scenario
 from planners.agent import Agent, ClairvoyantAgent
 
@@ -149,8 +148,7 @@ def make_search(
 ) -> gym.Env[Any, Any]:
     """Make the environment that gives an agent what it observes.
 
-    A model that observes scans searches in `parkenv/SearchSensors-v2`, any other agent in `parkenv/Search-v2`, or with
-    a rig in `parkenv/SearchPerception-v2`. Equal seeds give equal worlds in all three.
+    It is `parkenv/Search-v2`, or with a rig `parkenv/SearchPerception-v2`; equal seeds give equal worlds in both.
 
     Args:
         scenario: the scenario.
@@ -159,9 +157,6 @@ def make_search(
         options: further arguments of `gymnasium.make`.
     """
     name = "parkenv/Search-v2" if rig is None else "parkenv/SearchPerception-v2"
-    if getattr(agent, "scans_k", None) is not None:
-        name = "parkenv/SearchSensors-v2"
-        options |= {"observation": "scan", "captures": 1}
     if rig is not None:
         options["rig"] = rig
     # The environments are checked by their tests; checking each again takes as long as some searches.
@@ -170,20 +165,7 @@ def make_search(
 
 
 def adapt_to_agent(env: gym.Env[Any, Any], agent: Agent) -> gym.Env[Any, Any]:
-    """Give the environment the agent's observation: trained models use `LocalObservation` or `ScanObservation`.
-
-    Raises:
-        InputError: the agent observes scans, and the environment has none.
-    """
-    if (k := getattr(agent, "scans_k", None)) is not None:
-        from parkenv.envs.scan_observation import ScanObservation
-        from parkenv.envs.sensors import SearchSensorsEnv
-
-        if not isinstance(env.unwrapped, SearchSensorsEnv):
-            raise InputError(
-                f"{getattr(agent, 'name', 'the agent')} observes laser scans, this environment has none"
-            )
-        return ScanObservation(env, k)
+    """Give the environment the agent's observation: trained models use `LocalObservation`."""
     k = getattr(agent, "local_k", None)
     is_local = "local" in getattr(env.observation_space, "spaces", ())
     return env if k is None or is_local else LocalObservation(env, k)

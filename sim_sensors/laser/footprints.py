@@ -261,21 +261,6 @@ class ScanPlane:
         twin.replace(index, corners)
         return twin
 
-    def without_footprints(self, n: int) -> tuple[Cells, Cells, IntArray]:
-        """Return copies of both tables of obstacles without the first n footprints, and the places that these had.
-
-        Raises:
-            SensorError: one of these footprints has no more than four corners.
-        """
-        quads, others = self._quads.copy(), self._others.copy()
-        place = others._place[:n].copy()
-        if (place == NOWHERE).any():
-            raise SensorError(
-                f"footprints[{int(np.argmin(place))}] has {self._n_corners[:n].min()} corners, want more than {QUAD}"
-            )
-        others.cells.x[place] = others.cells.y[place] = FAR
-        return quads.cells, others.cells, place
-
     def _sort(self) -> None:
         pieces = _short_pieces(self._wall)
         corners = np.zeros((self.n_footprints + len(pieces), self.k_max, 2))

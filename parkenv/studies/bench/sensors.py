@@ -19,7 +19,6 @@ from scipy.ndimage import distance_transform_edt
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.engine.sensor_sampler import PICTURE_WIDTH
-from parkenv.envs.search_vector import ScanSearchVectorEnv
 from parkenv.studies.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot import PARK
 from sim_sensors.camera.ground_texture import ground_texture
@@ -160,9 +159,7 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     return rows + duration("camera", "true boxes of a frame", 1e3 * boxes, "ms")
 
 
-def search_rows(
-    seed: int = 0, seconds: float = 0.6, scenario: str = "campus", searches: int = 256
-) -> list[BenchRow]:
+def search_rows(seed: int = 0, seconds: float = 0.6, scenario: str = "campus") -> list[BenchRow]:
     """Measure the steps per second of random drives through sensors, resets included."""
     few = 10.0 * seconds  # an episode begins with a new world, weather and sky
     rows: list[BenchRow] = []
@@ -180,18 +177,7 @@ def search_rows(
         rows += rate(
             "environment", f"{name}-v2 on {scenario}, {case}", _steps_per_second(env, seed, few), "steps/s"
         )
-    envs = ScanSearchVectorEnv(searches, scenario, copy=False)
-    observation, _ = envs.reset(seed=seed)
-    rng = np.random.default_rng(seed)
-
-    def step(_: int) -> None:
-        nonlocal observation
-        chosen = (rng.random((searches, PARK)) * observation["action_mask"][:, :PARK]).argmax(axis=1)
-        observation = envs.step(chosen)[0]
-
-    batch = searches / seconds_each(step, few)
-    case = f"SearchSensors-v2 on {scenario}, scans alone, {searches} at once"
-    return rows + rate("environment", case, batch, "steps/s")
+    return rows
 
 
 def _steps_per_second(env: gym.Env[Any, Any], seed: int, seconds: float) -> float:

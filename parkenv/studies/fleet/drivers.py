@@ -57,16 +57,11 @@ def policy_of(
         return agent.compiled_policy(), None
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
-    if isinstance(agent, LearnedAgent):
-        if agent.local_k is None:
-            raise InputError(
-                f"agent {spec.label!r} observes laser scans, which the cars of a fleet do not have"
-            )
-        if agent.card.algorithm not in _WITHOUT_NETWORK_POLICY:
-            from parkenv.envs.fleet_vector import network_policy
+    if isinstance(agent, LearnedAgent) and agent.card.algorithm not in _WITHOUT_NETWORK_POLICY:
+        from parkenv.envs.fleet_vector import network_policy
 
-            sampled = agent.card.algorithm != "dqn"
-            return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
+        sampled = agent.card.algorithm != "dqn"
+        return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     if isinstance(agent, LearnedAgent) or not scenario.has_rules:
         return None, agent  # learned agents observe costs themselves
     return None, AgentsByStay(spec, scenario, known)

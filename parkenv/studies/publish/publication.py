@@ -32,7 +32,7 @@ from parkenv.version import __version__
 from parkenv.world.scenario import Scenario
 from planners.agent import make_agent
 from planners.driving.parking_agents import make_parking_agent
-from planners.model_file import SCANS_OBSERVATION, ModelCard
+from planners.model_file import ModelCard
 from planners.names import PARKING_PLANNER
 
 MODEL, FILM, CARD = "model.safetensors", "replay.gif", "README.md"
@@ -234,9 +234,6 @@ class SearchPublication(Publication):
     def usage(self) -> str:
         """See `Publication`."""
         wrapper, env = "local_observation import LocalObservation", '"parkenv/Search-v2", scenario=scenario'
-        if self.card.observation == SCANS_OBSERVATION:
-            wrapper = "scan_observation import ScanObservation"
-            env = '"parkenv/SearchSensors-v2", scenario=scenario, observation="scan", captures=1'
         return f"""import gymnasium as gym
 import parkenv
 from parkenv.envs.{wrapper}

@@ -100,12 +100,9 @@ RECORDED_DAY = np.dtype(
 """A log day replayed on a lot: its midnight, s since Monday 00:00; fields of `MappedLog`,
 `ReplayForecast` and `OccupancyLog`."""
 
-FUNCTIONS = np.dtype(
-    [("data", np.int64), ("state", ADDRESS), ("next_free", ADDRESS), ("sojourn", ADDRESS)], align=True
-)
-"""A world by the addresses of three functions of (int64 data, int64 slot, float64 time, s): whether the slot is taken,
-1 or 0; the earliest time from then on at which it is free, s, infinite if never; the number of its sojourn. They return
-float64.
+FUNCTIONS = np.dtype([("data", np.int64), ("state", ADDRESS), ("next_free", ADDRESS)], align=True)
+"""A world by the addresses of two functions of (int64 data, int64 slot, float64 time, s): whether the slot is taken,
+1 or 0; the earliest time from then on at which it is free, s, infinite if never. They return float64.
 """
 
 CURSOR_FIELDS = [
@@ -176,18 +173,6 @@ def find_end_of_stay(kind: int, model: int, world: Any, slot: int, cursor: Any, 
     while cursor.occupied and cursor.valid_until < np.inf:
         recorded_state(recorded_day_at(model, 0), slot, cursor, cursor.valid_until + 1e-3)
     return float(np.inf if cursor.occupied else cursor.valid_until)
-
-
-@inlined
-def sojourn_number(kind: int, model: int, slot: int, cursor: Any, time: float) -> int:
-    """Return the number of a slot's sojourn, which tells cars apart, at a time to which its cursor has been moved."""
-    if kind == EXTERNAL_KIND:
-        functions = functions_at(model, 0)
-        return int(call_world_at(functions.sojourn, functions.data, slot, time))
-    if kind == LOG_KIND:
-        day = recorded_day_at(model, 0)
-        return int(recorded_changes(day, slot, time - day.midnight))
-    return int(cursor.sojourn)
 
 
 @inlined

@@ -38,7 +38,7 @@ def _function(method: str) -> Any:
 
 
 # In the order of the fields of FUNCTIONS.
-_FUNCTIONS = tuple(_function(method) for method in ("occupied", "next_free", "sojourn"))
+_FUNCTIONS = tuple(_function(method) for method in ("occupied", "next_free"))
 
 
 def functions_of(world: World) -> int:
