@@ -23,69 +23,48 @@ from parkenv.errors import InputError, needs_extra
 from parkenv.version import __version__
 from sim_sensors.errors import SensorError
 
-START, SEARCH, SENSE, DRIVE, DATA = (
-    "Start here", "Search and compare", "Sensors and maps", "Drive", "Lots, logs and files",
+START, AGENTS, CROWDS, SENSE, DRIVE, DATA = (
+    "Start here", "Agents", "Many drivers", "Sensors and maps", "Manoeuvres", "Lots, logs and files",
 )  # fmt: skip
 COMMANDS = {
-    "demo": Entry(
-        "Survey a lot with simulated sensors, then search in it on other days.", "demo:Demo", START
-    ),
-    "compare": Entry(
-        "Compare agents over costs and speeds, all in the same worlds.", "compare:Compare", SEARCH
-    ),
-    "play": Entry("Play the search in the same worlds as the agents.", "play:Play", SEARCH),
-    "report": Entry("Write an HTML page on a run, with replays.", "report:Report", SEARCH),
-    "commute": Entry("Simulate daily commuters with a map that learns.", "drivers:Commute", SEARCH),
-    "fleet": Entry(
-        "Simulate many cars that search one lot; compare kinds of information.", "drivers:Fleet", SEARCH
-    ),
-    "policy": Entry(
-        "Search for a town's policy: prices, limits, permits, guidance, capacity.", "policy:Policy", SEARCH
-    ),
-    "curve": Entry(
-        "Fit search time and walk as functions of occupancy, for other models.", "drivers:Curve", SEARCH
-    ),
-    "plan": Entry("Plan searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", SEARCH),
-    "train": Entry("Train agents by reinforcement learning.", "train:Train", SEARCH),
-    "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", SEARCH),
-    "run": Entry("Run an experiment file.", "study_command:Run", SEARCH),
-    "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=SEARCH),
+    "demo": Entry("Survey a lot with simulated sensors, then search in it.", "demo:Demo", START),
+    "compare": Entry("Compare agents in the same worlds.", "compare:Compare", START),
+    "play": Entry("Play the search yourself, in the worlds of the agents.", "play:Play", START),
+    "report": Entry("Write an HTML page on a run, with replays.", "report:Report", START),
+    "run": Entry("Run an experiment file.", "study_command:Run", START),
+    "train": Entry("Train agents by reinforcement learning.", "train:Train", AGENTS),
+    "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", AGENTS),
+    "plan": Entry("Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", AGENTS),
+    "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=AGENTS),
     "benchmark run": Entry("Run agents through all episodes of the suite.", "benchmark:RunSuite"),
     "benchmark check": Entry("Check results of the suite, and print them side by side.", "benchmark:Check"),
-    "benchmark page": Entry(
-        "Check results of the suite, and write a page that compares them.", "benchmark:Page"
-    ),
+    "benchmark page": Entry("Check results of the suite, and write a page of them.", "benchmark:Page"),
     "benchmark show": Entry("Show the tasks and settings of the suite.", "benchmark:Show"),
-    "survey": Entry(
-        "Drive past every slot, and write which slots are taken to a map file.", "survey:Survey", SENSE
+    "commute": Entry("Simulate daily commuters with a map that learns.", "drivers:Commute", CROWDS),
+    "fleet": Entry("Simulate many cars that search at the same time.", "drivers:Fleet", CROWDS),
+    "curve": Entry("Fit search time and walk as functions of occupancy.", "drivers:Curve", CROWDS),
+    "policy": Entry(
+        "Search for a town's policy: prices, limits, permits, guidance, capacity.", "policy:Policy", CROWDS
     ),
-    "map": Entry("Show the predictions of a map file: how often each slot is taken.", "survey:Map", SENSE),
+    "survey": Entry("Drive past every slot, and map which are taken.", "survey:Survey", SENSE),
+    "map": Entry("Show the predictions of a map.", "survey:Map", SENSE),
     "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "survey:MapDrive", SENSE),
     "sensors": Entry("Preview the simulated sensors.", heading=SENSE),
     "sensors preview": Entry("Draw the sensor measurements on the way to the best slot.", "sensors:Preview"),
-    "fit-sensor-model": Entry(
-        "Measure how often slots are observed correctly.", "sensors:FitSensorModel", SENSE
-    ),
+    "fit-sensor-model": Entry("Measure how often slots are seen right.", "sensors:FitSensorModel", SENSE),
     "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
     "train-detector": Entry("Train a car model or a network.", "detect:TrainDetector", SENSE),
     "evaluate-detector": Entry(
         "Measure a detector on images, or on drives.", "detect:EvaluateDetector", SENSE
     ),
-    "calibrate": Entry(
-        "Measure the costs of the drive graph on whole driven trips.", "drive:Calibrate", DRIVE
-    ),
     "park": Entry("Evaluate agents that drive the car into a slot.", "drive:Park", DRIVE),
-    "lot": Entry(
-        "Show, check, import, count and convert lots (files, OpenStreetMap).",
-        heading=DATA,
-    ),
+    "calibrate": Entry("Measure the costs of searches on whole driven trips.", "drive:Calibrate", DRIVE),
+    "lot": Entry("Show, check, import, count and convert lots.", heading=DATA),
     "lot show": Entry("Draw a lot and summarise it.", "lot:Show"),
     "lot check": Entry(
         "List all errors and warnings of a lot file, by feature number (from 0).", "lot:Check"
     ),
-    "lot import": Entry(
-        "Import a lot of a real place; report what was found, guessed and left out.", "lot:Import"
-    ),
+    "lot import": Entry("Import a real place; report what was found, guessed and left out.", "lot:Import"),
     "lot census": Entry("Describe lots: size, kinds of slots, distances, error probability.", "lot:Census"),
     "lot convert": Entry("Write a lot as native GeoJSON.", "lot:Convert"),
     "occupancy": Entry("Fit models to recorded occupancy, and score forecasts.", heading=DATA),

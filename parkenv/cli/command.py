@@ -117,6 +117,7 @@ class _Page:
     help: str | None
     params: list[Any]
     examples: str = ""
+    order: Sequence[str] = ()
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         """Return the words after the command, without the braces of required arguments."""
@@ -140,7 +141,9 @@ class _Page:
         """Write arguments, options and commands, each under its heading."""
         sections: dict[str, list[tuple[str, str]]] = {"Arguments": [], "Options": []}
         commands = getattr(self, "commands", {})
-        for name, command in commands.items():
+        # Typer lists groups after commands.
+        for name in [name for name in self.order if name in commands] or commands:
+            command = commands[name]
             sections.setdefault(command.rich_help_panel or "Commands", []).append((name, command.help))
         for param in self.get_params(ctx):  # type: ignore[attr-defined]
             if isinstance(param, TyperArgument):
@@ -243,7 +246,7 @@ def make_app(text: str, examples: str, entries: Mapping[str, Entry]) -> typer.Ty
         examples: lines of that page.
         entries: commands and groups by their words; a group comes before its commands.
     """
-    app = _group("parkenv", Entry(text), examples)
+    app = _group("parkenv", Entry(text), examples, tuple(entries))
     groups = {"": app}
     for words, entry in entries.items():
         before, _, name = words.rpartition(" ")
@@ -259,8 +262,8 @@ def make_app(text: str, examples: str, entries: Mapping[str, Entry]) -> typer.Ty
     return app
 
 
-def _group(name: str, entry: Entry, examples: str) -> typer.Typer:
-    page = type(name, (_GroupPage,), {"examples": examples})
+def _group(name: str, entry: Entry, examples: str, order: Sequence[str] = ()) -> typer.Typer:
+    page = type(name, (_GroupPage,), {"examples": examples, "order": order})
     return typer.Typer(
         name=name, help=entry.summary, cls=page, rich_markup_mode=None, context_settings=CONTEXT
     )
