@@ -9,13 +9,11 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.models import Drawable, Frame, PinholeCamera, checked_pose
 from sim_sensors.camera.projection import project
 from sim_sensors.camera.rasterizer import edge_slope, sorted_by_row
-
-IntArray = NDArray[np.int32]
 
 END_LIMIT = math.radians(30.0)
 SIDE_LIMIT = math.radians(60.0)
@@ -33,11 +31,11 @@ class View(IntEnum):
 class VehicleBoxes:
     """The vehicles that would be visible without occlusion, nearest first."""
 
-    ids: IntArray  # (n,) int32, as in the instances
+    ids: Int32Array  # (n,) int32, as in the instances
     # (n, 4) int32, px: left, top, right, bottom (right and bottom exclusive) of the whole vehicle within the image,
     # hidden parts included
-    box: IntArray
-    visible_box: IntArray  # (n, 4) int32, the box of its visible pixels; zeros if there are none
+    box: Int32Array
+    visible_box: Int32Array  # (n, 4) int32, the box of its visible pixels; zeros if there are none
     # (n,) float64, visible pixels divided by the pixels that it would have alone, both within the image
     visible_fraction: FloatArray
     view: NDArray[np.int8]  # (n,) int8, a `View` each
@@ -87,8 +85,8 @@ def _views(offset: FloatArray, yaw: FloatArray) -> NDArray[np.int8]:
 
 @compiled
 def _extents_alone(
-    corners: NDArray[np.float32], instance: IntArray, n: int, width: int, height: int
-) -> tuple[NDArray[np.int64], IntArray]:
+    corners: NDArray[np.float32], instance: Int32Array, n: int, width: int, height: int
+) -> tuple[NDArray[np.int64], Int32Array]:
     """Return the pixel count and box of each instance without the others; triangles of an instance are consecutive."""
     last = np.full((height, width), -1, dtype=np.int32)
     count = np.zeros(n, dtype=np.int64)
@@ -119,7 +117,7 @@ def _extents_alone(
 
 
 @compiled
-def _extents_seen(ids: IntArray, n: int) -> tuple[NDArray[np.int64], IntArray]:
+def _extents_seen(ids: Int32Array, n: int) -> tuple[NDArray[np.int64], Int32Array]:
     height, width = ids.shape
     count = np.zeros(n, dtype=np.int64)
     box = _empty_boxes(n, width, height)
@@ -139,7 +137,7 @@ def _extents_seen(ids: IntArray, n: int) -> tuple[NDArray[np.int64], IntArray]:
 
 
 @compiled
-def _empty_boxes(n: int, width: int, height: int) -> IntArray:
+def _empty_boxes(n: int, width: int, height: int) -> Int32Array:
     box = np.zeros((n, 4), dtype=np.int32)
     box[:, 0] = width
     box[:, 1] = height

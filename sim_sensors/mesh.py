@@ -8,7 +8,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-Float32Array = NDArray[np.float32]
+from parkenv.compiled.arrays import Float32Array
 
 
 class Material(IntEnum):

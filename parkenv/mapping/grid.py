@@ -7,12 +7,10 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError, require_number
 from parkenv.perception.slot_filter import P_FREE, P_OCCUPIED
-
-Float32Array = NDArray[np.float32]
 
 MOST_LOG_ODDS = 12.0  # bound of the log-odds, so that later observations can still change the estimate
 _UNOBSERVED, _FREE, _OCCUPIED = 0, 1, 2

@@ -7,11 +7,10 @@ from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.errors import InputError
 from sim_sensors.ground_truth import View
 
-Float32Array = NDArray[np.float32]
 Float = TypeVar("Float", np.float32, np.float64)
 
 LEAST_PROBABILITY = 0.08

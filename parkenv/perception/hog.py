@@ -15,13 +15,10 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError, require_one_of
-
-Float32Array = NDArray[np.float32]
 
 CELL = 8  # pixels along each side of a cell
 ORIENTATIONS = 9  # bins over half a turn; opposite gradients count as one

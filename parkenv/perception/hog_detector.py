@@ -14,14 +14,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.compiled.threads import in_threads
 from parkenv.errors import InputError, require_number
 from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
 from parkenv.perception.detector import Detections, DetectorErrors, GroundBand
 from parkenv.perception.hog import CELL, Descriptor, correlate
-
-Float32Array = NDArray[np.float32]
 
 LEAST_SCORED = 0.002
 """Least probability of a detection that counts in an evaluation: curves go on to many false positives."""

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.errors import InputError
 from parkenv.files.onnx_file import OnnxFile, OnnxValue, read_onnx
 from parkenv.files.spec_file import Several, Spec
@@ -30,8 +30,6 @@ from parkenv.perception.onnx_outputs import (
     mirrored_centers,
 )
 from parkenv.perception.onnx_trial import require_runs
-
-Float32Array = NDArray[np.float32]
 
 SIDECARS = (".toml", ".json")
 CAR_NAMES = ("car", "cars", "van", "truck", "bus", "pickup", "suv", "vehicle", "automobile", "motor vehicle")

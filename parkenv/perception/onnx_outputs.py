@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.errors import InputError
-
-Float32Array = NDArray[np.float32]
 
 Layout = Literal["yolo", "yolo5", "boxes", "detr", "centers"]
 Scores = Literal["probabilities", "logits", "softmax"]

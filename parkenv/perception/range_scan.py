@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from sim_sensors.camera.models import StereoCamera, StereoFrame
 from sim_sensors.laser.scanner import LaserScanner
 from sim_sensors.rig import Mount
-
-Float32Array = NDArray[np.float32]
 
 STEREO_RANGE = 12.0
 """Range of stereo measurements, m; beyond it, half a pixel of disparity corresponds to more than a metre."""

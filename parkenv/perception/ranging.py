@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.errors import InputError
 from parkenv.perception.box_fit import CAR_LENGTH, CAR_WIDTH, LONG_SIDE, fit_box
 from parkenv.perception.range_scan import RangeScan
@@ -26,7 +26,6 @@ from sim_sensors.rig import Mount
 if TYPE_CHECKING:
     from parkenv.perception.detector import Detections
 
-Float32Array = NDArray[np.float32]
 
 GAP = 0.5  # m; neighbouring beams whose end points are farther apart belong to different objects
 WHOLE_END = 1.2  # m; a visible edge of this length is the front or rear of a car, not a part of its side

@@ -12,13 +12,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import Float32Array, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.vehicle import ACCELERATION, SPEED, STEERING, YAW, VehicleParameters
-
-Float32Array = NDArray[np.float32]
 
 INTERFACE = "drive-1"
 """Version of the layout of observation and action; models of another version are refused."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, JsonValue
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from parkenv.errors import InputError
 from parkenv.files.atomic_write import atomic_write
@@ -43,8 +44,6 @@ from planners.network.features import (
     TOKEN_FEATURES,
     Features,
 )
-
-Float32Array = NDArray[np.float32]
 
 FORMAT = "parkenv-network-1"
 SHIPPED = Path(__file__).with_name("models") / "network.safetensors"

@@ -5,14 +5,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Float32Array, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.daylight import Light
 from sim_sensors.camera.textures import VECTOR_LOOP, Single
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 
 class View(NamedTuple):
@@ -29,9 +26,9 @@ class View(NamedTuple):
 class Places(NamedTuple):
     """Pixels of one kind, (n,) int32 each, and the triangles seen there."""
 
-    column: IntArray
-    row: IntArray
-    triangle: IntArray
+    column: Int32Array
+    row: Int32Array
+    triangle: Int32Array
 
 
 class Batch(NamedTuple):

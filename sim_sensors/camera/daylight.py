@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.light_maps import LightMaps, open_sky
 from sim_sensors.camera.sky import look_up, packed_sky
 from sim_sensors.camera.textures import VECTOR_LEAF, Single
 from sim_sensors.camera.weather import Weather
 
-Float32Array = NDArray[np.float32]
 Color = tuple[Single, Single, Single]
 Vector = tuple[Single, Single, Single]
 

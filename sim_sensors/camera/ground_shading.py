@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import Batch, Places
 from sim_sensors.camera.daylight import SHADOW_BIAS, Light
@@ -14,8 +15,6 @@ from sim_sensors.camera.ground_texture import GroundTexture, sample_ground
 from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.sky import look_up
 from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, hash_unit, sample_tile
-
-Float32Array = NDArray[np.float32]
 
 _GRAIN_M = 3.0  # m, period of the asphalt's grain
 _GRAIN_PER_M = np.float32(1.0 / _GRAIN_M)

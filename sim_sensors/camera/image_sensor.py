@@ -11,12 +11,11 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.rasterizer import BAND, interleaved
 from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single
 from sim_sensors.errors import SensorError
-
-Float32Array = NDArray[np.float32]
 
 _CURVE_STEPS = 4096
 _BRIGHTEST = np.float32(4.0)  # greatest input of the tone curve; a plain sRGB curve would clip at 1

@@ -8,12 +8,10 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import VECTOR_LEAF, Single, mix, mix_quad
 from sim_sensors.mesh import MeshPool
-
-Float32Array = NDArray[np.float32]
 
 
 class LightMaps(NamedTuple):

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import Batch, Places, View
 from sim_sensors.camera.daylight import SHADOW_BIAS, Light, mirrored
@@ -14,8 +15,6 @@ from sim_sensors.camera.light_maps import LightMaps, open_sky, sunlit
 from sim_sensors.camera.textures import VECTOR_LEAF, VECTOR_LOOP, Single, Tile, mix, pixel_level, sample_tile
 from sim_sensors.facades import facade
 from sim_sensors.mesh import Material
-
-Float32Array = NDArray[np.float32]
 
 _PAINT = int(Material.PAINT)
 _FACADE = int(Material.FACADE)

@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.ground_texture import GroundTexture, ground_texture
 from sim_sensors.camera.image_sensor import ImageSensor
@@ -24,8 +24,6 @@ from sim_sensors.camera.sky import packed_sky, sky_of_view
 from sim_sensors.camera.weather import Weather
 from sim_sensors.errors import SensorError
 from sim_sensors.mesh import Ground, Instances, MeshPool
-
-Float32Array = NDArray[np.float32]
 
 _FOCAL = 520.0  # px, focal length to which `coarse_beyond` refers
 _AHEAD = 12.0  # m ahead of the camera: the middle of the area that is lit in detail

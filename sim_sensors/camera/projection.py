@@ -15,13 +15,10 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF
 from sim_sensors.mesh import Instances, Material, MeshPool
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 NEAR = 0.05  # m; nothing nearer is drawn
 _MOST_PARTS = 8
@@ -39,7 +36,7 @@ class ScreenTriangles(NamedTuple):
     corners: Float32Array
     inverse_depth: FloatArray  # (n, 3) float64: 1/depth in 1/m at (x, y) px is a·x + b·y + c
     # (n, 4) int32, px: first column, first row, and those after the last, of the pixels whose centres it may cover
-    box: IntArray
+    box: Int32Array
     nearest: Float32Array  # (n,) float32, 1/m: no point has a greater inverse depth
     is_back: NDArray[np.bool_]  # (n,) bool, whether its inner side is seen
     # (n, 9) float32: row-major 3×3 matrix from the ray (u, v, 1) in the camera frame to the interpolated outward
@@ -47,7 +44,7 @@ class ScreenTriangles(NamedTuple):
     normal: Float32Array
     material: NDArray[np.uint8]  # (n,) uint8
     color: NDArray[np.uint8]  # (n, 3) uint8, sRGB
-    instance: IntArray  # (n,) int32, index into the instances, the nearest first
+    instance: Int32Array  # (n,) int32, index into the instances, the nearest first
 
 
 class _Meshes(NamedTuple):
@@ -55,7 +52,7 @@ class _Meshes(NamedTuple):
 
     vertices: Float32Array
     normals: Float32Array
-    triangles: IntArray
+    triangles: Int32Array
     material: NDArray[np.uint8]
     color: NDArray[np.uint8]
     vertex_start: NDArray[np.int64]
@@ -66,8 +63,8 @@ class _Meshes(NamedTuple):
 class _Placed(NamedTuple):
     """The visible instances: their numbers, meshes, and the poses of all instances."""
 
-    visible: IntArray
-    mesh: IntArray
+    visible: Int32Array
+    mesh: Int32Array
     poses: FloatArray
 
 
@@ -90,7 +87,7 @@ class _Work(NamedTuple):
     to_camera: FloatArray  # (3, 4) instance to camera
     cross: FloatArray  # (3, 3) cross products of a triangle's corners
     polygon: FloatArray  # (4, 2) px, a triangle clipped at the near plane
-    box: IntArray  # (4,) pixels that it may cover
+    box: Int32Array  # (4,) pixels that it may cover
 
 
 def project(
@@ -165,7 +162,7 @@ def _visible_instances(
     pose: FloatArray,
     intrinsics: tuple[float, float, float, float],
     size: tuple[int, int],
-) -> IntArray:
+) -> Int32Array:
     """Return the instances whose bounding sphere intersects the view frustum."""
     fx, fy, cx, cy = intrinsics
     center = (instances.pose[:, :3] - pose[:3, 3]) @ pose[:3, :3]
@@ -339,7 +336,7 @@ def _clip(
 
 
 @compiled(**LEAF)
-def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int, box: IntArray) -> bool:
+def _covers_pixels(polygon: FloatArray, corners: int, width: int, height: int, box: Int32Array) -> bool:
     """Set `box` to the pixels whose centres are in the polygon's bounding box, and return whether there are any."""
     left = right = polygon[0, 0]
     top = bottom = polygon[0, 1]

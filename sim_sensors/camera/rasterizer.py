@@ -14,14 +14,11 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.projection import ScreenTriangles
 from sim_sensors.camera.textures import FAST, LEAF
 from sim_sensors.mesh import Material
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 FAR = 1000.0  # m, the ground ends there
 BAND = 16  # rows
@@ -39,10 +36,10 @@ class Visibility(NamedTuple):
 
     # float32, 1/m along the optical axis, of the first opaque surface; 0 for the sky
     inverse_depth: Float32Array
-    triangle: IntArray  # int32, of that surface; -1 for ground or sky
+    triangle: Int32Array  # int32, of that surface; -1 for ground or sky
     # float32, 1/m, of the nearest pane of glass in front of it; 0 where there is none
     pane_inverse_depth: Float32Array
-    pane: IntArray  # int32, that pane's triangle; -1 where there is none
+    pane: Int32Array  # int32, that pane's triangle; -1 where there is none
     n_panes: NDArray[np.uint8]  # uint8, number of panes in front of it
 
 
@@ -103,8 +100,8 @@ def interleaved(n: int) -> NDArray[np.int64]:
 
 @compiled(nogil=True)
 def _sort_into_bands(
-    box: IntArray, is_back: NDArray[np.bool_], material: NDArray[np.uint8], n_bands: int
-) -> tuple[NDArray[np.int64], IntArray]:
+    box: Int32Array, is_back: NDArray[np.bool_], material: NDArray[np.uint8], n_bands: int
+) -> tuple[NDArray[np.int64], Int32Array]:
     """Return the triangles of each band in their order, by kind.
 
     Those of kind k in band b are `members[start[3·b + k]:start[3·b + k + 1]]`.
@@ -159,17 +156,17 @@ def sorted_by_row(corners: Float32Array) -> tuple[float, float, float, float, fl
 def _rasterize(
     corners: Float32Array,
     planes: FloatArray,
-    box: IntArray,
+    box: Int32Array,
     nearest: Float32Array,
     start: NDArray[np.int64],
-    members: IntArray,
+    members: Int32Array,
     order: NDArray[np.int64],
     floor: FloatArray,
     minimum: float,
     depth: Float32Array,
-    triangle: IntArray,
+    triangle: Int32Array,
     pane_depth: Float32Array,
-    pane: IntArray,
+    pane: Int32Array,
     n_panes: NDArray[np.uint8],
 ) -> None:
     height, width = depth.shape
@@ -205,7 +202,7 @@ def _rasterize(
 
 
 @compiled(**LEAF)
-def _clear(y: int, floor: FloatArray, minimum: float, depth: Float32Array, triangle: IntArray) -> None:
+def _clear(y: int, floor: FloatArray, minimum: float, depth: Float32Array, triangle: Int32Array) -> None:
     """Fill a row with the ground and the sky."""
     # In double precision: towards the horizon most of the digits cancel.
     base = floor[1] * (y + 0.5) + floor[2] + 0.5 * floor[0]
@@ -230,7 +227,7 @@ def _refresh(depth: Float32Array, first: int, end: int, hiding: Float32Array) ->
 
 
 @compiled(**LEAF)
-def _is_hidden(box: IntArray, nearest: float, top: int, bottom: int, hiding: Float32Array) -> bool:
+def _is_hidden(box: Int32Array, nearest: float, top: int, bottom: int, hiding: Float32Array) -> bool:
     """Return whether a triangle is behind what is drawn in its columns of the strips that it is in."""
     limit = np.float32(nearest * _MARGIN)
     for strip in range((max(box[1], top) - top) // _STRIP, (min(box[3], bottom) - 1 - top) // _STRIP + 1):
@@ -249,7 +246,7 @@ def _draw_opaque(
     top: int,
     bottom: int,
     depth: Float32Array,
-    triangle: IntArray,
+    triangle: Int32Array,
 ) -> None:
     """Draw a triangle into the rows `top` to `bottom`."""
     ax, ay, bx, by, cx, cy = sorted_by_row(corners)
@@ -279,7 +276,7 @@ def _draw_pane(
     bottom: int,
     depth: Float32Array,
     pane_depth: Float32Array,
-    pane: IntArray,
+    pane: Int32Array,
     n_panes: NDArray[np.uint8],
 ) -> None:
     """Draw a triangle of glass into the rows `top` to `bottom`, in front of what is opaque."""

@@ -10,7 +10,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.batches import (
     BATCH_FIELDS,
@@ -45,9 +45,6 @@ from sim_sensors.camera.rasterizer import BAND, Visibility, interleaved
 from sim_sensors.camera.sky import sky_of_view
 from sim_sensors.camera.textures import FAST, VECTOR_LOOP, Single, Tile, cloud_tile, grain_tile
 from sim_sensors.camera.weather import Weather
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 _BATCH = 512  # pixels of a kind that are collected before they are shaded; their data stay in the first-level cache
 
@@ -193,10 +190,10 @@ def _draw_sky(inverse_depth: Float32Array, background: Float32Array, image: Floa
 @compiled(**VECTOR_LOOP)
 def _split(
     inverse_depth: Float32Array,
-    triangle: IntArray,
-    on_ground: IntArray,
+    triangle: Int32Array,
+    on_ground: Int32Array,
     grounds: int,
-    on_surface: IntArray,
+    on_surface: Int32Array,
     others: int,
 ) -> tuple[int, int]:
     """Append the columns of a row that show the ground or a surface to two lists, and return the new lengths.
@@ -214,7 +211,7 @@ def _split(
 
 
 @compiled(**VECTOR_LOOP)
-def _find_panes(pane: IntArray, on_pane: IntArray, panes: int) -> int:
+def _find_panes(pane: Int32Array, on_pane: Int32Array, panes: int) -> int:
     """Append the columns of a row that show glass, and return the new length."""
     nearest = np.int32(-1)
     for x in range(pane.shape[0]):
@@ -229,7 +226,7 @@ def _find_panes(pane: IntArray, on_pane: IntArray, panes: int) -> int:
 
 
 @compiled(**VECTOR_LOOP)
-def _note_row(y: int, begin: int, end: int, triangle: IntArray, places: Places) -> None:
+def _note_row(y: int, begin: int, end: int, triangle: Int32Array, places: Places) -> None:
     """Note the row and the triangles of the places that a row has added."""
     for i in range(begin, end):
         places.row[i] = y

@@ -18,15 +18,12 @@ import numpy as np
 from numba import get_num_threads, prange
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.compiled.arrays import Float32Array, FloatArray, Image, Int32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.light_maps import LightMaps, bounding_boxes
 from sim_sensors.camera.textures import quads
 from sim_sensors.camera.weather import Weather
 from sim_sensors.mesh import Instances, Material, MeshPool
-
-Float32Array = NDArray[np.float32]
-IntArray = NDArray[np.int32]
 
 _WINDOW = 72.0  # m, side of the square that the maps cover
 _STEP = 16.0  # m; the window moves in steps of this size, so a moving camera can reuse it
@@ -194,7 +191,7 @@ def _shadow_boxes(pool: MeshPool, rows: FloatArray, to_shadow: FloatArray) -> ND
     return np.asarray(np.floor(np.column_stack(ends)), dtype=np.int64)
 
 
-def _drawn_mesh(pool: MeshPool, rows: FloatArray) -> IntArray:
+def _drawn_mesh(pool: MeshPool, rows: FloatArray) -> Int32Array:
     mesh = rows[:, 0].astype(np.int32)
     return mesh if pool.coarse is None else pool.coarse[mesh]
 
@@ -237,11 +234,11 @@ def _cast(
 @compiled(parallel=True, nogil=True, error_model="numpy")
 def _cast_parts(
     vertices: Float32Array,
-    triangles: IntArray,
+    triangles: Int32Array,
     material: NDArray[np.uint8],
     vertex_start: NDArray[np.int64],
     triangle_start: NDArray[np.int64],
-    mesh: IntArray,
+    mesh: Int32Array,
     poses: FloatArray,
     boxes: NDArray[np.int64],
     to_shadow: FloatArray,

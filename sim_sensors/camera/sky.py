@@ -15,12 +15,10 @@ from numba import prange
 from numpy.typing import NDArray
 from scipy.fft import irfft, rfft2
 
-from parkenv.compiled.arrays import FloatArray
+from parkenv.compiled.arrays import Float32Array, FloatArray
 from parkenv.compiled.jit import compiled
 from sim_sensors.camera.textures import FAST, LEAF, VECTOR_LEAF, Single, cloud_noise, fractal_noise, mix
 from sim_sensors.camera.weather import Weather
-
-Float32Array = NDArray[np.float32]
 
 _DOME = 160  # texels across the hemisphere
 _SAMPLES = 3  # along each side of a texel

@@ -7,10 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from parkenv.compiled.arrays import IntArray
+from parkenv.compiled.arrays import FloatArray, IntArray
 from sim_sensors.errors import SensorError
-
-Float64Array = NDArray[np.float64]
 
 NO_RETURN = -1
 WALL = -2
@@ -49,12 +47,12 @@ class Cells(NamedTuple):
     """
 
     corners: NDArray[np.float32]
-    x: Float64Array
-    y: Float64Array
+    x: FloatArray
+    y: FloatArray
     radius: NDArray[np.float32]
     label: NDArray[np.int32]
     cell_start: IntArray
-    frame: Float64Array
+    frame: FloatArray
     k: int
 
 
@@ -68,7 +66,7 @@ class CellTable:
         labels: (n,) int64.
     """
 
-    def __init__(self, k: int, corners: Float64Array, n_corners: IntArray, labels: IntArray) -> None:
+    def __init__(self, k: int, corners: FloatArray, n_corners: IntArray, labels: IntArray) -> None:
         stands = np.flatnonzero((n_corners > 0) & (n_corners <= k))
         circle = _enclosing_circles(corners[stands], n_corners[stands])
         fits = circle[:, 2] <= LARGEST_IN_A_CELL_M
@@ -116,7 +114,7 @@ class CellTable:
         if place != NOWHERE:
             self.cells.x[place] = self.cells.y[place] = FAR
 
-    def put(self, index: int, corners: Float64Array, label: int) -> bool:
+    def put(self, index: int, corners: FloatArray, label: int) -> bool:
         """Replace polygon `index`; return False, without a change, if no place is free and a new sort is due.
 
         Args:
@@ -137,7 +135,7 @@ class CellTable:
         self._write(np.array([place]), circle, corners[None], count, np.array([label]))
         return True
 
-    def _in_cell_of(self, place: int, circle: Float64Array) -> bool:
+    def _in_cell_of(self, place: int, circle: FloatArray) -> bool:
         cell, start = int(_cell_of(circle, self.cells.frame)[0]), self.cells.cell_start
         return (
             cell >= 0 and circle[0, 2] <= LARGEST_IN_A_CELL_M and bool(start[cell] <= place < start[cell + 1])
@@ -146,8 +144,8 @@ class CellTable:
     def _write(
         self,
         place: IntArray,
-        circle: Float64Array,
-        corners: Float64Array,
+        circle: FloatArray,
+        corners: FloatArray,
         n_corners: IntArray,
         label: IntArray,
     ) -> None:
@@ -216,12 +214,12 @@ class ScanPlane:
         return self._quads.cells, self._others.cells
 
     @property
-    def footprints(self) -> tuple[Float64Array, IntArray]:
+    def footprints(self) -> tuple[FloatArray, IntArray]:
         """Corners, (n, k_max, 2) float64, m, world frame, counter-clockwise, zero-padded; (n,) int64 counts."""
         return self._corners.copy(), self._n_corners.copy()
 
     @property
-    def walls(self) -> Float64Array:
+    def walls(self) -> FloatArray:
         """(m, 2, 2) float64, m, world frame."""
         return self._wall.copy()
 
@@ -272,7 +270,7 @@ class ScanPlane:
         self._others = CellTable(max(OCTAGON, self.k_max), corners, larger, labels)
 
 
-def _short_pieces(walls: Float64Array) -> Float64Array:
+def _short_pieces(walls: FloatArray) -> FloatArray:
     """Return the walls cut into pieces that fit into a cell, (n, 2, 2) float64."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     n = np.ceil(np.hypot(along[:, 0], along[:, 1]) / (2 * LARGEST_IN_A_CELL_M)).astype(np.int64)
@@ -282,7 +280,7 @@ def _short_pieces(walls: Float64Array) -> Float64Array:
     return np.asarray(start[wall, None] + ends[..., None] * along[wall, None])
 
 
-def _frame(circle: Float64Array) -> Float64Array:
+def _frame(circle: FloatArray) -> FloatArray:
     """Return the frame of cells over all centres; see `Cells.frame`."""
     low, high = (circle[:, :2].min(0), circle[:, :2].max(0)) if len(circle) else (np.zeros(2), np.zeros(2))
     extent = high - low
@@ -292,7 +290,7 @@ def _frame(circle: Float64Array) -> Float64Array:
     return np.array([*low, size, rows, columns])
 
 
-def _cell_of(circle: Float64Array, frame: Float64Array) -> IntArray:
+def _cell_of(circle: FloatArray, frame: FloatArray) -> IntArray:
     """Return the cell of each centre, (n,) int64; -1 outside all cells."""
     x, y, size, rows, columns = frame[:5]
     column, row = np.floor((circle[:, 0] - x) / size), np.floor((circle[:, 1] - y) / size)
@@ -300,7 +298,7 @@ def _cell_of(circle: Float64Array, frame: Float64Array) -> IntArray:
     return np.where(inside, row * columns + column, -1).astype(np.int64)
 
 
-def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> Float64Array:
+def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
     """Return `value` as a finite float64 array of the given shape; None stands for any length.
 
     Raises:
@@ -330,11 +328,11 @@ def _as_ints(name: str, value: ArrayLike, n: int) -> IntArray:
     return array.astype(np.int64)
 
 
-def _cross(a: Float64Array, b: Float64Array) -> Float64Array:
+def _cross(a: FloatArray, b: FloatArray) -> FloatArray:
     return np.asarray(a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0])
 
 
-def _enclosing_circles(corners: Float64Array, n_corners: IntArray) -> Float64Array:
+def _enclosing_circles(corners: FloatArray, n_corners: IntArray) -> FloatArray:
     """Return x, y and radius of a circle around each polygon, (n, 3) float64."""
     used = np.arange(corners.shape[1]) < n_corners[:, None]
     centre = (corners * used[..., None]).sum(1) / n_corners[:, None]
@@ -342,7 +340,7 @@ def _enclosing_circles(corners: Float64Array, n_corners: IntArray) -> Float64Arr
     return np.column_stack([centre, np.where(used, reach, 0.0).max(1, initial=0.0)])
 
 
-def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[Float64Array, IntArray]:
+def _normalised(name: str, corners: FloatArray, n_corners: IntArray) -> tuple[FloatArray, IntArray]:
     """Return the footprints counter-clockwise, without collinear corners.
 
     Args:
@@ -391,7 +389,7 @@ def _normalised(name: str, corners: Float64Array, n_corners: IntArray) -> tuple[
     return kept, count
 
 
-def _refuse(name: str, wanted: str, group: IntArray, outline: Float64Array, wrong: NDArray[np.bool_]) -> None:
+def _refuse(name: str, wanted: str, group: IntArray, outline: FloatArray, wrong: NDArray[np.bool_]) -> None:
     if wrong.any():
         i = int(np.argmax(wrong.any(1)))
         raise SensorError(f"{name}[{group[i]}] is {outline[i].round(4).tolist()}, want {wanted}")

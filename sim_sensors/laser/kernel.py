@@ -13,12 +13,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.compiled.jit import compiled
 from sim_sensors.laser.footprints import LANES, LARGEST_IN_A_CELL_M, NO_RETURN, OCTAGON, QUAD, WALL
-
-Float32Array = NDArray[np.float32]
 
 BEAMS_PER_BLOCK = 16
 BEAMS_PER_DRAW = 64  # beams that use neighbouring numbers of the noise table, from one random offset

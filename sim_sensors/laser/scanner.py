@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtri
 
+from parkenv.compiled.arrays import Float32Array
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import NO_RETURN, ScanPlane
 from sim_sensors.laser.kernel import BEAMS_PER_BLOCK, BEAMS_PER_DRAW, BeamTable, scan_all
 
-Float32Array = NDArray[np.float32]
 Int32Array = NDArray[np.int32]
 
 NOISE_TABLE_SIZE = 1 << 16

@@ -12,9 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
-
-Float32Array = NDArray[np.float32]
+from parkenv.compiled.arrays import Float32Array, Image
 
 _OCTAVES = (2.0, 4.0, 8.0, 16.0, 32.0)  # px
 _ON_THE_GROUND = 0.15

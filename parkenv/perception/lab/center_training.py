@@ -15,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from parkenv.compiled.arrays import Float32Array
 from parkenv.errors import InputError, require_whole
 from parkenv.perception.detector import overlaps
 from parkenv.perception.lab.center_network import GREY_MEAN, GREY_STD, STRIDE, CenterNetwork, sides, to_onnx
@@ -22,7 +23,6 @@ from parkenv.perception.lab.simulated_scenes import SimulatedScene, simulated_sc
 from parkenv.perception.lab.simulated_streets import FRAMES
 from parkenv.perception.lab.training_crops import Example, ExampleMaker, draw_size
 
-Float32Array = NDArray[np.float32]
 Progress = Callable[[str], None]
 
 _SPREAD = 0.13  # standard deviation of a centre's peak, as a fraction of its box

@@ -6,12 +6,10 @@ import math
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.perception.lab.car_datasets import Crops, LabelledImage
 
-Float32Array = NDArray[np.float32]
 Box = tuple[int, int, int, int]  # left, top, right, bottom, px
 
 SIZES = (0.8, 2.2)

@@ -15,15 +15,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.compiled.arrays import Float32Array, FloatArray, Image
 from parkenv.errors import InputError
 from parkenv.files.archives import read_arrays
 from parkenv.perception.hog_detector import as_grey
 from parkenv.perception.lab.simulated_streets import FRAMES, LongLens, Street, StreetPictures
 from sim_sensors.camera.models import Frame, PinholeCamera, camera_pose
 from sim_sensors.ground_truth import VehicleBoxes
-
-Float32Array = NDArray[np.float32]
 
 DEPTH_STEPS = 32.0
 """Steps of the stored depth for a factor of e: they are 3 % apart."""

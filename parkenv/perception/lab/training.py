@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.errors import InputError, require_number, require_whole, with_extra
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import overlaps
@@ -17,7 +17,6 @@ from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, best_boxes
 from parkenv.perception.lab.car_datasets import LabelledImage
 
-Float32Array = NDArray[np.float32]
 Progress = Callable[[str], None]
 
 CAR_OVERLAP = 0.25

@@ -14,13 +14,11 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.files.images import decode_image
 from parkenv.perception.lab.backdrops import random_texture
 from parkenv.perception.lab.simulated_scenes import DEPTH_STEPS, SimulatedScene
 from sim_sensors.ground_truth import View
-
-Float32Array = NDArray[np.float32]
 
 SIZES = ((320, 256), (256, 192), (480, 320))
 """Width and height of the examples of a batch, px."""

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import FloatArray, IntArray
+from parkenv.compiled.arrays import Float32Array, FloatArray, IntArray
 from parkenv.compiled.jit import compiled
 from parkenv.driving.parking_task import AREA, KINDS, ParkingTask
 from parkenv.driving.vehicle import SPEED, YAW, VehicleParameters, advance
@@ -23,8 +23,6 @@ from parkenv.envs.drive_goals import goal_error, goal_of
 from parkenv.envs.drive_observation import MOST_CARS, MOST_LINES, obstacle_map
 from planners.driving import policy_interface as interface
 from planners.driving.policy_interface import Outlines, PolicyInterface
-
-Float32Array = NDArray[np.float32]
 
 RUNNING, PARKED, CONTACT, LEFT_AREA = range(4)  # status of a drive
 
