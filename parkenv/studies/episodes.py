@@ -28,14 +28,14 @@ class SearchRecorder(Observer):
     """Records a search, whose true occupancy no agent sees.
 
     Args:
-        agent: the agent, whose plans are recorded if it has `plan_preview`; None to record none.
+        agent: the agent, whose plans are recorded if it has `plan_preview`.
         keep: called with the arrival and each step; None to record the first plan alone.
 
     Attributes:
         policy: plan of the first decision, (n_vertices,) int64; None for agents without a policy.
     """
 
-    def __init__(self, agent: Agent | None = None, keep: Callable[[Moment], None] | None = None) -> None:
+    def __init__(self, agent: Agent, keep: Callable[[Moment], None] | None) -> None:
         self._preview_of, self._keep = getattr(agent, "plan_preview", None), keep
 
     def on_reset(self, env: gym.Env[Any, Any], observation: Any) -> None:

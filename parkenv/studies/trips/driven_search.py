@@ -17,7 +17,7 @@ from parkenv.envs.search import SearchEnv
 from parkenv.errors import require_whole
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
-from parkenv.studies.trips.executor import Leg, MotionExecutor, ParkingAttempt
+from parkenv.studies.trips.executor import Leg, ParkingAttempt
 from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.lot import PARK
@@ -41,7 +41,7 @@ class DrivenSearchEnv(SearchEnv):
     """
 
     def __init__(
-        self, scenario: Scenario, executor: MotionExecutor, perception: OnboardPerception | None = None
+        self, scenario: Scenario, executor: VehicleController, perception: OnboardPerception | None = None
     ) -> None:
         super().__init__(scenario)
         self.executor, self.perception = executor, perception

@@ -1,17 +1,10 @@
-"""Interface between a search on the drive graph and the car that executes its decisions."""
+"""What passes between a search on the drive graph and the car that executes its decisions."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple, Protocol
-
-import numpy as np
+from typing import NamedTuple
 
 from parkenv.compiled.arrays import FloatArray
-
-if TYPE_CHECKING:
-    from parkenv.world.occupancy.process import World
-    from sim_sensors.movers import Movers
-
 
 ALONG, TURN, ROUND, ACROSS = "along", "turn", "round", "across"
 OBSERVED, UNOBSERVED = "observed", "unobserved"
@@ -50,28 +43,3 @@ class TrackPoint(NamedTuple):
     driven_m: float  # distance driven so far, m
     pose: FloatArray  # (3,) x, y in m, yaw in rad, of the middle of the car's footprint
     clocks: FloatArray  # (n,) s, clocks of the moving road users, see `RoadUsers`
-
-
-class MotionExecutor(Protocol):
-    """Executes decisions on the drive graph and returns how long they took.
-
-    Attributes:
-        track: positions of the car since the last decision, every 0.1 s; empty if no time passed or there is no car.
-    """
-
-    track: list[TrackPoint]
-
-    def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
-        """Start at a vertex, at a time in s, in the world with this key."""
-
-    def drive(self, source: int, column: int) -> float:
-        """Drive along an edge; return the time taken, s."""
-
-    def park(self, slot: int, taken: bool) -> ParkingAttempt:
-        """Attempt to park; a taken slot looks free until the car notices that it is taken."""
-
-    def wait(self, seconds: float) -> float:
-        """Stand still; return the time taken, s."""
-
-    def movers_at(self, point: TrackPoint) -> Movers | None:
-        """Return the road users at a track point's time; None without traffic."""
