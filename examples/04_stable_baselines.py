@@ -29,7 +29,7 @@ model = MaskablePPO(
 )
 for _ in range(6):
     model.learn(50_000, reset_num_timesteps=False)
-    save_model(model, "campus.safetensors", scenarios=[SCENARIO])  # for parkenv compare, report and publish
+    save_model(model, "campus.safetensors", scenarios=[SCENARIO])  # for parkenv compare and report
     mean, low, high = mean_interval(total_times("maskable-ppo:campus.safetensors"))
     print(f"{model.num_timesteps:7,} decisions {mean:6.1f} s [{low:.1f}, {high:.1f}] {'#' * round(mean / 4)}")
 for name in ("mdp", "first-free", "greedy-drive"):

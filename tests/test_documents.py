@@ -106,6 +106,7 @@ FEWER = {
     r"every=2\.5, windows": "every=8.0, windows",
     r"range\(100, 200\)": "range(100, 110)",
     r"range\(1, 31\)": "range(1, 11)",
+    r"(ROUNDS, DAYS, HOURS) = .*": r"\1 = 2, 1, '10:00-10:30'",
     r"model.learn\(4_096\)\n    observations": "model.learn(1_024)\n    observations",
 }
 """What is done often on a page or in an example, and how it is done less often here: the same code runs."""

@@ -2,12 +2,10 @@
 
 import json
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
 from command_line import parkenv
-from PIL import Image
 from sb3_contrib import MaskablePPO
 from stable_baselines3 import DQN, PPO
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -252,21 +250,3 @@ def test_a_training_by_command_and_its_model_in_fleets(tmp_path, monkeypatch):
     rows = json.loads((crowd / "summary.json").read_text())["rows"]
     assert [row["agents"] for row in rows] == [model, "greedy-drive"]
     assert parkenv("report", out).returncode == 0
-    best = min(summary["rows"], key=lambda row: row["total_s"])
-    hub = tmp_path / "hub"
-    assert parkenv("publish", out, "--out", hub, "-n", "2", "--jobs", "1").returncode == 0
-    results = json.loads((hub / "results.json").read_text())
-    assert (hub / "model.safetensors").read_bytes() == Path(best["model"]).read_bytes()
-    card = (hub / "README.md").read_text(encoding="utf-8")
-    assert " ".join(results["command"]) in card
-    words = [*results["command"][1:], "--jobs", "1", "--no-figures", "--out", tmp_path / "again"]
-    assert parkenv(*words, cwd=hub).returncode == 0
-    again = json.loads((tmp_path / "again" / "summary.json").read_text())["rows"]
-    assert [row["total_s"] for row in again] == [row["total_s"] for row in results["rows"]]
-    with Image.open(hub / "replay.gif") as film:
-        assert film.n_frames > 3
-    alone = parkenv("publish", best["model"], "--out", tmp_path / "alone")
-    assert "was trained in a fleet; name the folder of its training" in " ".join(alone.stderr.split())
-    code = card.split("```python\n")[1].split("```")[0]
-    monkeypatch.chdir(hub)
-    exec(compile(code, "README.md", "exec"), {})

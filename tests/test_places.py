@@ -397,7 +397,3 @@ def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypat
     assert tested <= held_out
     assert shows_color(out / "learning_curve.png", "#0072b2"), "the first curve"
     assert (out / "report.html").exists()
-    done = parkenv("publish", out, "--out", folder / "hub", "--episodes", 2, "--jobs", 1)
-    assert done.returncode == 0, done.stderr
-    published = json.loads((folder / "hub" / "results.json").read_text())["rows"]
-    assert {row["scenario"] for row in published} == held_out

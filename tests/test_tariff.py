@@ -213,3 +213,32 @@ def test_prices_are_added_to_those_of_paid_zones():
     assert Tariff({"garage": "+0.5"}).priced(others[1]).price == Price(2.5)
     with pytest.raises(InputError, match="no paid zone 'lot"):
         Tariff({"lot*": "+1"}).require_zones([paid, *others], "town")
+
+
+def test_a_scenario_changes_the_rules_of_zones():
+    ring = {"price": "1 @ 08:00-12:00; 3 @ 12:00-20:00", "users": ["public", "permit-a"], "max_stay_s": 7200}
+    plain, changed = (make_scenario({"base": "town", "zones": its}).lot for its in ({}, {"ring": ring}))
+    price = changed.zone_rules["ring"].price.amount(np.array([10.0, 11.0, 18.0]) * 3600.0, 7200.0)
+    assert price.tolist() == [2.0, 4.0, 6.0]
+    assert changed.zone_rules["ring"].max_stay_s == 7200.0
+    assert changed.zone_rules["ring"].hours == plain.zone_rules["ring"].hours
+    assert changed.zone_rules["outer"] == plain.zone_rules["outer"]
+    for wrong, field in (
+        ({"mall": {"price": 1}}, "mall"),
+        ({"ring": {"users": ["nobody"]}}, "nobody"),
+        ({"ring": {"hours": "late"}}, "hours"),
+        ({"ring": {"price": "1 @ late"}}, "price"),
+    ):
+        with pytest.raises(InputError, match=field):
+            make_scenario({"base": "town", "zones": wrong})
+
+
+def test_prices_by_hours_are_a_tariff():
+    zone = Tariff({"near": "1 @ 08:00-12:00; 3 @ 12:00-15:00"}).priced(Zone("near", Price(9.0)))
+    begin = np.array([7.0, 11.5, 16.0]) * 3600.0
+    assert zone.price.amount(begin, 7200.0).tolist() == [1.0, 5.0, 0.0]
+    assert zone.price.raised(1.0).amount(begin, 7200.0).tolist() == [2.0, 7.0, 0.0]
+    with pytest.raises(InputError, match="hourly"):
+        Price(1.0, hourly=zone.price.hourly)
+    with pytest.raises(InputError, match="price"):
+        Tariff({"near": "cheap"})

@@ -33,7 +33,6 @@ COMMANDS = {
     "report": Entry("Write an HTML page on a run, with replays.", "report:Report", START),
     "run": Entry("Run an experiment file.", "study_command:Run", START),
     "train": Entry("Train agents by reinforcement learning.", "train:Train", AGENTS),
-    "publish": Entry("Make a folder for the Hugging Face Hub; nothing is uploaded.", "train:Publish", AGENTS),
     "plan": Entry("Draw planned searches, as in Fig. 4.9 to 4.12 of the thesis.", "compare:Plan", AGENTS),
     "benchmark": Entry("Run the benchmark suite, and check the results of others.", heading=AGENTS),
     "benchmark run": Entry("Run agents through all episodes of the suite.", "benchmark:RunSuite"),
@@ -43,9 +42,6 @@ COMMANDS = {
     "commute": Entry("Simulate daily commuters with a map that learns.", "drivers:Commute", CROWDS),
     "fleet": Entry("Simulate many cars that search at the same time.", "drivers:Fleet", CROWDS),
     "curve": Entry("Fit search time and walk as functions of occupancy.", "drivers:Curve", CROWDS),
-    "policy": Entry(
-        "Search for a town's policy: prices, limits, permits, guidance, capacity.", "policy:Policy", CROWDS
-    ),
     "survey": Entry("Drive past every slot, and map which are taken.", "survey:Survey", SENSE),
     "map": Entry("Show the predictions of a map.", "survey:Map", SENSE),
     "map-drive": Entry("Make a map from a recorded drive, photographs or a film.", "survey:MapDrive", SENSE),

@@ -51,7 +51,7 @@ class StudyCommand(RunCommand):
         """
         options = [option for option in field_options(cls) if option.name in given]
         command = made(cls, {option.name: given[option.name] for option in options if len(option.path) == 1})
-        study, file = command.asked_study(), (command.out or Path()) / SPEC_FILE
+        study, file = command.study, (command.out or Path()) / SPEC_FILE
         if command.resume and (file.exists() or study.goes_on != "always"):
             if not file.exists():
                 raise InputError(f"--resume: {command.out} holds no run to resume: no {SPEC_FILE}")
@@ -64,10 +64,6 @@ class StudyCommand(RunCommand):
         whole = {option.path[1] for option in options if len(option.path) == 2}
         require_trust(study, file.parent, command.trust or not command.resume, given=whole)
         return made(cls, {name: given[name] for name in inner}, command.changed(study=study))
-
-    def asked_study(self) -> Study:
-        """Return the study that options change."""
-        return self.study
 
     def run(self) -> None:
         """See `Command`."""
@@ -131,7 +127,6 @@ COMMANDS = {
     "fleet": "drivers:Fleet",
     "curve": "drivers:Curve",
     "demand": "occupancy:Demand",
-    "policy": "policy:Policy",
     "benchmark": "benchmark:RunSuite",
     "survey": "survey:Survey",
     "detectors": "detect:CompareDetectors",
@@ -148,8 +143,8 @@ class Run(RunCommand, ExecutionSpec):
     """Settings that the file omits have the defaults of its command.
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
-    command: compare (the default), commute, fleet, curve, demand, policy, benchmark, survey, detectors, demo,
-    calibrate, verify, train or park (scenes).
+    command: compare (the default), commute, fleet, curve, demand, benchmark, survey, detectors, demo, calibrate,
+    verify, train or park (scenes).
     """
 
     examples = """

@@ -1,19 +1,15 @@
-"""`parkenv train`: train agents by reinforcement learning; `parkenv publish`: a model for the Hugging Face Hub."""
+"""`parkenv train`: train agents by reinforcement learning."""
 
 from __future__ import annotations
 
-import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Self
 
-from parkenv.cli.options import Command, Given, field_options, made
+from parkenv.cli.options import Given, field_options, made
 from parkenv.cli.study_command import StudyCommand
-from parkenv.cli.tables import make_console, print_rows, stages
-from parkenv.cli.trust import Trust, require_trust
+from parkenv.cli.tables import print_rows
 from parkenv.errors import InputError
-from parkenv.files.option import Inside, Option, option, words_in
-from parkenv.studies.fields import SCENARIOS_HELP, SCENARIOS_TAKE, ScenarioList, Seed
-from parkenv.studies.study import ExecutionSpec
+from parkenv.files.option import option
 from parkenv.studies.training.spec import TrainingSpec
 
 if TYPE_CHECKING:
@@ -79,58 +75,3 @@ class Train(StudyCommand):
             models, planners = result.summary["transfer"], result.summary["planners"]
             rows = [*models, *(row | {"test_scenario": row["scenario"]} for row in planners)]
             print_rows(console, "Tests in held-out worlds", rows, SHOWN)
-
-
-class Publish(Command, ExecutionSpec):
-    """The published model is the best one of a training, with its learning curve, or a model file.
-
-    The model and planners are evaluated in the same worlds, by default in the test scenarios of the training; a model
-    trained in a fleet is evaluated in fleets with that demand. The model card gives results with 95 % intervals and the
-    command that repeats them.
-    """
-
-    examples = """
-        parkenv publish results/maskable-ppo --out hub/maskable-ppo
-        parkenv publish results/fleet-maskable-ppo --out hub/fleet
-        parkenv publish mine.safetensors --scenario my_lot.toml --out hub/mine
-        """
-
-    trained: Path = option(
-        ..., "The folder of a finished training, or a model file.", takes="DIR|FILE", argument=True
-    )
-    scenarios: Annotated[ScenarioList | None, Inside(only=())] = option(
-        None,
-        SCENARIOS_HELP,
-        name="--scenario",
-        takes=SCENARIOS_TAKE,
-        parse=words_in,
-        default="those of the training's test",
-    )
-    episodes: int | None = option(
-        None,
-        "Episodes of the evaluation in each scenario; in a fleet, days.",
-        short="-n",
-        default="500; in a fleet, 16",
-        ge=2,
-    )
-    seed: Annotated[Seed, Option(default="3000000, as in the tests of trainings")] = 3_000_000
-    trust: Trust = False
-    out: Path = option(..., "The folder to make.", short="-o")
-
-    def run(self) -> None:
-        """See `Command`."""
-        from parkenv.studies.publish.model_folder import TrainedModel, publish
-
-        if self.out.exists() and (not self.out.is_dir() or any(self.out.iterdir())):
-            raise InputError(f"--out {self.out}: exists; name a new folder")
-        model = TrainedModel.of(self.trained)
-        if model.spec is not None:
-            require_trust(model.spec, self.trained, self.trust)
-        console = make_console()
-        with stages(console) as progress, self.workers() as workers:
-            publish(
-                model, self.out, scenarios=self.scenarios, episodes=self.episodes, seed=self.seed, workers=workers,
-                progress=progress,
-            )  # fmt: skip
-        console.print(f"{self.out} holds {', '.join(sorted(path.name for path in self.out.iterdir()))}")
-        console.print(f"To upload it: hf upload USER/NAME {shlex.quote(str(self.out))}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import date, timedelta
 from functools import lru_cache
@@ -164,7 +163,7 @@ def build(spec: ScenarioSpec) -> Scenario:
             lot = dataclasses.replace(lot, goals=np.array([spec.goal]), goal_weights={})
         else:
             goal = spec.goal
-        lot = with_zones(lot, spec.zones)
+        lot = _with_rules(lot, spec.zones)
         if not goal < len(lot.goals):
             raise InputError(f"goal is {goal}, want an index from 0 to {len(lot.goals) - 1}")
         occupancy, window = _occupancy(spec.occupancy, lot, goal), spec.arrivals.window()
@@ -220,51 +219,26 @@ def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario
     )
 
 
-def with_zones(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
-    """Return a lot with other rules of zones, and with zones that are cut out of it.
+def _with_rules(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
+    """Return a lot with other rules of zones.
 
     Raises:
-        InputError: the lot has no such zone, class or facility; the message names the table.
+        InputError: the lot has no such zone or class; the message names the table.
     """
     if not zones:
         return lot
     rules = {name: lot.zone_rules.get(name, Zone(name)) for name in lot.zones} | dict(lot.zone_rules)
-    slot_zone = np.array([lot.zones[zone] for zone in lot.zone_of_slot.tolist()], object)
-    facilities = [facility.name for facility in lot.facilities]
-    users = {*lot.classes, *(user for rule in rules.values() for user in rule.users)}
-    for name, one in zones.items():
+    for name, spec in zones.items():
         with naming(f"zones.{name}"):
-            base = name if one.of is None else one.of
-            if base not in rules:
-                raise InputError(f"lot {lot.name!r:.40} has no zone {base!r:.40}; {nearest(base, rules)}")
-            for user in one.users or ():
-                if user not in users:
-                    raise InputError(f"users has {user!r:.40}, no class of the lot; {nearest(user, users)}")
-            if one.of is not None:
-                chosen = named(one.facilities, facilities) if one.facilities else range(-1, len(facilities))
-                its = (slot_zone == base) & np.isin(lot.facility_of_slot, list(chosen))
-                if not its.any():
-                    raise InputError(f"facilities have no slot in zone {base!r:.40}, want some")
-                slot_zone[its] = name
-            elif one.facilities:
-                raise InputError("facilities are given without `of`, want the zone that they are cut out of")
-            rules[name] = one.rules(name, rules[base])
-    return lot.rezoned(slot_zone.tolist(), rules)
-
-
-def named(patterns: Sequence[str], names: Sequence[str]) -> list[int]:
-    """Return the indices of the names that patterns mean, in which * stands for any letters.
-
-    Raises:
-        InputError: a pattern means none of them; the message names the nearest.
-    """
-    found = []
-    for pattern in patterns:
-        its = re.compile(".*".join(map(re.escape, pattern.split("*"))))
-        found += (new := [i for i, name in enumerate(names) if its.fullmatch(name)])
-        if not new:
-            raise InputError(f"{pattern!r:.60} is none of the lot's; {nearest(pattern, names)}")
-    return found
+            if name not in rules:
+                raise InputError(f"lot {lot.name!r:.40} has no zone {name!r:.40}; {nearest(name, rules)}")
+            for user in spec.users or ():
+                if user not in lot.classes:
+                    raise InputError(
+                        f"users has {user!r:.40}, no class of the lot; {nearest(user, lot.classes)}"
+                    )
+            rules[name] = spec.changed_rules(rules[name])
+    return lot.with_rules(rules)
 
 
 def _lot(spec: LotSpec) -> ParkingLot:

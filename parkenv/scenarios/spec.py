@@ -591,16 +591,8 @@ def _name(value: str) -> str:
 
 
 class ZoneSpec(Spec):
-    """Rules of a zone in place of the lot's, or of one that is cut out of it, such as the street of a market."""
+    """Rules of a zone in place of the lot's; it keeps those that are not given."""
 
-    of: str | None = Field(
-        None, description="Zone that it is cut out of; it inherits the rules that are not given."
-    )
-    facilities: Several[str] = Field(
-        (),
-        description="Facilities of that zone whose slots it contains; * stands for any letters. All if "
-        "absent.",
-    )
     price: Annotated[
         float | str | dict[str, Any] | None, WithJsonSchema({"type": ["number", "string", "object"]})
     ] = Field(
@@ -612,8 +604,8 @@ class ZoneSpec(Spec):
     max_stay_s: float | None = Field(None, ge=0.0, le=1e7, description="Longest stay; 0: no limit.")
     users: Several[str] | None = Field(None, description="Classes of drivers who may park there.")
 
-    def rules(self, name: str, base: Zone) -> Zone:
-        """Return the rules of the zone, those of its base where it has none of its own.
+    def changed_rules(self, zone: Zone) -> Zone:
+        """Return a zone with the rules that are given here.
 
         Raises:
             InputError: a rule is none; the message names the field.
@@ -627,7 +619,7 @@ class ZoneSpec(Spec):
             own["max_stay_s"] = self.max_stay_s or None
         if self.users is not None:
             own["users"] = self.users
-        return replace(base, name=name, part_of=self.of or base.part_of, **own)
+        return replace(zone, **own)
 
 
 _MERGED = ("arrivals", "costs", "demand", "speeds", "zones")
@@ -676,11 +668,7 @@ class ScenarioSpec(Spec):
     demand: dict[PurposeName, PurposeSpec] = Field(
         {}, description="Demand of many cars by purpose, in the hours of `arrivals`."
     )
-    zones: dict[str, ZoneSpec] = Field(
-        {},
-        description="Rules of zones in place of the lot's, by name; with `of`, new zones cut out of existing "
-        "ones.",
-    )
+    zones: dict[str, ZoneSpec] = Field({}, description="Rules of zones in place of the lot's, by name.")
     speeds: Speeds = Speeds()
     costs: Costs = Costs()
     sensor_model: Annotated[SensorModelSpec, BeforeValidator(_sensor_tables), OrText()] = option(

@@ -41,7 +41,6 @@ STUDIES: Mapping[str, str] = {
     "fleet": "parkenv.studies.fleet.study:FleetStudy",
     "curve": "parkenv.studies.curve.study:CurveStudy",
     "demand": "parkenv.studies.fleet.demand_study:DemandStudy",
-    "policy": "parkenv.studies.policy.study:PolicyStudy",
     "benchmark": "parkenv.studies.benchmark.study:Benchmark",
     "survey": "parkenv.studies.sensing.survey_study:SurveyStudy",
     "detectors": "parkenv.studies.sensing.detector_study:DetectorStudy",

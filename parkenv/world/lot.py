@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from functools import partial
 from typing import TYPE_CHECKING
@@ -393,40 +393,17 @@ class ParkingLot(_ByValue):
         users = {user for rules in self.zone_rules.values() for user in rules.users}
         set_field("classes", (PUBLIC, *sorted(users - {PUBLIC})))
 
-    def rezoned(self, slot_zone: Sequence[str], zone_rules: Mapping[str, Zone]) -> ParkingLot:
-        """Return the lot with other zones, on the same drive graph.
+    def with_rules(self, zone_rules: Mapping[str, Zone]) -> ParkingLot:
+        """Return the lot with other rules of its zones, on the same drive graph.
 
         Raises:
             InputError: see the class.
         """
         lot = copy.copy(self)
         set_field = partial(object.__setattr__, lot)
-        zones = np.array(slot_zone, np.str_)
-        of_counted = dict(zip(self.facility_of_slot.tolist(), zones.tolist(), strict=True))
-        its = (
-            replace(one, zone=of_counted[i]) if one.is_counted else one
-            for i, one in enumerate(self.facilities)
-        )
-        set_field("facilities", tuple(its))
-        set_field("slot_zone", zones)
         set_field("zone_rules", zone_rules)
         lot._set_zones(set_field)
         return lot
-
-    @property
-    def areas(self) -> tuple[str, ...]:
-        """Names of the zones before parts were cut out of them, sorted."""
-        return tuple(sorted(set(self._area_names)))
-
-    @property
-    def area_of_zone(self) -> IntArray:
-        """(n_zones,) int64, index into `areas`."""
-        return np.searchsorted(self.areas, self._area_names).astype(np.int64)
-
-    @property
-    def _area_names(self) -> list[str]:
-        rules = {name: zone.part_of for name, zone in self.zone_rules.items()}
-        return [rules.get(name) or name for name in self.zones]
 
     def _require_names(self) -> None:
         """Require slots with different names, all of them printable."""

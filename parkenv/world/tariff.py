@@ -304,7 +304,6 @@ class Zone:
         max_stay_s: s, longest stay; where the price has charged hours, only these count.
         users: classes of users, one of which a driver must belong to: `public` (everyone), or names such as
             `permit-a`, `disabled`, `charging`, `customers`, `delivery`, `private`.
-        part_of: zone that it was cut out of: what drivers see in one they expect in the other.
 
     Raises:
         InputError: a value out of its range; the message names the field.
@@ -315,7 +314,6 @@ class Zone:
     hours: Hours | None = None
     max_stay_s: float | None = None
     users: tuple[str, ...] = (PUBLIC,)
-    part_of: str = ""
 
     def __post_init__(self) -> None:
         if self.max_stay_s is not None:

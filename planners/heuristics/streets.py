@@ -94,15 +94,14 @@ STREETS = np.dtype(
         ("along_s", ADDRESS),
         ("move_into", ADDRESS),
         ("position", ADDRESS),
-        # (n_places + 1,) int32 first position of each place; (n_places,) int64 its zone, and its area; (n_goals,
+        # (n_places + 1,) int32 first position of each place; (n_places,) int64 its zone; (n_goals,
         # n_places) float64 lower bound on the arrival cost of its slots, s, without and with the price of the stay.
         ("place_first", ADDRESS),
         ("place_zone", ADDRESS),
-        ("place_area", ADDRESS),
         ("place_walk_s", ADDRESS),
         ("place_cost_s", ADDRESS),
-        # (n_slots,) int64 area of each slot: its zone, with those that are a part of it.
-        ("area_of_slot", ADDRESS),
+        # (n_slots,) int64 zone of each slot.
+        ("zone_of_slot", ADDRESS),
         # By goal: (n_slots,) float64 arrival costs, s; (n_junctions,) float64, the least drive and bound from there, s.
         ("arrival_cost_s", ADDRESS),
         ("onward_walk_s", ADDRESS),
@@ -143,7 +142,7 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
     lot, plain = problems[0].lot, heuristic_tables(GREEDY_DRIVE, problems, None)
     streets = streets_of(lot, np.asarray(problems[0].move_cost_s))
     n_junctions, n_streets = lot.n_vertices - lot.n_slots, len(streets["start"])
-    first, area_of_slot = streets["place_first"][:-1], lot.area_of_zone[lot.zone_of_slot]
+    first = streets["place_first"][:-1]
     # Rounding must not lift a bound above the cost.
     bounds = [
         np.minimum.reduceat(np.array(costs_s)[:, streets["slots"]], first, axis=1) - 1e-6
@@ -167,7 +166,6 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
         },
         **streets,
         "place_zone": lot.zone_of_slot[streets["slots"][first]],
-        "place_area": area_of_slot[streets["slots"][first]],
         **dict(zip(("place_walk_s", "place_cost_s"), bounds, strict=True)),
         **dict(
             zip(
@@ -176,7 +174,7 @@ def street_tables(problems: Sequence[SearchProblem]) -> PolicyData:
                 strict=True,
             )
         ),
-        "area_of_slot": area_of_slot,
+        "zone_of_slot": np.ascontiguousarray(lot.zone_of_slot, np.int64),
         "forecast": np.zeros(lot.n_slots),
         "last_states": np.full(lot.n_slots, UNOBSERVED, np.uint8),
         "seen_free": np.zeros(len(lot.zones)),
@@ -308,27 +306,27 @@ def _forecast(streets: Any, search: int, slot: int) -> float:
 
 @rule
 def _count_free(streets: Any, search: int) -> None:
-    """Count by area how many of the slots that the driver has seen were free, and how many the forecast expected."""
-    area_of_slot, n_zones = int64s(streets.area_of_slot), streets.n_zones
+    """Count by zone how many of the slots that the driver has seen were free, and how many the forecast expected."""
+    zone_of_slot, n_zones = int64s(streets.zone_of_slot), streets.n_zones
     free, expected = (
         float64_array(streets.seen_free, (n_zones,)),
         float64_array(streets.expected_free, (n_zones,)),
     )
     free[:] = expected[:] = 0.0
     # Sums of numbers that were rounded to float32 are exact, so their order does not matter.
-    area, n_free, n_expected = np.int64(0), 0.0, 0.0
+    zone, n_free, n_expected = np.int64(0), 0.0, 0.0
     for i in range(search_of(search).n_columns if search else streets.n_slots):
         slot, is_free, p = observed_column(search_of(search), i) if search else _observed_slot(streets, i)
         if slot < 0:
             continue
-        if area_of_slot[slot] != area:
-            free[area] += n_free
-            expected[area] += n_expected
-            area, n_free, n_expected = area_of_slot[slot], 0.0, 0.0
+        if zone_of_slot[slot] != zone:
+            free[zone] += n_free
+            expected[zone] += n_expected
+            zone, n_free, n_expected = zone_of_slot[slot], 0.0, 0.0
         n_free += is_free
         n_expected += 1.0 - p
-    free[area] += n_free
-    expected[area] += n_expected
+    free[zone] += n_free
+    expected[zone] += n_expected
 
 
 @inlined_rule
@@ -339,10 +337,10 @@ def _observed_slot(streets: Any, slot: int) -> tuple[Any, float, Any]:
 
 
 @inlined_rule
-def _level(streets: Any, area: int) -> float:
-    """Return the factor of the odds that a slot of an area is free: as many as were seen over those expected."""
+def _level(streets: Any, zone: int) -> float:
+    """Return the factor of the odds that a slot of a zone is free: as many as were seen over those expected."""
     return float(
-        (float64s(streets.seen_free)[area] + DOUBT) / (float64s(streets.expected_free)[area] + DOUBT)
+        (float64s(streets.seen_free)[zone] + DOUBT) / (float64s(streets.expected_free)[zone] + DOUBT)
     )
 
 
@@ -501,7 +499,7 @@ def _look_along(streets: Any, goal: int, search: int, street: int, position: int
             slot = np.int64(slots[(first_open + last_open) // 2])
             drive_s = before_s + (along_s[first_open] + along_s[last_open]) / 2.0
             p = _forecast(streets, search, slot)
-            p /= p + (1.0 - p) * _level(streets, int64s(streets.place_area)[k])
+            p /= p + (1.0 - p) * _level(streets, int64s(streets.place_zone)[k])
             q = 1.0 - p**n_open
             if q > 0.0:
                 _compare(streets, cost_of(streets, goal, search, slot) + drive_s / q, last_open, position)

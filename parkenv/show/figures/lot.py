@@ -200,16 +200,14 @@ def save_lot_picture(
 def draw_zones(lot: ParkingLot, ax: Axes, *, show_graph: bool = False) -> list[Patch]:
     """Draw a lot with its slots in the colours of their zones; return the entries of a legend."""
     colors = zone_colors(lot)
-    draw_lot(
-        lot, ax, slot_color=to_rgba_array(colors)[lot.area_of_zone[lot.zone_of_slot]], show_graph=show_graph
-    )
-    return [Patch(color=color, label=zone) for zone, color in zip(lot.areas, colors, strict=True)]
+    draw_lot(lot, ax, slot_color=to_rgba_array(colors)[lot.zone_of_slot], show_graph=show_graph)
+    return [Patch(color=color, label=zone) for zone, color in zip(lot.zones, colors, strict=True)]
 
 
 def zone_colors(lot: ParkingLot) -> list[str]:
     """Return the colour of each zone; slots without a zone are grey."""
     return [
-        INK_PALE if zone == NO_ZONE else ZONE_COLORS[i % len(ZONE_COLORS)] for i, zone in enumerate(lot.areas)
+        INK_PALE if zone == NO_ZONE else ZONE_COLORS[i % len(ZONE_COLORS)] for i, zone in enumerate(lot.zones)
     ]
 
 

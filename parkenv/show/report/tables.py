@@ -213,28 +213,6 @@ OF_FLEETS = {
     )
 }  # fmt: skip
 """Columns that mean something else in the table of `parkenv fleet`."""
-OF_POLICIES = {
-    column.key: column for column in (
-        Column("in_band", "block-hours in the band", share=True, digits=0, help="Means over the days; jackknife"),
-        Column("in_band_daily", "on single days", share=True, digits=0),
-        Column("occupancy", "spaces taken", share=True, digits=0, help="Of the blocks and hours that count"),
-        Column("cruised_km", "cruised a day", "km", 0),
-        Column("cruised_km_of_today", "of today's", share=True, digits=0),
-        Column("time_s", "time of a car", "s", 0, help="Drive, failed attempts, walk and penalties, without prices"),
-        Column("time_s_of_today", "of today's", share=True, digits=0),
-        Column("revenue", "paid a day", digits=0),
-        Column("revenue_of_today", "of today's", share=True, digits=0),
-        Column("scenario", "policy"),
-        Column("change_s", "change, prices as time", "s", 0, signed=True, help=_PAIRED),
-        Column("taken_today", "taken today", share=True, digits=0),
-        Column("taken_SFpark", "SFpark's rule", share=True, digits=0),
-        Column("taken_ours", "with this policy", share=True, digits=0),
-        Column("price_today", "price today", digits=2),
-        Column("price_ours", "new price, mean", digits=2),
-        Column("prices_ours", "new prices"),
-    )
-}  # fmt: skip
-"""Columns of `parkenv policy`."""
 _OF_GIVING_UP = ("median_s", "gave_up_fraction")
 """Columns that are left out where no search gave up."""
 _OF_MEMBERS = (

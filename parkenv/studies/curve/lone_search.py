@@ -53,8 +53,7 @@ class LoneSearches:
         for place in np.flatnonzero(lot.is_counted[first]):
             facility = lot.facilities[lot.facility_of_slot[first[place]]]
             self._inside_s[:, place] = np.add(facility.gate_s, facility.inside_s)
-        area = lot.area_of_zone[zone]
-        self._of_places = (*to_first_s, walk_s, self._mean(problem.enter_s), self._size, zone, area)
+        self._of_places = (*to_first_s, walk_s, self._mean(problem.enter_s), self._size, zone)
 
     def _mean(self, of_slots: FloatArray) -> FloatArray:
         return np.asarray(np.add.reduceat(of_slots[..., self._slots], self._begin, axis=-1) / self._size)
@@ -97,21 +96,21 @@ def lone_searches(
     entry: IntArray, goal: IntArray, hour: IntArray, walks: FloatArray, patience_s: FloatArray, zone_cost_s: FloatArray,
     per_cost: float, per_drive: float, believed: FloatArray, full: FloatArray, inside_s: FloatArray,
     entry_drive_s: FloatArray, drive_s: FloatArray, walk_s: FloatArray, enter_s: FloatArray,
-    size: IntArray, zone: IntArray, area: IntArray,
+    size: IntArray, zone: IntArray,
 ) -> FloatArray:  # fmt: skip
     """Follow the searches of n cars from place to place, in all ways that they may go.
 
     Tables have a column for each place, and a row for each entry, goal or hour; those of `zone_cost_s` are for each car
     and `zone`. `believed` is P(taken) that drivers expect of a slot, `full` the chance that there is no space,
     `inside_s` the time at the barrier and inside, `enter_s` what drivers expect of it, and `drive_s` leads from the
-    beginning of a place through it to that of another. An `area` are zones that fill alike.
+    beginning of a place through it to that of another. Places of a zone fill alike.
 
     Returns:
         (4, n) chance to park; places without a space on the way; search time beyond the direct drive, and walk, s, both
         times the chance.
     """
     found = np.zeros((4, len(entry)))
-    cost_s, expected_free = np.empty(len(size)), np.empty(area.max() + 1)
+    cost_s, expected_free = np.empty(len(size)), np.empty(zone.max() + 1)
     for car in range(len(entry)):
         p, full_now, direct_s = believed[hour[car]], full[hour[car]], entry_drive_s[entry[car]]
         for k in range(len(size)):
@@ -124,7 +123,7 @@ def lone_searches(
             for k in range(len(size)):
                 index_s = cost_s[k] + per_drive * ahead_s[k]
                 if index_s < best_s:
-                    odds = (1.0 - p[k]) * DOUBT / (DOUBT + expected_free[area[k]])
+                    odds = (1.0 - p[k]) * DOUBT / (DOUBT + expected_free[zone[k]])
                     index_s = cost_s[k] + per_drive * ahead_s[k] / (1.0 - (p[k] / (p[k] + odds)) ** size[k])
                     if index_s < best_s:
                         best, best_s = k, index_s
@@ -137,7 +136,7 @@ def lone_searches(
             found[1, car] += left
             found[2, car] += here * (max(driven_s - direct_s[best], 0.0) + inside_s[hour[car], best])
             found[3, car] += here * walk_s[goal[car], best] * walks[car]
-            expected_free[area[best]] += size[best] * (1.0 - p[best])
+            expected_free[zone[best]] += size[best] * (1.0 - p[best])
             cost_s[best] = np.inf
             ahead_s = drive_s[best]
     return found

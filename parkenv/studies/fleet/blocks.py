@@ -95,20 +95,19 @@ class Blocks:
         )
         several = np.bincount(pairs[:, 0]) > 1
         names, types = [], []
-        areas = np.array(lot.areas)[lot.area_of_zone]
         for number, zone in pairs.tolist():
             if number == len(lot.facilities):
-                names.append(str(areas[zone]))
+                names.append(lot.zones[zone])
                 types.append("zone")
             else:
                 its = lot.facilities[number]
-                names.append(f"{its.name}, {areas[zone]}" if several[number] else its.name)
+                names.append(f"{its.name}, {lot.zones[zone]}" if several[number] else its.name)
                 types.append(its.kind)
         twice = {name for name in names if names.count(name) > 1} if len({*names}) < len(names) else {NOWHERE}
         names = [
             f"{name} ({kind})" if name in twice else name for name, kind in zip(names, types, strict=True)
         ]
-        zones = tuple(areas[pairs[:, 1]].tolist())
+        zones = tuple(lot.zones[zone] for zone in pairs[:, 1])
         slots = np.bincount(of_slot, lot.capacity).astype(np.int64)
         return cls(tuple(names), tuple(types), zones, slots, of_slot)
 
@@ -118,18 +117,12 @@ def has_zones(scenario: Scenario) -> bool:
     return scenario.has_rules or scenario.lot.zones != (NO_ZONE,)
 
 
-def area_prices(scenario: Scenario) -> dict[str, float]:
-    """Return what an hour costs in the zones of a lot; where parts were cut out of one, the mean over its spaces."""
-    lot = scenario.lot
-    price = np.array([float(zone.price.amount(scenario.priced_at_s, HOUR_S)) for zone in scenario.zone_rules])
-    spaces = np.bincount(lot.zone_of_slot, lot.capacity, len(lot.zones))
-    means = {}
-    for number, name in enumerate(lot.areas):
-        its = lot.area_of_zone == number
-        means[name] = float(
-            price[its][0] if its.sum() == 1 else np.average(price[its], weights=spaces[its]).round(2)
-        )
-    return means
+def zone_prices(scenario: Scenario) -> dict[str, float]:
+    """Return what an hour costs in the zones of a lot."""
+    return {
+        name: float(zone.price.amount(scenario.priced_at_s, HOUR_S))
+        for name, zone in zip(scenario.lot.zones, scenario.zone_rules, strict=True)
+    }
 
 
 def paid(fleet: Fleet) -> FloatArray:

@@ -185,7 +185,7 @@ def car_lists(fleet: Fleet, members: BoolArray) -> dict[str, str]:
     cars, members = fleet.cars[arrives], members[arrives]
     lists = {"total_cs": 100.0 * cars["total_s"], "member": members}
     if has_zones(fleet.scenario):
-        zone = np.where(cars["slot"] >= 0, 1 + lot.area_of_zone[lot.zone_of_slot[cars["slot"]]], 0)
+        zone = np.where(cars["slot"] >= 0, 1 + lot.zone_of_slot[cars["slot"]], 0)
         lists |= {"zone": zone, "paid_cents": 100.0 * paid(fleet)[arrives]}
     if len(fleet.demand.purposes) > 1:
         lists["purpose"] = cars["purpose"]

@@ -431,7 +431,7 @@ class FleetStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.fleet.blocks import ALL, BLOCKS, area_prices, has_zones, summarize_blocks
+        from parkenv.studies.fleet.blocks import ALL, BLOCKS, zone_prices, has_zones, summarize_blocks
         from parkenv.studies.fleet.changes import summarize_changes
         from parkenv.studies.fleet.tables import summarize_days, summarize_hours
 
@@ -444,7 +444,7 @@ class FleetStudy(Study):
         mixed = [row for row in shown if set(row["purpose"]) != {ALL}]
         options = {name: getattr(self, name) for name in OPTIONS}
         first = next(iter(self.built.values())).arrival.start_s // 3600.0
-        prices = {name: area_prices(its) for name, its in self.built.items()}
+        prices = {name: zone_prices(its) for name, its in self.built.items()}
         purposes = {
             name: [purpose.name for purpose in its.demand.purposes]
             for name, its in self.built.items()

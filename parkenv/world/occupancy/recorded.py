@@ -228,8 +228,6 @@ class RecordedOccupancy(OccupancyModel):
         forecast_from: the days of the arrival's class that the forecast and the ranks are made from: `others`, all
             that the world does not replay; `rolling`, those before the earliest that the world replays; `past`, those
             before `replay_from`. The last two need a `replay_from`.
-        expected: (n, 48) float64, P(taken) of each slot in the half-hours of a day that is forecast instead, in which
-            NaN keeps the log's.
     """
 
     kind: ClassVar[int] = LOG_KIND
@@ -240,7 +238,6 @@ class RecordedOccupancy(OccupancyModel):
     mapping: IntArray | None = None
     replay_from: date | None = None
     forecast_from: ForecastFrom = "others"
-    expected: FloatArray | None = None
     _mapped_logs: dict[int, MappedLog] = field(init=False, repr=False, default_factory=dict)
     _forecasts: dict[int, ReplayForecast] = field(init=False, repr=False, default_factory=dict)
 
@@ -403,8 +400,6 @@ class RecordedOccupancy(OccupancyModel):
         share = np.bincount(which) / which.size
         level = np.sqrt(np.einsum("j,pjk,k->p", share, found.level_covariance, share))
         p = np.clip(found.p_taken[which, mapped.log_slot], MIN_PROBABILITY, MAX_PROBABILITY)
-        if self.expected is not None:
-            p = np.where(np.isnan(self.expected), p, np.clip(self.expected, MIN_PROBABILITY, MAX_PROBABILITY))
         return ReplayForecast(np.ascontiguousarray(logit(p)), np.minimum(level, MAX_LOGITS), rates)
 
     def _decay_rates(self, known: IntArray) -> FloatArray:

@@ -1,1 +1,0 @@
-"""Folders of trained models for the Hugging Face Hub."""
