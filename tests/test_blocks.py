@@ -15,7 +15,6 @@ from parkenv.show.report.page import SCHEMA
 from parkenv.show.report.town_map import town_data
 from parkenv.studies.fleet.blocks import ALL, BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.studies.fleet.measures import Roads
-from parkenv.studies.fleet.tables import unreached
 from parkenv.world.facility import Facility
 
 
@@ -197,9 +196,6 @@ def test_a_counted_facility_is_a_block_of_its_capacity_and_a_square_at_its_place
     assert 1 <= len(slots["areas"]) <= 4
 
 
-def test_entries_from_which_most_spaces_cannot_be_reached_are_said():
+def test_entries_from_which_most_spaces_cannot_be_reached_are_counted():
     found = Roads(make_scenario("mini")).reach()
     assert found == {"entries": 1, "entries_cut_off": 0}
-    assert not unreached([found | {"scenario": "far"}])
-    (said,) = unreached([found | {"scenario": "far", "entries_cut_off": 1}])
-    assert "from 1 of the 1 entries" in said

@@ -13,7 +13,8 @@ from parkenv.errors import InputError
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.fleet.changes import CHANGES, headlines, sentence, summarize_changes
+from parkenv.studies.fleet.changes import CHANGES, summarize_changes
+from parkenv.studies.fleet.setting import NOWHERE
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.results import without_nan
 from parkenv.studies.statistics import mean_interval
@@ -87,20 +88,6 @@ def test_changes_are_paired_by_day_and_by_car(days):
     assert 0.0 <= row["better_off"] + row["worse_off"] <= 1.0
 
 
-@pytest.mark.parametrize("ends", [(-3.0, 1.0), (-1.0, 0.0), (math.nan, math.nan)])
-def test_nobody_wins_where_the_interval_includes_nothing(days, ends):
-    row = summarize_changes(list(days.values()))[0] | {"days": 10}
-    for name in CHANGES:
-        row = {**row, f"{name}_ci95": list(ends)}
-    clear = {**row, "change_s": -2.0, "change_s_ci95": [-3.0, -1.0]}
-    assert "saves 2.0 s [1.0, 3.0]" in sentence(without_nan(clear))
-    for unclear in (row, clear | {"days": 4}):
-        said = sentence(without_nan(unclear))
-        assert "saves" not in said
-        assert "loses" not in said
-        assert "a car" not in headlines([], [without_nan(unclear)])[0]["value"]
-
-
 def test_only_equal_hours_have_the_same_cars():
     with pytest.raises(InputError, match=r"arrivals\.hours of 'after' are not those of 'before'"):
         study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
@@ -122,7 +109,7 @@ def test_the_command_compares_lots_and_goes_on_with_another(tmp_path):
     (change,) = summary["changes"]
     first, second = summary["rows"]
     assert change["change_s"] == pytest.approx(second["total_s"] - first["total_s"])
-    assert "after instead of before" in done.stdout
+    assert "What changes for whom" in done.stdout
 
 
 def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
@@ -144,8 +131,6 @@ def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
         whole["change_s"], rel=0.1
     )
     assert all(low <= row["change_s"] <= high for row in parts for low, high in [row["change_s_ci95"]])
-    assert "commuters" in sentence(parts[1])
-    assert not [row for row in headlines([], [whole, *parts]) if "commuters" in row["where"]]
 
 
 def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
@@ -185,11 +170,10 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
             for name in parts
         ]
     )
-    assert "near 1 → 1.2 an hour" in sentence(without_nan(whole))
-    assert not [row for row in headlines([], without_nan(rows)) if "zone" in row["where"]]
+    assert whole["prices"] == "near 1 → 1.2 an hour"
     for day in before:
         day["zone"] = " ".join(["0", *day["zone"].split()[1:]])
     whole, nowhere, *by_zone = without_nan(summarize_changes(days, prices))
     assert nowhere["cars_a_day"] == 1.0
     assert sum(row["cars_a_day"] for row in (nowhere, *by_zone)) == pytest.approx(whole["cars_a_day"])
-    assert "found no slot before" in sentence(nowhere)
+    assert nowhere["zone"] == NOWHERE

@@ -19,7 +19,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.measures import Roads, gini, looks_s
 from parkenv.studies.fleet.setting import MEASURES, Setting
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.fleet.tables import carried, summarize_days
+from parkenv.studies.fleet.tables import summarize_days
 from parkenv.studies.runner import open_run
 from parkenv.world.scenario import SearchProblem
 
@@ -136,24 +136,6 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     assert math.isnan(summarize_days(days[1:2])[0]["difference_s"])
     alone = summarize_days(days[:1])
     assert math.isnan(alone[0]["price_of_anarchy"])
-
-
-def test_the_largest_demand_at_which_few_find_no_slot_is_said_with_the_demands_to_try_next():
-    its = {
-        "scenario": "lot",
-        "agents": "usual",
-        "knows": "own",
-        "share": 0.0,
-        "balked_fraction_ci95": (None, None),
-    }
-    rates = {200.0: 0.09, 60.0: 0.0, 160.0: 0.05, 300.0: 0.04}
-    rows = [its | {"arrivals_per_hour": rate, "balked_fraction": share} for rate, share in rates.items()]
-    (said,) = carried(rows, 0.05)
-    assert "up to 160 cars an hour at most 5%" in said
-    assert "--arrivals-per-hour 170,180,190 " in said, "more cars that do better by chance are no answer"
-    assert "at 60 cars an hour, the fewest tried" in carried(rows, -0.01)[0]
-    assert "at 300 cars an hour, the most tried" in carried(rows, 0.1)[0]
-    assert not carried(rows[:1], 0.05)
 
 
 def test_the_closed_form_of_random_looks_ends_at_the_last_slot():

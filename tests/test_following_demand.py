@@ -13,7 +13,6 @@ from hypothesis.extra.numpy import arrays
 from parkenv.engine.fleet import Fleet
 from parkenv.scenarios.build import make_scenario
 from parkenv.studies.fleet.setting import rate_of
-from parkenv.studies.fleet.tables import departures
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, FollowingArrivals
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.counted import process_of_curve
@@ -146,31 +145,7 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     assert hours[0]["counted_occupancy"] < 0.3 < 0.7 < hours[4]["counted_occupancy"]
     for its in hours:
         assert its["occupancy"] == pytest.approx(its["counted_occupancy"], abs=0.05)
-    assert departures(summary["hours"], summary["rows"]) == []
     few = parkenv("fleet", "--resume", "--arrivals-per-hour", "counted,20", "--out", tmp_path / "out")
     assert (few.returncode, few.stderr) == (0, "")
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    (said,) = departures(summary["hours"], summary["rows"])
-    assert said in few.stdout
-    assert "20 cars an hour" in said
-    assert "--arrivals-per-hour counted" in said
-
-
-@pytest.mark.parametrize(("balked", "said"), [(0.0, False), (0.02, True)])
-def test_a_lot_is_said_to_be_full_only_where_cars_went_elsewhere(balked, said):
-    compared = [
-        {"scenario": name, "agents": "random", "knows": "own", "share": 0.0, "arrivals_per_hour": "counted"}
-        for name in ("first", "second")
-    ]
-    short = {
-        "hour": 12,
-        "occupancy": 0.79,
-        "counted_occupancy": 0.85,
-        "excess": -0.06,
-        "excess_ci95": [-0.08, -0.04],
-    }
-    lines = departures(
-        [its | short for its in compared], [its | {"balked_fraction": balked} for its in compared]
-    )
-    assert [name in line for name, line in zip(("first", "second"), lines, strict=True)] == [True, True]
-    assert ["elsewhere" in line for line in lines] == [said, said]
+    assert min(its["excess_ci95"][1] for its in summary["hours"] if its["arrivals_per_hour"] == 20.0) < -0.05

@@ -323,20 +323,15 @@ return [1, 3, 5].reduce((sum, i) => sum + parseInt(hex.slice(i, i + 2), 16) / 3,
 
 
 @pytest.mark.slow
-def test_a_phone_shows_first_what_changes(browser, tmp_path):
+def test_a_phone_shows_every_number_of_a_table(browser, tmp_path):
     wide = {"name": "wide", "lot": {"grid": {"rows": 2, "columns": 6}}, "arrivals": {"hours": "08:00-08:30"}}
     (tmp_path / "wide.json").write_text(json.dumps(wide))
     command = ["fleet", "--scenario", "mini,wide.json", "--hours", "08:00-08:30", "--arrivals-per-hour", "20",
                "--knows", "own,reserve", "-n", "5", "--jobs", "1", "--report", "--out", "out"]  # fmt: skip
     assert parkenv(*command, cwd=tmp_path).returncode == 0
-    (change, *_) = json.loads((tmp_path / "out" / "summary.json").read_text())["changes"]
     screen(browser, 390, 844)
     browser.get((tmp_path / "out" / "report.html").as_uri())
     assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
-    first = one(browser, ".headline")
-    assert first.rect["y"] + first.rect["height"] < 844
-    assert all(f"{abs(end):.1f}" in first.text for end in change["change_s_ci95"])
-    assert "wide instead of mini" in first.text
     # Every number of a table can be read: a row is a card, its columns are labelled, and further ones unfold.
     hidden = one(browser, 'table[data-table="rows"] td[data-key="clairvoyant_s"]')
     assert not hidden.is_displayed()

@@ -13,10 +13,8 @@ from parkenv.show.plurals import plural
 from parkenv.show.report.tables import OF_FLEETS
 from parkenv.studies.commute.study import Commute as CommuteStudy
 from parkenv.studies.curve.study import CurveStudy
-from parkenv.studies.fleet.changes import sentence, shown_changes
 from parkenv.studies.fleet.setting import SETTING_COLUMNS
 from parkenv.studies.fleet.study import FleetStudy
-from parkenv.studies.fleet.tables import ONE_DAY, carried, departures, unreached
 from parkenv.studies.results import Row, without_nan
 from parkenv.world.cost_terms import COST_FIELDS
 
@@ -120,13 +118,11 @@ class Fleet(AgentStudyCommand):
     )
 
     def show(self, console: Console, result: Result) -> None:
-        """Print the tables of a study of many cars, and what changes between scenarios in sentences."""
+        """Print the tables of a study of many cars."""
         rows, changes = result.rows, without_nan(result.summary["changes"])
         if not rows:
             return
         print_rows(console, self.study.title, rows, (*SETTING_COLUMNS, *SHOWN), OF_FLEETS)
-        if all(row["days"] == 1 for row in rows):
-            console.print(ONE_DAY, soft_wrap=True)
         what = (
             *COST_FIELDS,
             "queued_s",
@@ -140,13 +136,7 @@ class Fleet(AgentStudyCommand):
         if changes:
             title = "What changes for whom: time after minus before, of the same cars on the same days"
             print_rows(console, title, changes, (*SETTING_COLUMNS, *OF_CHANGES))
-        for row in shown_changes(changes):
-            if row["change"] == "scenario":
-                console.print(sentence(row), soft_wrap=True)
-        told = [f"On {name}, {caution}" for name, caution in result.summary["cautions"].items()]
-        told += carried(without_nan(rows), self.study.most_balked)
-        told += unreached(result.summary["reach"])
-        for line in [*told, *departures(result.summary["hours"], rows)]:
+        for line in self.study.findings(result.summary):
             console.print(line, soft_wrap=True)
 
 
@@ -175,7 +165,7 @@ class Curve(AgentStudyCommand):
     )
 
     def show(self, console: Console, result: Result) -> None:
-        """Print how full a lot is at each demand, how far curves are off, and that in sentences."""
+        """Print how full a lot is at each demand, and how far curves are off."""
         from parkenv.studies.curve.fit import PREDICTORS
 
         if not result.rows:

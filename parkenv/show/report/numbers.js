@@ -64,16 +64,6 @@ function shortName(agent) {
   return `${agent.slice(0, colon)} ${parts.slice(-1)[0].replace("_", " ")}`;
 }
 
-/** A result in large type; of a change also the shares of the cars that are better and worse off. */
-function headline({ label, value, where, interval, better, worse }) {
-  const percent = (share) => `${written(100 * share, 0)} %`;
-  const shares = better === undefined ? [] : [
-    make("span", { class: "shares", "aria-hidden": "true" }, make("i", { class: "better", style: `width: ${100 * better}%` }), make("i", { class: "worse", style: `width: ${100 * worse}%` })),
-    make("span", { class: "off" }, make("span", { class: "better" }, `${percent(better)} better off`), make("span", { class: "worse" }, `${percent(worse)} worse off`)),
-  ];
-  return make("article", { class: "card headline" }, make("b", {}, value), interval ? make("span", { class: "interval" }, interval) : null, make("span", {}, label), where ? make("small", {}, where) : null, ...shares);
-}
-
 /** An entry of a legend: a mark and what it means. */
 function keyed(mark, text) {
   return make("span", { class: "key" }, mark, text);

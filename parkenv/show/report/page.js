@@ -15,12 +15,7 @@ setTheme(dark.matches ? "dark" : "light");
 dark.addEventListener("change", () => setTheme(dark.matches ? "dark" : "light"));
 part("theme").addEventListener("click", () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
 
-part("headlines").hidden = data.run.headlines.length === 0;
-part("headlines").append(...data.run.headlines.map(headline));
-const MOST_FINDINGS = 8;
-const { findings } = data.run;
-part("findings").append(...findings.slice(0, MOST_FINDINGS).map((finding) => make("li", {}, finding)));
-if (findings.length > MOST_FINDINGS) part("findings").append(make("li", { class: "quiet" }, `${findings.length - MOST_FINDINGS} more settings: see the table`));
+part("findings").append(...data.run.findings.map((finding) => make("li", {}, finding)));
 part("notes").append(...data.run.notes.map((note) => make("p", { class: "note", role: "note" }, note)));
 
 if (data.learning.length) {

@@ -54,9 +54,7 @@ class Page(NamedTuple):
 
     Attributes:
         title: heading of the page.
-        findings: the results in sentences.
-        headlines: the main results, for large type: `label` and `value`, perhaps `where` and `interval`, and the shares
-            `better` and `worse`.
+        findings: the main result, and what to mind, a line each.
         tables: from `tables.table_of`.
         learning: from `learning.learning_panels`.
     """
@@ -65,7 +63,6 @@ class Page(NamedTuple):
     findings: Sequence[str] = ()
     tables: Sequence[Mapping[str, Any]] = ()
     learning: Sequence[Mapping[str, Any]] = ()
-    headlines: Sequence[Mapping[str, Any]] = ()
 
 
 def page_data(
@@ -101,7 +98,6 @@ def page_data(
             "kind": kind,
             "title": page.title,
             "findings": list(page.findings),
-            "headlines": list(page.headlines),
             "command": shlex.join(str(word) for word in summary["command"]),
             "parkenv": summary["version"],
             "seed": summary.get("seed"),

@@ -16,7 +16,6 @@ from parkenv.files.option import Option, numbers_in, option
 from parkenv.files.spec_file import FilePath, Spec
 from parkenv.scenarios.spec import Cost, Probability, ScenarioSpec, SensorModelSpec, Speed, scenario_spec
 from parkenv.show.columns import SETTING_AXES
-from parkenv.show.plurals import plural
 from parkenv.studies.agent_spec import AgentSpec, split_agents
 from parkenv.studies.fields import (
     AGENTS_HELP,
@@ -391,39 +390,20 @@ class Comparison(CaseStudy):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: the fastest agents in each setting with several, the oracle apart."""
-        settings: dict[tuple[Any, ...], list[Row]] = {}
-        for row in summary["rows"]:
-            settings.setdefault((row["scenario"], *(row[name] for name in SETTING_AXES)), []).append(row)
-        findings = []
-        speeds = len({key[2:] for key in settings}) > 1
-        for (name, failure, walk, drive), its in settings.items():
-            agents = [row for row in its if row["agent"] not in UNBEATEN]
-            if len(agents) < 2:
-                continue
-            leaders = sorted((row for row in agents if row["leads"]), key=lambda row: float(row["total_s"]))
-            best, at = leaders[0], f", walking at {walk:g} and driving at {drive:g} km/h" if speeds else ""
-            found = f"{name}, failure cost {failure:g} s{at}: "
-            if len(leaders) == 1:
-                low, high = best["total_s_ci95"]
-                among = "of the agents that do not know the future, " if len(agents) < len(its) else ""
-                found += (
-                    f"{among}{best['agent']} has the lowest mean total time, {best['total_s']:.1f} s "
-                    f"[{low:.1f}, {high:.1f}], and the paired differences of the others to it are above 0"
-                )
-            else:
-                found += (
-                    f"{plural(best['episodes'], 'search', 'searches')} cannot tell which of "
-                    f"{', '.join(row['agent'] for row in leaders)} is fastest; their mean total times are "
-                    f"{best['total_s']:.1f} to {leaders[-1]['total_s']:.1f} s"
-                )
-            found += f". The clairvoyant lower bound is {best['bound_s']:.1f} s"
-            for row in its:
-                if row["agent"] == BOUND:
-                    gap = f"{best['agent']} is within {best['gap_to_bound']:.1%} of that"
-                    found += f". No agent can have a mean below {row['total_s']:.1f} s (bound); {gap}"
-            findings.append(f"{found}.")
-        return findings
+        """See `Study`: the agents that none beats in the first setting; the table marks those of all."""
+
+        def setting(row: Row) -> tuple[Any, ...]:
+            return row["scenario"], *(row[name] for name in SETTING_AXES)
+
+        first, *_ = rows = summary["rows"]
+        agents = [row for row in rows if setting(row) == setting(first) and row["agent"] not in UNBEATEN]
+        if len(agents) < 2:
+            return []
+        leaders = ", ".join(f"{row['agent']} ({row['total_s']:.1f} s)" for row in agents if row["leads"])
+        return [
+            f"On {first['scenario']}, failure cost {first['failure_cost_s']:g} s, no agent is clearly faster than "
+            f"{leaders}."
+        ]
 
 
 def _driven(cells: Sequence[Cell]) -> list[Cell]:

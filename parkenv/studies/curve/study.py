@@ -212,18 +212,15 @@ class CurveStudy(FleetStudy):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: how far the curves are off, beside the usual forms."""
+        """See `Study`: how far the first curve is off, and what to mind of the lots."""
         from parkenv.studies.curve.fit import CURVE, FORMS
 
-        found = [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
-        for row in summary["errors"]:
-            label, best = row["outcome"].partition(",")[0], min(row[form] for form in FORMS)
-            found.append(
-                f"{label.capitalize()}, {row['held_out']} held out: {row[CURVE]:.1%} off by zone-hours, of which "
-                f"chance in so few days makes {row['chance']:.0%}; means over the day {row['of_zones']:.1%}. "
-                f"The best of the usual forms in the occupancy, fitted to the same: {best:.0%}."
-            )
-        return found
+        findings = [
+            f"{row['outcome']}, {row['held_out']} held out: {row[CURVE]:.1%} off by zone-hours; the best of the usual "
+            f"forms {min(row[form] for form in FORMS):.1%}."
+            for row in summary["errors"][:1]
+        ]
+        return findings + [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:

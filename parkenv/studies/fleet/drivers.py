@@ -67,34 +67,6 @@ def policy_of(
     return None, AgentsByStay(spec, scenario, known)
 
 
-def guided_fleet(
-    spec: AgentSpec,
-    scenario: Scenario,
-    demand: Demand | TownDemand,
-    guidance: tuple[str, float],
-    arrivals_per_hour: float | str | None = None,
-    **options: Any,
-) -> tuple[Fleet, Any]:
-    """Return a fleet of which a share is guided, and its agent, or None if that is compiled.
-
-    Args:
-        spec: the agent that drives all cars.
-        scenario: the lot.
-        demand: who comes.
-        guidance: what members know, one of `KNOWLEDGE`, and their share of the cars.
-        arrivals_per_hour: see `policy_of`; cars that see others count them instead.
-        options: of `Fleet`.
-
-    Raises:
-        InputError: see `policy_of`.
-    """
-    told = None if options.get("sees_cars") else arrivals_per_hour
-    policy, agent = policy_of(spec, scenario, told)
-    knows, share = guidance
-    kinds = [DriverKind(share, policy, knows, shares=knows == "shared"), DriverKind(1.0 - share, policy)]
-    return Fleet(scenario, demand, drivers=kinds, leave_full_lot=False, **options), agent
-
-
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
     """Return the compiled policy of an agent.
 

@@ -175,11 +175,6 @@ class FleetStudy(Study):
         ge=0.01,
         le=1e5,
     )
-    most_balked: Probability = option(
-        0.05,
-        "Largest acceptable share of cars that find no slot: the output names the largest demand within it.",
-        panel="Demand",
-    )
     seed: Seed = 0
     figures: Figures = True
 
@@ -300,18 +295,23 @@ class FleetStudy(Study):
         Raises:
             InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
         """
+        from parkenv.engine.fleet import DriverKind, Fleet
         from parkenv.studies.fleet.decision_limit import LimitedAgent
-        from parkenv.studies.fleet.drivers import demand_in, guided_fleet
+        from parkenv.studies.fleet.drivers import demand_in, policy_of
 
-        rate = setting.arrivals_per_hour
-        fleet, agent = guided_fleet(
-            setting.agent,
-            self.built[setting.scenario],
+        scenario, rate, knows = self.built[setting.scenario], setting.arrivals_per_hour, setting.knows
+        # Cars that see others count them instead.
+        policy, agent = policy_of(setting.agent, scenario, None if self.sees_cars else rate)
+        members = DriverKind(setting.share, policy, knows, shares=knows == "shared")
+        fleet = Fleet(
+            scenario,
             demand_in(self._followed(setting), rate, self.stay_s, self.patience_s),
-            (setting.knows, setting.share),
-            rate,
+            drivers=[members, DriverKind(1.0 - setting.share, policy)],
+            leave_full_lot=False,
             manoeuvre_s=self.blocked_s,
-            **{name: getattr(self, name) for name in ("delay_s", "leaving_soon_s", "sees_cars")},
+            delay_s=self.delay_s,
+            leaving_soon_s=self.leaving_soon_s,
+            sees_cars=self.sees_cars,
         )
         if agent is not None and self.decision_limit_s is not None:
             agent = LimitedAgent(agent, self.decision_limit_s)
@@ -431,7 +431,7 @@ class FleetStudy(Study):
 
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
-        from parkenv.studies.fleet.blocks import ALL, BLOCKS, zone_prices, has_zones, summarize_blocks
+        from parkenv.studies.fleet.blocks import ALL, BLOCKS, has_zones, summarize_blocks, zone_prices
         from parkenv.studies.fleet.changes import summarize_changes
         from parkenv.studies.fleet.tables import summarize_days, summarize_hours
 
@@ -460,7 +460,6 @@ class FleetStudy(Study):
             "blocks": summarize_blocks(grouped, "block", prices),
             "purposes": summarize_blocks(mixed, "purpose"),
             "reach": [{"scenario": name, **roads.reach()} for name, roads in self._roads.items()],
-            "most_balked": self.most_balked,
             "cautions": self._cautions(),
         }
 
@@ -519,48 +518,32 @@ class FleetStudy(Study):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: what competition costs, for each agent and demand."""
-        from parkenv.studies.fleet.changes import sentence, shown_changes
-        from parkenv.studies.fleet.tables import ONE_DAY, carried, departures, unreached
-
-        shown: dict[tuple[Any, ...], Row] = {}
-        for row in sorted(summary["rows"], key=lambda row: row["knows"] != OWN):
-            shown.setdefault((row["scenario"], row["agents"], row["arrivals_per_hour"]), row)
-        changes = shown_changes(summary["changes"])
-        findings = [f"On {name}, {caution}" for name, caution in summary.get("cautions", {}).items()]
-        findings += [sentence(row) for row in changes if row["change"] == "scenario"]
-        for (scenario, agent, per_hour), row in shown.items():
-            finding = (
-                f"{agent} on {scenario}, {rate_text(per_hour)}, {row['occupancy']:.0%} of the slots taken: "
-                f"{row['total_s']:.1f} s a car, {row['balked_fraction']:.1%} find no slot"
-            )
-            low, high = row["price_of_anarchy_ci95"]
-            if None not in (row["price_of_anarchy"], low, high) and row["knows"] == OWN:
-                finding += f"; the price of anarchy is {row['price_of_anarchy']:.3f} [{low:.3f}, {high:.3f}]"
-                finding += (
-                    f": uncoordinated search takes {row['price_of_anarchy'] - 1.0:.0%} longer than with slots "
-                    "reserved for all"
-                    if low > 1.0
-                    else ": reservations would save nothing measurable"
-                )
-            findings.append(f"{finding}.")
-        findings += carried(summary["rows"], summary.get("most_balked", 0.05))
-        findings += [sentence(row) for row in changes if row["change"] == "knows"]
-        findings += [ONE_DAY] if all(row["days"] == 1 for row in summary["rows"]) else []
-        findings += unreached(summary["reach"])
-        return findings + departures(summary["hours"], summary["rows"])
+        """See `Study`: the first setting, and what to mind of the lots and the days."""
+        row = summary["rows"][0]
+        findings = [
+            f"{row['agents']} on {row['scenario']}, {rate_text(row['arrivals_per_hour'])}: {row['total_s']:.1f} s a "
+            f"car, {row['balked_fraction']:.1%} find no slot."
+        ]
+        findings += [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
+        findings += [
+            f"On {reach['scenario']}, most spaces are out of reach of {reach['entries_cut_off']} of the "
+            f"{reach['entries']} entries (parkenv lot show --graph)."
+            for reach in summary["reach"]
+            if reach["entries_cut_off"]
+        ]
+        if row["days"] == 1:
+            findings.append("One day has no interval; five days or more (-n 5) show what is chance.")
+        return findings
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         """See `Study`; some columns mean something else than in other tables."""
         from parkenv.show.report.tables import OF_FLEETS, tables_of
-        from parkenv.studies.fleet.changes import headlines
 
         # Of a town with many streets the map tells, and blocks.csv.
         blocks = summary["blocks"] if len(summary["blocks"]) <= MOST_BLOCKS else []
         tables = tables_of({**summary, "blocks": blocks}, cls.table_titles, OF_FLEETS)
-        large = headlines(summary["rows"], summary["changes"])
-        return super().page(summary, folder)._replace(tables=tables, headlines=large)
+        return super().page(summary, folder)._replace(tables=tables)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
         """See `Study`."""

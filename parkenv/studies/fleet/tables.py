@@ -2,29 +2,22 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Collection, Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
 from parkenv.studies.fleet.setting import (
     BY_HOUR,
-    COUNTED,
     MEASURES,
     OWN,
     SETTING_COLUMNS,
-    rate_text,
-    times_demanded,
 )
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of, mean_interval, ratio_interval
 
 ASSIGNED = "reserve"
 COUNTS = "counted_occupancy"
-FAR = 0.03
-"""Difference between simulated and counted occupancy that is said."""
 WITH_INTERVAL = ("total_s", "search_s", "members_s", "others_s", "balked_fraction")
 """Measures whose summary has a 95 % interval over days."""
 DIFFERENCES = {
@@ -33,8 +26,6 @@ DIFFERENCES = {
     "others_difference_s": "others_s",
 }
 """Columns of paired differences, and the measures that are compared."""
-ONE_DAY = "One day has no interval: a difference may be chance. Five days or more (-n 5) tell."
-"""Said where each setting has one day."""
 Pairs = list[tuple[Row, Row]]
 """The same days in two settings."""
 
@@ -96,97 +87,6 @@ def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
             means = {"occupancy": float(mine.mean()), COUNTS: float(theirs.mean())}
             rows.append(its | means | columns_of("excess", mean_interval(mine - theirs)))
     return rows
-
-
-def carried(rows: Sequence[Row], most_balked: float) -> list[str]:
-    """Say up to which of the demands driven at most a share of the cars finds no slot; nothing of a single demand.
-
-    A line for each scenario, agent and guidance of all cars, of demands in cars an hour and of multiples.
-
-    Args:
-        rows: of `summarize_days`.
-        most_balked: that share.
-    """
-    groups: dict[tuple[Any, ...], list[Row]] = {}
-    for row in rows:
-        if row["share"] in (0.0, 1.0):
-            key = (row["scenario"], row["agents"], row["knows"], isinstance(row["arrivals_per_hour"], str))
-            groups.setdefault(key, []).append(row)
-
-    def rate(row: Row) -> float:
-        its = row["arrivals_per_hour"]
-        return times_demanded(its) if isinstance(its, str) else float(its)
-
-    def found(row: Row) -> str:
-        low, high = row["balked_fraction_ci95"]
-        interval = "" if None in (low, high) or low != low else f" [{max(low, 0.0):.1%}, {high:.1%}]"
-        return f"{row['balked_fraction']:.1%}{interval}"
-
-    said = []
-    for (scenario, agent, knows, is_times), its in groups.items():
-        its = sorted(its, key=rate)
-        if len(its) == 1:
-            continue
-        few = list(itertools.takewhile(lambda row: row["balked_fraction"] <= most_balked, its))
-        if len(few) == len(its):
-            tried = (
-                f"at {rate_text(its[-1]['arrivals_per_hour'])}, the most tried, {found(its[-1])} find no slot"
-            )
-        else:
-            above, most = its[len(few)], f"{most_balked:.0%} of the cars find no slot"
-            at = f"at {rate_text(above['arrivals_per_hour'])}"
-            tried = f"{at}, the fewest tried, already more than {most}: {found(above)}"
-            if few:
-                up_to = f"up to {rate_text(few[-1]['arrivals_per_hour'])}"
-                tried = f"{up_to} at most {most} ({found(few[-1])}); {at} it is {found(above)}"
-            between = np.linspace(rate(few[-1]) if few else 0.0, rate(above), 5)[1:-1]
-            closer = ",".join(f"{value:.3g}{'x' * is_times}" for value in between)
-            tried += f". --arrivals-per-hour {closer} looks closer"
-        said.append(f"{agent} on {scenario}, {knows}: {tried}.")
-    return said
-
-
-def unreached(reach: Sequence[Row]) -> list[str]:
-    """Say from how many entries of a lot most spaces cannot be reached: `scenario`, and `Roads.reach`."""
-    return [
-        f"On {its['scenario']}, most spaces cannot be reached from {its['entries_cut_off']} of the {its['entries']} "
-        "entries: look at the streets there (parkenv lot show --graph)."
-        for its in reach
-        if its["entries_cut_off"]
-    ]
-
-
-def departures(hours: Sequence[Row], rows: Sequence[Row]) -> list[str]:
-    """Say when the lot is least as full as counted, by more than `FAR` and not by chance, and why, if that is known.
-
-    A line for each scenario, agent and demand; nothing of so many times the counted demand, which is not meant to be as
-    full.
-
-    Args:
-        hours: of `summarize_hours`.
-        rows: of `summarize_days`.
-    """
-    balked = {tuple(row[name] for name in SETTING_COLUMNS): row["balked_fraction"] for row in rows}
-    worst: dict[tuple[str, str, float | str], Row] = {}
-    for row in sorted(hours, key=lambda row: abs(row["excess"])):
-        (low, high), rate = row["excess_ci95"], row["arrivals_per_hour"]
-        meant = rate == COUNTED or not isinstance(rate, str)
-        if meant and abs(row["excess"]) > FAR and (low or 0.0) * (high or 0.0) > 0.0:
-            worst[row["scenario"], row["agents"], rate] = row
-
-    def reason(row: Row) -> str:
-        gone = balked.get(tuple(row[name] for name in SETTING_COLUMNS))
-        if row["arrivals_per_hour"] != COUNTED:
-            return "; --arrivals-per-hour counted follows the counts"
-        if row["excess"] > 0.0:
-            return "; shorter stays (--stay-min) may follow better"
-        return f"; it is full at times, and {gone:.1%} of the cars go elsewhere" if gone else ""
-
-    return [
-        f"{agent} on {scenario}, {row['knows']}, {rate_text(rate)}: from {row['hour']}:00 to {row['hour'] + 1}:00 "
-        f"{row['occupancy']:.0%} of the slots are taken, as counted {row[COUNTS]:.0%}{reason(row)}."
-        for (scenario, agent, rate), row in worst.items()
-    ]
 
 
 def _differences(pairs: Pairs) -> Row:

@@ -206,8 +206,7 @@ class SurveyStudy(Study):
         right, unknown = row["slot_accuracy"], row["unknown_fraction"]
         return [
             f"{plural(row['sessions'], 'drive')} past {plural(row['slots'], 'slot')}: {row['car_detection_rate']:.1%} "
-            f"of the parked cars were detected. Slots: {slots_text(right, unknown)}; unknown were never in view. "
-            "Ranges alone classify slots, too, so a car that was detected in no image can still be in the map."
+            f"of the parked cars were detected; slots: {slots_text(right, unknown)}."
         ]
 
     @classmethod
