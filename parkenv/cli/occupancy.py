@@ -42,8 +42,10 @@ DEMAND_COLUMNS = (
     Column("arrivals_a_day", "cars a day", digits=0),
     Column("stay_h", "stay", "h"),
     Column("days_held_out", "days", digits=0),
-    Column("fit_error", "fit", share=True),
-    *(Column(f"{name}_error", name.replace("_", " "), share=True) for name in PREDICTIONS),
+    Column("counted", "counted", share=True, digits=0),
+    Column("simulated", "simulated", share=True, digits=0),
+    Column("fit_error", "error, fit", share=True),
+    *(Column(f"{name}_error", f"error, {name.replace('_', ' ')}", share=True) for name in PREDICTIONS),
 )
 LogFile = Annotated[Path, Option("LOG", takes="FILE", argument=True)]
 TimeZone = Annotated[str, Option(takes="NAME")]
@@ -195,21 +197,9 @@ class Demand(StudyCommand):
         rows = without_nan([*result.rows, {**summary, "car_park": "all"}])
         columns = {column.key: column for column in DEMAND_COLUMNS}
         print_rows(console, f"{self.study.scenario.title}: {what}", rows, columns, columns)
-        console.print(
-            "Mean absolute differences from the counts by car park and hour: of the fit on the weeks followed, and on "
-            "each day held out of the town driven with the day's demand, of the forecast that it follows, of the same "
-            "hour a week before, and of the mean of the weeks followed",
-            soft_wrap=True,
-        )
-        for row in result.rows:
-            if row["simulated_error"] > FAR_OFF:
-                console.print(
-                    f"warning: {row['car_park']} is not followed: {row['counted']:.0%} of its places are counted as "
-                    f"taken, {row['simulated']:.0%} when driven. Compare its name, capacity and price in the lot with "
-                    "the city's (lot import --car-parks), look for free places beside it that may be a guess (lot "
-                    "import --untagged-kerbs 0.3), or correct longer (--rounds 8).",
-                    style="yellow", soft_wrap=True,
-                )  # fmt: skip
+        off = [row["car_park"] for row in result.rows if row["simulated_error"] > FAR_OFF]
+        if off:
+            console.print(f"warning: not followed: {', '.join(off)}", style="yellow", soft_wrap=True)
         if summary["not_in_lot"]:
             console.print(f"Not in the lot: {', '.join(summary['not_in_lot'])}", soft_wrap=True)
 
