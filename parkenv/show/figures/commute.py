@@ -6,14 +6,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
-from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.picture_files import picture
 from parkenv.show.figures.times import agent_color
 
 Row = Mapping[str, Any]
@@ -39,8 +37,11 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
     columns = list(dict.fromkeys((r["scenario"], r["map"]) for r in rows if r["map"] not in (FIXED, NONE)))
     if not columns:
         return
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(1.2 + max(2.9 * len(columns), 4.4), 5.6), layout="constrained")
+    with picture(
+        path,
+        (1.2 + max(2.9 * len(columns), 4.4), 5.6),
+        "Time and forecast error of drivers whose map learns from every trip",
+    ) as figure:
         panels = figure.subplots(2, len(columns), sharex="col", squeeze=False)
         for i, ((scenario, start), (above, below)) in enumerate(zip(columns, panels.T, strict=True)):
             its = [row for row in rows if row["scenario"] == scenario]
@@ -63,7 +64,6 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
         figure.legend(
             handles=_legend(rows), loc="outside lower center", ncols=max(2, int(figure.get_figwidth() // 2.2))
         )
-        save_picture(figure, path, "Time and forecast error of drivers whose map learns from every trip")
 
 
 def _draw_excess(axes: Axes, rows: Sequence[Row], start: str) -> None:

@@ -6,14 +6,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, picture
 
 Row = Mapping[str, Any]
 _GREY, _COLORS = "#9a9a9a", ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#666666")
@@ -45,8 +43,11 @@ def save_curves(
         by_purpose["balked_fraction"] = "share that finds no space"
     n_panels = 1 + 2 * bool(points) + len(by_purpose)
     columns = min(n_panels, 3)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(0.6 + 3.6 * columns, 3.3 * -(-n_panels // columns)), layout="constrained")
+    with picture(
+        path,
+        (0.6 + 3.6 * columns, 3.3 * -(-n_panels // columns)),
+        f"{title}: curves with 95 % bands, and zones that were held out.",
+    ) as figure:
         axes = figure.subplots(-(-n_panels // columns), columns, squeeze=False).ravel()
         _draw_search(axes[0], curves, points, forms)
         if points:
@@ -62,7 +63,6 @@ def save_curves(
         for ax in axes[n_panels:]:
             ax.set_axis_off()
         figure.suptitle(title, x=0.01, ha="left")
-        save_picture(figure, path, f"{title}: curves with 95 % bands, and zones that were held out.")
 
 
 def _areas(points: Sequence[Row]) -> FloatArray:

@@ -6,16 +6,14 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.show.figures.lot import draw_zones, zone_colors
-from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, picture
 from parkenv.world.lot import ParkingLot
 
 Row = dict[str, Any]
@@ -63,8 +61,7 @@ def save_fleet_figure(
         panels["occupancy by hour"] = lambda ax: _draw_hours(ax, hours)
     agents = list(dict.fromkeys(row["agents"] for row in rows))
     known = list(dict.fromkeys(row["knows"] for row in rows))
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(0.6 + 4.0 * len(panels), 3.9), layout="constrained")
+    with picture(path, (0.6 + 4.0 * len(panels), 3.9), f"{title}: {', '.join(panels)}.") as figure:
         for ax, draw in zip(np.ravel(figure.subplots(1, len(panels))), panels.values(), strict=True):
             draw(ax)
             ax.grid(visible=True)
@@ -80,7 +77,6 @@ def save_fleet_figure(
                 handles=handles, loc="outside lower center", ncols=min(len(handles), 2 * len(panels))
             )
         figure.suptitle(title, x=0.01, ha="left")
-        save_picture(figure, path, f"{title}: {', '.join(panels)}.")
 
 
 def _cycled(agents: Sequence[str]) -> list[tuple[Any, str]]:
@@ -213,8 +209,7 @@ def save_zones_figure(
         InputError: the file cannot be written.
     """
     at = [hour + 0.5 for hour in hours]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.8, 6.2), layout="constrained")
+    with picture(path, (5.8, 6.2), f"{title}: map, slots taken and revenue by hour.") as figure:
         axes = figure.subplot_mosaic([["map", "map"], ["occupancy", "paid"]], height_ratios=(1.3, 1.0))
         zones = draw_zones(lot, axes["map"])
         axes["map"].legend(
@@ -229,4 +224,3 @@ def save_zones_figure(
             _mark_hours(axes[name], hours)
             axes[name].grid(visible=True)
         figure.suptitle(title, x=0.01, ha="left")
-        save_picture(figure, path, f"{title}: map, slots taken and revenue by hour.")

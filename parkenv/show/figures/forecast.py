@@ -8,10 +8,8 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from parkenv.compiled.arrays import FloatArray
@@ -20,7 +18,7 @@ from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import draw_days
 from parkenv.forecast.scores import Band, mean_where
 from parkenv.forecast.slot_comparison import ComparedSlots
-from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, picture
 
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
 _WEEK = 7
@@ -115,8 +113,7 @@ def save_forecast(shown: ShownForecast, path: Path) -> None:
         shown: what to draw.
         path: the PNG to write.
     """
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 5.6), layout="constrained")
+    with picture(path, (10.5, 5.6), f"Day-ahead forecasts of {shown.model} and what was counted") as figure:
         grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.15), width_ratios=(1.0, 1.6))
         _draw_days(figure.add_subplot(grid[0, :]), shown)
         reliability, coverage = (figure.add_subplot(grid[1, column]) for column in (0, 1))
@@ -128,7 +125,6 @@ def save_forecast(shown: ShownForecast, path: Path) -> None:
             x=0.01,
             ha="left",
         )
-        save_picture(figure, path, f"Day-ahead forecasts of {shown.model} and what was counted")
 
 
 def _draw_days(ax: Axes, shown: ShownForecast) -> None:

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from parkenv.show.columns import columns_of
-from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, picture
 from parkenv.show.figures.times import spread
 
 COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#555555")
@@ -48,9 +46,13 @@ def save_learning_curves(
         title: title of the figure.
         path: the PNG file to write.
     """
-    with mpl.rc_context(STYLE):
-        layout = ConstrainedLayoutEngine(w_pad=_MARGIN_IN)
-        figure = Figure(figsize=(7.2, 4.2 if len(curves) == 1 else 4.8), layout=layout)
+    layout = ConstrainedLayoutEngine(w_pad=_MARGIN_IN)
+    with picture(
+        path,
+        (7.2, 4.2 if len(curves) == 1 else 4.8),
+        "Learning curves, and planners in the same worlds",
+        layout=layout,
+    ) as figure:
         axes = figure.subplots()
         highest = 0.0
         for (name, its), color in zip(curves.items(), COLORS, strict=False):
@@ -72,7 +74,6 @@ def save_learning_curves(
             axes.legend(loc="upper right", frameon=True, facecolor="white", edgecolor="none", framealpha=1.0)
         else:
             figure.legend(loc="outside lower left", ncols=2, frameon=False)
-        save_picture(figure, path, "Learning curves, and planners in the same worlds")
 
 
 def save_success_curves(
@@ -93,9 +94,8 @@ def save_success_curves(
         title: title of the figure.
         path: the PNG file to write.
     """
-    with mpl.rc_context(STYLE):
-        kinds = list(next(iter(means.values())))
-        figure = Figure(figsize=(2.4 + 2.8 * len(kinds), 3.4), layout="constrained")
+    kinds = list(next(iter(means.values())))
+    with picture(path, (2.4 + 2.8 * len(kinds), 3.4)) as figure:
         panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         for axes, kind in zip(panels, kinds, strict=True):
             for (name, its), color in zip(curves.items(), COLORS, strict=False):
@@ -115,7 +115,6 @@ def save_success_curves(
             loc="lower right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8
         )
         figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
-        save_picture(figure, path)
 
 
 def _draw(

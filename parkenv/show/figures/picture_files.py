@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -51,6 +52,17 @@ def legend_columns(labels: Sequence[str], width: float, most: int) -> int:
         if sum(part.max(initial=0.0) for part in np.array_split(length, n)) <= width
     )
     return next(fits, 1)
+
+
+@contextmanager
+def picture(
+    path: str | Path, size: tuple[float, float], caption: str = "", layout: Any = "constrained"
+) -> Iterator[Figure]:
+    """Yield a figure, of a size in inches, and write it as a PNG when the block ends; see `save_picture`."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=size, layout=layout)
+        yield figure
+        save_picture(figure, path, caption)
 
 
 def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:

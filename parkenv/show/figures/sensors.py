@@ -5,17 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import cv2
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
-from matplotlib.figure import Figure
 
 from parkenv.compiled.arrays import Image
 from parkenv.perception.range_scan import disparity
 from parkenv.show.colors import PALETTE, hex_color
 from parkenv.show.figures.lot import draw_lot
-from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.picture_files import picture
 from parkenv.show.painters.opencv import write_tag
 from parkenv.world.lot import ParkingLot
 from sim_sensors.ground_truth import VehicleBoxes, View
@@ -71,8 +69,7 @@ def save_sensor_preview(
     """
     frame = capture.images[rig.cameras[0][0]]
     name, stereo, _ = rig.stereo_cameras[0]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.6, 8.4))
+    with picture(path, (10.6, 8.4), layout=None) as figure:
         figure.suptitle(title, x=0.02, ha="left", weight="bold")
         places = ((0.02, 0.5), (0.02, 0.02), (0.52, 0.02), (0.52, 0.5))
         axes = [figure.add_axes((x, y, 0.44, 0.43)) for x, y in places]
@@ -90,4 +87,3 @@ def save_sensor_preview(
             ax.set_axis_off()
         draw_scan(axes[3], lot, capture, rig)
         axes[3].set_title("270° scan at knee height")
-        save_picture(figure, path)

@@ -24,7 +24,7 @@ from parkenv.mapping.survey import SessionResult
 from parkenv.perception.detector import LEAST_PROBABILITY, PROBABILITY, Detections
 from parkenv.show.colors import PALETTE, hex_color
 from parkenv.show.figures.lot import BELIEF_MAP, draw_discs, draw_lot
-from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, picture
 from parkenv.show.painters.axes import paint
 from parkenv.show.painters.opencv import write_tag
 from parkenv.show.plurals import plural, slots_text
@@ -80,9 +80,10 @@ def headings(poses: FloatArray, color: str, length: float = 2.5) -> Lines:
 
 def save_detections(result: SessionResult, path: Path) -> None:
     """Draw some frames of a session with their detections (T Fig. 4.4)."""
-    with mpl.rc_context(STYLE):
-        n = len(result.shown)
-        figure = Figure(figsize=(4.2 * n, 3.7))
+    n = len(result.shown)
+    with picture(
+        path, (4.2 * n, 3.7), "Camera frames of a survey drive, with the cars that were detected", layout=None
+    ) as figure:
         weather = result.session.weather.replace("_", " ")
         figure.suptitle(f"Detected cars, {weather}", x=0.01, ha="left", weight="bold")
         for i, shown in enumerate(result.shown):
@@ -102,13 +103,15 @@ def save_detections(result: SessionResult, path: Path) -> None:
         note = Line2D([], [], linestyle="none", label=f"number: probability, at least {least}")
         figure.legend(handles=[*handles, note], loc="lower left", ncols=5)
         figure.subplots_adjust(0.01, 0.08, 0.99, 0.91, wspace=0.02)
-        save_picture(figure, path, "Camera frames of a survey drive, with the cars that were detected")
 
 
 def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
     """Draw a session from above (T Fig. 4.5): grid, detected cars and slots."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, 3)), layout="constrained")
+    with picture(
+        path,
+        (11.0, _height(lot, 11.0, 3)),
+        "One survey drive: occupancy grid, detected cars, and the states of the slots",
+    ) as figure:
         axes = figure.subplots(3, 1)
         for ax in axes:
             draw_lot(lot, ax)
@@ -133,9 +136,6 @@ def save_session(lot: ParkingLot, result: SessionResult, path: Path) -> None:
         heading = Line2D([], [], color=CAR_COLOR, linewidth=2.0, label="a car's middle and heading")
         _draw_key(axes[1], [heading])
         _draw_states(lot, result, axes[2])
-        save_picture(
-            figure, path, "One survey drive: occupancy grid, detected cars, and the states of the slots"
-        )
 
 
 def save_localisation(lot: ParkingLot, result: SessionResult, path: Path) -> None:
@@ -144,8 +144,11 @@ def save_localisation(lot: ParkingLot, result: SessionResult, path: Path) -> Non
     by_odometry = [
         moved(result.odometry[i], between(result.poses[i], car)) for i, car in zip(at, cars, strict=True)
     ]
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, 2)), layout="constrained")
+    with picture(
+        path,
+        (11.0, _height(lot, 11.0, 2)),
+        "A survey drive by drifting odometry, and as corrected by scan matching",
+    ) as figure:
         panels = (
             ("by odometry", result.odometry, np.array(by_odometry).reshape(-1, 3)),
             ("corrected", result.poses, cars),
@@ -167,13 +170,15 @@ def save_localisation(lot: ParkingLot, result: SessionResult, path: Path) -> Non
             Line2D([], [], color=CAR_COLOR, linewidth=2.0, label="a located car, frame by frame"),
         ]
         _draw_key(figure.axes[0], keys)
-        save_picture(figure, path, "A survey drive by drifting odometry, and as corrected by scan matching")
 
 
 def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, path: Path) -> None:
     """Draw the drive graph with the map's prediction and one session's observation of each slot (T Fig. 4.7)."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, 1) + 0.5), layout="constrained")
+    with picture(
+        path,
+        (11.0, _height(lot, 11.0, 1) + 0.5),
+        "The map's P(taken) on the drive graph, and what one drive saw",
+    ) as figure:
         ax = figure.subplots()
         draw_lot(lot, ax, show_graph=True)
         states = result.states
@@ -185,13 +190,13 @@ def save_graph(lot: ParkingLot, predicted: Prediction, result: SessionResult, pa
             f"({result.session.weather.replace('_', ' ')})"
         )
         _draw_scale(figure, ax, BELIEF_MAP, "P(taken)")
-        save_picture(figure, path, "The map's P(taken) on the drive graph, and what one drive saw")
 
 
 def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, path: Path) -> None:
     """Draw the slots discovered from the cars of all sessions over the true slots."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, 1)), layout="constrained")
+    with picture(
+        path, (11.0, _height(lot, 11.0, 1)), "Slots discovered from detected cars, without a map of the lot"
+    ) as figure:
         ax = figure.subplots()
         draw_lot(lot, ax)
         slots = posed(found.xy, found.yaw)
@@ -205,13 +210,13 @@ def save_found_slots(lot: ParkingLot, found: FoundSlots, score: DiscoveryScore, 
             [], [], color=SLOT_COLOR, marker="o", markersize=3, label="a discovered slot and its heading"
         )
         _draw_key(ax, [found_slot])
-        save_picture(figure, path, "Slots discovered from detected cars, without a map of the lot")
 
 
 def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Path) -> None:
     """Draw detection rates by weather and distance, rows of `surveys.detection_by_distance`."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(7.0, 3.8), layout="constrained")
+    with picture(
+        path, (7.0, 3.8), "How often a car in the frame is detected, by weather and distance"
+    ) as figure:
         ax = figure.subplots()
         weathers = list(dict.fromkeys(row["weather"] for row in rows))
         for i, weather in enumerate(weathers):
@@ -234,27 +239,25 @@ def save_detection_reach(rows: Sequence[Mapping[str, Any]], title: str, path: Pa
         ax.grid(axis="y")
         ax.legend(loc="lower left", ncols=2)
         ax.set_title(title)
-        save_picture(figure, path, "How often a car in the frame is detected, by weather and distance")
 
 
 def save_map(lot: ParkingLot, predicted: Prediction, true: FloatArray | None, title: str, path: Path) -> None:
     """Draw the map's prediction for every slot (T Fig. 4.6), and the true probabilities if known."""
-    with mpl.rc_context(STYLE):
-        panels: list[tuple[str, str, Colormap, FloatArray]] = [
-            ("what the map says", "P(taken)", BELIEF_MAP, predicted.p_occupied)
-        ]
-        if true is not None:
-            panels.append(("the truth", "P(taken)", BELIEF_MAP, true))
-        width = predicted.high - predicted.low
-        # Neither colour map passes through the grey of the asphalt.
-        panels.append(("how unsure it is", "width of the 95 % interval", mpl.colormaps["plasma"], width))
-        figure = Figure(figsize=(11.0, _height(lot, 11.0, len(panels))), layout="constrained")
+    panels: list[tuple[str, str, Colormap, FloatArray]] = [
+        ("what the map says", "P(taken)", BELIEF_MAP, predicted.p_occupied)
+    ]
+    if true is not None:
+        panels.append(("the truth", "P(taken)", BELIEF_MAP, true))
+    width = predicted.high - predicted.low
+    # Neither colour map passes through the grey of the asphalt.
+    panels.append(("how unsure it is", "width of the 95 % interval", mpl.colormaps["plasma"], width))
+    size = 11.0, _height(lot, 11.0, len(panels))
+    with picture(path, size, "The map: how likely each slot is taken, and how sure the map is") as figure:
         axes = np.atleast_1d(figure.subplots(len(panels), 1))
         for ax, (name, label, colors, values) in zip(axes, panels, strict=True):
             draw_lot(lot, ax, slot_color=colors(values))
             ax.set_title(f"{title}: {name}")
             _draw_scale(figure, ax, colors, label)
-        save_picture(figure, path, "The map: how likely each slot is taken, and how sure the map is")
 
 
 def _draw_states(lot: ParkingLot, result: SessionResult, ax: Axes) -> None:

@@ -10,9 +10,7 @@ import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from pydantic import TypeAdapter
 from scipy import stats
 
@@ -20,7 +18,7 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.parking_task import KINDS
 from parkenv.errors import InputError
 from parkenv.scenarios.calibration import Calibration
-from parkenv.show.figures.picture_files import INK, STYLE, save_picture
+from parkenv.show.figures.picture_files import INK, picture
 from parkenv.studies.results import Row
 from parkenv.studies.statistics import columns_of, mean_interval
 from parkenv.studies.trips.driven_search import Trip
@@ -145,8 +143,7 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
 def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path: Path) -> None:
     """Draw the distributions: speed, manoeuvres and failed attempts by kind of slot, edges by kind."""
     known = samples(rows, speed_limit)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.0, 6.4), layout="constrained")
+    with picture(path, (10.0, 6.4)) as figure:
         figure.suptitle(title, x=0.02, ha="left", weight="bold")
         axes = figure.subplots(2, 2).ravel()
         panels = (
@@ -180,4 +177,3 @@ def save_distributions(rows: Sequence[Row], speed_limit: float, title: str, path
         ax.boxplot([known[f"s_per_m.{k}"] for k in kinds], tick_labels=kinds, whis=(5, 95), showfliers=False)
         ax.axhline(1.0 / speed_limit, color="#d55e00", lw=1.0, ls="--")
         ax.set_title("edges (s/m; dashed: speed limit)")
-        save_picture(figure, path)
