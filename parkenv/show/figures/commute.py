@@ -29,10 +29,6 @@ def save_commute_curves(rows: Sequence[Row], path: Path) -> None:
     Excess time is what a search takes beyond that of the first agent with the right map, which does not learn, in the
     same worlds (10 % trimmed mean). Shaded are 95 % intervals. All of the first agent's curve is in the panel; others
     may leave it.
-
-    Args:
-        rows: rows of `commute.day_rows`.
-        path: the PNG file to write.
     """
     columns = list(dict.fromkeys((r["scenario"], r["map"]) for r in rows if r["map"] not in (FIXED, NONE)))
     if not columns:

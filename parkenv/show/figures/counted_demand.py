@@ -27,13 +27,7 @@ class CarParkDays(NamedTuple):
 
 @mpl.rc_context(STYLE)
 def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, path: Path) -> None:
-    """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones.
-
-    Args:
-        car_parks: the car parks.
-        hours: (n_hours,) hours of the day that the cars were counted at.
-        path: the PNG to write.
-    """
+    """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones."""
     columns = min(len(car_parks), 4)
     rows = ceil(len(car_parks) / columns)
     figure = Figure(figsize=(2.8 * columns + 0.6, 2.1 * rows + 0.6), layout="constrained")

@@ -43,9 +43,6 @@ def save_fleet_figure(
         title: title of the figure.
         path: file to write.
         hours: of `summarize_hours`.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     whole = [row for row in rows if row["share"] in (0.0, max(row["share"] for row in rows))]
     mixed = [row for row in rows if 0.0 < row["share"] < 1.0]
@@ -204,9 +201,6 @@ def save_zones_figure(
         hours: of the day.
         courses: `occupancy` and `paid` by zone and hour, (n_zones, n_hours) each.
         path: file to write.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     at = [hour + 0.5 for hour in hours]
     with picture(path, (5.8, 6.2), f"{title}: map, slots taken and revenue by hour.") as figure:

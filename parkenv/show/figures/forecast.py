@@ -44,13 +44,7 @@ class ShownForecast(NamedTuple):
 
 
 def shown_counts(compared: Compared, counts: Counts, week: tuple[int, int]) -> ShownForecast:
-    """Return what to show of a model of counts.
-
-    Args:
-        compared: its forecasts and scores.
-        counts: what was observed.
-        week: car park and first day to show, by index (`shown_week`).
-    """
+    """Return what to show of a model of counts."""
     forecast, scores, (park, monday) = compared.forecast, compared.scores, week
     dates = counts.days[monday : monday + _WEEK]
     days = slice(monday - forecast.first, monday - forecast.first + _WEEK)
@@ -64,12 +58,7 @@ def shown_counts(compared: Compared, counts: Counts, week: tuple[int, int]) -> S
 
 
 def shown_slots(compared: ComparedSlots, log: str) -> ShownForecast:
-    """Return what to show of a model of slots: the last days that were scored, a week at most.
-
-    Args:
-        compared: its forecasts and scores.
-        log: name of the log.
-    """
+    """Return what to show of a model of slots: the last days that were scored, a week at most."""
     days, scores = compared.days[-_WEEK:], compared.scores
     means = scores.means()
     draws, forecast, observed = (
@@ -87,12 +76,7 @@ def shown_slots(compared: ComparedSlots, log: str) -> ShownForecast:
 
 
 def shown_week(counts: Counts, first: int) -> tuple[int, int]:
-    """Return car park and first day, by index, of the week to show: from Monday on, with many readings that vary most.
-
-    Args:
-        counts: what was observed.
-        first: index of the first day that may be shown.
-    """
+    """Return car park and first day, by index, of the week to show: from a Monday on, with many varied readings."""
     mondays = [d for d in range(first, len(counts.days) - _WEEK + 1) if counts.weekday[d] == 0]
     best, chosen = -1.0, (0, first)
     for monday in mondays:
@@ -107,12 +91,7 @@ def shown_week(counts: Counts, first: int) -> tuple[int, int]:
 
 
 def save_forecast(shown: ShownForecast, path: Path) -> None:
-    """Draw the figure of one model.
-
-    Args:
-        shown: what to draw.
-        path: the PNG to write.
-    """
+    """Draw the figure of one model."""
     with picture(path, (10.5, 5.6), f"Day-ahead forecasts of {shown.model} and what was counted") as figure:
         grid = figure.add_gridspec(2, 2, height_ratios=(1.0, 1.15), width_ratios=(1.0, 1.6))
         _draw_days(figure.add_subplot(grid[0, :]), shown)

@@ -163,9 +163,6 @@ def save_lot_picture(
 
     Slots are filled with the colour of their zone, which a legend names; in lots without zones with that of their
     parking cost, of which a colour bar gives the scale. Guesses of an import are marked and listed below the lot.
-
-    Raises:
-        InputError: the format is unknown, or the file cannot be written.
     """
     path = Path(path)
     x0, y0, x1, y1 = lot.bounds()

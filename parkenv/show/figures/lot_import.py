@@ -47,9 +47,6 @@ def save_import_picture(draft: LotDraft, path: str | Path) -> None:
 
     Slots are coloured by their source, each with a line from its open side to its lane. One-way lanes have arrows.
     Missing parts are listed below the drawing.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     notes = [line for text in draft.missing for line in wrap(f"missing: {text}", 110)]
     points = _extent(draft)

@@ -21,12 +21,7 @@ _SIZE = (480, 640, 3)
 
 
 def save_parkings(ends: Sequence[tuple[ParkingLot, DriveState]], path: Path) -> None:
-    """Write a PNG of the final states and driven paths of parking episodes, two per row.
-
-    Args:
-        ends: lot and final state of each episode.
-        path: the file to write.
-    """
+    """Write a PNG of the final states and driven paths of parking episodes, two per row."""
     pictures = [DriveRenderer(lot).frame(state) for lot, state in ends]
     save_sheet(pictures, path)
 

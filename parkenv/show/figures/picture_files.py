@@ -68,11 +68,6 @@ def picture(
 def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:
     """Write a PNG atomically.
 
-    Args:
-        figure: the figure.
-        path: the file to write.
-        caption: caption in reports, kept in the file.
-
     Raises:
         InputError: the file cannot be written.
     """

@@ -17,13 +17,7 @@ _DAYS = (("weekday", 0, "#0072b2"), ("weekend", 5, "#e69f00"))
 
 @mpl.rc_context(STYLE)
 def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> None:
-    """Draw the mean occupancy with its spread over slots, and the profiles of both rates, for each day class.
-
-    Args:
-        process: the process; Monday represents weekdays, Saturday the weekend.
-        path: the PNG to write.
-        title: title of the figure.
-    """
+    """Draw the mean occupancy with its spread over slots, and the profiles of both rates, for each day class."""
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     full, rates = figure.subplots(1, 2)
     hours = np.arange(0.0, 24.01, 0.25)

@@ -141,14 +141,7 @@ def _text_marker(text: str) -> MplPath:
 
 
 def draw_searches(records: Sequence[SearchRecord]) -> Figure:
-    """Draw searches of several agents or settings in the same world side by side.
-
-    Args:
-        records: at least one search.
-
-    Raises:
-        InputError: there are no records.
-    """
+    """Draw searches of several agents or settings in the same world side by side."""
     if not records:
         raise InputError("no search to draw")
     bounds = np.array([record.scenario.lot.bounds() for record in records])

@@ -26,14 +26,7 @@ _DASHED = ("oracle", BOUND)
 
 
 def draw_time_distribution(panels: Mapping[str, Totals]) -> Figure:
-    """Draw the empirical distribution functions of total times, with each agent's mean as a dot on its curve.
-
-    Args:
-        panels: the total times of each scenario's agents.
-
-    Raises:
-        InputError: there are no times.
-    """
+    """Draw the empirical distribution functions of total times, with each agent's mean as a dot on its curve."""
     if not panels or not any(panels.values()):
         raise InputError("no total times to draw")
     columns = len(panels) if len(panels) < 4 else 2 if len(panels) == 4 else 3

@@ -61,9 +61,6 @@ def draw_time_split(rows: Sequence[Row]) -> Figure:
 
     Args:
         rows: rows of one scenario, as `parkenv compare` writes them to `summary.json`.
-
-    Raises:
-        InputError: there are no rows.
     """
     _require_rows(rows)
     panels: dict[tuple[Any, ...], list[Row]] = {}
@@ -161,9 +158,6 @@ def draw_time_against_occupancy(rows: Sequence[Row], about: str = "") -> Figure:
     Args:
         rows: rows with occupancy (0..1), agent, failure_cost_s, total_s, total_s_ci95.
         about: what else the rows have in common; follows the failure cost in the titles.
-
-    Raises:
-        InputError: there are no rows.
     """
     _require_rows(rows)
     costs = sorted({row["failure_cost_s"] for row in rows})
@@ -191,9 +185,6 @@ def draw_time_against_decision_time(panels: Mapping[str, Sequence[Row]]) -> Figu
 
     Args:
         panels: rows of each scenario with planner, total_s, total_s_ci95 and decision_ms, the median.
-
-    Raises:
-        InputError: there are no rows.
     """
     panels = {name: [row for row in rows if row["agent"] not in UNBEATEN] for name, rows in panels.items()}
     _require_rows([row for rows in panels.values() for row in rows])
@@ -255,9 +246,6 @@ def draw_time_against_failure_cost(observed: Sequence[Row], blind: Sequence[Row]
     Args:
         observed: rows of one scenario with failure_cost_s, agent, total_s, total_s_ci95.
         blind: the same without observations from the lane.
-
-    Raises:
-        InputError: there are no rows.
     """
     _require_rows(observed)
     _require_rows(blind)
@@ -289,9 +277,6 @@ def draw_time_against_map(rows: Sequence[Row], own: Sequence[Row], forecast: Map
         rows: rows with scenario, agent, total_s, total_s_ci95, of one world with several flat forecasts.
         own: rows of the same world with its own forecast, drawn dashed.
         forecast: P(taken) of each flat forecast, by scenario.
-
-    Raises:
-        InputError: there are no rows.
     """
     _require_rows(rows)
     with mpl.rc_context(STYLE):

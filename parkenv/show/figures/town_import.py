@@ -23,11 +23,7 @@ SPACE_M2 = 60.0  # m² of a counted facility's disc for each place: twice the ro
 
 @mpl.rc_context(STYLE)
 def save_town_picture(town: TownDraft, path: str | Path) -> None:
-    """Draw a town to a PNG file: slots are dots, counted facilities discs by capacity, hollow where a rule says it.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Draw a town to a PNG file: slots are dots, counted facilities discs by capacity, hollow where a rule says it."""
     draft = town.draft
     points = np.concatenate([lane.points for lane in draft.lanes])
     low, high = points.min(axis=0), points.max(axis=0)

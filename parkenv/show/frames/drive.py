@@ -110,12 +110,7 @@ def _movers(poses: FloatArray, outlines: Sequence[FloatArray]) -> list[Layer]:
 
 
 def steered_car(vehicle: VehicleParameters, state: FloatArray) -> list[Layer]:
-    """Return the layers of a car with its steered wheels.
-
-    Args:
-        vehicle: the car.
-        state: (6,) as in `parkenv.driving.vehicle`.
-    """
+    """Return the layers of a car with its steered wheels."""
     axles = ((0.0, 0.0), (vehicle.wheelbase, float(state[STEERING])))
     side = 0.5 * vehicle.width - 0.02
     wheels = [
@@ -135,12 +130,7 @@ def _panes(poses: FloatArray, size: FloatArray) -> list[Layer]:
 
 
 def trail(vehicle: VehicleParameters, poses: FloatArray) -> list[Layer]:
-    """Return the path of the car's centre, and its outline at the start and at changes of direction.
-
-    Args:
-        vehicle: the car.
-        poses: (n, 3), of its rear axle.
-    """
+    """Return the path of the car's centre, and its outline at the start and at changes of direction."""
     step = np.diff(poses[:, :2], axis=0)
     forward = (step * np.stack([np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])], axis=1)).sum(axis=1)
     moving = np.flatnonzero(np.abs(forward) > 1e-6)

@@ -11,12 +11,7 @@ Row = Mapping[str, Any]
 
 
 def learning_panels(summary: Mapping[str, Any], seeds: Sequence[Sequence[Row]]) -> list[dict[str, Any]]:
-    """Build the panels of learning curves: total time of searches, or success by kind of slot.
-
-    Args:
-        summary: content of the `summary.json` of a training.
-        seeds: rows of each seed's `curve.csv`, NaN as None.
-    """
+    """Build the panels of learning curves: total time of searches, or success by kind of slot."""
     curve, lines = summary.get("curve"), summary.get("evaluated")
     if not curve or not isinstance(lines, Mapping):
         return []

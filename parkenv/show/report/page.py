@@ -121,26 +121,13 @@ def terms_data() -> list[dict[str, Any]]:
 
 
 def write_page(data: Mapping[str, Any], path: Path, figures: Sequence[Path] = ()) -> None:
-    """Write the page atomically.
-
-    Args:
-        data: data from `page_data`.
-        path: the HTML file to write.
-        figures: PNG files to show.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the page atomically."""
     shown = "\n".join(_figure(f) for f in sorted(figures, key=_rank))
     _write(path, "page.html", data, SCRIPTS, title=html.escape(data["run"]["title"]), figures=shown)
 
 
 def write_game(data: Mapping[str, Any], path: Path) -> None:
-    """Write the page of a game atomically; see `parkenv.studies.play.game_data`.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write the page of a game atomically; see `parkenv.studies.play.game_data`."""
     _write(path, "game.html", data, GAME_SCRIPTS, game=(_HERE / "game.css").read_text(encoding="utf-8"))
 
 

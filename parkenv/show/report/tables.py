@@ -356,13 +356,7 @@ def tables_of(
     titles: Mapping[str, str],
     columns: Mapping[str, Column] = MappingProxyType({}),
 ) -> list[dict[str, Any]]:
-    """Build the tables of a command's summary: of its entry `rows`, and of others unless they are empty.
-
-    Args:
-        summary: summary of the command.
-        titles: title of the table of each entry.
-        columns: formats of columns that differ from `column_of`.
-    """
+    """Build the tables of a command's summary: of its entry `rows`, and of others unless they are empty."""
     return [
         table_of(name, title, summary[name], columns=columns)
         for name, title in titles.items()
@@ -371,12 +365,7 @@ def tables_of(
 
 
 def survey_tables(surveyed: Row, sessions: Sequence[Row]) -> list[dict[str, Any]]:
-    """Build the tables of a survey.
-
-    Args:
-        surveyed: its row in the summary.
-        sessions: rows of `sessions.csv`.
-    """
+    """Build the tables of a survey."""
     tables = [table_of("survey", "The survey", [surveyed], facts=True)]
     if by_weather := surveyed.get("by_weather"):
         its = [{"weather": _plain(w), **row} for w, row in by_weather.items()]

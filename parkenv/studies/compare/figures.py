@@ -244,19 +244,7 @@ FIGURES = (
 
 
 def draw_figures(results: ComparisonResults, folder: Path, names: Sequence[str] | None = None) -> list[Path]:
-    """Draw the figures of a comparison to PNG files.
-
-    Args:
-        results: results of the comparison.
-        folder: output folder.
-        names: names of the figures to draw; all if None.
-
-    Returns:
-        The files written.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
+    """Draw the figures of a comparison to PNG files."""
     files = []
     for kind in FIGURES:
         if names is None or kind.name in names:

@@ -122,11 +122,7 @@ class SearchFilm:
         self._take(f"At the goal after {metrics['total_s']:.0f} s", hold=LAST_S, walker=goal)
 
     def save(self, path: Path) -> None:
-        """Write the film as a GIF.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write the film as a GIF."""
         step = -(-len(self.frames) // MOST_FRAMES)
         save_film([*self.frames[:-1:step], self.frames[-1]], path, fps=FPS, colors=COLORS)
 
@@ -257,9 +253,5 @@ class SearchFilm:
 
 
 def film_search(case: Case, seed: int, path: Path) -> None:
-    """Repeat a search of a case with simulated sensors, and write a film of it.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Repeat a search of a case with simulated sensors, and write a film of it."""
     SearchFilm(case.runner().run(seed, moments=True)).save(path)

@@ -81,12 +81,7 @@ class SearchReplay(NamedTuple):
 
 
 def choose(cases: Sequence[tuple[Case, Sequence[int]]], episodes: int) -> list[Encounter]:
-    """Choose the first searches of each setting in turn, up to a total number; at least one world.
-
-    Args:
-        cases: cases, each with the seeds of its searches.
-        episodes: number of searches to choose.
-    """
+    """Choose the first searches of each setting in turn, up to a total number; at least one world."""
     settings: dict[tuple[Any, ...], list[tuple[Case, Sequence[int]]]] = {}
     for case, seeds in cases:
         setting = tuple(v for k, v in case.columns.items() if k != "agent")

@@ -83,12 +83,7 @@ class CountedTown:
         return days[np.isin(self.counts.weekday[days], self._window.weekdays)]
 
     def cars(self, occupied: FloatArray, days: IntArray) -> tuple[FloatArray, FloatArray]:
-        """Return the cars at the beginning of the window, (d, n), and at the end of its hours, (d, n, n_hours).
-
-        Args:
-            occupied: (n, all days, 24) share of the places, NaN: not counted.
-            days: (d,) indices.
-        """
+        """Return the cars at the beginning of the window, (d, n), and at the end of its hours, (d, n, n_hours)."""
         start = int(self.hours[0])
         cars = occupied * self.capacity[:, None, None]
         before = cars[:, days, start - 1] if start else cars[:, np.maximum(days - 1, 0), DAY_HOURS - 1]

@@ -70,14 +70,7 @@ class FleetReplay(NamedTuple):
 
 
 def record_day(study: FleetStudy, setting: Setting, day: int, counted: Mapping[Key, float]) -> Recording:
-    """Repeat a day, and record it: times in centiseconds since the day's arrivals begin.
-
-    Args:
-        study: the study.
-        setting: one of its settings.
-        day: number of the day.
-        counted: mean total time, s, of the days in the original run, by `FleetStudy.keys`.
-    """
+    """Repeat a day, and record it: times in centiseconds since the day's arrivals begin."""
     fleet, agents = study.fleet(setting)
     scenario = fleet.scenario
     fleet.keep_steps()

@@ -68,11 +68,7 @@ def policy_of(
 
 
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
-    """Return the compiled policy of an agent.
-
-    Raises:
-        InputError: it decides in Python.
-    """
+    """Return the compiled policy of an agent."""
     policy, _ = policy_of(spec, scenario)
     if policy is None:
         raise InputError(f"--agents is {spec.label!r}, want a compiled one, such as usual")
@@ -169,13 +165,7 @@ class MixedFleet:
         return "every car" if self.among is None else f"{self.share:g} among {self.among.label}"
 
     def run_day(self, member: AgentSpec | CompiledPolicy, seed: int, day: int) -> Row:
-        """Run a day; return mean times, s, of members and others, and the fraction of the members that parked.
-
-        Args:
-            member: driver of the members.
-            seed: seed of the days.
-            day: index of the day.
-        """
+        """Run a day; return mean times, s, of members and others, and the fraction of the members that parked."""
         policy, agent = (
             (member, None) if isinstance(member, CompiledPolicy) else policy_of(member, self.scenario)
         )

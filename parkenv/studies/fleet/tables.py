@@ -73,12 +73,7 @@ def _is_counted(days: Sequence[Row]) -> bool:
 
 
 def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
-    """Return the mean occupancy in each hour, simulated and as counted, of settings where it is known.
-
-    Args:
-        settings: the days of each setting.
-        first: the hour of the day in which cars begin to arrive.
-    """
+    """Return the mean occupancy in each hour, simulated and as counted, of settings where it is known."""
     rows = []
     for days in filter(_is_counted, settings):
         simulated, counted = (np.array([day[name].split() for day in days], float).T for name in BY_HOUR)
