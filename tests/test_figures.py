@@ -12,11 +12,15 @@ from parkenv import make_scenario
 from parkenv.errors import InputError
 from parkenv.lots import grid_lot
 from parkenv.show.figures import times as time_figures
+from parkenv.show.figures.forecast import save_rates
 from parkenv.show.figures.picture_files import CAPTION, INK, save_picture
-from parkenv.show.figures.rates import save_rates
 from parkenv.show.figures.searches import BELIEF_MAP, draw_search, draw_searches
-from parkenv.show.figures.time_distribution import draw_time_distribution
-from parkenv.show.figures.times import AGENT_COLORS, draw_time_against_occupancy, draw_time_split
+from parkenv.show.figures.times import (
+    AGENT_COLORS,
+    draw_time_against_occupancy,
+    draw_time_distribution,
+    draw_time_split,
+)
 from parkenv.studies.compare import figures as comparison_figures
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.figures import FIGURES, ComparisonResults, draw_figures, remove_figures

@@ -13,9 +13,9 @@ from parkenv.errors import InputError
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.studies.fleet.changes import CHANGES, summarize_changes
 from parkenv.studies.fleet.setting import NOWHERE
 from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.fleet.tables import CHANGES, summarize_changes
 from parkenv.studies.results import without_nan
 from parkenv.studies.statistics import mean_interval
 

@@ -35,8 +35,8 @@ from parkenv.show.report.page import write_page
 from parkenv.studies.benchmark.result_file import check_result
 from parkenv.studies.benchmark.suite import Suite
 from parkenv.studies.compare.comparison import Comparison
-from parkenv.studies.fleet.changes import CHANGES
 from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.fleet.tables import CHANGES
 from parkenv.studies.report import RunFolder
 from parkenv.studies.results import EPISODES, Results, decision_s
 from parkenv.studies.sensing.sessions import SESSIONS

@@ -1,15 +1,18 @@
-"""Figure of a forecasting model: reliability, a week with its intervals, and how often the intervals hold."""
+"""Figures of occupancy: forecasts and what was counted, fitted rates, and demand that follows counts."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from datetime import date
 from itertools import pairwise
+from math import ceil
 from pathlib import Path
 from typing import NamedTuple
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
 from parkenv.compiled.arrays import FloatArray
@@ -18,7 +21,9 @@ from parkenv.forecast.counts import HOURS, Counts
 from parkenv.forecast.day_forecast import draw_days
 from parkenv.forecast.scores import Band, mean_where
 from parkenv.forecast.slot_comparison import ComparedSlots
-from parkenv.show.figures.picture_files import INK, picture
+from parkenv.show.figures.picture_files import INK, STYLE, picture, save_picture
+from parkenv.world.occupancy.process import OccupancyProcess
+from parkenv.world.week import DAY_S, HOUR_S
 
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
 _WEEK = 7
@@ -169,3 +174,81 @@ def _draw_coverage(ax: Axes, shown: ShownForecast) -> None:
     )  # fmt: skip
     ax.yaxis.set_major_formatter(PercentFormatter(1.0))
     ax.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, borderaxespad=0.0)
+
+
+_DAYS = (("weekday", 0, "#0072b2"), ("weekend", 5, "#e69f00"))
+
+
+@mpl.rc_context(STYLE)
+def save_rates(process: OccupancyProcess, path: Path, *, title: str = "") -> None:
+    """Draw the mean occupancy with its spread over slots, and the profiles of both rates, for each day class."""
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    full, rates = figure.subplots(1, 2)
+    hours = np.arange(0.0, 24.01, 0.25)
+    for name, day, color in _DAYS:
+        moments = np.stack([process.marginal(day * DAY_S + h * HOUR_S) for h in hours])
+        low, middle, high = np.quantile(moments, [0.1, 0.5, 0.9], axis=1)
+        full.fill_between(hours, low, high, color=color, alpha=0.18, linewidth=0)
+        full.plot(hours, moments.mean(axis=1), color=color, label=f"{name}, mean")
+        full.plot(hours, middle, color=color, linewidth=0.8, linestyle=":")
+        for profile, style in ((process.arrival_profile, "-"), (process.departure_profile, "--")):
+            event = "arrivals" if style == "-" else "departures"
+            rates.stairs(
+                profile[24 * day : 24 * day + 24] * HOUR_S, baseline=None, color=color, linestyle=style, linewidth=1.5,
+                label=f"{event}, {name}",
+            )  # fmt: skip
+    full.set(
+        xlabel="hour of the day",
+        ylabel="fraction occupied",
+        ylim=(0, 1.02),
+        title="Occupancy (band: 80 % of slots)",
+    )
+    rates.set(
+        xlabel="hour of the day",
+        ylabel="per hour and slot",
+        yscale="log",
+        title="Arrival and departure rates",
+    )
+    rates.yaxis.set_major_formatter("{x:g}")
+    for ax in (full, rates):
+        ax.set(xlim=(0, 24), xticks=range(0, 25, 4))
+        ax.grid(visible=True)
+        ax.legend(fontsize=8)
+    if title:
+        figure.suptitle(title)
+    save_picture(figure, path)
+
+
+class CarParkDays(NamedTuple):
+    """A car park over the hours of a day."""
+
+    name: str
+    capacity: float
+    simulated: FloatArray  # (n_hours,) cars, mean of the days of the fleet
+    followed: FloatArray  # (n_hours,) cars counted, mean of the days that the demand follows
+    held_out: FloatArray  # (d, n_hours) cars counted on later days; NaN: not counted
+
+
+@mpl.rc_context(STYLE)
+def save_counted_demand(car_parks: Sequence[CarParkDays], hours: FloatArray, path: Path) -> None:
+    """Draw the share of the places that is taken: simulated, as counted on the days followed, and on later ones."""
+    columns = min(len(car_parks), 4)
+    rows = ceil(len(car_parks) / columns)
+    figure = Figure(figsize=(2.8 * columns + 0.6, 2.1 * rows + 0.6), layout="constrained")
+    axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
+    for ax, its in zip(axes, car_parks, strict=False):
+        seen = its.held_out[np.isfinite(its.held_out).any(axis=1)]
+        for k, day in enumerate(seen):
+            ax.plot(hours, day / its.capacity, color="#999999", linewidth=0.5, alpha=0.5,
+                    label="counted later, each day" if k == 0 else None)  # fmt: skip
+        ax.plot(hours, its.followed / its.capacity, "--", color="#0072b2", label="counted, days followed")
+        ax.plot(hours, its.simulated / its.capacity, color="#d55e00", label="simulated")
+        ax.set_title(f"{its.name}, {its.capacity:.0f}", fontsize=8)
+        ax.set(xlim=(hours[0] - 1, hours[-1]), ylim=(0, 1.02))
+        ax.grid(visible=True)
+    for ax in axes[len(car_parks) :]:
+        ax.set_axis_off()
+    figure.supxlabel("hour of the day", fontsize=9)
+    figure.supylabel("share of the places taken", fontsize=9)
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside upper left", ncols=3, fontsize=8)
+    save_picture(figure, path)

@@ -21,12 +21,13 @@ from parkenv.scenarios.blind import BLIND
 from parkenv.show.columns import SETTING_AXES
 from parkenv.show.figures.picture_files import save_picture
 from parkenv.show.figures.searches import draw_searches
-from parkenv.show.figures.time_distribution import BOUND, draw_time_distribution
 from parkenv.show.figures.times import (
+    BOUND,
     draw_time_against_decision_time,
     draw_time_against_failure_cost,
     draw_time_against_map,
     draw_time_against_occupancy,
+    draw_time_distribution,
     draw_time_split,
 )
 from parkenv.studies.compare.cases import Case, against_occupancy

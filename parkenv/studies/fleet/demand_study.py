@@ -273,7 +273,7 @@ class DemandStudy(Study):
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: the predictions, scenarios with the demand of the last roll-out, its weekdays as a picture."""
-        from parkenv.show.figures.counted_demand import CarParkDays, save_counted_demand
+        from parkenv.show.figures.forecast import CarParkDays, save_counted_demand
 
         town, found, fits = self.town, self._found(result.results), result.results.rows(FITTED)
         fitted = {kind: fits[self.roll_outs - 1, kind]["car_parks"] for kind in KINDS}

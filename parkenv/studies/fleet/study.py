@@ -296,8 +296,7 @@ class FleetStudy(Study):
             InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
         """
         from parkenv.engine.fleet import DriverKind, Fleet
-        from parkenv.studies.fleet.decision_limit import LimitedAgent
-        from parkenv.studies.fleet.drivers import demand_in, policy_of
+        from parkenv.studies.fleet.drivers import LimitedAgent, demand_in, policy_of
 
         scenario, rate, knows = self.built[setting.scenario], setting.arrivals_per_hour, setting.knows
         # Cars that see others count them instead.
@@ -432,8 +431,7 @@ class FleetStudy(Study):
     def summarise(self, results: Results) -> Row:
         """See `Study`."""
         from parkenv.studies.fleet.blocks import ALL, BLOCKS, has_zones, summarize_blocks, zone_prices
-        from parkenv.studies.fleet.changes import summarize_changes
-        from parkenv.studies.fleet.tables import summarize_days, summarize_hours
+        from parkenv.studies.fleet.tables import summarize_changes, summarize_days, summarize_hours
 
         days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
         keys = [key for work, items in self.cells() for item in items for key in self.keys(work, item)]
