@@ -22,6 +22,7 @@ SOURCES = {
     "occupancy": "parkenv/forecast parkenv/world/occupancy parkenv/studies/occupancy.py",
 }  # fmt: skip
 NUMBER = re.compile(r"\|\s*\**[+-]?\d[\d,.]*( ?%| ?s| ?m| ?ms| ?\[[^]|]*\])?\**\s*(?=\|)")
+STATED = re.compile(r"[Cc]ommits? ([0-9a-f]{8})")
 COMMAND = re.compile(r"(?:parkenv|python3?|examples/\S+\.py)(?: [^`\n]+|(?=$))")
 
 
@@ -51,7 +52,8 @@ def figures():
                 after = commands(text[found.end() : end if end > 0 else None])
                 command = [*after, *commands(text[start : found.start()])[::-1], ""][0]
                 what = found[1].removeprefix("../").removeprefix("docs/") if found[1] else "table"
-                stated = re.findall(r"[Cc]ommit ([0-9a-f]{8})", text[start : end if end > 0 else None])
+                section = text[found.end() : end if end > 0 else None], text[start : found.start()]
+                stated = [commit for part in section for commit in STATED.findall(part)]
                 line = text.count("\n", 0, found.start()) + 1
                 yield Figure(str(page.relative_to(ROOT)), line, what, command, *stated[:1])
 

@@ -271,8 +271,8 @@ def test_the_documented_lines_make_a_folder_of_photographs_of_a_recording(tmp_pa
             writer.add(TimedCapture(200_000.0 + k, capture), np.array([2.0 * k, 1.0, 0.1]))
         writer.close(Head("key", 200_000.0, "camera", "rain"))
     monkeypatch.chdir(tmp_path)
-    code = (Path(__file__).parents[1] / "docs/camera.md").read_text().split("```py\n")[1].split("```")[0]
-    exec(compile(code, "camera.md", "exec"), {})
+    code = (Path(__file__).parents[1] / "docs/calibration.md").read_text().split("```py\n")[1].split("```")[0]
+    exec(compile(code, "calibration.md", "exec"), {})
     taken = Photographs(tmp_path / "photos", PhotoOptions(fov=90.0))
     photographed = RecordedDrive(tmp_path / "photos", photographs=taken)
     assert photographed.start == 200_000.0
