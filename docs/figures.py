@@ -15,7 +15,7 @@ SENSORS = "sim_sensors parkenv/perception parkenv/mapping parkenv/studies/sensin
 SOURCES = {
     "compare": SEARCHES, "plan": SEARCHES, "benchmark": f"{SEARCHES} parkenv/studies/benchmark",
     "commute": f"{SEARCHES} parkenv/studies/commute", "fleet": f"{SEARCHES} parkenv/studies/fleet",
-    "verify": f"{SEARCHES} parkenv/studies/verify", "train": f"{SEARCHES} parkenv/studies/training",
+    "train": f"{SEARCHES} parkenv/studies/training",
     "calibrate": f"{SEARCHES} parkenv/driving parkenv/studies/trips",
     "trip": "parkenv/driving parkenv/studies/trips planners/driving",
     "park": "parkenv/driving parkenv/envs/drive.py planners/driving", "lot": "parkenv/lots parkenv/show/figures",

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ordered_entry import ORDERED_ENTRY
 from small_lots import small_lot
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
-from parkenv.studies.verify.queues import ORDERED_ENTRY
 from parkenv.world.demand import (
     ConstantTime,
     Demand,

@@ -69,7 +69,6 @@ COMMANDS = {
     "occupancy evaluate": Entry("Score forecasts of occupancy against simple ones.", "occupancy:Evaluate"),
     "occupancy record": Entry("Record days of a town's own demand as a log.", "occupancy:Record"),
     "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "checks:Schema", DATA),
-    "verify": Entry("Compare closed forms of the literature with this package.", "checks:Verify", DATA),
     "bench": Entry("Measure throughput, also of other software for the same task.", "checks:Bench", DATA),
 }
 """Commands and groups of commands, as the help page lists them."""

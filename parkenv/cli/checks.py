@@ -1,4 +1,4 @@
-"""`parkenv verify`, `parkenv bench` and `parkenv schema`: the package against theory, other software and files."""
+"""`parkenv bench` and `parkenv schema`: the package against other software, and schemas of files."""
 
 from __future__ import annotations
 
@@ -7,12 +7,10 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
-import typer
 from pydantic import Field
 from typer import echo
 
 from parkenv.cli.options import Command
-from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, make_table, save_summary
 from parkenv.errors import InputError, nearest
 from parkenv.files.option import numbers_in, option
@@ -20,67 +18,9 @@ from parkenv.files.spec_file import Several
 from parkenv.studies.compare.comparison import Milliseconds
 from parkenv.studies.fields import MAX_EPISODES, Seed
 from parkenv.studies.study import STUDIES, schemas
-from parkenv.studies.verify.study import Verification
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from parkenv.studies.bench.rows import BenchRow
-    from parkenv.studies.runner import Result
-    from parkenv.studies.verify.rows import Row
-
-
-class Verify(StudyCommand):
-    """A deterministic case must match exactly. A simulated one agrees if theory lies in an interval of the mean.
-
-    This is the 99.99 % interval, so all rows of a correct program agree with a probability of 0.995 and more. The exit
-    code is 1 if any row disagrees.
-    """
-
-    examples = """
-        parkenv verify --out results/verify
-        parkenv verify --cases line,inspections --seed 7
-        """
-
-    study: Verification = Verification()
-    out: Path | None = option(None, "Folder for summary.json and verify.png.", short="-o", default="none")
-
-    def run(self) -> None:
-        """See `Command`."""
-        from parkenv.studies.verify.rows import disagreeing
-
-        if disagreeing(self.study.statements(self.run_study().results)):
-            raise typer.Exit(1)
-
-    def show(self, console: Console, result: Result) -> None:
-        """Print what theory expects and what is found."""
-        from parkenv.show.plurals import plural
-        from parkenv.studies.verify.rows import CONFIDENCE, disagreeing
-
-        rows = self.study.statements(result.results)
-        cells = (
-            (
-                row.case,
-                _figure(row.expected),
-                _figure(row.found),
-                _interval(row),
-                "" if row.agrees else "DISAGREES",
-            )
-            for row in rows
-        )
-        console.print(
-            make_table(None, ("case", "expected", "found", f"{CONFIDENCE:.2%} interval", ""), cells)
-        )
-        agree = len(rows) - len(disagreeing(rows))
-        console.print(f"{agree} of {plural(len(rows), 'row')} agree with theory.")
-
-
-def _interval(row: Row) -> str:
-    return "exact" if row.exact else " to ".join(map(_figure, row.interval))
-
-
-def _figure(value: float) -> str:
-    return f"{value:.0f}" if float(value).is_integer() else f"{value:.4g}"
 
 
 PARTS = {

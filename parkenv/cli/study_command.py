@@ -132,7 +132,6 @@ COMMANDS = {
     "detectors": "detect:CompareDetectors",
     "demo": "demo:Demo",
     "calibrate": "drive:Calibrate",
-    "verify": "checks:Verify",
     "train": "train:Train",
     "park": "drive:Park",
 }
@@ -144,7 +143,7 @@ class Run(RunCommand, ExecutionSpec):
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
     command: compare (the default), commute, fleet, curve, demand, benchmark, survey, detectors, demo, calibrate,
-    verify, train or park (scenes).
+    train or park (scenes).
     """
 
     examples = """

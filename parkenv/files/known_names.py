@@ -40,5 +40,3 @@ BackendName = Literal["loky", "ray", "dask"]
 ForecastFrom = Literal["others", "rolling", "past"]
 FORECAST_FROM: tuple[ForecastFrom, ...] = get_args(ForecastFrom)
 """Recorded days that a forecast is made from; see `parkenv.world.occupancy.recorded`."""
-VERIFY_CASES = ("line", "inspections", "entry", "stays", "blocking", "balance", "strategies", "game", "town")
-"""Cases of `parkenv verify`."""

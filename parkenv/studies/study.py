@@ -46,7 +46,6 @@ STUDIES: Mapping[str, str] = {
     "detectors": "parkenv.studies.sensing.detector_study:DetectorStudy",
     "demo": "parkenv.studies.demo.study:Demo",
     "calibrate": "parkenv.studies.trips.calibration_study:CalibrationStudy",
-    "verify": "parkenv.studies.verify.study:Verification",
     "train": "parkenv.studies.training.spec:TrainingSpec",
     "park": "parkenv.studies.trips.manoeuvre_study:ManoeuvreStudy",
 }

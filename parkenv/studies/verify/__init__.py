@@ -1,1 +1,0 @@
-"""Closed forms for parking searches, compared with the package's planners and worlds."""
