@@ -39,12 +39,8 @@ class Figure(NamedTuple):
 def figures():
     """Find the pictures and the tables of results, those with at least six numbers, of all pages."""
     for page in [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]:
-        if page.parent.name == "bench":
-            continue  # part of other pages
         text = page.read_text(encoding="utf-8")
-        for found in re.finditer(
-            r"(?:!\[[^]]*\]\(|--8<-- \"docs/(?=bench))([^)\"]+)|(?:^\|.*\n)+", text, re.M
-        ):
+        for found in re.finditer(r"!\[[^]]*\]\(([^)]+)|(?:^\|.*\n)+", text, re.M):
             specified = "| Meaning |" in found[0].partition("\n")[0]  # what numbers mean, no results
             if found[1] or (len(NUMBER.findall(found[0])) >= 6 and not specified):
                 start = text.rfind("\n#", 0, found.start()) + 1

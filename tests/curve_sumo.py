@@ -9,11 +9,11 @@ import sys
 
 import numpy as np
 
+from benchmarks.sumo import run_fleet, run_sumo, sumo_folder
+from benchmarks.town import SHIFT, SPEED, blocks_of
 from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots.generators import city_lot
-from parkenv.studies.bench.sumo import run_fleet, run_sumo, sumo_folder
-from parkenv.studies.bench.town import SHIFT, SPEED, blocks_of
 from parkenv.studies.curve.fit import Paths, Town, fit_curve
 from parkenv.studies.curve.lone_search import LoneSearches
 from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Zones

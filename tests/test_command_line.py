@@ -184,7 +184,7 @@ def test_version_and_help_load_nothing_large(answers):
     assert answers["--version"] == [["parkenv 0.1.0"], []]
     page, loaded = answers["--help"]
     assert loaded == []
-    assert {line.split()[0] for line in page if line.startswith("  ")} >= {"demo", "compare", "lot", "bench"}
+    assert {line.split()[0] for line in page if line.startswith("  ")} >= {"demo", "compare", "lot", "schema"}
 
 
 def test_agents_and_scenarios_are_listed_in_help():

@@ -19,8 +19,6 @@ from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstac
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.lots import packaged_lot, read_lot, write_lot
-from parkenv.studies.bench import drive as bench_drive
-from parkenv.studies.bench.drive import bare_physics, environment_steps
 from parkenv.studies.trips.parking_runs import ParkingCase, park_all, park_once, parking_table
 from parkenv.studies.workers import Workers
 from planners.driving.car_path import CarPath
@@ -398,16 +396,3 @@ def test_park_refuses_what_is_not_there(options, message, tmp_path):
     assert isinstance(result.exception, InputError)
     assert message in str(result.exception)
     assert not (tmp_path / "p").exists()
-
-
-def test_bench_says_what_is_not_installed(monkeypatch):
-    monkeypatch.setattr(bench_drive, "find_spec", lambda name: None)
-    rows = bench_drive.drive_rows(seconds=0.02)
-    assert [row["case"] for row in rows if row["value"] is None] == ["highway-env parking-v0: not installed"]
-    assert {row["unit"] for row in rows} == {"physics steps/s", "ms"}
-
-
-def test_the_measured_rates_are_rates():
-    assert bare_physics(0, 0.02) > 1000.0
-    plain, scanning = (environment_steps(a, 0, 0.02) for a in ({}, {"laser": True}))
-    assert plain > scanning > 100.0

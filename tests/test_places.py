@@ -16,10 +16,9 @@ from stable_baselines3.common.env_checker import check_env as check_env_of_sb3
 from parkenv import InputError, SensorModel, make_scenario, make_scenarios
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.lots import write_lot
+from parkenv.lots import grid_lot, write_lot
 from parkenv.scenarios.selection import by_size, lot_share, open_scenarios, scenario_of_episode, split_by_lot
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
-from parkenv.studies.bench.env import grids
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.training.cloning import clone
 from parkenv.studies.training.search import SearchTraining, episode_times
@@ -29,6 +28,14 @@ from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR
 from parkenv.world.occupancy.typical_week import typical_occupancy
 from planners.model_file import ModelCard
+
+
+def grids(n, seed):
+    """Grids of slots with different numbers of rows and columns."""
+    rng = np.random.default_rng(seed)
+    rows, columns = rng.integers(2, 16, n), rng.integers(6, 34, n)
+    return [grid_lot(int(r), int(c)) for r, c in zip(rows, columns, strict=True)]
+
 
 LOTS = grids(6, seed=1)
 PLACES = [

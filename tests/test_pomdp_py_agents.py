@@ -7,8 +7,8 @@ from command_line import parkenv as command
 from test_model import numbers_in
 
 import parkenv
+from benchmarks.pomdp import planners_in_time
 from parkenv import InputError
-from parkenv.studies.bench.pomdp import planners_in_time
 from parkenv.studies.compare.figures import ComparisonResults, draw_figures
 from parkenv.studies.runner import run
 from planners import make_agent

@@ -14,13 +14,13 @@ from hypothesis import strategies as st
 from made_maps import STREET, Map
 from scipy.sparse.csgraph import dijkstra
 
+from benchmarks import sumo
+from benchmarks.town import blocks_of
 from parkenv import make_agent, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.lots import check_lot, import_lot, import_town, read_lot, write_lot
 from parkenv.mapping.route import survey_route
-from parkenv.studies.bench import sumo
-from parkenv.studies.bench.town import blocks_of
 from parkenv.studies.simulate import adapt_to_agent
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from parkenv.world.lot import GraphError, Lane, Mouth, ParkingLot, Turn

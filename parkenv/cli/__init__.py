@@ -68,8 +68,7 @@ COMMANDS = {
     "occupancy demand": Entry("Fit the demand of a town to counts of its car parks.", "occupancy:Demand"),
     "occupancy evaluate": Entry("Score forecasts of occupancy against simple ones.", "occupancy:Evaluate"),
     "occupancy record": Entry("Record days of a town's own demand as a log.", "occupancy:Record"),
-    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "checks:Schema", DATA),
-    "bench": Entry("Measure throughput, also of other software for the same task.", "checks:Bench", DATA),
+    "schema": Entry("Print the JSON schema of a kind of file, or write all schemas.", "schema:Schema", DATA),
 }
 """Commands and groups of commands, as the help page lists them."""
 app = make_app(

@@ -22,7 +22,6 @@ from parkenv.files.known_names import (
     PACKAGED_LOTS,
     SCENARIO_NAMES,
     SENSOR_MODELS,
-    VERIFY_CASES,
     WEATHERS,
 )
 from planners.names import AGENTS
@@ -72,7 +71,6 @@ _TABLES = (".toml", ".json")
 COMPLETERS: dict[str, Completer] = {
     "agents": completer(tuple(AGENTS), several=True),
     "calibrated": completer((), (".json",)),
-    "cases": completer(VERIFY_CASES, several=True),
     "clone": completer(tuple(AGENTS)),
     "detector": completer(DETECTORS, DETECTOR_SUFFIXES),
     "evaluate_on": completer(SCENARIO_NAMES, (*_TABLES, ".geojson"), several=True),

@@ -206,7 +206,7 @@ def cost_ratio(line):
 
 @closed_form(
     "Parking on a line without return",
-    "MacQueen & Miller 1960; DeGroot, *Optimal Statistical Decisions*, 1970",
+    "MacQueen & Miller 1960; DeGroot 1970",
 )
 def thresholds():
     r"""A car drives along a one-way lane towards its goal and past it. It sees only the slot beside it, each is taken

@@ -16,10 +16,10 @@ from numba import get_num_threads
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
+from benchmarks.rows import Row, duration, rate, seconds_each
 from parkenv.compiled.arrays import FloatArray
 from parkenv.compiled.jit import compiled
 from parkenv.engine.sensor_sampler import PICTURE_WIDTH
-from parkenv.studies.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot import PARK
 from sim_sensors.camera.ground_texture import ground_texture
 from sim_sensors.camera.models import PinholeCamera, StereoCamera, camera_pose
@@ -43,8 +43,8 @@ _WARM_STEPS = 5
 LIT_AHEAD = 12.0  # distance of the light maps' centre in front of the camera, m, when shading is timed alone
 
 
-def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Return the rows of `parkenv bench sensors`.
+def sensors_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py sensors`.
 
     Args:
         seed: seed of the lots and the noise.
@@ -53,7 +53,7 @@ def sensor_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     return laser_rows(seed, seconds) + camera_rows(seed, seconds) + search_rows(seed, seconds)
 
 
-def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
+def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
     """Measure scans per second of 1081 beams on one core, exact and noisy, in a batch and one by one.
 
     Batches are compared with batches of the peers, single scans with single scans. Peers simulate no noise.
@@ -102,7 +102,7 @@ def laser_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     return rows + rate("laser", "10,000 cars, 256 at once", large_batch, "scans/s", **smaller)
 
 
-def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
+def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
     """Measure 640×480 frames per second, their stages, and stereo pairs, on as many cores as numba uses.
 
     OpenCV's rasteriser, on one core, draws the depth of the same triangles, which are already culled and projected for
@@ -159,10 +159,10 @@ def camera_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     return rows + duration("camera", "true boxes of a frame", 1e3 * boxes, "ms")
 
 
-def search_rows(seed: int = 0, seconds: float = 0.6, scenario: str = "campus") -> list[BenchRow]:
+def search_rows(seed: int = 0, seconds: float = 0.6, scenario: str = "campus") -> list[Row]:
     """Measure the steps per second of random drives through sensors, resets included."""
     few = 10.0 * seconds  # an episode begins with a new world, weather and sky
-    rows: list[BenchRow] = []
+    rows: list[Row] = []
     drives: list[tuple[str, dict[str, Any], str]] = [
         ("SearchSensors", {"observation": "scan"}, "scans alone, up to 4 a step")
     ]

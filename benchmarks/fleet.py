@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.rows import Row, duration, median_of, rate
+from benchmarks.sumo import sumo_rows
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, duration, median_of, rate
-from parkenv.studies.bench.sumo import sumo_rows
 from parkenv.world.demand import Demand, ExponentialTime, Headways, PoissonArrivals
 from parkenv.world.scenario import Scenario
 from parkenv.world.week import DAY_S, HOUR_S
@@ -35,8 +35,8 @@ def fleet_rows(
     large: int = LARGE,
     day_cars: int = DAY_CARS,
     growth: Sequence[int] = GROWTH,
-) -> list[BenchRow]:
-    """Return the rows of `parkenv bench fleet`, on one core.
+) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py fleet`, on one core.
 
     A batch is many worlds with random actions, from their beginning to their end, one world after the other. Days are
     24 hours in which cars arrive as a Poisson process and stay for two hours on average; the residents of the lot,
@@ -52,7 +52,7 @@ def fleet_rows(
         growth: cars of the days in which time is measured against their number.
     """
     small = make_scenario(grid_lot(*SLOTS))
-    rows: list[BenchRow] = []
+    rows: list[Row] = []
     batch = [_fleet(small, Demand(Headways(CARS)), "random") for _ in range(worlds)]
     case = f"batch of {worlds} worlds, {CARS} cars, {small.lot.n_slots} slots"
     rows += rate("decisions", f"{case}, random", _decisions_per_second(batch, seed, seconds), "decisions/s")
@@ -84,7 +84,7 @@ def fleet_rows(
     return rows + _street_rows(seed)
 
 
-def _street_rows(seed: int) -> list[BenchRow]:
+def _street_rows(seed: int) -> list[Row]:
     """Return rows of the lot `street`, where all lanes are one-way, beside SUMO."""
     begin, end, cars = 8 * HOUR_S, 13 * HOUR_S, 60.0
     demand = Demand(PoissonArrivals(cars, begin, end), ExponentialTime(HOUR_S))

@@ -12,10 +12,10 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.rows import Row, absent, medians, rate
 from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import ScenarioSources, make_scenario
-from parkenv.studies.bench.rows import BenchRow, absent, medians, rate
 from parkenv.world.lot import ACTIONS, PARK, ParkingLot
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.typical_week import typical_occupancy
@@ -36,8 +36,8 @@ Stepper = Callable[[], int]  # runs some steps and returns their number
 
 def env_rows(
     seed: int = 0, seconds: float = 0.6, *, batch: int = BATCH, large: int = LARGE, places: int = PLACES
-) -> list[BenchRow]:
-    """Return the rows of `parkenv bench env`, on one core, with random actions.
+) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py env`, on one core, with random actions.
 
     A step is a full `step()` of one environment, alone or in a batch, including observations, infos and automatic
     resets. Actions are drawn beforehand. Gymnasium's CartPole batch is numpy on four numbers per environment, without
@@ -91,7 +91,7 @@ def env_rows(
     others, missing = installed_peers(batch, seed)
     rates = measured(steppers | others, seconds)
     peers = {"gymnasium CartPole-v1 batch": rates["CartPole batch"]}
-    rows: list[BenchRow] = []
+    rows: list[Row] = []
     for case in batches:
         rows += rate("batch", case, rates[case], "steps/s", **peers)
     single = {"gymnasium CartPole-v1": rates["CartPole"]} | {name: rates[name] for name in others}

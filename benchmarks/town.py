@@ -9,13 +9,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from benchmarks.rows import Row, duration, equal, peak_memory_gib
+from benchmarks.sumo import streets_of, sumo_rows
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.lots import city_lot
 from parkenv.lots.generators import Slots
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, duration, equal, peak_memory_gib
-from parkenv.studies.bench.sumo import streets_of, sumo_rows
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNormalTime, PoissonArrivals
 from parkenv.world.drive_graph import NODE_TOLERANCE, node_labels
 from parkenv.world.facility import Facility
@@ -40,8 +40,8 @@ SHIFT = 1.5  # m, from the middle of a two-way street to the lanes of its direct
 
 def town_rows(
     seed: int = 0, seconds: float = 0.6, *, cars: Sequence[int] = CARS, lots: Sequence[str] = ()
-) -> list[BenchRow]:
-    """Return the rows of `parkenv bench town`.
+) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py town`.
 
     In the town of `city_lot`, cars arrive from 7 to 20 o'clock at `ENTRIES` entries, head for `GOALS` goals, stay for
     2.5 hours in the mean, and are driven by `usual`.
@@ -53,7 +53,7 @@ def town_rows(
         lots: files of lots, such as an imported district, whose days are compared with SUMO's, besides a made one.
     """
     del seconds
-    rows: list[BenchRow] = []
+    rows: list[Row] = []
     scenario = made_town(SPACES, seed)
     for n in cars:
         driver = DriverKind(policy=POLICIES["usual"])
@@ -67,8 +67,7 @@ def town_rows(
         case = f"{SPACES:,} spaces, {n:,} cars from 7 to 20, usual"
         rows += duration("town", case, took, "s of CPU")
         rows += duration("town", case, 1e9 * took / fleet.totals["decisions"], "ns a decision")
-        if memory_gib := peak_memory_gib():
-            rows += duration("town", f"{case}: peak memory of the process", memory_gib, "GiB")
+        rows += duration("town", f"{case}: peak memory of the process", peak_memory_gib(), "GiB")
     made = with_garage(made_town(BLOCKS, seed).lot)
     return rows + [
         row for lot in (made, *(make_scenario(name).lot for name in lots)) for row in beside_sumo(lot, seed)
@@ -101,7 +100,7 @@ def town_demand(scenario: Scenario, cars: int) -> Demand:
 # ---- beside SUMO
 
 
-def beside_sumo(lot: ParkingLot, seed: int) -> list[BenchRow]:
+def beside_sumo(lot: ParkingLot, seed: int) -> list[Row]:
     """Return rows with CPU times, search times and occupancy of the same day of a district in a fleet and in SUMO.
 
     The district is that of `blocks_of`. Drivers are `greedy-drive`: they head for the nearest facility not known to be

@@ -11,19 +11,19 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from benchmarks.rows import Row, absent, duration, median_of, rate, seconds_each
 from parkenv.driving.collision_world import CollisionWorld
 from parkenv.driving.parking_task import ParkingTasks
 from parkenv.driving.vehicle import advance
 from parkenv.envs.drive import SUBSTEPS
 from parkenv.lots import packaged_lot
-from parkenv.studies.bench.rows import BenchRow, absent, duration, median_of, rate, seconds_each
 from planners.driving.parking import ParkingAgent
 
 STEPS = 100  # steps of an environment between two resets
 
 
-def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Return the rows of `parkenv bench drive`: physics steps, environment steps and planning.
+def drive_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py drive`: physics steps, environment steps and planning.
 
     A physics step is 0.05 s here, including pymunk's step and contacts, and 1/15 s in highway-env's parking. Resets are
     not counted.

@@ -1,86 +1,57 @@
-"""Rows of the benchmark table, and timing."""
+"""Rows of the benchmarks, and timing.
+
+A row has the keys part, case (the input), value, unit, peer (other software for the same task, None without one),
+peer_value and ratio, above 1 if ours is faster. The value is None if nothing was measured; `case` says why.
+"""
 
 from __future__ import annotations
 
+import resource
 import sys
 import time
 from collections.abc import Callable, Mapping
-from importlib.util import find_spec
-from typing import TypedDict
+from typing import Any
 
 import numpy as np
 
-
-class BenchRow(TypedDict):
-    """One measured value, and that of a peer in the same run.
-
-    Keys:
-        part, case: what was measured, and on which input.
-        value, unit: the value; None if nothing was measured, for the reason given in `case`.
-        peer, peer_value: other software for the same task and its value; None without a peer.
-        ratio: above 1 if ours is faster.
-    """
-
-    part: str
-    case: str
-    value: float | None
-    unit: str
-    peer: str | None
-    peer_value: float | None
-    ratio: float | None
+Row = dict[str, Any]
+Measure = Callable[[int], float]
+"""Measures something once; called with 0, 1, ..."""
 
 
-def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
-    """Return one row per peer for a value where higher is better; a single row without peers.
-
-    Args:
-        part: what was measured.
-        case: the input.
-        value: value per second.
-        unit: unit, such as `scans/s`.
-        peers: values of the peers.
-    """
+def rate(part: str, case: str, value: float, unit: str, **peers: float) -> list[Row]:
+    """Return one row per peer for a value where higher is better; a single row without peers."""
     return _rows(part, case, value, unit, {name: (other, value / other) for name, other in peers.items()})
 
 
-def duration(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
+def duration(part: str, case: str, value: float, unit: str, **peers: float) -> list[Row]:
     """Return rows like `rate` for a value where lower is better."""
     return _rows(part, case, value, unit, {name: (other, other / value) for name, other in peers.items()})
 
 
-def equal(part: str, case: str, value: float, unit: str, **peers: float) -> list[BenchRow]:
+def equal(part: str, case: str, value: float, unit: str, **peers: float) -> list[Row]:
     """Return rows like `rate` for a value that is to be equal, not high or low."""
     return _rows(part, case, value, unit, {name: (other, None) for name, other in peers.items()})
 
 
-def absent(part: str, case: str, unit: str) -> list[BenchRow]:
+def absent(part: str, case: str, unit: str) -> list[Row]:
     """Return the row of a value that could not be measured."""
     return _rows(part, case, None, unit, {})
 
 
-def _rows(
-    part: str, case: str, value: float | None, unit: str, peers: Mapping[str, tuple[float, float | None]]
-) -> list[BenchRow]:
-    alone: dict[str | None, tuple[float | None, float | None]] = {None: (None, None)}
+def _rows(part: str, case: str, value: float | None, unit: str, peers: Mapping[Any, Any]) -> list[Row]:
+    head = {"part": part, "case": case, "value": value, "unit": unit}
+    found = peers or {None: (None, None)}
     return [
-        BenchRow(part=part, case=case, value=value, unit=unit, peer=peer, peer_value=other, ratio=ratio)
-        for peer, (other, ratio) in (peers or alone).items()
+        head | {"peer": peer, "peer_value": other, "ratio": ratio} for peer, (other, ratio) in found.items()
     ]
 
 
-def peak_memory_gib() -> float | None:
-    """Return this process's peak of resident memory; None where the system does not report it."""
-    if find_spec("resource") is None:
-        return None
-    import resource
-
+def peak_memory_gib() -> float:
+    """Return this process's peak of resident memory."""
     # Kilobytes, except on macOS.
     unit = 1 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30
-
-
-Measure = Callable[[int], float]
-"""Measures something once; called with 0, 1, ..."""
 
 
 def medians(measures: Mapping[str, Measure], seconds: float = 0.6, least: int = 3) -> dict[str, float]:

@@ -16,9 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_matrix, vstack
 
+from benchmarks.rows import Row, duration, peak_memory_gib, seconds_each
 from parkenv.lots import city_lot, packaged_lot
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, duration, peak_memory_gib, seconds_each
 from parkenv.studies.simulate import simulate
 from parkenv.studies.workers import worker_start
 from parkenv.world.lot import PARK, ParkingLot
@@ -41,8 +41,8 @@ LONG_S = 2.0  # solvers that take longer are timed only once, s
 EPSILON = 0.01  # tolerance of the values of iterative peers, s
 
 
-def planning_rows(seed: int = 0, seconds: float = 0.6, *, largest: int = SIZES[-1]) -> list[BenchRow]:
-    """Return the rows of `parkenv bench planning`, on one core.
+def planning_rows(seed: int = 0, seconds: float = 0.6, *, largest: int = SIZES[-1]) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py planning`, on one core.
 
     Args:
         seed: seed of the cities and of the observations.
@@ -57,13 +57,13 @@ def planning_rows(seed: int = 0, seconds: float = 0.6, *, largest: int = SIZES[-
     ]
 
 
-def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
+def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[Row]:
     """Measure planning from scratch in cities of increasing size, and its growth.
 
     Raises:
         AssertionError: a peer's plan is worse than ours.
     """
-    rows: list[BenchRow] = []
+    rows: list[Row] = []
     expected: dict[str, float] = {}
     measured: dict[str, float] = {}
     vertices, own = [], []
@@ -93,7 +93,7 @@ def solving_rows(sizes: list[int], seed: int, seconds: float) -> list[BenchRow]:
     return rows
 
 
-def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
+def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[Row]:
     """Measure replanning after each observed slot; peers plan from scratch, or by policy iteration."""
     mdp = forecast_process(lot, seed)
     graph = StoppingGraph.of(mdp)
@@ -121,7 +121,7 @@ def repair_rows(lot: ParkingLot, seed: int, seconds: float) -> list[BenchRow]:
     ]
 
 
-def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
+def city_rows_apart(n_slots: int, seed: int) -> list[Row]:
     """Run `city_rows` in a separate process, to measure its peak memory alone."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), **worker_start()) as apart:
         try:
@@ -132,7 +132,7 @@ def city_rows_apart(n_slots: int, seed: int) -> list[BenchRow]:
             raise
 
 
-def city_rows(n_slots: int, seed: int) -> list[BenchRow]:
+def city_rows(n_slots: int, seed: int) -> list[Row]:
     """Measure searches in a city: an agent's time for the first and for later decisions, and peak memory.
 
     Args:
@@ -141,7 +141,7 @@ def city_rows(n_slots: int, seed: int) -> list[BenchRow]:
     """
     scenario = make_scenario(city_lot(n_slots, seed))
     env = gym.make("parkenv/Search-v2", scenario=scenario)
-    rows: list[BenchRow] = []
+    rows: list[Row] = []
     for name in ("mdp", "mdp-tuned", "belief"):
         first, decisions = [], []
         agent = make_agent(name, scenario)
@@ -153,9 +153,7 @@ def city_rows(n_slots: int, seed: int) -> list[BenchRow]:
         rows += duration("search", f"{case}: first plan", float(np.median(first)), "s")
         rows += duration("search", f"{case}: decision, median", 1e3 * float(np.median(decisions)), "ms")
         rows += duration("search", f"{case}: decision, 99 %", 1e3 * float(np.quantile(decisions, 0.99)), "ms")
-    if memory_gib := peak_memory_gib():
-        rows += duration("search", f"city, {n_slots:,} slots: peak memory", memory_gib, "GiB")
-    return rows
+    return rows + duration("search", f"city, {n_slots:,} slots: peak memory", peak_memory_gib(), "GiB")
 
 
 def drive(

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.rows import Row, duration, rate, seconds_each
 from parkenv.errors import InputError
 from parkenv.files.limited_reading import parse_json
 from parkenv.mapping.grid import OccupancyGrid
@@ -23,7 +24,6 @@ from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.perception.range_scan import scan_from_laser
 from parkenv.perception.slot_filter import SlotFilter
 from parkenv.scenarios.build import make_scenario
-from parkenv.studies.bench.rows import BenchRow, duration, rate, seconds_each
 from parkenv.world.lot_scene import slot_lot
 from sim_sensors.rig import SensorRig, TimedCapture
 
@@ -61,8 +61,8 @@ print(json.dumps(found))
 """
 
 
-def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
-    """Return the rows of `parkenv bench perception`, with the peers that are installed for `PEERS_PYTHON`.
+def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[Row]:
+    """Return the rows of `python benchmarks/run.py perception`, with the peers that are installed for `PEERS_PYTHON`.
 
     Args:
         seed: seed of the lot.
@@ -106,7 +106,7 @@ def perception_rows(seed: int = 0, seconds: float = 0.6) -> list[BenchRow]:
     return rows + rate("mapping", "sessions of mini, pictures drawn and seen", 60.0 / session, "sessions/min")
 
 
-def _detector_rows(grey: NDArray[np.uint8], seconds: float, peers: dict[str, float]) -> list[BenchRow]:
+def _detector_rows(grey: NDArray[np.uint8], seconds: float, peers: dict[str, float]) -> list[Row]:
     """Measure the side model on one thread, at all sizes from the window's own upwards, as OpenCV does."""
     side = CarModel.load("side")
     plain = CarModel(side.descriptor, side.weights, -1e3, 2.0)

@@ -21,10 +21,10 @@ from xml.etree import ElementTree
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.rows import Row, absent, duration, equal
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import Fleet, drive_times
 from parkenv.errors import InputError
-from parkenv.studies.bench.rows import BenchRow, absent, duration, equal
 from parkenv.world.lot import ParkingLot
 from parkenv.world.week import HOUR_S
 
@@ -112,7 +112,7 @@ def sumo_version(folder: Path) -> str:
 
 def sumo_rows(
     fleet: Fleet, case: str, seed: int, end_s: float, steps_s: Sequence[float], days: int = 1
-) -> tuple[list[BenchRow], dict[str, list[ParkedDay]]]:
+) -> tuple[list[Row], dict[str, list[ParkedDay]]]:
     """Return rows with CPU times and mean search times of days in a fleet and in SUMO, and these days.
 
     Args:

@@ -1,1 +1,0 @@
-"""Throughput benchmarks of each part against peers."""
