@@ -97,11 +97,6 @@ def _next_free(period_s, slot, time):
     return time + max(900.0 - (time - 97.0 * slot) % period_s, 0.0)
 
 
-@numba.cfunc("float64(int64, int64, float64)")
-def _sojourn(period_s, slot, time):
-    return 2 * ((time - 97.0 * slot) // period_s) + _state(period_s, slot, time)
-
-
 class CompiledTimetable(Timetable):
     """The same timetable with compiled functions: compiled code never calls Python for a slot."""
 
@@ -111,7 +106,7 @@ class CompiledTimetable(Timetable):
 
     @property
     def address(self):
-        self._record = np.array([(1200, _state.address, _next_free.address, _sojourn.address)], FUNCTIONS)
+        self._record = np.array([(1200, _state.address, _next_free.address)], FUNCTIONS)
         return address_of(self._record, FUNCTIONS)
 
 
