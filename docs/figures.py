@@ -47,7 +47,7 @@ def figures():
                 end = text.find("\n#", found.end())
                 after = commands(text[found.end() : end if end > 0 else None])
                 command = [*after, *commands(text[start : found.start()])[::-1], ""][0]
-                what = found[1].removeprefix("../") if found[1] else "table"
+                what = found[1].removeprefix("../").removeprefix("docs/") if found[1] else "table"
                 section = text[found.end() : end if end > 0 else None], text[start : found.start()]
                 stated = [commit for part in section for commit in STATED.findall(part)]
                 line = text.count("\n", 0, found.start()) + 1
