@@ -76,4 +76,4 @@ def test_what_needs_an_extra_says_so_in_a_line(monkeypatch, tmp_path):
 
 def test_the_two_commands_of_the_readme_need_few_packages():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    assert len(project["dependencies"]) <= 18
+    assert len(project["dependencies"]) <= 17
