@@ -1,6 +1,7 @@
 """Budgets: no folder grows above its lines and statements; `python tests/test_budgets.py` prints where each stands."""
 
 import ast
+import functools
 import tomllib
 from collections import Counter
 from pathlib import Path
@@ -21,6 +22,7 @@ def folder_of(module):
     return max((name for name in FOLDERS if module.is_relative_to(name)), key=len)
 
 
+@functools.cache
 def sizes():
     """Lines and statements (`ast.stmt`) of each folder of the packages."""
     lines, statements = Counter(), Counter()
