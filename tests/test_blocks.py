@@ -3,7 +3,6 @@
 import json
 import re
 
-import jsonschema
 import numpy as np
 import pytest
 from small_lots import features
@@ -11,7 +10,6 @@ from small_lots import features
 from parkenv import ParkingLot, fleet, make_scenario
 from parkenv.engine.records import STATES
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.show.report.page import SCHEMA
 from parkenv.show.report.town_map import town_data
 from parkenv.studies.fleet.blocks import ALL, BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.studies.fleet.measures import Roads
@@ -163,7 +161,6 @@ def test_zones_are_groups_of_blocks(run):
 def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
     text = (run[0].folder / "fleet.html").read_text(encoding="utf-8")
     data = json.loads(re.search(r'id="report-data">(.*?)</script>', text, flags=re.DOTALL)[1])
-    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
     (shown,), (town,) = data["maps"], data["towns"]
     assert [block["name"] for block in town["blocks"]] == ["Mill Street", "P1", "centre", "other"]
     assert town["blocks"][0]["rules"] == "3 an hour"

@@ -1,10 +1,8 @@
 """The report of a fleet: its data are the run's, its replay the days of the run."""
 
 import itertools
-import json
 import shutil
 
-import jsonschema
 import numpy as np
 import pytest
 from command_line import parkenv
@@ -13,7 +11,6 @@ from test_report import data_of
 from parkenv import make_scenario
 from parkenv.cli.report import make_report
 from parkenv.errors import InputError
-from parkenv.show.report.page import SCHEMA
 from parkenv.studies.fleet.day_replay import DRIVE, FAIL, QUEUE, choose_days, record_day
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.report_options import ReportOptions
@@ -32,9 +29,8 @@ def run(tmp_path_factory):
     return out
 
 
-def test_the_data_keep_to_the_schema_and_replay_the_days_of_the_run(run):
+def test_the_data_replay_the_days_of_the_run(run):
     data = data_of(run / "report.html")
-    jsonschema.validate(data, json.loads(SCHEMA.read_text(encoding="utf-8")))
     assert data["run"]["title"] == "Many cars on mini"
     assert len(data["run"]["findings"]) == 1
     assert len(data["fleets"]) == 8

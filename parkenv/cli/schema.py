@@ -20,7 +20,7 @@ class Schema(Command):
 
     examples = """
         parkenv schema scenario
-        parkenv schema --out docs/schemas
+        parkenv schema --out schemas
         """
 
     kind: str | None = option(None, f"{', '.join(KINDS)}.", argument=True, default="scenario; all with --out")

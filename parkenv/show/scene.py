@@ -223,7 +223,7 @@ class LotScene:
         ]
 
     def data(self) -> dict[str, Any]:
-        """Return the `lot` of `report.schema.json`: lengths in m, rounded to centimetres."""
+        """Return the `lot` of a page: lengths in m, rounded to centimetres."""
         lot = self.lot
         entries = Marks(self.entries, ARROWHEAD, "entry", (2.4, 2.4), px=13.0)
         return {

@@ -23,7 +23,6 @@ from parkenv.world.cost_terms import COST_TERMS
 Row = Mapping[str, Any]
 
 FORMAT, VERSION = "parkenv-report", 1
-SCHEMA = Path(__file__).with_name("report.schema.json")
 """JSON schema of the data in a page."""
 SCRIPTS = (
     "numbers.js", "tables.js", "time_chart.js", "learning_chart.js", "lot_view.js", "player.js", "search_track.js",
@@ -72,7 +71,7 @@ def page_data(
     recordings: Sequence[Mapping[str, Any]] = (),
     notes: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Build the data of a page, without the figures; see `report.schema.json`.
+    """Build the data of a page, without the figures.
 
     Args:
         kind: kind of the run: compare, survey, demo, train, ...
@@ -116,7 +115,7 @@ def page_data(
 
 
 def terms_data() -> list[dict[str, Any]]:
-    """Return the `terms` of `report.schema.json`: what a search can cost."""
+    """Return the `terms` of a page: what a search can cost."""
     return [{"name": t.name, "field": t.field, "label": t.label, "optional": t.optional} for t in COST_TERMS]
 
 

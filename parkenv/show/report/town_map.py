@@ -21,7 +21,7 @@ COUNTED_AREA, LEAST_SIDE = 6.0, 12.0
 
 
 def town_data(lot: ParkingLot, blocks: Sequence[Mapping[str, Any]], of_slot: IntArray) -> dict[str, Any]:
-    """Return a `town` of `report.schema.json`: lengths in m, rounded to decimetres.
+    """Return a `town` of a page: lengths in m, rounded to decimetres.
 
     Args:
         lot: the lot.

@@ -128,7 +128,7 @@ def neighbours(suite: Suite, entries: Sequence[Entry]) -> list[Row]:
 
 
 def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, Any]:
-    """Build the data of a page, the best score first; see `report.schema.json`.
+    """Build the data of a page, the best score first.
 
     Args:
         results: contents of result files that passed `check_result`.

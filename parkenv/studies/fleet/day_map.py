@@ -59,7 +59,7 @@ def write_map_page(study: FleetStudy, summary: Row, rows: Rows, folder: Path) ->
 
 
 def map_recordings(study: FleetStudy, rows: Rows) -> list[Recording]:
-    """Return `town` and `map` of `report.schema.json` of some settings, those to be shown first."""
+    """Return `town` and `map` of a page of some settings, those to be shown first."""
     shown = study.shown_settings
     chosen = [*shown, *(one for one in study.fleet_settings if one not in shown)][:MOST_MAPS]
     towns = {name: _town(study.built[name]) for name in {setting.scenario for setting in chosen}}
