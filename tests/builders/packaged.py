@@ -4,19 +4,14 @@ Sizes are in metres. Positions are rounded to a millimetre and angles to a nanor
 depend on the math library.
 """
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import ArrayLike
 from packaged_town import town
 
-from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.formats.geojson import write_lot
 from parkenv.lots.generators import BAY_SIZE, BUILDING_SETBACK, Slots, StreetGrid, bay_row
 from parkenv.world.lot import Lane, ParkingLot
@@ -25,10 +20,9 @@ PACKAGED = Path(__file__).parents[2] / "parkenv" / "lots" / "packaged"
 PITCH = BAY_SIZE[1]
 AISLE = 6.0
 EAST, WEST = 0.0, np.pi
-Row = tuple[str, Slots]
 
 
-def row(letter: str, start: tuple[float, float], heading: float, *runs: int, angle: float = np.pi / 2) -> Row:
+def row(letter, start, heading, *runs, angle=np.pi / 2):
     """Create a row with planted islands: positive `runs` are numbers of slots, negative ones of omitted slots."""
     parts = []
     along = np.array([np.cos(heading), np.sin(heading)]) * PITCH / np.sin(angle)
@@ -40,26 +34,17 @@ def row(letter: str, start: tuple[float, float], heading: float, *runs: int, ang
     return letter, Slots.joined(parts)
 
 
-def rectangle(x0: float, y0: float, x1: float, y1: float) -> list[tuple[float, float]]:
+def rectangle(x0, y0, x1, y1):
     """Return the closed outline of a rectangle, m."""
     return [(x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0)]
 
 
-def lot(
-    name: str,
-    rows: Sequence[Row],
-    lanes: Iterable[tuple[ArrayLike, bool]],
-    entries: ArrayLike,
-    goals: ArrayLike,
-    walls: Iterable[ArrayLike],
-    turned: float = 0.0,
-) -> ParkingLot:
+def lot(name, rows, lanes, entries, goals, walls, turned=0.0):
     """Create a lot: number the slots row by row, rotate everything by `turned` rad, and round it."""
     turn = np.array([[np.cos(turned), -np.sin(turned)], [np.sin(turned), np.cos(turned)]])
 
-    def placed(points: ArrayLike) -> FloatArray:
-        turned_points: FloatArray = np.asarray(points, dtype=np.float64) @ turn.T
-        return np.round(turned_points, 3)
+    def placed(points):
+        return np.round(np.asarray(points, dtype=np.float64) @ turn.T, 3)
 
     slots = Slots.joined([part for _, part in rows])
     slots = replace(slots, xy=placed(slots.xy), yaw=np.round(slots.yaw + turned, 9))
@@ -74,7 +59,7 @@ def lot(
     )
 
 
-def campus() -> ParkingLot:
+def campus():
     """Create a wide lot with double rows, modelled on the Freiburg campus (T Fig. 4.5).
 
     Three aisles connect a straight road in the west and a slanting one in the east, with a passage half-way and
@@ -107,15 +92,8 @@ def campus() -> ParkingLot:
         ([(x, y) for y, x in east.items()], two_way),
         ([(-24.0, middle), (0.0, middle)], two_way),
     ]
-    faculty = [
-        (112.0, -14.0),
-        (130.0, -14.0),
-        (130.0, 48.0),
-        (100.0, 48.0),
-        (103.0, 36.0),
-        (112.0, 36.0),
-        (112.0, -14.0),
-    ]
+    x, y = (112.0, 130.0, 130.0, 100.0, 103.0, 112.0, 112.0), (-14.0, -14.0, 48.0, 48.0, 36.0, 36.0, -14.0)
+    faculty = [*zip(x, y, strict=True)]
     walls = [
         faculty,
         rectangle(-16.0, 24.0, -6.0, 40.0),
@@ -125,7 +103,7 @@ def campus() -> ParkingLot:
     return lot("campus", rows, lanes, [(-24.0, middle)], [(110.5, 14.0)], walls)
 
 
-def jam() -> ParkingLot:
+def jam():
     """Create a lot on a site that narrows to the north (after T Fig. 4.10), rotated by 11° like its street.
 
     There are four aisles of unequal length; the northern one is a dead end. Cars enter from the west at the second
@@ -160,19 +138,18 @@ def jam() -> ParkingLot:
     return lot("jam", rows, lanes, [(-16.0, y[1])], [(90.0, 20.0)], walls, turned=np.radians(11.0))
 
 
-def street() -> ParkingLot:
+def street():
     """Create kerbside slots around six city blocks; three of the seven streets are one-way.
 
     Cars enter from the west and from the east. Houses line the streets around courtyards with one driveway each, whose
     kerb is kept clear; trees replace some more slots. The goal is a door in a courtyard.
     """
-    crossings = np.array(
-        [
-            [(0.0, 0.0), (64.0, -3.0), (131.0, -4.0), (190.0, 0.0)],
-            [(2.0, 55.0), (62.0, 53.0), (133.0, 56.0), (193.0, 58.0)],
-            [(-2.0, 104.0), (61.0, 106.0), (130.0, 110.0), (188.0, 108.0)],
-        ]
+    rows = (
+        [(0.0, 0.0), (64.0, -3.0), (131.0, -4.0), (190.0, 0.0)],
+        [(2.0, 55.0), (62.0, 53.0), (133.0, 56.0), (193.0, 58.0)],
+        [(-2.0, 104.0), (61.0, 106.0), (130.0, 110.0), (188.0, 108.0)],
     )
+    crossings = np.array(rows)
     streets = StreetGrid(crossings, along=np.array([0, -1, 0]), across=np.array([0, 1, -1, 0]))
     west, east = crossings[1, 0] - (28.0, 0.0), crossings[1, -1] + (28.0, 0.0)
     lanes = [(lane.points, lane.oneway) for lane in streets.lanes()]
@@ -199,19 +176,17 @@ def street() -> ParkingLot:
     return lot("street", [("S", slots[kept])], lanes, [west, east], [goal], walls, turned=np.radians(-6.0))
 
 
-def mini() -> ParkingLot:
+def mini():
     """Create ten slots on one aisle; cars enter from the west, the goal is in the east."""
     rows = [row("A", (15.0, -AISLE / 2), WEST, 6), row("B", (2.5, AISLE / 2), EAST, 2, -1, 2)]
     walls = [[(-1.0, -8.6), (16.0, -8.6)], rectangle(21.0, -7.0, 29.0, -2.0)]
     return lot("mini", rows, [([(-9.0, 0.0), (17.0, 0.0)], False)], [(-9.0, 0.0)], [(25.0, 0.0)], walls)
 
 
-LOTS: dict[str, Callable[[], ParkingLot]] = {
-    make.__name__: make for make in (campus, jam, street, mini, town)
-}
+LOTS = {make.__name__: make for make in (campus, jam, street, mini, town)}
 
 
-def build(folder: Path) -> None:
+def build(folder):
     """Write all packaged lots into a folder."""
     for name, make in LOTS.items():
         write_lot(make(), folder / f"{name}.geojson")

@@ -5,15 +5,11 @@ fifth street outside the centre is for residents alone. Four main streets, witho
 from outside. Four garages and a station's car park are counted, three car parks are drawn.
 """
 
-from __future__ import annotations
-
-from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
 import shapely
 
-from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.generators import BUILDING_SETBACK, Slots, StreetGrid, bay_row, outlines
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, ParkingLot
@@ -56,8 +52,15 @@ CAR_PARKS = (("Market square", (4, 2), "market"), ("Town hall", (5, 6), "ring"),
 BAYS = (("disabled", 17, 3), ("charging", 23, 5), ("delivery", 29, 11))
 """Zone of single bays in the centre and the ring: each so-many-th slot, from the so-many-th on."""
 
+PURPOSES, COMING_FAR = (
+    ("residents", "commuters", "shoppers", "visitors", "deliveries"),
+    ("commuters", "visitors"),
+)
+EVEN, FAR = (3.0, 2.0, 2.0, 1.0, 3.0, 2.0, 2.0, 1.0), (5.0, 2.0, 2.0, 1.0, 5.0, 1.0, 2.0, 1.0)
+"""Weights of the eight entries: most cars come from the west and the south."""
 
-def town() -> ParkingLot:
+
+def town():
     """Create the town."""
     rng = np.random.default_rng(2014)
     streets = _streets(rng)
@@ -89,11 +92,11 @@ def town() -> ParkingLot:
         facilities=tuple(facilities),
         zone_rules={zone.name: zone for zone in ZONES},
         goal_weights=goal_weights,
-        entry_weights=_entry_weights(),
+        entry_weights={name: np.array(FAR if name in COMING_FAR else EVEN) for name in PURPOSES},
     )
 
 
-def _streets(rng: np.random.Generator) -> StreetGrid:
+def _streets(rng):
     """Draw the crossings; minor streets between the main ones are one-way in turn."""
     n = N_BLOCKS + 1
     at = np.stack(np.meshgrid(np.arange(n) * 92.0, np.arange(n) * 78.0), axis=-1)
@@ -102,7 +105,7 @@ def _streets(rng: np.random.Generator) -> StreetGrid:
     return StreetGrid(crossings, along=oneway, across=-oneway)
 
 
-def _lanes_of(streets: StreetGrid) -> list[tuple[FloatArray, bool]]:
+def _lanes_of(streets):
     """Return the streets, the main ones as far as the edge of the town."""
     lanes = [(lane.points, lane.oneway) for lane in streets.lanes()]
     ends = _outer_ends(streets).reshape(-1, 2, 2)
@@ -111,7 +114,7 @@ def _lanes_of(streets: StreetGrid) -> list[tuple[FloatArray, bool]]:
     return lanes
 
 
-def _outer_ends(streets: StreetGrid) -> FloatArray:
+def _outer_ends(streets):
     """Return both ends of each main street, (8, 2) m: those along from west and east, then from south and north."""
     p = streets.crossings
     ends = []
@@ -121,11 +124,10 @@ def _outer_ends(streets: StreetGrid) -> FloatArray:
     return np.array(ends)
 
 
-def _kerbs(streets: StreetGrid, rng: np.random.Generator) -> tuple[Slots, list[str]]:
+def _kerbs(streets, rng):
     """Return the slots at kerbs with their zones and facilities, one for each side of a block, and their names."""
     slots = streets.kerb_slots(outer=False)
-    segments: list[FloatArray] = []
-    names, levels = [], []
+    segments, names, levels = [], [], []
     n = N_BLOCKS + 1
     for way, lines in (("street", streets.crossings), ("row", streets.crossings.swapaxes(0, 1))):
         for number, points in enumerate(lines):
@@ -159,7 +161,7 @@ def _kerbs(streets: StreetGrid, rng: np.random.Generator) -> tuple[Slots, list[s
 _ORDINALS = ("1st", "2nd", "3rd", "4th", "5th", "6th", "7th", "8th", "9th", "10th")
 
 
-def _car_park(lanes: list[tuple[FloatArray, bool]], block: FloatArray, name: str, zone: str) -> Slots:
+def _car_park(lanes, block, name, zone):
     """Return two rows along an aisle through a block, from street to street, which joins the lanes."""
     south, north = (np.round((block[a] + block[b]) / 2, 3) for a, b in ((0, 1), (3, 2)))
     for end, corners in ((south, block[:2]), (north, block[2:])):
@@ -180,7 +182,7 @@ def _car_park(lanes: list[tuple[FloatArray, bool]], block: FloatArray, name: str
     )  # fmt: skip
 
 
-def _join(lanes: list[tuple[FloatArray, bool]], at: FloatArray, corners: FloatArray) -> None:
+def _join(lanes, at, corners):
     """Insert a point into the street between two crossings."""
     for number, (points, oneway) in enumerate(lanes):
         for k, pair in enumerate(pairwise(points)):
@@ -190,7 +192,7 @@ def _join(lanes: list[tuple[FloatArray, bool]], at: FloatArray, corners: FloatAr
     raise AssertionError(f"no street between {corners}")
 
 
-def _garage(name: str, capacity: int, block: FloatArray, known: str) -> Facility:
+def _garage(name, capacity, block, known):
     """Return a garage that is entered from the south side of its block."""
     xy = (block[0] + block[1]) / 2 + np.array([0.0, BUILDING_SETBACK])
     delay_s = 60.0 if known == "live" else 0.0
@@ -199,40 +201,16 @@ def _garage(name: str, capacity: int, block: FloatArray, known: str) -> Facility
     )
 
 
-def _goals(blocks: FloatArray) -> tuple[FloatArray, dict[str, FloatArray]]:
+def _goals(blocks):
     """Return a goal for each inner block, and one for each two by two of the others, with their weights by purpose."""
-    at, size = [], []
-    middle = blocks.mean(axis=2)
-    for i in range(N_BLOCKS):
-        for j in range(N_BLOCKS):
-            if _is_inner(i) and _is_inner(j):
-                at.append(middle[i, j])
-                size.append(
-                    (4.0, 6.0, 8.0, 3.0, 4.0) if 3 <= i <= 5 and 3 <= j <= 5 else (6.0, 4.0, 2.0, 3.0, 2.0)
-                )
-            elif i % 2 == 0 and j % 2 == 0:
-                near = middle[i : i + 2, j : j + 2].reshape(-1, 2)
-                at.append(near[-1])
-                size.append(
-                    (7.0 * len(near), 1.5 * len(near), 0.2 * len(near), 1.5 * len(near), 0.6 * len(near))
-                )
-    purposes = ("residents", "commuters", "shoppers", "visitors", "deliveries")
-    weights = dict(zip(purposes, np.array(size).T, strict=True))
-    return np.round(np.array(at), 3), weights
-
-
-def _is_inner(number: int) -> bool:
-    return 2 <= number <= 6
-
-
-def _entry_weights() -> dict[str, FloatArray]:
-    """Return the weights of the eight entries: most come from the west and the south."""
-    even: Sequence[float] = (3.0, 2.0, 2.0, 1.0, 3.0, 2.0, 2.0, 1.0)
-    far: Sequence[float] = (5.0, 2.0, 2.0, 1.0, 5.0, 1.0, 2.0, 1.0)
-    return {
-        "residents": np.array(even),
-        "commuters": np.array(far),
-        "shoppers": np.array(even),
-        "visitors": np.array(far),
-        "deliveries": np.array(even),
-    }
+    at, weights, middle = [], [], blocks.mean(axis=2)
+    for i, j in np.ndindex(N_BLOCKS, N_BLOCKS):
+        if 2 <= i <= 6 and 2 <= j <= 6:
+            centre = 3 <= i <= 5 and 3 <= j <= 5
+            at.append(middle[i, j])
+            weights.append((4.0, 6.0, 8.0, 3.0, 4.0) if centre else (6.0, 4.0, 2.0, 3.0, 2.0))
+        elif i % 2 == 0 and j % 2 == 0:
+            near = middle[i : i + 2, j : j + 2].reshape(-1, 2)
+            at.append(near[-1])
+            weights.append(tuple(each * len(near) for each in (7.0, 1.5, 0.2, 1.5, 0.6)))
+    return np.round(np.array(at), 3), dict(zip(PURPOSES, np.array(weights).T, strict=True))
