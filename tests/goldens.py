@@ -93,7 +93,7 @@ CASES: dict[str, tuple[str, ...]] = {
 """Commands of each golden, in a folder of their own with `counts.csv` and `crops`; `{data}` is that of real data."""
 
 VOLATILE = re.compile(
-    r"^(decision_ms.*|seconds.*|.*_seconds|compile.*|command|version|date|commit|findings)$"
+    r"^(decision_ms.*|seconds.*|.*_seconds|compile.*|command|version|date|commit|findings|most_balked)$"
 )
 """Members of summaries that differ from run to run, or are texts."""
 COMPARED = {".csv", ".gz", ".geojson", ".png", ".gif", ".jsonl", ".json"}
