@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.errors import InputError
 from parkenv.world.scenario import SearchProblem
-from planners.model_file import OBSERVATION, load_model
+from planners.model_file import load_model
 
 
 class LearnedAgent:
@@ -24,7 +24,7 @@ class LearnedAgent:
         path: the model file.
 
     Raises:
-        InputError: the file is not a model, or is one of another algorithm, task or observation.
+        InputError: the file is not a model, or is one of another algorithm or observation.
 
     Attributes:
         card: metadata of the file.
@@ -35,7 +35,7 @@ class LearnedAgent:
     def __init__(self, problem: SearchProblem, algorithm: str, path: str | os.PathLike[str]) -> None:
         self.name = f"{algorithm}:{path}"
         self.problem = problem.public()
-        self.card, self.model = load_model(algorithm, path, "search", OBSERVATION)
+        self.card, self.model = load_model(algorithm, path)
         lots = self.card.scenarios
         if lots and not {problem.lot.name, getattr(problem, "name", "")} & {*lots, *self.card.held_out}:
             named = ", ".join(lots[:3]) + (f" and {len(lots) - 3} more" if len(lots) > 3 else "")

@@ -9,14 +9,13 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from gymnasium import spaces
-from pydantic import Field, JsonValue
+from pydantic import Field, JsonValue, model_validator
 from pydantic_core import to_jsonable_python
 
 from parkenv.errors import InputError, with_extra
@@ -28,16 +27,11 @@ from parkenv.world.lot import ACTIONS
 from planners.model_header import CARD_KEY, read_header
 from planners.names import ALGORITHMS
 
-if TYPE_CHECKING:
-    from parkenv.driving.vehicle import VehicleParameters
-
 SUFFIX = ".safetensors"
 OBSERVATION = "local-1"
 """Version of the layout of `parkenv.engine.local_observation`, which search models observe."""
 FIXED_NUMBERS, NUMBERS_PER_SLOT = 46, 8
 """Size of that observation: for k slots, 46 + 8k numbers."""
-COMMANDS = {"search": "parkenv compare", "drive": "parkenv park", "scenes": "parkenv park --levels"}
-"""Commands that run the models of each task."""
 _MAX_BYTES = 500_000_000
 _MAX_WEIGHT = 1e6  # products of larger ones over several layers could overflow
 _ZIP = b"PK"
@@ -77,55 +71,54 @@ class BoxSpace(Spec):
         return spaces.Box(low, high, self.shape, np.dtype(self.dtype).type)
 
 
-class PolicyOptions(Spec):
+class _WithNulls(Spec):
+    """Content of a card, in which null is as good as absent."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_nulls(cls, tables: Any) -> Any:
+        if not isinstance(tables, Mapping):
+            return tables
+        return {name: value for name, value in tables.items() if value is not None}
+
+
+class PolicyOptions(_WithNulls):
     """Arguments of stable-baselines3's policies that a model file can hold; classes go by their names."""
 
-    net_arch: Layers | dict[Literal["pi", "vf", "qf"], Layers] | None = None
+    net_arch: Layers | dict[Literal["pi", "vf"], Layers] | None = None
     activation_fn: Literal["Tanh", "ReLU", "ELU", "GELU", "SiLU", "LeakyReLU"] | None = None
-    features_extractor_class: Literal["GoalFeatures"] | None = None
-    log_std_init: float | None = None
     ortho_init: bool | None = None
     lstm_hidden_size: Width | None = None
     n_lstm_layers: Annotated[int, Field(ge=1, le=4)] | None = None
     shared_lstm: bool | None = None
     enable_critic_lstm: bool | None = None
-    n_critics: Annotated[int, Field(ge=1, le=8)] | None = None
-    n_quantiles: Annotated[int, Field(ge=1, le=256)] | None = None
-    use_sde: Literal[False] | None = None
 
     def arguments(self) -> dict[str, Any]:
         """Return the keyword arguments, with classes instead of names."""
         import torch
 
-        from planners.goal_features import GoalFeatures
-
         given = self.model_dump(exclude_none=True)
         if self.activation_fn is not None:
             given["activation_fn"] = getattr(torch.nn, self.activation_fn)
-        if self.features_extractor_class is not None:
-            given["features_extractor_class"] = GoalFeatures
         if isinstance(self.net_arch, tuple):
             given["net_arch"] = list(self.net_arch)
         return given
 
 
-class ModelCard(Spec):
+class ModelCard(_WithNulls):
     """Metadata of a model file."""
 
     format: Literal["parkenv-model-2"] = "parkenv-model-2"
-    algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo", "sac", "tqc"]
-    task: Literal["search", "drive", "scenes"]
+    algorithm: Literal["dqn", "ppo", "maskable-ppo", "recurrent-ppo"]
+    task: Literal["search"] = "search"
     observation: str = Field(description="Version of the observation's layout.")
-    k: int = Field(ge=0, le=1_000, description="Slots in the observation; 0 for driving.")
+    k: int = Field(ge=1, le=1_000, description="Slots in the observation.")
     policy: Literal["MultiInputPolicy", "MultiInputLstmPolicy"]
     policy_options: PolicyOptions
     observation_space: Annotated[dict[str, BoxSpace], Field(max_length=16)]
-    action_space: BoxSpace | Annotated[int, Field(ge=1, le=1_000)]
-    scenarios: Several[str] = Field((), description="Trained on; for driving, lots.")
+    action_space: Annotated[int, Field(ge=1, le=1_000)]
+    scenarios: Several[str] = Field((), description="Trained on.")
     held_out: Several[str] = Field((), description="Places never trained on, which it was evaluated in.")
-    vehicle: dict[str, float] | None = Field(
-        None, description="Of the training, for driving; None for the default."
-    )
     seed: int | None = Field(None, description="Of the training.")
     steps: int = Field(0, ge=0, description="Decisions of the training.")
     settings: dict[str, JsonValue] = Field({}, description="Of the algorithm.")
@@ -147,17 +140,17 @@ class ModelCard(Spec):
         if data.startswith(_ZIP):
             raise InputError(
                 f"{path}: is an archive of pickled objects, which run code when they are loaded; if you trust its "
-                f"author, convert it to a {SUFFIX} file: name it once with --trust-model (compare, park, benchmark run)"
+                f"author, convert it to a {SUFFIX} file: name it once with --trust-model (compare, benchmark run)"
             )
         return cls.parse(read_header(data, path).card, f"{path}: card")
 
     def build(self) -> Any:
         """Build the policy, with random weights."""
         observed = spaces.Dict({name: space.box() for name, space in self.observation_space.items()})
-        action = self.action_space
-        acted = spaces.Discrete(action) if isinstance(action, int) else action.box()
         kind = algorithm_class(self.algorithm).policy_aliases[self.policy]
-        return kind(observed, acted, lambda _: 0.0, **self.policy_options.arguments())
+        return kind(
+            observed, spaces.Discrete(self.action_space), lambda _: 0.0, **self.policy_options.arguments()
+        )
 
 
 def algorithm_class(name: str) -> Any:
@@ -179,7 +172,6 @@ def save_model(
     *,
     scenarios: Sequence[str] = (),
     held_out: Sequence[str] = (),
-    vehicle: VehicleParameters | None = None,
     settings: Mapping[str, Any] | None = None,
     results: Mapping[str, float] | None = None,
     command: Sequence[str] = (),
@@ -187,12 +179,10 @@ def save_model(
     """Write a model of stable-baselines3 or sb3-contrib to a model file, atomically.
 
     Args:
-        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local`
-            observation; or on the driving observation of `planners.driving.policy_interface`.
+        model: trained on `parkenv.envs.sb3.SearchVecEnv`, or another environment of the `local` observation.
         path: file to write; its name should end in `.safetensors`.
-        scenarios: names of the training scenarios; for driving, of the lots.
+        scenarios: names of the training scenarios.
         held_out: names of the places that it was evaluated in, and never trained on.
-        vehicle: car of the training, for driving; None for the default one.
         settings: settings of the algorithm, for the card.
         results: results of an evaluation, for the card.
         command: command line of the training, for the card.
@@ -207,25 +197,21 @@ def save_model(
     algorithm = next((key for key, (_, class_name) in ALGORITHMS.items() if class_name == name), None)
     if algorithm is None:
         raise InputError(f"the model is a {name}, want one of {', '.join(ALGORITHMS)}")
-    task, observation, k = observation_of(model.observation_space)
+    k = slots_observed(model.observation_space)
     aliases = {kind: alias for alias, kind in type(model).policy_aliases.items()}
     options = {
         key: value.__name__ if isinstance(value, type) else value
         for key, value in (model.policy_kwargs or {}).items()
         if not key.startswith("optimizer_")
     }
-    action = model.action_space
-    if task == "drive":
-        vehicle = vehicle or import_module("parkenv.driving.vehicle").VehicleParameters()
     found = {key: None if value != value else float(value) for key, value in (results or {}).items()}
     card = ModelCard.parse(
         {
-            "algorithm": algorithm, "task": task, "observation": observation, "k": k,
+            "algorithm": algorithm, "observation": OBSERVATION, "k": k,
             "policy": aliases.get(model.policy_class, model.policy_class.__name__), "policy_options": options,
             "observation_space": {key: BoxSpace.of(space) for key, space in model.observation_space.items()},
-            "action_space": int(action.n) if isinstance(action, spaces.Discrete) else BoxSpace.of(action),
+            "action_space": int(model.action_space.n),
             "scenarios": tuple(scenarios), "held_out": tuple(held_out), "seed": model.seed,
-            "vehicle": None if vehicle is None else asdict(vehicle),
             "steps": model.num_timesteps, "settings": to_jsonable_python(dict(settings or {})),
             "results": found, "command": tuple(command),
         },
@@ -237,48 +223,35 @@ def save_model(
         beside.write_bytes(save(weights, {CARD_KEY: card.model_dump_json()}))
 
 
-def observation_of(space: spaces.Space[Any]) -> tuple[str, str, int]:
-    """Return task, observation version and k of a model's observation space.
+def slots_observed(space: spaces.Space[Any]) -> int:
+    """Return k of a model's observation space.
 
     Raises:
-        InputError: it is of no task.
+        InputError: it is of another observation.
     """
-    if isinstance(space, spaces.Dict) and "local" in space.spaces and (shape := space["local"].shape):
-        return "search", OBSERVATION, (shape[0] - FIXED_NUMBERS) // NUMBERS_PER_SLOT
-    if isinstance(space, spaces.Dict) and "achieved_goal" in space.spaces:
-        return "drive", import_module("planners.driving.policy_interface").INTERFACE, 0
-    if isinstance(space, spaces.Dict) and "moves" in space.spaces:
-        return "scenes", import_module("planners.driving.learned_moves").INTERFACE, 0
-    raise InputError(
-        "the model observes neither `local` (to search), `achieved_goal` (to drive) nor `moves` (in scenes)"
-    )
+    shape = space["local"].shape if isinstance(space, spaces.Dict) and "local" in space.spaces else None
+    if not shape:
+        raise InputError("the model does not observe `local`")
+    return (shape[0] - FIXED_NUMBERS) // NUMBERS_PER_SLOT
 
 
-def load_model(
-    algorithm: str, path: str | os.PathLike[str], task: str, observation: str
-) -> tuple[ModelCard, Any]:
+def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard, Any]:
     """Load a model's card and policy; no code from the file is run.
 
     Args:
         algorithm: algorithm that it was trained with.
         path: the model file.
-        task: `search`, `drive` or `scenes`.
-        observation: version of the layout that the environment gives.
 
     Raises:
-        InputError: the file is not a model, or is one of another algorithm, task or observation.
+        InputError: the file is not a model, or is one of another algorithm or observation.
     """
     data = read_bytes(Path(path), _MAX_BYTES)
     card = ModelCard._of_bytes(data, path)
     if card.algorithm != algorithm:
         raise InputError(f"{path}: is a model of {card.algorithm}, not of {algorithm}")
-    if card.task != task:
+    if card.observation != OBSERVATION:
         raise InputError(
-            f"{path}: was trained to {card.task}, not to {task}; `{COMMANDS[card.task]}` runs it"
-        )
-    if card.observation != observation:
-        raise InputError(
-            f"{path}: observes {card.observation!r}, this version of parkenv gives {observation!r}; "
+            f"{path}: observes {card.observation!r}, this version of parkenv gives {OBSERVATION!r}; "
             f"it was trained with parkenv {card.parkenv}"
         )
     _require_spaces(card, path)
@@ -297,21 +270,12 @@ def load_model(
 
 
 def _require_spaces(card: ModelCard, path: str | os.PathLike[str]) -> None:
-    """Refuse a card whose observation or action differs from that of its task, which would fail in a search."""
+    """Refuse a card whose observation or action differs from that of a search, which would fail in one."""
     observed = {name: space.shape for name, space in card.observation_space.items()}
-    acted = card.action_space if isinstance(card.action_space, int) else card.action_space.shape
-    if card.task == "search":
-        wanted = {"local": (FIXED_NUMBERS + NUMBERS_PER_SLOT * card.k,), "action_mask": (len(ACTIONS),)}
-        act: int | tuple[int, ...] = len(ACTIONS)
-    elif card.task == "scenes":
-        moves = import_module("planners.driving.learned_moves")
-        wanted, act = {"moves": (moves.OBSERVATION_SIZE,), "action_mask": (moves.MOVES,)}, moves.MOVES
-    else:
-        size = import_module("planners.driving.policy_interface").OBSERVATION_SIZE
-        wanted, act = {"observation": (size,), "achieved_goal": (7,), "desired_goal": (7,)}, (2,)
-    if observed != wanted or acted != act:
+    wanted = {"local": (FIXED_NUMBERS + NUMBERS_PER_SLOT * card.k,), "action_mask": (len(ACTIONS),)}
+    if observed != wanted or card.action_space != len(ACTIONS):
         raise InputError(
-            f"{path}: card: observes {observed} and acts {acted}, want {wanted} and {act} to {card.task}"
+            f"{path}: card: observes {observed} and acts {card.action_space}, want {wanted} and {len(ACTIONS)}"
         )
 
 

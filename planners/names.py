@@ -28,14 +28,10 @@ ALGORITHMS = {
     "ppo": ("stable_baselines3", "PPO"),
     "maskable-ppo": ("sb3_contrib", "MaskablePPO"),
     "recurrent-ppo": ("sb3_contrib", "RecurrentPPO"),
-    "sac": ("stable_baselines3", "SAC"),
-    "tqc": ("sb3_contrib", "TQC"),
 }
 """Module and class of each learning algorithm; `ALGORITHM:FILE` names a trained model."""
 NETWORK = "network"
 """The agent whose weights can be another file: `network:FILE`."""
-PARKING_PLANNER = "planner"
-"""The agent that plans how to drive into a slot."""
 HUMAN = "human"
 """The agent that repeats what a person did in a game of `parkenv play`: `human:FILE`."""
 FILE_AGENTS = (*ALGORITHMS, NETWORK, HUMAN)

@@ -24,7 +24,7 @@ from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.studies.runner import run
 from parkenv.studies.trips.manoeuvre_study import ManoeuvreStudy
 from planners.driving.manoeuvre import park
-from planners.driving.parking_agents import make_parking_agent
+from planners.driving.parking import ParkingAgent
 
 PUBLIC = Path(__file__).parents[2] / "shared" / "data" / "manoeuvres"
 # A parallel slot along x below a lane, between two blocks: 0.5 m longer than TPCAP's car.
@@ -333,5 +333,5 @@ def test_an_environment_takes_a_car_by_name_and_an_agent_of_another_car_is_refus
     assert env.unwrapped.vehicle == TPCAP
     observation, _ = env.reset(seed=0)
     with pytest.raises(InputError, match="vehicle with length"):
-        make_parking_agent("planner").predict(observation)
-    assert np.isfinite(make_parking_agent("planner", TPCAP).predict(observation)[0]).all()
+        ParkingAgent().predict(observation)
+    assert np.isfinite(ParkingAgent(TPCAP).predict(observation)[0]).all()

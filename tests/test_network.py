@@ -1,7 +1,9 @@
 """The agent `network`: symmetry, one size for all lots, masks, parity with PyTorch, files, training."""
 
+import importlib.util
 import itertools
 import json
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -124,9 +126,19 @@ def test_the_look_ahead_knows_the_shortest_drive_and_walk_where_all_slots_are_fr
     assert agent.last_features.lookahead_s.min() == pytest.approx(best, rel=0.02)
 
 
-def test_numpy_and_torch_agree():
-    torch = pytest.importorskip("torch")
-    from parkenv.studies.training.network.fit import Network
+@pytest.fixture(scope="module")
+def example():
+    """The example that trains the network."""
+    pytest.importorskip("torch")
+    file = Path(__file__).parents[1] / "examples" / "train_network.py"
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_numpy_and_torch_agree(example):
+    import torch
 
     rng = np.random.default_rng(0)
     n = 32
@@ -135,20 +147,38 @@ def test_numpy_and_torch_agree():
     actions = rng.uniform(0.0, 1.0, (n, 6, ACTION_FEATURES)).astype(np.float32)
     allowed = rng.random((n, 6)) < 0.6
     allowed[:, 0] = True
-    for without in ((), ("lookahead",), ("tokens",), ("day", "memory")):
-        policy = random_policy(without=without)
-        network = Network(policy.card)
-        with torch.no_grad():
-            for name, values in policy.weights.items():
-                network.layers[name.replace(".", "_")].copy_(torch.from_numpy(values))
-            found = network(*map(torch.from_numpy, (actions, tokens, allowed))).numpy()
-        batch = policy.scores(Features(actions, tokens, allowed, np.zeros((n, 6))))
-        np.testing.assert_allclose(batch[allowed], found[allowed], atol=2e-5)
-        for i in range(3):
-            single = policy.scores(Features(actions[i], tokens[i], allowed[i], np.zeros(6)))
-            np.testing.assert_allclose(single, batch[i], atol=2e-5)
-        for name, values in network.policy().weights.items():
-            np.testing.assert_array_equal(values, policy.weights[name])
+    policy = random_policy()
+    network = example.Network(policy.card)
+    with torch.no_grad():
+        for name, values in policy.weights.items():
+            network.layers[name.replace(".", "_")].copy_(torch.from_numpy(values))
+        found = network(*map(torch.from_numpy, (actions, tokens, allowed))).numpy()
+    batch = policy.scores(Features(actions, tokens, allowed, np.zeros((n, 6))))
+    np.testing.assert_allclose(batch[allowed], found[allowed], atol=2e-5)
+    for i in range(3):
+        single = policy.scores(Features(actions[i], tokens[i], allowed[i], np.zeros(6)))
+        np.testing.assert_allclose(single, batch[i], atol=2e-5)
+    for name, values in network.policy().weights.items():
+        np.testing.assert_array_equal(values, policy.weights[name])
+
+
+def test_trained_weights_are_repeatable_and_drive(example, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, few in (
+        ("SCENARIOS", ("mini",)),
+        ("DECISIONS", 20),
+        ("EPOCHS", 20),
+        ("BATCH", 16),
+        ("WORLDS", 2),
+    ):
+        monkeypatch.setattr(example, name, few)
+    files = []
+    for _ in range(2):
+        example.main()
+        files.append((tmp_path / example.FILE).read_bytes())
+    assert files[0] == files[1]
+    agent = make_agent(f"network:{example.FILE}", make_scenario("mini"))
+    assert agent.policy.card.trained_on == ("mini",)
 
 
 def test_files_keep_weights_and_card(tmp_path):
@@ -228,7 +258,6 @@ def test_the_shipped_network_is_small_and_says_what_it_is():
     assert sum(w.size for w in policy.weights.values()) < 300_000
     assert policy.card.trained_on
     assert policy.card.command[:3] == ("parkenv", "train", "network")
-    assert not policy.card.without
 
 
 @pytest.mark.parametrize("name", ["campus", "street", "jam", "mini"])
@@ -253,31 +282,6 @@ def test_without_news_it_does_not_circle_forever():
     visited = [int(observation["vertex"]) for observation, *_ in decisions(agent, scenario, 0, most=200)]
     pairs = list(itertools.pairwise(visited))
     assert max(pairs.count(pair) for pair in set(pairs)) < 20
-
-
-@pytest.mark.slow
-def test_trainings_are_repeatable_and_learn(tmp_path):
-    from parkenv.studies.training.network.training import NetworkTraining
-    from parkenv.studies.training.spec import NetworkTrainingSpec
-    from parkenv.studies.training.training import MODEL
-
-    places = tuple(make_scenario(name) for name in ("mini", "campus"))
-    held_out = (make_scenario(grid_lot(4, 10), name="grid", day_error=0.8),)
-    training = NetworkTraining(NetworkTrainingSpec(steps=200, evaluation_episodes=5))
-    training.sides, training.places = (places, held_out), places
-    curves = [training.train(0, tmp_path / str(i)) for i in range(2)]
-    assert (tmp_path / "0" / MODEL).read_bytes() == (tmp_path / "1" / MODEL).read_bytes()
-    for one, other in zip(*curves, strict=True):
-        assert {**one, "wall_s": 0.0} == {**other, "wall_s": 0.0}
-    card = NetworkPolicy.load(tmp_path / "0" / MODEL).card
-    assert card.trained_on == ("mini", "campus")
-    assert card.decisions == curves[0][-1]["steps"] > 200
-    # A training that has ended is not repeated.
-    before = (tmp_path / "0" / MODEL).stat().st_mtime_ns
-    training.train(0, tmp_path / "0")
-    assert (tmp_path / "0" / MODEL).stat().st_mtime_ns == before
-    with pytest.raises(InputError, match="steps is 0"):
-        training.spec.changed(steps=0)
 
 
 def test_it_does_not_prove_a_full_lot_full():

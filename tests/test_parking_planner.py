@@ -310,9 +310,7 @@ def test_failures_are_named_and_drawn(tmp_path, monkeypatch):
     from parkenv.studies.trips import parking_runs
 
     no_room = SearchSettings(attempts=((0.2, 0.5),), most_expansions=1, patience=0.0)
-    monkeypatch.setattr(
-        parking_runs, "make_parking_agent", lambda name, vehicle: ParkingAgent(vehicle, search=no_room)
-    )
+    monkeypatch.setattr(parking_runs, "ParkingAgent", lambda vehicle: ParkingAgent(vehicle, search=no_room))
     out = tmp_path / "park"
     options = [
         "--lot",

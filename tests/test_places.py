@@ -21,8 +21,9 @@ from parkenv.scenarios.selection import by_size, lot_share, open_scenarios, scen
 from parkenv.scenarios.spec import lot_scenario, scenario_spec, scenario_specs
 from parkenv.studies.compare.comparison import Comparison
 from parkenv.studies.training.cloning import clone
-from parkenv.studies.training.search import SearchTraining, episode_times
-from parkenv.studies.training.spec import SearchTrainingSpec
+from parkenv.studies.training.evaluation import episode_times
+from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.training import Training
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.real_week import real_week_occupancy
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR
@@ -333,16 +334,16 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
     make_small(monkeypatch)
     met = []
     training = search_training("ppo", 2_048, 1_024, PLACES[:4], PLACES[4:], episodes=12, curriculum="size")
-    before = SearchTraining.before_rollout
+    before = Training.open_places
 
-    def watched(self, model):
-        before(self, model)
-        met.append((model.num_timesteps, model.env.batch.n_places))
+    def watched(self, env, steps):
+        before(self, env, steps)
+        met.append((steps, env.batch.n_places))
 
-    monkeypatch.setattr(SearchTraining, "before_rollout", watched)
+    monkeypatch.setattr(Training, "open_places", watched)
     curve = training.train(0, tmp_path)
-    assert met == [(steps, open_scenarios(4, steps / 2_048)) for steps in (0, 512, 1024, 1536)]
-    assert [n for _, n in met] == [1, 3, 4, 4]
+    assert met == [(steps, open_scenarios(4, steps / 2_048)) for steps in (0, 0, 512, 1024, 1536)]
+    assert [n for _, n in met] == [1, 1, 3, 4, 4]
     card = ModelCard.of_file(tmp_path / "model.safetensors")
     assert card.scenarios == ("lot0", "lot1", "lot2", "lot3")
     assert card.held_out == ("lot4", "lot5")
@@ -365,7 +366,7 @@ def test_a_training_evaluates_on_places_it_never_met(tmp_path, monkeypatch):
 
 def test_a_task_names_both_sides_and_keeps_them_apart(folder):
     specs = tuple(scenario_specs(folder))
-    training = SearchTraining(SearchTrainingSpec().changed(scenarios=specs, held_out=0.5))
+    training = Training(TrainingSpec().changed(scenarios=specs, held_out=0.5))
     names = tuple({one.name for one in side} for side in training.sides)
     assert names[0] | names[1] == {spec.title for spec in specs}
     assert not names[0] & names[1]
@@ -378,12 +379,12 @@ def test_a_task_names_both_sides_and_keeps_them_apart(folder):
         (specs[1:2], "scenarios has 'lot0' twice, want different names"),
     ):
         with pytest.raises(InputError, match=message):
-            SearchTraining(SearchTrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
+            Training(TrainingSpec().changed(scenarios=specs, evaluate_on=others)).settings()
 
 
 @pytest.mark.slow
 def test_the_command_learns_on_some_places_and_tests_on_others(folder, monkeypatch):
-    monkeypatch.setattr("parkenv.studies.training.search.clone", partial(clone, updates=50))
+    monkeypatch.setattr("parkenv.studies.training.training.clone", partial(clone, updates=50))
     make_small(monkeypatch)
     out = folder / "trained"
     done = parkenv(

@@ -227,43 +227,32 @@ def test_episodes_of_other_commands_are_not_read_as_searches(tmp_path):
     assert data_of(tmp_path / "report.html")["tables"][0]["rows"] == [["mini", 1.0]]
 
 
-@pytest.mark.parametrize("drives", [False, True])
-def test_learning_curves_are_those_of_the_training(tmp_path, drives):
-    """One panel for searches, one per kind of slot for driving; other trainings are shown by their medians."""
-    names = ["oblique_success", "parallel_success"] if drives else ["total_s"]
+def test_learning_curves_are_those_of_the_training(tmp_path):
+    """Other trainings are shown by their medians."""
     (tmp_path / "seed_3").mkdir()
     (tmp_path / "seed_4").mkdir()
-    (tmp_path / "seed_4" / "curve.csv").write_text(f"step,{names[0]}\n0,1\n")
-    examinations = [["steps", *names], ["0", *("0.25" for _ in names)], ["500", *("0.5" for _ in names)]]
-    (tmp_path / "seed_3" / "curve.csv").write_text("\n".join(",".join(row) for row in examinations) + "\n")
-    ends = ("low", "high") if drives else ("low_s", "high_s")
-    median = "median" if drives else "median_s"
-    curves = [
-        [
-            {"steps": steps, name: value, ends[0]: None, ends[1]: None, median: value - 0.125}
-            for steps, value in ((0.0, 0.25), (500.0, 0.5))
-        ]
-        for name in names
+    (tmp_path / "seed_4" / "curve.csv").write_text("step,total_s\n0,1\n")
+    (tmp_path / "seed_3" / "curve.csv").write_text("steps,total_s\n0,0.25\n500,0.5\n")
+    curve = [
+        {"steps": steps, "total_s": value, "low_s": None, "high_s": None, "median_s": value - 0.125}
+        for steps, value in ((0.0, 0.25), (500.0, 0.5))
     ]
-    kinds = [name.removesuffix("_success") for name in names]
     summary_in(
         tmp_path,
         command=["parkenv", "train"],
-        rows=[{"agent": "ppo", "scenario": "campus,street", "seed": k, "success": 0.5} for k in (3, 4)],
-        evaluated=dict.fromkeys(kinds, 1.0) if drives else {"mdp": 80.0, "clairvoyant bound": 60.0},
-        curve=dict(zip(kinds, curves, strict=True)) if drives else curves[0],
-        beside={"dqn": dict(zip(kinds, curves, strict=True)) if drives else curves[0]},
+        rows=[{"agent": "ppo", "scenario": "campus,street", "seed": k, "total_s": 0.5} for k in (3, 4)],
+        evaluated={"mdp": 80.0, "clairvoyant bound": 60.0},
+        curve=curve,
+        beside={"dqn": curve},
     )
     data = RunFolder.read(tmp_path).data()
     assert data["run"]["title"] == "ppo trained on campus and street"
-    assert [panel["title"] for panel in data["learning"]] == (kinds if drives else ["total time, s"])
-    for panel in data["learning"]:
-        assert panel["mean"] == [[0.0, 0.25, None, None], [500.0, 0.5, None, None]]
-        assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]], []], "a curve without steps is not drawn"
-        assert panel["beside"] == [["dqn", [[0.0, 0.125], [500.0, 0.375]]]]
-        assert panel["lines"] == (
-            [["planner", 1.0]] if drives else [["mdp", 80.0], ["clairvoyant bound", 60.0]]
-        )
+    (panel,) = data["learning"]
+    assert panel["title"] == "total time, s"
+    assert panel["mean"] == [[0.0, 0.25, None, None], [500.0, 0.5, None, None]]
+    assert panel["seeds"] == [[[0.0, 0.25], [500.0, 0.5]], []], "a curve without steps is not drawn"
+    assert panel["beside"] == [["dqn", [[0.0, 0.125], [500.0, 0.375]]]]
+    assert panel["lines"] == [["mdp", 80.0], ["clairvoyant bound", 60.0]]
 
 
 def test_text_in_the_data_cannot_end_its_element(tmp_path):

@@ -1,37 +1,23 @@
-"""A training of any kind that is killed and resumed ends with the same evaluations and the same model, to the byte."""
+"""A training that is killed and resumed ends with the same evaluations and the same model, to the byte."""
 
 import pytest
-from small_trainings import (
-    drive_training,
-    fleet_training,
-    make_small,
-    scenes_training,
-    search_training,
-    stop_training,
-)
+from small_trainings import make_small, search_training, stop_training
 
 from parkenv import InputError, make_scenario
-from parkenv.envs.fleet_vector import FleetVectorEnv
-from parkenv.lots import grid_lot, packaged_lot
-from parkenv.studies.fleet.drivers import MixedFleet
+from parkenv.envs.sb3 import SearchVecEnv
+from parkenv.lots import grid_lot
 from parkenv.studies.runner import run
 from parkenv.studies.training.configs import SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import read_curve
-from parkenv.studies.training.search import episode_times
+from parkenv.studies.training.evaluation import episode_times
 from parkenv.studies.training.spec import TrainingSpec
-from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
 from planners.learned import LearnedAgent
 
 PLACES = [make_scenario("mini"), make_scenario("campus")]
-DEMAND = Demand(PoissonArrivals(60.0, 8 * 3600, 8.5 * 3600), ExponentialTime(480.0), ConstantTime(300.0))
 LOTS = [make_scenario(grid_lot(2, 6 + i), name=f"lot{i}") for i in range(6)]
 TRAININGS = {
     **{name: lambda name=name: search_training(name, 1_500, 400, PLACES) for name in sorted(SEARCH_CONFIGS)},
     "curriculum": lambda: search_training("ppo", 1_536, 512, LOTS, episodes=8, curriculum="size"),
-    "fleet": lambda: fleet_training(MixedFleet(PLACES[0], DEMAND), 768, 256),
-    "drive, ppo": lambda: drive_training("ppo", 2_000, 600, (packaged_lot("mini"),)),
-    "scenes": lambda: scenes_training(512, 128, ("parallel-complex", "oblique-normal")),
-    "drive, sac": lambda: drive_training("sac", 1_000, 300, (packaged_lot("mini"),)),
 }
 
 
@@ -40,11 +26,8 @@ def small(monkeypatch):
     make_small(monkeypatch)
 
 
-FAST = ("maskable-ppo", "fleet", "scenes")
-
-
 @pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind not in FAST)) for kind in TRAININGS]
+    "kind", [pytest.param(kind, marks=[pytest.mark.slow] * (kind != "maskable-ppo")) for kind in TRAININGS]
 )
 def test_a_resumed_training_equals_an_unbroken_one(kind, tmp_path, monkeypatch):
     """Killed right before its third checkpoint: the evaluation before it is repeated."""
@@ -81,17 +64,17 @@ def test_a_finished_training_goes_on_with_more_steps(tmp_path):
 
 
 def test_a_training_that_stops_within_a_rollout_goes_on_from_its_last_checkpoint(tmp_path, monkeypatch):
-    training = fleet_training(MixedFleet(PLACES[0], DEMAND))
+    training = search_training("ppo", 2_048, 512, PLACES)
     whole = training.train(0, tmp_path / "whole")
-    steps, step = iter(range(1_000)), FleetVectorEnv.step
+    steps, step = iter(range(1_000)), SearchVecEnv.step_wait
 
-    def stops(self, actions):
-        if next(steps) == 200:
+    def stops(self):
+        if next(steps) == 80:
             raise KeyboardInterrupt
-        return step(self, actions)
+        return step(self)
 
     with monkeypatch.context() as patched:
-        patched.setattr(FleetVectorEnv, "step", stops)
+        patched.setattr(SearchVecEnv, "step_wait", stops)
         with pytest.raises(KeyboardInterrupt):
             training.train(0, tmp_path / "broken")
     assert len(read_curve(tmp_path / "broken" / "curve.csv")) > 1

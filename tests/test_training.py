@@ -36,18 +36,11 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.study import schemas
 from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
-from parkenv.studies.training.configs import DRIVE_CONFIGS, MAX_STEPS, SEARCH_CONFIGS
+from parkenv.studies.training.configs import MAX_STEPS, SEARCH_CONFIGS
 from parkenv.studies.training.curve_file import across_seeds, read_curve
-from parkenv.studies.training.search import SearchTraining, episode_times
-from parkenv.studies.training.spec import (
-    DriveTrainingSpec,
-    FleetTrainingSpec,
-    NetworkTrainingSpec,
-    ScenesTrainingSpec,
-    SearchTrainingSpec,
-    TrainingSpec,
-)
-from parkenv.studies.training.training import TRAINING_SEEDS, curves_beside
+from parkenv.studies.training.evaluation import episode_times
+from parkenv.studies.training.spec import TrainingSpec
+from parkenv.studies.training.training import TRAINING_SEEDS, Training
 from parkenv.studies.trips.driven_search import DrivenSearch
 from parkenv.world.occupancy.day_error import DayError
 from planners.agent import make_agent
@@ -286,6 +279,7 @@ def encoded(mark):
         (changed_card(policy_options={"activation_fn": "Module"}), "maskable-ppo", "activation_fn is 'Module'"),
         (changed_card(policy="os.system"), "maskable-ppo", "policy is 'os.system'"),
         (changed_card(observation_space={}), "maskable-ppo", r"card: observes {} and acts 5, want {'local': \(86,\)"),
+        (changed_card(task="drive"), "maskable-ppo", "task is 'drive', want 'search'"),
         (changed_card(action_space=6), "maskable-ppo", "and acts 6, want"),
         (changed_card(observation="local-0"), "maskable-ppo", "observes 'local-0', this version of parkenv gives"),
         (lambda *_: None, "dqn", "is a model of maskable-ppo, not of dqn"),
@@ -405,7 +399,7 @@ def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, keys, value, want
 
 def test_checkpoints_and_models_on_a_full_disk_are_named(checkpoint, tmp_path):
     training, _ = checkpoint
-    model = PPO("MultiInputPolicy", training.make_env(), n_steps=8, batch_size=16)
+    model = PPO("MultiInputPolicy", training.make_env(4), n_steps=8, batch_size=16)
     model.env.reset()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, limits[1]))
@@ -466,7 +460,7 @@ def test_short_trainings_have_smaller_batches(algorithm):
 
 
 def test_every_algorithm_has_a_recipe():
-    assert SEARCH_CONFIGS.keys() | DRIVE_CONFIGS.keys() == ALGORITHMS.keys()
+    assert SEARCH_CONFIGS.keys() == ALGORITHMS.keys()
 
 
 def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
@@ -536,13 +530,12 @@ def training_in(folder, **changed):
     return str(folder)
 
 
-def course_of(algorithm="ppo"):
-    return SearchTraining(
-        SearchTrainingSpec(
-            algorithm=algorithm, scenarios=(scenario_spec("mini"),), steps=10, evaluate_every=10,
-            evaluation_episodes=16, agents=(),
-        )
+def curves_beside(folders, out):
+    spec = TrainingSpec(
+        algorithm="ppo", scenarios=(scenario_spec("mini"),), steps=10, evaluation_episodes=16, agents=(),
+        beside=tuple(folders),
     )  # fmt: skip
+    return Training(spec).curves_beside(out)
 
 
 def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
@@ -551,24 +544,14 @@ def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
         training_in(tmp_path / "again", algorithm="ppo"),
         training_in(tmp_path / "cloned", algorithm="ppo", clone="mdp"),
     ]
-    beside = curves_beside(folders, tmp_path / "own", course_of())
+    beside = curves_beside(folders, tmp_path / "own")
     assert list(beside) == ["dqn", f"ppo ({folders[1]})", "ppo after cloning mdp"]
     assert beside["dqn"] == [[{"steps": 0, "total_s": 300.0}, {"steps": 10, "total_s": 90.0}]]
 
 
-@pytest.mark.parametrize(
-    ("tables", "kind"),
-    [
-        ({}, SearchTrainingSpec),
-        ({"algorithm": "network", "scenarios": ["mini"]}, NetworkTrainingSpec),
-        ({"env": "fleet", "arrivals_per_hour": 120}, FleetTrainingSpec),
-        ({"env": "drive", "algorithm": "sac", "agents": ["planner"]}, DriveTrainingSpec),
-        ({"env": "scenes", "levels": ["parallel-extreme"]}, ScenesTrainingSpec),
-    ],
-)
-def test_a_file_chooses_the_kind_of_training_and_its_copy_is_the_same(tables, kind, tmp_path):
-    spec = TrainingSpec.parse({"kind": "train", **tables}, "file")
-    assert type(spec) is kind
+def test_a_specification_in_a_file_is_the_same(tmp_path):
+    tables = {"kind": "train", "algorithm": "dqn", "scenarios": ["mini"], "agents": ["mdp"], "steps": 3_000}
+    spec = TrainingSpec.parse(tables, "file")
     spec.write(tmp_path / "experiment.json")
     assert TrainingSpec.read(tmp_path / "experiment.json") == spec
     jsonschema.validate(read_tables(tmp_path / "experiment.json"), schemas()["train"])
@@ -576,42 +559,18 @@ def test_a_file_chooses_the_kind_of_training_and_its_copy_is_the_same(tables, ki
         TrainingSpec.parse({**tables, "step": 3}, "file")
 
 
-OF_FLEET, OF_DRIVES = {"env": "fleet"}, {"env": "drive"}
-
-
 @pytest.mark.parametrize(
     ("fields", "message"),
     [
-        ({"env": "fly"}, "env is 'fly', want one of search, fleet, drive"),
-        ({"algorithm": "sarsa"}, "algorithm is 'sarsa', want one of"),
-        ({"algorithm": "sac"}, "algorithm is 'sac', want one of ppo, maskable-ppo, recurrent-ppo, dqn with env search"),
+        ({"algorithm": "sac"}, "algorithm is 'sac', want 'ppo', 'maskable-ppo', 'recurrent-ppo' or 'dqn'"),
         ({"agents": ["mdp", "belif"]}, "unknown agent 'belif'"),
         ({"algorithm": "ppo", "clone": "oracle"}, "oracle cannot be cloned"),
         ({"algorithm": "dqn", "clone": "mdp"}, "dqn has no behaviour cloning"),
         ({"demonstrations": 5}, "demonstrations requires clone"),
-        ({"without": ["day"]}, "without requires algorithm network"),
         ({"held_out": 0.0}, "held_out is 0.0, want a number above 0"),
         ({"held_out": 0.5, "evaluate_on": ["mini"]}, "at most one of held_out, evaluate_on"),
-        ({"knows": "own"}, "knows requires env fleet"),
-        ({"algorithm": "network", "clone": "mdp"}, "clone requires env search, not algorithm network"),
-        ({"algorithm": "network", "evaluate_every": 9}, "evaluate_every requires env search or"),
-        ({"algorithm": "network", "tensorboard": True}, "not algorithm network"),
-        ({"algorithm": "network", "without": ["legs"]}, "without.0 is 'legs', want 'lookahead'"),
-        (OF_FLEET | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, maskable-ppo with env fleet"),
-        (OF_FLEET | {"clone": "mdp"}, "clone requires env search"),
-        (OF_FLEET | {"learners": 0.5}, "learners requires among"),
-        (OF_FLEET | {"arrivals_per_hour": 0.0}, "arrivals_per_hour"),
-        (OF_FLEET | {"test_on": ["mini"]}, "test_on requires"),
-        (OF_FLEET | {"scenarios": ["mini", "campus"]}, "want one with --env fleet"),
-        (OF_FLEET | {"among": "belief"}, "want a compiled policy"),
-        (OF_FLEET | {"agents": ["oracle"]}, "knows the future"),
-        (OF_DRIVES | {"algorithm": "dqn"}, "algorithm is 'dqn', want one of ppo, sac, tqc with env drive"),
-        (OF_DRIVES | {"held_out": 0.2}, "held_out requires env search or algorithm network, not"),
-        (OF_DRIVES | {"agents": ["mdp"]}, "agents has 'mdp', want planner or none with env drive"),
-        ({"env": "scenes", "levels": ["parallel-tight"]}, "levels is 'parallel-tight'"),
-        (OF_DRIVES | {"k": 3}, "k requires env search or env fleet, not env drive"),
     ],
-)  # fmt: skip
+)
 def test_trainings_that_make_no_sense_are_refused(fields, message):
     with pytest.raises(InputError, match=message):
         TrainingSpec.parse(fields, "file").training.check()
@@ -657,14 +616,14 @@ def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil,
     if spoil is not None:
         spoil(tmp_path / "other")
     with pytest.raises(InputError, match=wanted):
-        curves_beside([folder], tmp_path / "own", course_of())
+        curves_beside([folder], tmp_path / "own")
 
 
 def test_a_training_is_drawn_once(tmp_path):
     folder = training_in(tmp_path / "other")
     for folders, own in (([folder, f"{folder}/../other"], "own"), ([folder], "other")):
         with pytest.raises(InputError, match="is already drawn"):
-            curves_beside(folders, tmp_path / own, course_of())
+            curves_beside(folders, tmp_path / own)
 
 
 def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
@@ -690,16 +649,13 @@ def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "wanted"),
     [
-        ("ppo --env fly", "env is 'fly', want one of search, fleet, drive"),
         ("ppo --curriculum age", "--curriculum is 'age', want 'size'"),
         ("ppo --evaluate-on nowhere", "unknown scenario 'nowhere'"),
         ("ppo --resume", "to resume"),
         ("ppo --scenario nowhere", "unknown scenario 'nowhere'"),
-        ("sac --env drive --lot nowhere", "--lot is 'nowhere', want a packaged lot (campus, jam"),
-        ("sac --env drive --lot nowhere.geojson", "--lot is 'nowhere.geojson', want a file; there is"),
-        ("network --day-error 0.5", "--day-error requires --scenario or --lot"),
+        ("dqn --lot nowhere", "--lot is 'nowhere', want a packaged lot (campus, jam"),
+        ("dqn --lot nowhere.geojson", "--lot is 'nowhere.geojson', want a file; there is"),
         ("ppo --scenario mini --day-error x", "--day-error"),
-        ("ppo --env drive --demonstrations 5", "demonstrations requires env search, not env drive"),
     ],
 )
 def test_bad_options_are_one_clear_line(tmp_path, arguments, wanted):

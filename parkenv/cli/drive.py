@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, print_rows, save_summary, stages, writing_into
-from parkenv.cli.trust import TrustModel, readable_models
 from parkenv.files.option import Inside, option, words_in
 from parkenv.files.spec_file import Axis
 from parkenv.scenarios.spec import Probability, scenario_spec
@@ -31,7 +30,7 @@ SHOWN = (
     "agent", "kind", "way", "parked", "success", "contacts", "planning_ms", "planning_ms_p95", "time_s", "time_s_p95",
     "direction_changes", "direction_changes_p95", "driven_m", "turned_rad",
 )  # fmt: skip
-"""Columns of a comparison of parking agents that are printed."""
+"""Columns of parkings on lots that are printed."""
 
 
 class Calibrate(StudyCommand):
@@ -78,7 +77,7 @@ def _all_or(text: str) -> object:
 class Park(StudyCommand):
     """On lots it writes pictures of one successful episode per kind of slot and orientation, and an animation of one.
 
-    It also draws failures, if any; with several agents, into one folder per agent.
+    It also draws failures, if any.
 
     With --cases or --levels, every scene is planned, driven within the car's limits, and checked with footprints 2 cm
     apart against the exact obstacles: no contact, and an end within 0.05 m and 0.01 rad of the target. The command
@@ -87,7 +86,6 @@ class Park(StudyCommand):
 
     examples = """
         parkenv park --episodes 250 --scenario campus,street,jam
-        parkenv park --agents planner,sac:results/drive-sac/seed_0/model.safetensors
         parkenv park --lot parking_map.yml --way back-in
         parkenv park --cases tpcap --vehicle tpcap --out results/tpcap
         parkenv park --levels parallel-extreme,oblique-complex --episodes 10
@@ -124,7 +122,6 @@ class Park(StudyCommand):
         ge=0.0,
         le=100.0,
     )
-    trust_model: TrustModel = False
     out: Path = option(
         Path("results/park"), "Folder for pictures, episodes.csv and summary.json.", short="-o"
     )
@@ -150,7 +147,7 @@ class Park(StudyCommand):
         from parkenv.driving.parking_task import WAYS
         from parkenv.driving.vehicle import VehicleParameters
         from parkenv.scenarios.build import build
-        from parkenv.studies.trips.parking_comparison import compare_parking
+        from parkenv.studies.trips.parking_comparison import PLANNER, park_on_lots
         from parkenv.studies.trips.parking_runs import ParkingCase
 
         study, vehicle = self.study, self.study.vehicle or VehicleParameters()
@@ -158,20 +155,18 @@ class Park(StudyCommand):
             ParkingCase(build(spec).lot, self.kinds, self.ways or WAYS, self.occupied, self.slack, vehicle)
             for spec in self.scenarios
         ]
-        agents = readable_models(study.agents) if self.trust_model else study.agents
         seeds = range(study.seed, study.seed + study.episodes)
         console = make_console()
         with writing_into(self.out):
             with stages(console, "episodes") as progress, study.workers() as workers:
-                found = compare_parking(cases, agents, seeds, self.out, workers=workers, progress=progress)
+                found = park_on_lots(cases, seeds, self.out, workers=workers, progress=progress)
             names = [case.lot.name for case in cases]
-            save_summary(self.out, study.seed, found.table, lots=names, agents=found.labels)
+            save_summary(self.out, study.seed, found.table, lots=names, agents={PLANNER: PLANNER})
         print_rows(
             console, f"{', '.join(names)}, {plural(study.episodes, 'episode')} per lot", found.table, SHOWN
         )
         for row in [row for row in found.rows if not row["parked"]][:SHOWN_ROWS]:
-            agent = f"{row['agent']}, " if len(found.labels) > 1 else ""
             console.print(
-                f"failed: {agent}{row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
+                f"failed: {row['lot']}, seed {row['seed']}, {row['slot']} {row['way']}: {row['reason']}"
             )
         console.print(f"Episodes, summary and pictures are in {self.out}")

@@ -171,10 +171,6 @@ def field_options(model: type[Spec], path: tuple[str, ...] = ()) -> Iterator[Fie
 
     What a command itself declares is an option anyway; other fields if they have an `Option`.
     """
-    if variants := model.variants():
-        for variant in variants:
-            yield from field_options(variant, path)
-        return
     of_command = {
         name for kind in model.__mro__ if issubclass(kind, Command) for name in inspect.get_annotations(kind)
     }
@@ -230,8 +226,6 @@ def _made(model: type[SpecT], base: SpecT | None, values: _Values) -> SpecT:
         spec = spec.changed(names, **fields)
     for name in dict.fromkeys(path[0] for path in values if len(path) > 1):
         inner = {path[1:]: value for path, value in values.items() if path[0] == name and len(path) > 1}
-        if name not in type(spec).model_fields:
-            continue  # an option of another variant
         table = getattr(spec, name)
         if table is None:
             annotation = type(spec).model_fields[name].annotation

@@ -1,14 +1,13 @@
-"""`parkenv train`: train agents by reinforcement learning."""
+"""`parkenv train`: train search agents by reinforcement learning."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
 
-from parkenv.cli.options import Given, field_options, made
+from parkenv.cli.options import Given, made
 from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import print_rows
-from parkenv.errors import InputError
 from parkenv.files.option import option
 from parkenv.studies.training.spec import TrainingSpec
 
@@ -17,20 +16,15 @@ if TYPE_CHECKING:
 
     from parkenv.studies.runner import Result
 
-SHOWN = (
-    "test_scenario", "kind", "agent", "seed", "episodes", "days", "total_s", "others_s", "search_s", "parked_fraction",
-    "success", "contacts", "time_s",
-)  # fmt: skip
+SHOWN = ("test_scenario", "agent", "seed", "episodes", "total_s", "parked_fraction")
 """Columns of the tests that are printed."""
 
 
 class Train(StudyCommand):
     """The reward of search agents is minus the time in seconds. They observe the surroundings of the car.
 
-    So they run on any lot. In a fleet, one network drives all cars, or a
-    share of them. Driving agents park the car in a slot, with hindsight experience replay (sac, tqc) or the dense
-    reward (ppo); their curriculum starts just outside the slot. All are evaluated in held-out worlds; each seed's best
-    model is kept, and tested at the end. Hyperparameters are in parkenv/studies/training/configs.py.
+    So they run on any lot. They are evaluated in held-out worlds; each seed's best model is kept, and tested at the
+    end. Hyperparameters are in parkenv/studies/training/configs.py.
 
     With --resume, trainings continue from the checkpoints in --out; the models equal those of an uninterrupted
     training. With more --steps, finished trainings continue, too.
@@ -42,30 +36,20 @@ class Train(StudyCommand):
         parkenv train ppo --scenario my_lot.toml --steps 200000 --trainings 1
         parkenv train maskable-ppo --scenario lots --held-out 0.2 --curriculum size
         parkenv train ppo --clone mdp-tuned --test-on street,jam --out cloned
-        parkenv train network --scenario my-lots --evaluate-on other-lots
         parkenv train ppo --beside results/maskable-ppo,results/dqn
-        parkenv train --env fleet --arrivals-per-hour 120 --trainings 3
-        parkenv train sac --env drive --scenario campus,street --trainings 3
         parkenv compare --agents mdp,ppo:results/ppo/seed_0/model.safetensors
         """
 
-    study: TrainingSpec
+    study: TrainingSpec = TrainingSpec()
     out: Path | None = option(
-        None,
-        "Folder for models, curves and figures.",
-        short="-o",
-        default="results/ALGORITHM, results/drive-ALGORITHM, results/fleet-ALGORITHM",
+        None, "Folder for models, curves and figures.", short="-o", default="results/ALGORITHM"
     )
 
     @classmethod
     def of(cls, given: Given) -> Self:
-        """See `Command`; what is given chooses the kind of training."""
-        inner = {option.name for option in field_options(TrainingSpec)}
-        study = made(TrainingSpec, {name: value for name, value in given.items() if name in inner})
-        if "--day-error" in given and study.scenarios is None:
-            raise InputError("--day-error requires --scenario or --lot")
-        base = cls(study=study, out=Path("results") / study.training.folder)
-        return made(cls, {name: value for name, value in given.items() if name not in inner}, base)
+        """See `Command`; with --resume the options are those of the training, which may have more steps."""
+        command = made(cls, given)
+        return command if command.out else command.changed(out=Path("results") / command.study.algorithm)
 
     def show(self, console: Console, result: Result) -> None:
         """Print the tests of the models and of the planners."""

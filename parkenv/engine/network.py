@@ -7,14 +7,12 @@ from collections.abc import Sequence
 from functools import partial
 from itertools import pairwise
 from typing import Any
-from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.compiled.memory import (
     ADDRESS,
-    address_of,
     float32_array,
     float32s,
     float64_array,
@@ -94,14 +92,6 @@ def decide_by_network(address: int, number: int) -> int:
     width = FIRST_NEAR + PER_NEAR * surroundings_at(network.surroundings, 0).k
     observe_surroundings(search, around, float32_array(network.local, (width,)))
     return int(_choose(network, search, _logits(network, search)))
-
-
-@kernel
-def observe_locally(address: int, number: int, local: NDArray[np.float32]) -> None:
-    """Write the `local` observation of a car whose kind is driven by a network; call once at each of its decisions."""
-    car = car_of(address, number)
-    network = network_at(policy_data(address, car), 0)
-    observe_surroundings(search_of(car.search), _surroundings_of(network), local)
 
 
 @inlined
@@ -192,8 +182,6 @@ def _choose(network: Any, search: Any, logits_at: int) -> int:
 class NetworkPolicy(CompiledPolicy):
     """A policy network, a multilayer perceptron on the `local` observation, as a compiled policy of a fleet.
 
-    Several fleets may share one; its weights may change at any time.
-
     Args:
         layers: weights and biases from the inputs, `action_mask` and `local`, to logits, or values, of the actions.
         k: number of slots in the observation.
@@ -217,16 +205,7 @@ class NetworkPolicy(CompiledPolicy):
         name: str = "network",
     ) -> None:
         super().__init__(name, decide_by_network)
-        self._data: WeakSet[PolicyData] = WeakSet()
-        self.k, self.sampled = k, sampled
-        self.set_layers(layers, activation=activation, masked=masked)
-
-    def set_layers(self, layers: Sequence[Layer], *, activation: str = "tanh", masked: bool = True) -> None:
-        """Replace the network, in all fleets that use this policy.
-
-        Raises:
-            InputError: layers that do not fit.
-        """
+        self.k = k
         if activation not in ACTIVATIONS:
             raise InputError(f"activation is {activation!r}, want one of {', '.join(ACTIVATIONS)}")
         shapes = [weights.shape for weights, _ in layers]
@@ -237,18 +216,22 @@ class NetworkPolicy(CompiledPolicy):
             raise InputError(
                 f"layers have shapes {shapes}, want a chain from {wanted} numbers to {N_ACTIONS}"
             )
-        self.layers, self.activation, self.masked = list(layers), activation, masked
         flat = [part for weights, biases in layers for part in (weights.T.ravel(), biases)]
         self._arrays: dict[str, NDArray[Any]] = {
             "widths": np.array(widths, np.int64),
             "weights": np.concatenate(flat).astype(np.float32),
             "values": np.zeros(2 * max(widths), np.float32),
         }
-        for data in self._data:
-            self._write(data.record)
+        self._numbers = {
+            "n_layers": len(layers), "widest": max(widths), "activation": ACTIVATIONS.index(activation),
+            "masked": masked, "sampled": sampled,
+        }  # fmt: skip
+        self._arguments = partial(
+            type(self), layers, k, activation=activation, masked=masked, sampled=sampled
+        )
 
     def data_for(self, problems: Sequence[SearchProblem]) -> PolicyData:
-        """Return a NETWORK record for a fleet, which follows `set_layers`."""
+        """Return a NETWORK record for a fleet."""
         around = Surroundings.of(problems, self.k)
         arrays = {name: np.ascontiguousarray(array) for name, array in around._asdict().items()}
         numbers = {
@@ -262,19 +245,10 @@ class NetworkPolicy(CompiledPolicy):
             PolicyData(SURROUNDINGS, numbers, arrays),
             np.zeros(FIRST_NEAR + PER_NEAR * self.k, np.float32),
         )
-        data = PolicyData(NETWORK, {}, {"surroundings": its.record, "local": local}, its)
-        self._write(data.record)
-        self._data.add(data)
-        return data
-
-    def _write(self, record: NDArray[np.void]) -> None:
-        for name, array in self._arrays.items():
-            record[name] = address_of(array, array.dtype)
-        record["n_layers"], record["widest"] = len(self.layers), len(self._arrays["values"]) // 2
-        record["activation"] = ACTIVATIONS.index(self.activation)
-        record["masked"], record["sampled"] = self.masked, self.sampled
+        return PolicyData(
+            NETWORK, self._numbers, {**self._arrays, "surroundings": its.record, "local": local}, its
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle the network; records hold addresses of this process."""
-        options = {name: getattr(self, name) for name in ("activation", "masked", "sampled", "name")}
-        return partial(type(self), **options), (self.layers, self.k)
+        return partial(self._arguments, name=self.name), ()

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from numpy.typing import NDArray
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvIndices
 
 from parkenv.envs.search_vector import ParkSearchVectorEnv
@@ -171,13 +170,3 @@ class SearchVecEnv(BatchVecEnv):
             num_envs, scenario, observation, k, max_episode_steps, AutoresetMode.SAME_STEP
         )
         super().__init__(batch, reward_scale)
-
-
-class ShareNetwork(BaseCallback):  # type: ignore[misc]
-    """Callback for `learn`: before each rollout, hand the policy's weights to the other cars of a `FleetVectorEnv`."""
-
-    def _on_rollout_start(self) -> None:
-        self.training_env.env_method("follow", self.model.policy)
-
-    def _on_step(self) -> bool:
-        return True

@@ -138,11 +138,6 @@ class Spec(BaseModel):
         path = Path(path)
         return cls.parse(read_tables(path), str(path), path.parent).of_file(path)
 
-    @classmethod
-    def variants(cls) -> tuple[type[Spec], ...]:
-        """Return the classes that `parse` chooses from by the content; none if it is this one."""
-        return ()
-
     def of_file(self, path: str | Path) -> Self:
         """Remember the file that the specification was read from, for messages."""
         self._file = str(path)

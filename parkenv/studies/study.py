@@ -10,9 +10,7 @@ from __future__ import annotations
 import itertools
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import reduce
 from importlib import import_module
-from operator import or_
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -267,16 +265,11 @@ def study_class(kind: object, source: str = "") -> type[Any]:
 
 def schemas() -> dict[str, dict[str, Any]]:
     """Return the JSON schema of each kind of file, made from the class that validates it."""
-    from pydantic import TypeAdapter
-
     from parkenv.scenarios.spec import ScenarioSpec
 
     models: dict[str, Any] = {"scenario": ScenarioSpec} | {kind: study_class(kind) for kind in STUDIES}
     draft = {"$schema": "https://json-schema.org/draft/2020-12/schema"}
-    return {
-        kind: draft | TypeAdapter(reduce(or_, model.variants() or (model,))).json_schema()
-        for kind, model in models.items()
-    }
+    return {kind: draft | model.model_json_schema() for kind, model in models.items()}
 
 
 def read_study(file: Path) -> Any:

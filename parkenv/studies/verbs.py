@@ -86,5 +86,5 @@ survey = _verb(
 train = _verb(
     TrainingSpec,
     "Train agents by reinforcement learning, one model per seed, and test them; the folder holds the models.",
-    "`env`, `algorithm`, `scenarios`, `steps`, `trainings`, `seed`",
+    "`algorithm`, `scenarios`, `steps`, `trainings`, `seed`",
 )

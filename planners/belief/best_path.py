@@ -196,62 +196,6 @@ def _best_path(
     )
 
 
-def action_values(
-    vertex: int,
-    following: IntArray,
-    failure_costs: FloatArray,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-    paths: PathBuffers,
-) -> FloatArray:
-    """Return the expected time, s, of driving to each of some neighbours next, (k,).
-
-    Of the paths of the thesis's planner at several failure costs that begin with the edge, and of driving to a slot
-    that is known to be free, the best counts. No targets are inserted, so `best_path` may find better paths.
-
-    Args:
-        vertex: where the car is.
-        following: (k,) int64, neighbours of the vertex.
-        failure_costs: (m,) float64, s.
-        graph: the lot.
-        belief: the belief.
-        paths: buffers.
-    """
-    values: FloatArray = _action_values(vertex, following, failure_costs, graph, belief, paths)
-    return values
-
-
-@compiled(error_model="numpy")
-def _action_values(
-    vertex: int,
-    following: IntArray,
-    failure_costs: FloatArray,
-    graph: PlanningGraph,
-    belief: BeliefSnapshot,
-    paths: PathBuffers,
-) -> FloatArray:
-    values, path = np.full(len(following), np.inf), _path_at(0, paths)
-    search_s, no_options, no_fallback_s = np.inf, np.empty(0, np.int64), np.zeros(len(belief.slots))
-    for cost in failure_costs:
-        n_stops, left_s = rollout_path(vertex, no_options, -1, cost, graph, belief, path)
-        found = _evaluate(vertex, n_stops, left_s, np.inf, no_options, no_fallback_s, graph, belief, path)
-        search_s = min(search_s, found.onward_s)
-    options, fallback_s = _options_and_fallbacks(vertex, search_s, graph, belief)
-    for i in range(len(following)):
-        move_s, target = graph.drive_s[vertex, following[i]], following[i : i + 1]
-        for s in options:
-            value = expected_cost_to_slot(
-                following[i], s, belief.slots[s].p_free, move_s, fallback_s[s], graph, belief
-            )
-            values[i] = min(values[i], move_s + value)
-        for cost in failure_costs:
-            n_stops, left_s = rollout_path(vertex, target, -1, cost, graph, belief, path)
-            found = _evaluate(vertex, n_stops, left_s, np.inf, options, fallback_s, graph, belief, path)
-            if found.next_vertex == following[i]:
-                values[i] = min(values[i], found.onward_s)
-    return values
-
-
 class Plans(NamedTuple):
     """Paths of the thesis's planner at several failure costs, rolled out into buffers of their own."""
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,9 +14,9 @@ from numpy.typing import NDArray
 from parkenv.compiled.arrays import FloatArray
 from parkenv.driving.encounters import encounter_times
 from parkenv.driving.vehicle import VehicleParameters
+from parkenv.errors import InputError
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path, why_no_path
-from planners.driving.map_agent import MapAgent, Observation
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
 MOST_PLANS = 12
@@ -29,6 +30,7 @@ PATIENCE_S = 3.0
 _CONTROL_S = 0.1
 _NOWHERE = 999.0  # m; unused rows of the obstacle map are farther away
 _STANDS = 0.01
+Observation = Mapping[str, Any]
 _Task = tuple[VehicleParameters, FloatArray, NDArray[np.int64], FloatArray, FloatArray]
 
 
@@ -53,7 +55,7 @@ class ParkingMemory:
     waited_s: float = 0.0
 
 
-class ParkingAgent(MapAgent):
+class ParkingAgent:
     """Parks in `parkenv/Drive-v1` with hybrid A*, Reeds-Shepp shots and a tracking controller.
 
     The agent knows the car and the observation: the poses of car and slot and, with `obstacle_map=True`, the outlines
@@ -77,10 +79,51 @@ class ParkingAgent(MapAgent):
         self.search = search or SearchSettings()
         self.tracking = tracking or TrackingSettings()
 
-    def _decide_all(
-        self, observation: Observation, memories: list[Any], start: Any, deterministic: bool
-    ) -> tuple[NDArray[np.float32], list[ParkingMemory]]:
+    def predict(
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: NDArray[np.bool_] | Sequence[bool] | None = None,
+        deterministic: bool = True,
+    ) -> tuple[NDArray[np.float32], Any]:
+        """Decide on single observations, or on batches with a leading axis (stable-baselines3's interface).
+
+        Args:
+            observation: from `parkenv/Drive-v1` with `obstacle_map=True`, or a vector of them.
+            state: returned by the previous call; None at the start.
+            episode_start: for each environment, whether its episode has just begun. With None, episodes begin where
+                `state` is None.
+            deterministic: for the interface; a planner always is.
+
+        Returns:
+            The action, (2,) or (n_envs, 2) float32, and the state for the next call.
+
+        Raises:
+            InputError: an observation without the obstacle map, or of another vehicle than the agent's.
+        """
         del deterministic
+        self.require_map(observation)
+        if np.ndim(observation["achieved_goal"]) == 1:
+            start = None if episode_start is None else [bool(np.any(episode_start))]
+            several = {key: np.asarray(values)[None] for key, values in observation.items()}
+            actions, memories = self._decide_all(several, [state], start)
+            return actions[0], memories[0]
+        before = [None] * len(observation["achieved_goal"]) if state is None else list(state)
+        return self._decide_all(observation, before, episode_start)
+
+    def require_map(self, observation: Observation) -> None:
+        """Raise an `InputError` unless observations have the obstacle map and are of the agent's own vehicle."""
+        for key in ("cars", "lines", "vehicle"):
+            if key not in observation:
+                raise InputError(
+                    f"the observation has no {key!r}: make the environment with obstacle_map=True"
+                )
+        self.vehicle.require_same(observation["vehicle"], f"agent {self.name!r}")
+
+    def _decide_all(
+        self, observation: Observation, memories: list[Any], start: Any
+    ) -> tuple[NDArray[np.float32], list[ParkingMemory]]:
+        """Return the actions, (n, 2) float32, and the memories; a memory is None where an episode begins."""
         actions = np.empty((len(memories), 2), dtype=np.float32)
         for i in range(len(memories)):
             if memories[i] is None or (start is not None and start[i]):

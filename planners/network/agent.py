@@ -77,7 +77,7 @@ class NetworkAgent(BeliefAgent):
 
     Args:
         problem: lot, goal, speeds and costs.
-        weights: file of `parkenv train network`, or its content; by default the packaged weights.
+        weights: a file of weights, or its content; by default the packaged weights.
         most_vertices: a larger lot is searched in parts (`Neighborhoods`).
 
     Raises:

@@ -25,22 +25,9 @@ from planners.model_header import CARD_KEY, read_header
 from planners.network.features import (
     ACTION_COUNT,
     ACTION_FEATURES,
-    BEST_KNOWN_FREE,
     CANDIDATES,
-    DAY_SHIFT,
-    DAY_SPREAD,
-    EXPECTED_REGRET,
-    IS_RETURN,
     IS_SLOT,
-    KNOWN_FREE,
-    KNOWN_FREE_REGRET,
-    LAST_OBSERVED,
-    LAST_VISIT,
     LOOKAHEAD,
-    P_FREE_SPREAD,
-    PATHS,
-    SITUATION,
-    SLOT_SHIFT,
     TOKEN_FEATURES,
     Features,
 )
@@ -50,7 +37,6 @@ SHIPPED = Path(__file__).with_name("models") / "network.safetensors"
 _MAX_BYTES, _MAX_WEIGHT = 8_000_000, 1e4
 
 LAYERS = "token_1", "token_2", "attention", "action_1", "action_2", "score_1", "score_2"
-Part = Literal["lookahead", "tokens", "day", "memory"]
 
 
 class NetworkCard(Spec):
@@ -60,7 +46,6 @@ class NetworkCard(Spec):
     observation: Literal["network-1"] = "network-1"
     width: Annotated[int, Field(ge=1, le=256)] = Field(64, description="Units of a layer.")
     token_width: Annotated[int, Field(ge=1, le=256)] = Field(48, description="Units of a layer over tokens.")
-    without: Several[Part] = Field((), description="Parts left out, for comparisons.")
     trained_on: Several[str] = Field((), description="Places that it was trained on.")
     seed: int | None = Field(None, description="Of the training.")
     decisions: int = Field(0, ge=0, description="Decisions that it was trained on.")
@@ -78,21 +63,6 @@ class NetworkCard(Spec):
         return {f"{name}.weight": shape for name, shape in layers.items()} | {
             f"{name}.bias": shape[1:] for name, shape in layers.items()
         }
-
-
-def feature_masks(without: tuple[Part, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return factors of the features of actions, (ACTION_FEATURES,), and of tokens: 0 for parts left out."""
-    actions, tokens = np.ones(ACTION_FEATURES, np.float32), np.ones(TOKEN_FEATURES, np.float32)
-    if "lookahead" in without:
-        actions[[LOOKAHEAD, KNOWN_FREE, KNOWN_FREE_REGRET, BEST_KNOWN_FREE]] = 0.0
-        actions[PATHS:SITUATION] = tokens[EXPECTED_REGRET] = 0.0
-    if "tokens" in without:
-        tokens[:] = 0.0
-    if "day" in without:
-        actions[[DAY_SHIFT, DAY_SPREAD]] = tokens[[P_FREE_SPREAD, SLOT_SHIFT]] = 0.0
-    if "memory" in without:
-        actions[[IS_RETURN, LAST_VISIT]] = tokens[LAST_OBSERVED] = 0.0
-    return actions, tokens
 
 
 class Layer(NamedTuple):
@@ -118,7 +88,7 @@ class NetworkPolicy(NamedTuple):
         data = read_bytes(Path(path), _MAX_BYTES)
         header = read_header(data, path)
         if header.card.get("format") != FORMAT:
-            raise InputError(f"{path}: has no card of a network; want a file of `parkenv train network`")
+            raise InputError(f"{path}: has no card of a network; want a file of weights of `network`")
         card = NetworkCard.parse(header.card, f"{path}: card")
         weights = {}
         for name, shape in card.shapes().items():
@@ -149,9 +119,6 @@ class NetworkPolicy(NamedTuple):
             features: the observation of a decision, or of many: arrays with further axes before theirs.
         """
         own, tokens = features.actions, features.tokens
-        if without := self.card.without:
-            of_actions, of_tokens = feature_masks(without)
-            own, tokens = own * of_actions, tokens * of_tokens
         shape = features.allowed.shape
         scores = np.empty((int(np.prod(shape[:-1])), ACTION_COUNT), np.float32)
         _score(
@@ -159,7 +126,6 @@ class NetworkPolicy(NamedTuple):
             tokens.reshape(-1, *tokens.shape[-3:]),
             features.allowed.reshape(-1, ACTION_COUNT),
             tuple(Layer(self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]) for name in LAYERS),
-            "lookahead" not in without,
             scores,
         )
         return scores.reshape(shape)
@@ -191,10 +157,9 @@ def _score(
     tokens: Float32Array,
     allowed: NDArray[np.bool_],
     layers: tuple[Layer, ...],
-    ahead: bool,
     scores: Float32Array,
 ) -> None:
-    """Write the scores, (n, 6), of n decisions; with `ahead`, the look-ahead's regret is subtracted."""
+    """Write the scores, (n, 6), of n decisions: outputs of the network minus the look-ahead's regret."""
     token_1, token_2, attention, action_1, action_2, score_1, score_2 = layers
     n_own, t, w = actions.shape[2], len(token_1.bias), len(action_1.bias)
     hidden = np.empty((CANDIDATES, t), np.float32)
@@ -234,8 +199,7 @@ def _score(
                 of_all[:w] = of_action[a]
                 _rectified(of_all, score_1, between[:w])
                 _linear(between[:w], score_2, scores[i, a : a + 1])
-                if ahead:
-                    scores[i, a] -= actions[i, a, LOOKAHEAD]
+                scores[i, a] -= actions[i, a, LOOKAHEAD]
 
 
 def _offsets(

@@ -6,12 +6,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.ticker import FuncFormatter, PercentFormatter
+from matplotlib.ticker import FuncFormatter
 
-from parkenv.show.columns import columns_of
 from parkenv.show.figures.picture_files import INK, picture
 from parkenv.show.figures.times import spread
 
@@ -41,7 +39,7 @@ def save_learning_curves(
 
     Args:
         curves: rows of `curve.csv` by algorithm and seed.
-        means: their means over seeds: steps, `total_s` and its `columns_of`.
+        means: their means over seeds: steps, `total_s`, `low_s`, `high_s` and `median_s`.
         planners: mean total time, s, of each planner in the same worlds.
         title: title of the figure.
         path: the PNG file to write.
@@ -56,7 +54,7 @@ def save_learning_curves(
         axes = figure.subplots()
         highest = 0.0
         for (name, its), color in zip(curves.items(), COLORS, strict=False):
-            drawn = _draw(axes, name, its, means[name], "total_s", color, alone=len(curves) == 1)
+            drawn = _draw(axes, name, its, means[name], color, alone=len(curves) == 1)
             highest = max([highest, *drawn[len(drawn) // 10 :]])
         low = min([*planners.values(), *(r["total_s"] for its in curves.values() for c in its for r in c)])
         # An untrained policy drives in circles, so cut off high values to keep the end of the curves readable.
@@ -76,59 +74,24 @@ def save_learning_curves(
             figure.legend(loc="outside lower left", ncols=2, frameon=False)
 
 
-def save_success_curves(
-    curves: Mapping[str, Curves],
-    means: Mapping[str, Mapping[str, Evaluations]],
-    planner: Mapping[str, float],
-    title: str,
-    path: Path,
-) -> None:
-    """Draw the success rates of algorithms and of the planner, one panel per kind of slot.
-
-    As in `save_learning_curves`, a single algorithm is drawn as the mean over seeds, several as medians.
-
-    Args:
-        curves: rows of `curve.csv` by algorithm and seed; see `DriveTraining.evaluate`.
-        means: their means over seeds by algorithm and kind of slot, as in `save_learning_curves`.
-        planner: success rate of the planner in the same tasks, by kind; empty to draw none.
-        title: title of the figure.
-        path: the PNG file to write.
-    """
-    kinds = list(next(iter(means.values())))
-    with picture(path, (2.4 + 2.8 * len(kinds), 3.4)) as figure:
-        panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
-        for axes, kind in zip(panels, kinds, strict=True):
-            for (name, its), color in zip(curves.items(), COLORS, strict=False):
-                _draw(axes, name, its, means[name][kind], f"{kind}_success", color, alone=len(curves) == 1)
-            if kind in planner:
-                share = planner[kind]
-                axes.axhline(share, color=INK, lw=0.8, ls=(0, (4, 3)), zorder=1)
-                axes.annotate(
-                    f"planner {share:.0%}", (0.0, share), xycoords=("axes fraction", "data"), xytext=(4, 3),
-                    textcoords="offset points", fontsize=8, color=INK,
-                )  # fmt: skip
-            axes.set(title=kind, xlabel="decisions in training", ylim=(-0.03, 1.1))
-            axes.set_yticks(np.linspace(0.0, 1.0, 6))
-            axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-        panels[0].set_ylabel("success rate")
-        panels[-1].legend(
-            loc="lower right", frameon=True, facecolor="white", edgecolor="none", framealpha=0.8
-        )
-        figure.suptitle(title, x=0.01, ha="left", fontsize=9.0)
-
-
 def _draw(
-    axes: Axes, name: str, curves: Curves, rows: Evaluations, measure: str, color: str, *, alone: bool
+    axes: Axes, name: str, curves: Curves, rows: Evaluations, color: str, *, alone: bool
 ) -> Sequence[float]:
     """Draw the mean over seeds with its interval, or the median, and single seeds as thin lines; return the line."""
-    low, high, median = columns_of(measure)
-    steps, line = [row["steps"] for row in rows], [row[measure if alone else median] for row in rows]
+    steps, line = [row["steps"] for row in rows], [row["total_s" if alone else "median_s"] for row in rows]
     words = f"{len(curves)} seeds" if alone or len(curves) == 1 else f"median of {len(curves)} seeds"
     for single in curves:
-        axes.plot([r["steps"] for r in single], [r[measure] for r in single], color=color, lw=0.5, alpha=0.35)
+        axes.plot(
+            [r["steps"] for r in single], [r["total_s"] for r in single], color=color, lw=0.5, alpha=0.35
+        )
     if alone and len(curves) > 1:
         axes.fill_between(
-            steps, [row[low] for row in rows], [row[high] for row in rows], color=color, alpha=0.2, lw=0
+            steps,
+            [row["low_s"] for row in rows],
+            [row["high_s"] for row in rows],
+            color=color,
+            alpha=0.2,
+            lw=0,
         )
     axes.plot(steps, line, color=color, lw=2.0, label=f"{name}, {words}")
     axes.set_xlim(left=0.0)

@@ -21,19 +21,19 @@ function spread(positions, apart) {
   return placed;
 }
 
-function learningPanel({ title, share, mean, seeds, beside, lines }, width) {
+function learningPanel({ title, mean, seeds, beside, lines }, width) {
   const [height, left, right, top, bottom] = [340, 46, 150, 10, 34];
   const others = beside.map(([name, points], i) => ({ name, points, color: BESIDE[i % BESIDE.length] }));
   const curves = [...seeds, ...others.map(({ points }) => points)].flat();
   const steps = Math.max(...mean.map((point) => point[0]), ...curves.map((point) => point[0]), 1);
   const all = [...mean.map((point) => point[1]), ...curves.map((point) => point[1]), ...lines.map((line) => line[1])].filter((value) => value !== null);
-  let [low, high] = [share ? 0 : Math.min(...all), share ? 1 : Math.max(...all)];
-  if (!share) high = Math.min(high, OFF_CHART * low);
-  const margin = share ? 0.02 : 0.06 * (high - low);
-  [low, high] = [low - margin * (share ? 0 : 1), high + margin];
+  let [low, high] = [Math.min(...all), Math.max(...all)];
+  high = Math.min(high, OFF_CHART * low);
+  const margin = 0.06 * (high - low);
+  [low, high] = [low - margin, high + margin];
   const x = (value) => left + (value / steps) * (width - left - right);
   const y = (value) => top + ((high - value) / (high - low)) * (height - top - bottom);
-  const svg = makeSvg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}: ${lines.map((line) => `${line[0]} ${written(line[1], share ? 2 : 1)}`).join(", ")}; trained ${written(mean[mean.length - 1][1], share ? 2 : 1)}` });
+  const svg = makeSvg("svg", { viewBox: `0 0 ${width} ${height}`, role: "img", "aria-label": `${title}: ${lines.map((line) => `${line[0]} ${written(line[1], 1)}`).join(", ")}; trained ${written(mean[mean.length - 1][1], 1)}` });
   const text = (content, attributes) => {
     const element = makeSvg("text", attributes);
     element.textContent = content;
@@ -42,7 +42,7 @@ function learningPanel({ title, share, mean, seeds, beside, lines }, width) {
   const gap = tickStep(high - low, 5);
   for (let tick = Math.ceil(low / gap) * gap; tick <= high; tick += gap) {
     svg.append(makeSvg("line", { class: "axis", x1: left, x2: width - right, y1: y(tick), y2: y(tick) }));
-    text(share ? `${Math.round(100 * tick)} %` : `${Math.round(tick)}${tick + gap > high ? " s" : ""}`, { x: left - 8, y: y(tick) + 4, "text-anchor": "end" });
+    text(`${Math.round(tick)}${tick + gap > high ? " s" : ""}`, { x: left - 8, y: y(tick) + 4, "text-anchor": "end" });
   }
   const along = tickStep(steps, 4);
   for (let tick = 0; tick <= steps; tick += along) {
@@ -66,7 +66,7 @@ function learningPanel({ title, share, mean, seeds, beside, lines }, width) {
   labels.forEach(({ name, value, strong, color }, i) => {
     if (!strong && !color) svg.append(makeSvg("line", { class: "bound", x1: left, x2: width - right, y1: y(value), y2: y(value) }));
     svg.append(makeSvg("path", { d: `M${width - right + 2} ${y(value)}L${width - right + 12} ${heights[i]}`, style: "fill: none; stroke: var(--faint); stroke-width: 0.8" }));
-    text(`${name ? `${name}  ` : ""}${share ? `${written(100 * value, 0)} %` : written(value, 1)}`, { x: width - right + 16, y: heights[i] + 4, class: strong ? "lead" : "strong", style: color ? `fill: ${color}` : "" });
+    text(`${name ? `${name}  ` : ""}${written(value, 1)}`, { x: width - right + 16, y: heights[i] + 4, class: strong ? "lead" : "strong", style: color ? `fill: ${color}` : "" });
   });
   return svg;
 }

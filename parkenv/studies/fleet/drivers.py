@@ -1,4 +1,4 @@
-"""Agents that drive the cars of a fleet, and fleets in which some cars have another driver than the rest."""
+"""Agents that drive the cars of a fleet, and its demand."""
 
 from __future__ import annotations
 
@@ -6,21 +6,15 @@ import signal
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
-from functools import partial
 from types import FrameType
 from typing import Any
 
-from parkenv.engine.fleet import DriverKind, Fleet
+from parkenv.engine.network import Layer, NetworkPolicy
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.setting import COUNTED, GIVEN, times_demanded
-from parkenv.studies.fleet.tables import day_means
 from parkenv.studies.interruption import unsafe_to_raise
-from parkenv.studies.results import Row
-from parkenv.studies.statistics import mean_or_nan
-from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
@@ -63,13 +57,52 @@ def policy_of(
     if isinstance(agent, ClairvoyantAgent):
         raise InputError(f"agent {spec.label!r} knows the future of single searches, and drives no fleet")
     if isinstance(agent, LearnedAgent) and agent.card.algorithm not in _WITHOUT_NETWORK_POLICY:
-        from parkenv.envs.fleet_vector import network_policy
-
         sampled = agent.card.algorithm != "dqn"
         return network_policy(agent.model, agent.local_k, sampled=sampled, name=spec.label), None
     if isinstance(agent, LearnedAgent) or not scenario.has_rules:
         return None, agent  # learned agents observe costs themselves
     return None, AgentsByStay(spec, scenario, known)
+
+
+def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> NetworkPolicy:
+    """Return a policy of stable-baselines3 or sb3-contrib as a compiled driver of a fleet.
+
+    Args:
+        policy: of PPO, MaskablePPO or DQN on the `local` observation.
+        k: number of slots in the observation.
+        sampled: whether to draw actions from the policy, instead of taking the most probable one.
+        name: for tables.
+
+    Raises:
+        InputError: a policy that is no multilayer perceptron.
+    """
+    layers, activation, masked = _layers_of(policy)
+    return NetworkPolicy(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
+
+
+def _layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
+    """Return the layers of a policy network, their activation, and whether actions are masked.
+
+    Raises:
+        InputError: a policy that is no multilayer perceptron with one of the activations of `NetworkPolicy`.
+    """
+    from torch import nn
+
+    if hasattr(policy, "q_net"):
+        parts = list(policy.q_net.q_net)
+    elif hasattr(policy, "mlp_extractor") and not hasattr(policy, "lstm_actor"):
+        parts = [*policy.mlp_extractor.policy_net, policy.action_net]
+    else:
+        parts = []
+    linear = [part for part in parts if isinstance(part, nn.Linear)]
+    others = {type(part).__name__.lower() for part in parts if not isinstance(part, nn.Linear)}
+    if not linear or len(others) > 1 or not others <= {"tanh", "relu"}:
+        raise InputError(
+            f"policy is a {type(policy).__name__} with {', '.join(sorted(others)) or 'no layers'}, want a multilayer "
+            "perceptron of PPO, MaskablePPO or DQN with tanh or relu"
+        )
+    layers = [(part.weight.detach().cpu().numpy(), part.bias.detach().cpu().numpy()) for part in linear]
+    return layers, others.pop() if others else "tanh", type(policy).__name__.startswith("Maskable")
 
 
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
@@ -142,67 +175,6 @@ def demand_in(
     entries = weights_of_all(scenario.lot.entry_weights) if scenario.entry is None else ()
     goals = weights_of_all(scenario.lot.goal_weights)
     return Demand(arrivals, stay, ConstantTime(patience_s), entry_weights=entries, goal_weights=goals)
-
-
-@dataclass(frozen=True)
-class MixedFleet:
-    """A lot and a demand in which a share of the cars, the *members*, has one driver, and the others have another.
-
-    Args:
-        scenario: lot, residents, speeds and costs.
-        demand: when cars arrive, how long they stay and search.
-        knows: what members know, see `DriverKind`; the others know their own observations.
-        share: share of the members.
-        among: agent that drives the others; None if all are members.
-        max_steps: limit of a car's decisions.
-    """
-
-    scenario: Scenario
-    demand: Demand | TownDemand
-    knows: str = "own"
-    share: float = 1.0
-    among: AgentSpec | None = None
-    max_steps: int = 2000
-
-    @property
-    def name(self) -> str:
-        """The fleet in a table: `every car`, or `0.1 among greedy-drive`."""
-        return "every car" if self.among is None else f"{self.share:g} among {self.among.label}"
-
-    def run_day(self, member: AgentSpec | CompiledPolicy, seed: int, day: int) -> Row:
-        """Run a day; return mean times, s, of members and others, and the fraction of the members that parked."""
-        policy, agent = (
-            (member, None) if isinstance(member, CompiledPolicy) else policy_of(member, self.scenario)
-        )
-        kinds, agents = [DriverKind(self.share, policy, self.knows, shares=self.knows == "shared")], [agent]
-        if self.among is not None:
-            other_policy, other = policy_of(self.among, self.scenario)
-            kinds.append(DriverKind(1.0 - self.share, other_policy))
-            agents.append(other)
-        fleet = Fleet(
-            self.scenario, self.demand, drivers=kinds, max_steps=self.max_steps, leave_full_lot=False
-        )
-        fleet.reset(seed, day)
-        fleet.run(agents)
-        cars, members = fleet.cars, fleet.cars["kind"] == 0
-        return {
-            "cars": int(members.sum()),
-            "total_s": mean_or_nan(cars["total_s"][members]),
-            "search_s": mean_or_nan((cars["ended_at"] - cars["arrival"])[members]),
-            "parked_fraction": mean_or_nan((cars["slot"] >= 0)[members]),
-            "others_s": mean_or_nan(cars["total_s"][~members]),
-        }
-
-    def row(self, member: AgentSpec | CompiledPolicy, seed: int, days: int, workers: Workers = SERIAL) -> Row:
-        """Return means over days, with 95 % intervals; see `run_day`."""
-        tasks = [partial(self.run_day, member, seed, day) for day in range(days)]
-        done = list(workers.in_order(tasks))
-        with_interval = ("total_s", "search_s", "others_s")
-        return {
-            "days": days,
-            "cars": sum(day["cars"] for day in done),
-            **day_means(done, ("parked_fraction", *with_interval), with_interval),
-        }
 
 
 _RETRY_S = 0.05

@@ -46,7 +46,6 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
         "curve": _plain(curve),
         "numbers": _numbers(model),
         "parameters": model.get_parameters(),
-        "variables": {name: getattr(model, name).detach() for name in _variables(model)},
         "last": _tensors({name: getattr(model, name) for name in _LAST}),
         "memory": _tensors(getattr(model, "_last_lstm_states", None)),
         "buffer": None if buffer is None else _tensors(_transitions(buffer)),
@@ -115,8 +114,6 @@ def restore(state: Mapping[str, Any], model: Any) -> None:
         model.set_parameters(state["parameters"], device="cpu")
         if _options(model) != options:
             raise ValueError("the optimizers have other options")
-        for name in _variables(model):
-            getattr(model, name).data = state["variables"][name]
         _require_sound_weights(model)
         for name, value in _arrays(state["last"]).items():
             setattr(model, name, value)
@@ -200,11 +197,6 @@ def _numbers(model: Any) -> dict[str, Any]:
     }
 
 
-def _variables(model: Any) -> list[str]:
-    """Return the names of learned variables outside the networks, such as SAC's entropy coefficient."""
-    return [name for name in model._get_torch_save_params()[1] if getattr(model, name) is not None]
-
-
 def _transitions(buffer: Any) -> dict[str, Any]:
     """Return the transitions in a replay buffer and the position in it."""
     names = [
@@ -213,8 +205,7 @@ def _transitions(buffer: Any) -> dict[str, Any]:
         if name in ("pos", "full", "observations", "next_observations")
         or (isinstance(value, np.ndarray) and value.dtype != object)
     ]
-    # Hindsight experience replay keeps `info`, of which only contacts are used.
-    return {name: getattr(buffer, name) for name in names + ["contacts"] * hasattr(buffer, "contacts")}
+    return {name: getattr(buffer, name) for name in names}
 
 
 def _tensors(tree: Any) -> Any:

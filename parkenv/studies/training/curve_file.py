@@ -10,7 +10,6 @@ import numpy as np
 
 from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NAN, WHOLE, Kind, typed_records
-from parkenv.show.columns import columns_of
 
 CURVE = "curve.csv"
 
@@ -42,25 +41,22 @@ def require_columns(curve: list[Row], columns: Sequence[str], path: Path) -> lis
     return curve
 
 
-def across_seeds(curves: Sequence[Sequence[Row]], measure: str = "total_s") -> list[dict[str, float]]:
-    """Return the mean over seeds with its 95 % interval, and the median, at evaluations that all seeds have.
+def across_seeds(curves: Sequence[Sequence[Row]]) -> list[dict[str, float]]:
+    """Return mean, 95 % interval and median of `total_s` over seeds, at evaluations that all seeds have.
 
     Args:
         curves: rows of `curve.csv` of each seed.
-        measure: the column.
-
-    Returns:
-        Rows with steps, `measure` and its `columns_of`.
     """
     from parkenv.studies.statistics import mean_interval
 
-    low_name, high_name, median_name = columns_of(measure)
     rows = []
     for evaluations in zip(*curves, strict=False):
-        values = [row[measure] for row in evaluations]
+        values = [row["total_s"] for row in evaluations]
         mean, low, high = mean_interval(values)
-        row = {"steps": float(np.mean([row["steps"] for row in evaluations])), measure: mean}
-        rows.append(row | {low_name: low, high_name: high, median_name: float(np.median(values))})
+        rows.append({
+            "steps": float(np.mean([row["steps"] for row in evaluations])), "total_s": mean, "low_s": low,
+            "high_s": high, "median_s": float(np.median(values)),
+        })  # fmt: skip
     return rows
 
 

@@ -1,114 +1,141 @@
-"""What all kinds of training have: seeds of evaluations, checks, settings, and the report of the models."""
+"""Training of search agents with stable-baselines3: learn, evaluate in held-out worlds, test, compare with planners."""
 
 from __future__ import annotations
 
+import itertools
 import os
 import threading
-from abc import ABC, abstractmethod
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from importlib import import_module
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.utils import LinearSchedule
+
+from parkenv.envs.sb3 import SearchVecEnv
 from parkenv.errors import InputError
+from parkenv.files.csv_tables import write_csv
 from parkenv.files.spec_file import Several, Spec
-from parkenv.scenarios.spec import ScenarioSpec
+from parkenv.scenarios.build import build
+from parkenv.scenarios.selection import (
+    by_size,
+    lot_share,
+    open_scenarios,
+    require_different_names,
+    scenario_of_episode,
+    split_by_lot,
+)
 from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
+from parkenv.show.plurals import plural
+from parkenv.studies.agent_spec import AgentSpec
+from parkenv.studies.compare.cases import Case, rows_of
+from parkenv.studies.compare.search_replay import SearchReplay
 from parkenv.studies.fingerprints import fingerprints, flat_tables
 from parkenv.studies.report import Replay
 from parkenv.studies.results import SETTINGS, read_settings
+from parkenv.studies.statistics import mean_interval
 from parkenv.studies.study import Progress
-from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve
+from parkenv.studies.training.checkpoint import read_checkpoint, restore, save_checkpoint
+from parkenv.studies.training.cloning import Demonstrations, clone, require_cloneable
+from parkenv.studies.training.configs import MAX_STEPS, REWARD_SCALE, SEARCH_CONFIGS, TrainingConfig
+from parkenv.studies.training.curve_file import CURVE, Row, across_seeds, read_curve, require_columns
+from parkenv.studies.training.evaluation import episode_times, times_row
 from parkenv.studies.workers import Workers
+from parkenv.world.scenario import Scenario
+from planners.agent import make_agent
+from planners.learned import LearnedAgent
+from planners.model_file import algorithm_class, save_model
 
 if TYPE_CHECKING:
-    from parkenv.studies.agent_spec import AgentSpec
     from parkenv.studies.training.spec import TrainingSpec
 
-EVALUATION_SEED, TEST_SEED = 2_000_000, 3_000_000
-"""First world seeds of the evaluations during training, and of the final test."""
+EVALUATION_SEED, TEST_SEED, DEMONSTRATION_SEED = 2_000_000, 3_000_000, 5_000_000
+"""First world seeds of the evaluations during training, of the final test, and of the demonstrations."""
 TRAINING_SEEDS = 10_000_000
 """World seeds of training seed s start at (s + 1) times this, far from those of evaluations and benchmark suites."""
-MODEL, FIGURE = "model.safetensors", "learning_curve.png"
+EVALUATIONS, MOST_BETWEEN = 10, 100_000
+"""Number of evaluations, and decisions between two at most, if the specification does not say."""
+MODEL, FIGURE, CHECKPOINT = "model.safetensors", "learning_curve.png", "checkpoint.pt"
+METRICS = ("total_s", "low_s", "high_s", "parked_fraction")
+HELD_OUT = ("held_out_s", "held_out_low_s", "held_out_high_s", "held_out_parked_fraction")
+BESIDE_MODELS = 3
+"""Number of planners replayed beside a trained model."""
+EVALUATED_BY = ("scenario", "held_out", "evaluation_episodes")
+"""Settings that evaluations depend on: curves are comparable if these are equal."""
+PLANNERS = tuple(
+    AgentSpec(name=name)
+    for name in ("belief", "mdp-tuned", "mdp", "first-free", "greedy-drive", "greedy-goal")
+)
+"""Agents to compare with, if none are named."""
+PLANNERS_OF_PLACES = tuple(spec for spec in PLANNERS if spec.name not in ("mdp-tuned", "greedy-goal"))
+"""The same with held-out places: those that need no time on each lot."""
 _OUTSIDE = {
-    "kind", "jobs", "backend", "address", "trainings", "seed", "agents", "tensorboard", "scenarios", "held_out",
-    "evaluate_on", "test_on", "test_among", "beside",
+    "kind", "jobs", "backend", "address", "trainings", "seed", "steps", "agents", "tensorboard", "scenarios",
+    "held_out", "evaluate_on", "test_on", "beside",
 }  # fmt: skip
-"""Fields of a specification that do not change its trainings, or that `settings` gives in other words."""
+"""Fields of a specification that do not change its trainings, that `settings` gives in other words, or that a resumed
+training may change."""
 
 
-class Trained(NamedTuple):
-    """Trainings that have ended.
-
-    Attributes:
-        curves: rows of `curve.csv`, by training.
-        models: model files by seed.
-        beside: curves of other trainings, by name.
-    """
-
-    curves: list[list[Row]]
-    models: dict[int, Path]
-    beside: dict[str, list[list[Row]]]
-
-
-class Tested(NamedTuple):
-    """The test of one model.
-
-    Attributes:
-        scenario: what it was tested in, for its row of the summary.
-        own: columns of this row.
-        transfer: a row for each test.
-        places: a row for each place of tests that are in many.
-    """
-
-    scenario: str
-    own: Row
-    transfer: list[Row]
-    places: Sequence[Row] = ()
-
-
-class Training(ABC):
-    """A kind of training: what is trained, how it is evaluated, and the report of its models.
+class Training:
+    """Trainings of a search agent in one scenario or several; the score is the mean total time in held-out worlds.
 
     Args:
         spec: specification of the training.
-    """
 
-    evaluated_by: ClassVar[tuple[str, ...]]
-    """Settings that evaluations depend on: curves are comparable if these are equal."""
-    command: tuple[str, ...] = ()
-    """Command line, for the model's card."""
-    shared: Any = None
-    """What the trainings with all seeds share; made by `begin`."""
+    Attributes:
+        command: command line, for the model's card.
+        shared: demonstrations to clone before training; made by `begin`.
+    """
 
     def __init__(self, spec: TrainingSpec) -> None:
         self.spec = spec
-        self.algorithm = spec.algorithm
-        self.scenarios = spec.scenarios or ()
-        self.evaluation_episodes = spec.evaluation_episodes
-        self.evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + self.evaluation_episodes)
-        self.test_seeds = range(TEST_SEED, TEST_SEED + 2 * self.evaluation_episodes)
+        self.evaluation_seeds = range(EVALUATION_SEED, EVALUATION_SEED + spec.evaluation_episodes)
+        self.test_seeds = range(TEST_SEED, TEST_SEED + 2 * spec.evaluation_episodes)
+        self.command: tuple[str, ...] = ()
+        self.shared: Demonstrations | None = None
 
     @property
-    def folder(self) -> str:
-        """Default name of the output folder."""
-        return self.algorithm if self.spec.env == "search" else f"{self.spec.env}-{self.algorithm}"
+    def holds_out(self) -> bool:
+        """Whether evaluations are also in places that are not trained in."""
+        return self.spec.held_out is not None or self.spec.evaluate_on is not None
 
     @property
-    @abstractmethod
-    def steps(self) -> int:
-        """Decisions of a training."""
+    def compared(self) -> tuple[AgentSpec, ...]:
+        """Agents to compare with."""
+        usual = PLANNERS_OF_PLACES if self.holds_out else PLANNERS
+        return usual if self.spec.agents is None else self.spec.agents
+
+    @cached_property
+    def sides(self) -> tuple[Sequence[Scenario], Sequence[Scenario]]:
+        """Scenarios to train in, and places to evaluate in and not to train in."""
+        given = [build(scenario) for scenario in self.spec.scenarios]
+        if self.spec.held_out is not None:
+            sides = split_by_lot(given, self.spec.held_out)
+        else:
+            sides = given, [build(scenario) for scenario in self.spec.evaluate_on or ()]
+        require_apart(*sides)
+        return sides
+
+    @cached_property
+    def tests(self) -> dict[str, Sequence[Scenario]]:
+        """The tests in the end, by name: each is in one scenario, or in many of which every search draws one."""
+        learned, held_out = self.sides
+        if self.spec.test_on is None and self.holds_out:
+            return {f"{_places(learned)} trained on": learned, f"{_places(held_out)} held out": held_out}
+        tested = learned if self.spec.test_on is None else [build(one) for one in self.spec.test_on]
+        return {scenario.name: [scenario] for scenario in tested}
 
     @property
-    def given_scenarios(self) -> tuple[ScenarioSpec, ...]:
-        """All scenarios that are trained or evaluated on."""
-        return self.scenarios
-
-    @property
-    @abstractmethod
     def metrics(self) -> tuple[str, ...]:
-        """Names of the results of an evaluation; columns of `curve.csv`."""
+        """Mean total time, s, its 95 % interval, and the fraction of episodes that ended parked; also held out."""
+        return METRICS + (HELD_OUT if self.sides[1] else ())
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -116,14 +143,13 @@ class Training(ABC):
         return ("steps", *self.metrics, "wall_s")
 
     @property
-    @abstractmethod
-    def measures(self) -> tuple[str, ...]:
-        """Columns of `curve.csv` to draw."""
-
-    @property
     def announcement(self) -> str | None:
-        """What is said before the training begins."""
-        return None
+        """Which places are held out, if any."""
+        if not self.holds_out:
+            return None
+        learned, held_out = self.sides
+        names = ", ".join(scenario.name for scenario in held_out)
+        return f"Trained on {_places(learned)}, and evaluated on {_places(held_out)} held out: {names}"
 
     def check(self) -> None:
         """Check, before training, that everything can be trained, tested and drawn.
@@ -131,22 +157,35 @@ class Training(ABC):
         Raises:
             InputError: an invalid option, or a missing package.
         """
-        from planners.model_file import algorithm_class
-
-        algorithm_class(self.algorithm)
+        algorithm_class(self.spec.algorithm)
+        learned = self.sides[0]
+        if self.spec.clone is not None:
+            require_cloneable(self.spec.algorithm, self.spec.clone, learned[0])
+        for world in (learned[0], *(places[0] for places in self.tests.values())):
+            for agent in self.compared:
+                make_agent(agent.name, world, **agent.options)
 
     def settings(self) -> Row:
         """Return the settings that a resumed training must share with this one."""
-        given = self.given_scenarios
+        given = (*self.spec.scenarios, *(self.spec.evaluate_on or ()))
+        learned, held_out = self.sides
         return {
             **self.spec.model_dump(mode="json", exclude=_OUTSIDE),
             "scenarios": {s.title: flat_tables(s.model_dump(mode="json")) for s in given},
             "files": fingerprints([file for s in given for file in s.files()]),
+            "scenario": [world.name for world in learned],
+            "held_out": [world.name for world in held_out],
         }
 
     def begin(self, progress: Progress) -> None:
-        """Make what the trainings with all seeds share."""
-        del progress
+        """Record the searches of the planner to clone, which the trainings with all seeds share."""
+        planner = self.spec.clone
+        if planner is not None:
+            count = self.spec.demonstrations or 2000
+            seeds = range(DEMONSTRATION_SEED, DEMONSTRATION_SEED + count)
+            progress(f"Recording searches of {planner}", 0, count)
+            self.shared = Demonstrations.collect(planner, self.sides[0], seeds, self.spec.k)
+            progress(f"Recording searches of {planner}", count, count)
 
     @contextmanager
     def watched(self, out: Path, seeds: Sequence[int], progress: Progress) -> Iterator[None]:
@@ -160,7 +199,7 @@ class Training(ABC):
                     with suppress(InputError):
                         if curve := read_curve(out / f"seed_{seed}" / CURVE, self.columns):
                             last = curve[-1]
-                            progress(f"seed {seed}", last["steps"], self.steps)
+                            progress(f"seed {seed}", last["steps"], self.spec.steps)
 
         watcher = threading.Thread(target=follow, daemon=True)
         watcher.start()
@@ -170,14 +209,39 @@ class Training(ABC):
             over.set()
             watcher.join()
 
-    def replays(self, summary: Row, folder: Path) -> Sequence[Replay]:
-        """Return what a report may show again; nothing by default."""
-        del summary, folder
-        return ()
+    # Learning
 
-    @abstractmethod
+    def config(self, n_envs: int | None = None) -> TrainingConfig:
+        """Return the training config of the algorithm.
+
+        Args:
+            n_envs: environments of the training that goes on; None for a new one.
+        """
+        return SEARCH_CONFIGS[self.spec.algorithm].for_steps(self.spec.steps, n_envs)
+
+    @property
+    def evaluate_every(self) -> int:
+        """Decisions between evaluations."""
+        return self.spec.evaluate_every or min(max(1, self.spec.steps // EVALUATIONS), MOST_BETWEEN)
+
+    def make_env(self, n_envs: int) -> SearchVecEnv:
+        """Make a batch of search environments over all scenarios."""
+        places = self.sides[0] if self.spec.curriculum is None else by_size(self.sides[0])
+        env = SearchVecEnv(n_envs, places, REWARD_SCALE, self.spec.k, "local", MAX_STEPS)
+        self.open_places(env, 0)
+        return env
+
+    def open_places(self, env: SearchVecEnv, steps: int) -> None:
+        """Let the environments draw from the places that the curriculum has come to."""
+        if self.spec.curriculum is not None:
+            env.batch.n_places = open_scenarios(len(self.sides[0]), steps / self.spec.steps)
+
     def train(self, seed: int, folder: Path) -> list[Row]:
-        """Train with one seed; write the model and `curve.csv` to a folder.
+        """Train with one seed; resume from the folder's checkpoint if there is one, as if there had been no stop.
+
+        `model.safetensors` is the model with the best evaluation, `curve.csv` lists all evaluations. The checkpoint
+        stays, so that a training can be made longer: what depends on how much of it is over, such as the learning
+        rate, goes on as at that point of the longer one.
 
         Args:
             seed: seed of the network and of the worlds.
@@ -185,88 +249,264 @@ class Training(ABC):
 
         Returns:
             The rows of `curve.csv`.
-        """
 
-    def report(self, progress: Progress, workers: Workers, trained: Trained, figure: Path) -> Row:
-        """Test the models and draw the figure; return the entries of the summary."""
-        lines, planners = self.planners(progress, workers)
+        Raises:
+            InputError: a training to go on with has lost its checkpoint.
+        """
+        folder.mkdir(parents=True, exist_ok=True)
+        checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE, self.columns)
+        if curve and curve[-1]["steps"] >= self.spec.steps:
+            return curve
+        if len(curve) > 1 and not checkpoint.exists():
+            raise InputError(
+                f"{checkpoint}: is gone; the training cannot go on from {curve[-1]['steps']} steps"
+            )
+        begun = read_checkpoint(checkpoint) if checkpoint.exists() else None
+        config = self.config(begun and begun[0]["numbers"]["n_envs"])
+        env, rate = self.make_env(config.n_envs), config.settings["learning_rate"]
+        model = algorithm_class(self.spec.algorithm)(
+            config.policy,
+            env,
+            seed=seed,
+            device="cpu",
+            tensorboard_log=str(folder / "tensorboard") if self.spec.tensorboard else None,
+            **config.settings
+            | {"learning_rate": LinearSchedule(rate, rate * config.final_learning_rate, 1.0)},
+        )
+        if not self.spec.tensorboard:
+            # Otherwise stable-baselines3 makes a new folder for logs in the system's folder of temporary files.
+            model.set_logger(Logger(None, []))
+        # stable-baselines3 has seeded the environment with the network's seed.
+        env.seed(TRAINING_SEEDS * (seed + 1))
+        if begun is not None:
+            state, curve = begun
+            require_columns(curve, self.columns, checkpoint)
+            restore(state, model)
+        else:
+            curve = []
+            if self.shared is not None:
+                clone(model, self.shared, seed)
+        evaluator = _Evaluator(self, config, folder, curve)
+        left = self.spec.steps - model.num_timesteps
+        if left > 0:
+            model.learn(left, callback=evaluator, reset_num_timesteps=False, tb_log_name="run")
+        if curve[-1]["steps"] < model.num_timesteps:
+            evaluator.evaluate(model)
+        return curve
+
+    def evaluate(self, policy: Any) -> Row:
+        """Run one episode in each held-out world, in the places trained on and in those held out."""
+        found = (episode_times(policy, places, self.evaluation_seeds) for places in filter(None, self.sides))
+        values = ((*mean_interval(times), float(parked.mean())) for times, parked in found)
+        return dict(zip(self.metrics, itertools.chain.from_iterable(values), strict=True))
+
+    def description(self, config: TrainingConfig) -> dict[str, Any]:
+        """Return scenarios and settings for the model file."""
+        learned, held_out = self.sides
+        return {
+            "scenarios": [place.name for place in learned],
+            "held_out": [place.name for place in held_out],
+            "settings": {
+                "n_envs": config.n_envs, "policy": config.policy, **config.settings,
+                "clone": self.spec.clone, "curriculum": self.spec.curriculum,
+            },
+        }  # fmt: skip
+
+    # Testing
+
+    def report(
+        self,
+        progress: Progress,
+        workers: Workers,
+        curves: list[list[Row]],
+        models: Mapping[int, Path],
+        beside: Mapping[str, list[list[Row]]],
+        figure: Path,
+    ) -> Row:
+        """Test the models and draw the figure; return the entries of the summary.
+
+        Args:
+            progress: called as tests finish.
+            workers: where the planners search.
+            curves: rows of `curve.csv`, by training.
+            models: model files by seed.
+            beside: curves of other trainings, by name.
+            figure: file of the figure.
+        """
+        lines, planners = self._test_planners(progress, workers)
         rows, transfer, places = list[Row](), list[Row](), list[Row]()
-        for number, (seed, model) in enumerate(trained.models.items()):
-            progress("Testing", number, len(trained.models))
-            of_model, last = {"agent": self.algorithm, "seed": seed}, trained.curves[number][-1]
-            tested = self.test(model, workers)
-            transfer += [of_model | row for row in tested.transfer]
-            places += [of_model | row for row in tested.places]
+        # Of tests on either side of a split, the one on held-out places stands for the model.
+        main = -1 if self.holds_out and self.spec.test_on is None else 0
+        for number, (seed, model) in enumerate(models.items()):
+            progress("Testing", number, len(models))
+            of_model, last = {"agent": self.spec.algorithm, "seed": seed}, curves[number][-1]
+            tested, by_place = self.test(model)
+            transfer += [of_model | row for row in tested]
+            places += [of_model | row for row in by_place]
             rows.append({
-                "agent": self.algorithm, "scenario": tested.scenario, "seed": seed, "steps": last["steps"],
-                **tested.own, "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
+                "agent": self.spec.algorithm, "scenario": tested[main]["test_scenario"], "seed": seed,
+                "steps": last["steps"], "total_s": tested[main]["total_s"],
+                "total_s_ci95": tested[main]["total_s_ci95"],
+                "steps_per_s": last["steps"] / max(last["wall_s"], 1e-9), "model": str(model),
             })  # fmt: skip
-        self.draw(trained, lines, figure)
+        drawn = self._drawn(curves) | dict(beside)
+        means = {label: across_seeds(its) for label, its in drawn.items()}
+        save_learning_curves(drawn, means, lines, self._title, figure)
         progress("Testing", len(rows), len(rows))
         return {
             "rows": rows, "transfer": transfer, "planners": planners, "evaluated": lines,
             **({"places": places} if places else {}),
-            "curve": self.across_seeds(trained.curves),
-            "beside": {name: self.across_seeds(its) for name, its in trained.beside.items()},
+            "curve": across_seeds(curves),
+            "beside": {name: across_seeds(its) for name, its in beside.items()},
         }  # fmt: skip
 
-    @property
-    @abstractmethod
-    def compared(self) -> tuple[AgentSpec, ...]:
-        """Agents to compare with."""
-
-    @property
-    @abstractmethod
-    def tests(self) -> Mapping[str, Any]:
-        """The tests in the end, by name: what is run in each."""
-
-    def planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
-        """Run the agents to compare with; return their scores in the evaluations by name, and their rows of tests."""
+    def _test_planners(self, progress: Progress, workers: Workers) -> tuple[dict[str, float], list[Row]]:
+        """Return the scores of the agents to compare with and of the clairvoyant bound, and the rows of their tests."""
         lines, rows = dict[str, float](), list[Row]()
         if self.compared:
             doing, count = "Planners in the same worlds", 1 + len(self.tests)
             progress(doing, 0, count)
-            lines = self.evaluate_planners(workers)
-            for number, name in enumerate(self.tests, start=1):
+            learned, held_out = self.sides
+            evaluated = rows_of(self.compared, held_out or learned, self.evaluation_seeds, workers)
+            lines = {row["agent"]: row["total_s"] for row in evaluated}
+            lines["clairvoyant bound"] = evaluated[0]["bound_s"]
+            for number, (name, places) in enumerate(self.tests.items(), start=1):
                 progress(doing, number, count)
-                rows += self.test_planners(name, workers)
+                rows += rows_of(self.compared, places, self.test_seeds, workers, name)
             progress(doing, count, count)
         return lines, rows
 
-    @abstractmethod
-    def evaluate_planners(self, workers: Workers) -> dict[str, float]:
-        """Return the scores of the agents to compare with in the worlds of the evaluations, by name."""
+    def test(self, model: Path) -> tuple[list[Row], list[Row]]:
+        """Test a model; return a row for each test, and a row for each place of tests that are in many."""
+        policy = LearnedAgent(self.sides[0][0], self.spec.algorithm, model).model
+        rows, by_place = list[Row](), list[Row]()
+        for name, places in self.tests.items():
+            times, parked = episode_times(policy, places, self.test_seeds)
+            rows.append({"test_scenario": name, **times_row(times, parked)})
+            if len(places) > 1:
+                by_place += [{"test_scenario": name, **row} for row in self._by_place(places, times, parked)]
+        return rows, by_place
 
-    @abstractmethod
-    def test_planners(self, name: str, workers: Workers) -> list[Row]:
-        """Return the rows of a test of the agents to compare with: agent, scenario (the test's name) and results."""
+    def _by_place(
+        self, places: Sequence[Scenario], times: NDArray[np.float64], parked: NDArray[np.bool_]
+    ) -> list[Row]:
+        """Return a row of the test for each place that a search was in."""
+        place_of = np.array([scenario_of_episode(seed, 0, len(places)) for seed in self.test_seeds])
+        return [
+            {"place": place.name, "slots": place.lot.n_slots, **times_row(times[its], parked[its])}
+            for i, place in enumerate(places)
+            if (its := place_of == i).any()
+        ]
 
-    @abstractmethod
-    def test(self, model: Path, workers: Workers) -> Tested:
-        """Test a model."""
+    def replays(self, summary: Row, folder: Path) -> Sequence[Replay]:
+        """Return the tests of the best model and of the best planners; nothing without a test."""
+        if not summary.get("transfer"):
+            return ()
+        best = min(summary["rows"], key=lambda row: float(row["total_s"]))
+        model = folder / f"seed_{int(best['seed'])}" / MODEL
+        seeds = range(TEST_SEED, TEST_SEED + int(summary["transfer"][0]["episodes"]))
+        cases: list[tuple[Case, Sequence[int]]] = []
+        for name, (scenario, *_) in self.tests.items():
+            planners = [row for row in summary.get("planners", []) if row["scenario"] == name]
+            beside = sorted(planners, key=lambda row: float(row["total_s"]))[:BESIDE_MODELS]
+            cases.append((Case(scenario, f"{self.spec.algorithm}:{model}"), seeds))
+            compared = (Case(scenario, agent.name, options=agent.options) for agent in self.compared)
+            made = {case.label: case for case in compared}
+            cases += [(made[row["agent"]], seeds) for row in beside if row["agent"] in made]
+        return [SearchReplay(cases, folder)]
 
     @property
-    @abstractmethod
-    def title(self) -> str:
+    def _title(self) -> str:
         """Title of the figure of learning curves."""
+        learned, held_out = self.sides
+        where = learned[0].name if len(learned) == 1 else _places(learned)
+        where = f"{_places(held_out)} held out" if self.holds_out else where
+        return f"{where}: {self.spec.evaluation_episodes} searches in held-out worlds"
 
-    def drawn(self, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
+    def _drawn(self, curves: list[list[Row]]) -> dict[str, list[list[Row]]]:
         """Return the curves to draw, by name."""
-        return {self.algorithm: curves}
+        name = name_of(self.settings())
+        if not self.holds_out:
+            return {name: curves}
+        apart = [[row | {"total_s": row["held_out_s"]} for row in curve] for curve in curves]
+        return {f"{name}, {_places(self.sides[0])} trained on": curves, f"{name}, held out": apart}
 
-    def draw(self, trained: Trained, lines: Mapping[str, float], figure: Path) -> None:
-        """Draw the learning curves, and scores of planners as lines."""
-        curves = self.drawn(trained.curves) | trained.beside
-        means = {label: self.across_seeds(its) for label, its in curves.items()}
-        self.save_curves(curves, means, lines, self.title, figure)
+    def curves_beside(self, out: Path) -> dict[str, list[list[Row]]]:
+        """Read the curves of the trainings to draw beside: the rows of `curve.csv` of each seed, by name.
 
-    def save_curves(self, *drawn: Any) -> None:
-        """Draw curves, their means and lines, with a title, into a file."""
-        save_learning_curves(*drawn)
+        Args:
+            out: folder of this training.
 
-    def across_seeds(self, curves: list[list[Row]]) -> Any:
-        """Return the mean of the curves, for the summary."""
-        return across_seeds(curves)
+        Raises:
+            InputError: a folder has no training, or one with other evaluations; a folder is given twice; or there are
+                too many to tell apart.
+        """
+        if len(self.spec.beside) >= len(COLORS):
+            raise InputError(
+                f"--beside names {len(self.spec.beside)} folders, want at most {len(COLORS) - 1}"
+            )
+        own, known = self.settings(), {os.path.realpath(out)}
+        columns = ("steps", "total_s", "held_out_s") if self.holds_out else ("steps", "total_s")
+        beside: dict[str, list[list[Row]]] = {}
+        for folder in map(Path, self.spec.beside):
+            if os.path.realpath(folder) in known:
+                raise InputError(f"--beside: {folder} is already drawn")
+            known.add(os.path.realpath(folder))
+            settings = read_settings(folder)
+            curves = [read_curve(its, columns) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
+            curves = [curve for curve in curves if curve]
+            if settings is None or not curves or "algorithm" not in settings:
+                raise InputError(f"--beside: {folder} holds no training")
+            label = name_of(settings, str(folder / SETTINGS))
+            for name in EVALUATED_BY:
+                theirs, ours = settings.get(name), own.get(name)
+                if theirs != ours:
+                    raise InputError(
+                        f"--beside: {name} is {theirs!r} in {folder} and {ours!r} here; their evaluations cannot be "
+                        "compared"
+                    )
+            if label == name_of(own) or label in beside:
+                label = f"{label} ({folder})"
+            beside[label] = curves
+        return beside
+
+
+class _Evaluator(BaseCallback):  # type: ignore[misc]
+    """Callback that evaluates and saves the model during training."""
+
+    def __init__(self, training: Training, config: TrainingConfig, folder: Path, curve: list[Row]) -> None:
+        super().__init__()
+        self.subject, self.config, self.folder, self.curve = training, config, folder, curve
+        self._start = time.monotonic() - (curve[-1]["wall_s"] if curve else 0.0)
+        self._due = self._due_after(curve[-1]["steps"] if curve else 0)
+
+    def _due_after(self, steps: int) -> int:
+        """Return the step of the next evaluation; it depends on `steps` alone, so an interruption changes nothing."""
+        return self.subject.evaluate_every * (1 + steps // self.subject.evaluate_every)
+
+    def _on_rollout_start(self) -> None:
+        self.subject.open_places(self.model.env, self.model.num_timesteps)
+        # Between rollouts, so that a checkpoint loses no samples.
+        if not self.curve or self.num_timesteps >= self._due:
+            self._due = self._due_after(self.num_timesteps)
+            for name, value in self.evaluate(self.model).items():
+                self.logger.record(f"evaluation/{name}", value)
+
+    def _on_step(self) -> bool:
+        return True
+
+    def evaluate(self, model: Any) -> Row:
+        """Evaluate; keep the model if it is the best so far; write the curve and a checkpoint; return the metrics."""
+        scores = self.subject.evaluate(model.policy)
+        best = min((row["total_s"] for row in self.curve), default=np.inf)
+        self.curve.append({"steps": model.num_timesteps, **scores, "wall_s": time.monotonic() - self._start})
+        if scores["total_s"] <= best:
+            described = self.subject.description(self.config)
+            save_model(model, self.folder / MODEL, results=scores, command=self.subject.command, **described)
+        write_csv(self.folder / CURVE, list(self.curve[0]), self.curve)
+        # Last: a training that is killed before this line repeats what it has just done.
+        save_checkpoint(self.folder / CHECKPOINT, model, self.curve)
+        return scores
 
 
 def use_one_thread() -> None:
@@ -277,13 +517,6 @@ def use_one_thread() -> None:
     # Starting numba's threads sets the number of OpenMP's, which PyTorch has, too.
     get_num_threads()
     torch.set_num_threads(1)
-
-
-def training_of(spec: TrainingSpec) -> Training:
-    """Return the training of a specification."""
-    module, _, name = spec.trained_by.partition(":")
-    made: Training = getattr(import_module(f"parkenv.studies.training.{module}"), name)(spec)
-    return made
 
 
 class _Naming(Spec, extra="ignore"):
@@ -306,41 +539,22 @@ def name_of(settings: Row, source: str = "settings") -> str:
     return f"{name} after cloning {its.clone}" if its.clone else name
 
 
-def curves_beside(folders: Sequence[str], out: Path, training: Training) -> dict[str, list[list[Row]]]:
-    """Read the curves of other trainings: the rows of `curve.csv` of each seed, by name.
-
-    Args:
-        folders: output folders of `parkenv train` (`--beside`).
-        out: folder of the training to draw them with.
-        training: that training.
+def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
+    """Check that no place is on both sides.
 
     Raises:
-        InputError: a folder has no training, or one with other evaluations; a folder is given twice; or there are too
-            many to tell apart.
+        InputError: two places have one name, or a held-out lot is also one to train on.
     """
-    if len(folders) >= len(COLORS):
-        raise InputError(f"--beside names {len(folders)} folders, want at most {len(COLORS) - 1}")
-    own, known = training.settings(), {os.path.realpath(out)}
-    beside: dict[str, list[list[Row]]] = {}
-    for folder in map(Path, folders):
-        if os.path.realpath(folder) in known:
-            raise InputError(f"--beside: {folder} is already drawn")
-        known.add(os.path.realpath(folder))
-        settings = read_settings(folder)
-        columns = ("steps", *training.measures)
-        curves = [read_curve(its, columns) for its in sorted(folder.glob(f"seed_*/{CURVE}"))]
-        curves = [curve for curve in curves if curve]
-        if settings is None or not curves or "algorithm" not in settings:
-            raise InputError(f"--beside: {folder} holds no training")
-        label = name_of(settings, str(folder / SETTINGS))
-        for name in training.evaluated_by:
-            theirs, ours = settings.get(name), own.get(name)
-            if theirs != ours:
-                raise InputError(
-                    f"--beside: {name} is {theirs!r} in {folder} and {ours!r} here; their evaluations cannot be "
-                    "compared"
-                )
-        if label == name_of(own) or label in beside:
-            label = f"{label} ({folder})"
-        beside[label] = curves
-    return beside
+    if not held_out:
+        return
+    require_different_names([*learned, *held_out])
+    shares = {lot_share(scenario.lot): scenario.name for scenario in learned}
+    for scenario in held_out:
+        if (same := shares.get(lot_share(scenario.lot))) is not None:
+            raise InputError(
+                f"evaluate_on has {scenario.name!r}, whose lot is that of {same!r}, which is trained on"
+            )
+
+
+def _places(scenarios: Sequence[Scenario]) -> str:
+    return plural(len(scenarios), "scenario")

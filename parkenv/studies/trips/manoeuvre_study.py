@@ -16,13 +16,11 @@ from parkenv.errors import InputError
 from parkenv.files.csv_tables import NUMBER_OR_NOTHING, TEXT, WHOLE, YES_OR_NO
 from parkenv.files.known_names import SCENE_LEVELS
 from parkenv.files.option import option
-from parkenv.files.spec_file import Axis
 from parkenv.studies.fields import Figures, SceneLevels, Seed, Vehicle, levels_in
 from parkenv.studies.fingerprints import fingerprints
 from parkenv.studies.results import CsvTable, LongTable, Results, Row
 from parkenv.studies.study import Cell, Study
 from parkenv.version import __version__
-from planners.names import PARKING_PLANNER
 
 if TYPE_CHECKING:
     from parkenv.driving.scene import Scene
@@ -65,15 +63,10 @@ def _there(value: object, info: ValidationInfo) -> object:
     return (Path(folder) / Path(value).expanduser()).absolute() if isinstance(value, str | Path) else value
 
 
-class _Scenes(NamedTuple):
-    """An agent in the scenes."""
+class _Planned(NamedTuple):
+    """Scenes for the planner."""
 
-    agent: str
-
-    @property
-    def columns(self) -> Row:
-        """The agent."""
-        return {"agent": self.agent}
+    columns: Row = {"agent": "planner"}  # noqa: RUF012 - never changed
 
 
 class ManoeuvreStudy(Study):
@@ -103,14 +96,6 @@ class ManoeuvreStudy(Study):
         default="none",
         panel="Scenes",
         parse=levels_in,
-    )
-    agents: Axis[str] = option(
-        (PARKING_PLANNER,),
-        "Parking agents, compared on the same tasks: planner, or ALGORITHM:FILE for a model of "
-        "`parkenv train --env drive`; in scenes, learned, the packaged network, hybrid, which "
-        "falls back to the planner where the network fails, and maskable-ppo:FILE or hybrid:FILE "
-        "for a model of `parkenv train --env scenes`.",
-        takes="NAME[,...]",
     )
     episodes: int = option(100, "Episodes per lot, or scenes per level.", short="-n", ge=1, le=1_000_000)
     vehicle: Vehicle = None
@@ -152,12 +137,8 @@ class ManoeuvreStudy(Study):
 
     def check(self) -> None:
         """See `Study`: all files are read, and a scene of each level is drawn."""
-        from planners.driving.parking_agents import manoeuvre_planner
-
         if (self.cases is None) == (self.levels is None):
             raise InputError("cases and levels exclude each other: want one of them")
-        for agent in self.agents:
-            manoeuvre_planner(agent)
         if self.shorten_s > 0.0:
             from planners.driving.time_optimal import require_casadi
 
@@ -170,29 +151,26 @@ class ManoeuvreStudy(Study):
         return {"version": __version__, **self.tables(), "files": fingerprints(self.files())}
 
     def files(self) -> list[Path]:
-        """See `Spec`: the scenes instead of their folder, and trained models."""
+        """See `Spec`: the scenes instead of their folder."""
         scenes = [source for source in self.sources.values() if isinstance(source, Path)]
-        models = [Path(agent.partition(":")[2]) for agent in self.agents if ":" in agent]
-        return [file for file in super().files() if file != self.cases] + scenes + models
+        return [file for file in super().files() if file != self.cases] + scenes
 
     def cells(self) -> list[Cell]:
         """See `Study`."""
-        return [Cell(_Scenes(agent), list(self.sources)) for agent in self.agents]
+        return [Cell(_Planned(), list(self.sources))]
 
-    def run(self, work: _Scenes, items: Sequence[str]) -> list[Row]:
+    def run(self, work: _Planned, items: Sequence[str]) -> list[Row]:
         """See `Study`."""
         from planners.driving.manoeuvre import park
-        from planners.driving.parking_agents import manoeuvre_planner
         from planners.driving.time_optimal import shorten
 
-        _warm(work.agent)
-        plan = manoeuvre_planner(work.agent)
-        made = {name: park(self.scene(name), plan) for name in items}
+        _warm()
+        made = {name: park(self.scene(name)) for name in items}
         if self.shorten_s > 0.0:
             made = {name: shorten(each, self.shorten_s) for name, each in made.items()}
         return [work.columns | manoeuvre_row(name, each) for name, each in made.items()]
 
-    def keep(self, work: _Scenes, rows: Sequence[Row], results: Results) -> None:
+    def keep(self, work: _Planned, rows: Sequence[Row], results: Results) -> None:
         """See `Study`: what was driven."""
         for table, name in ((TRAJECTORIES, "states"), (ROAD_USERS, "others")):
             results.add(
@@ -253,14 +231,11 @@ class ManoeuvreStudy(Study):
         return tasks
 
     def _says(self, row: Row) -> str:
-        agent = f"{row['agent']}, " if len(self.agents) > 1 else ""
         if row["driven"]:
             n = row["direction_changes"]
             times = f"{row['time_s']:.1f} s, {n} change{'' if n == 1 else 's'}"
-            return f"{agent}{times}, {100 * row['clearance_m']:.0f} cm clear"
-        return agent + (
-            "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
-        )
+            return f"{times}, {100 * row['clearance_m']:.0f} cm clear"
+        return "no path" if not row["planned"] else "contact" if row["contact"] else "not at the target"
 
 
 def manoeuvre_row(name: str, made: Manoeuvre) -> Row:
@@ -328,10 +303,9 @@ def level_table(rows: Sequence[Row], level: Callable[[str], str]) -> list[Row]:
 
 
 @functools.cache
-def _warm(agent: str) -> None:
+def _warm() -> None:
     """Plan and drive once, so that the times of the others do not include loading compiled code."""
     from parkenv.driving.levels import level_scene
     from planners.driving.manoeuvre import park
-    from planners.driving.parking_agents import manoeuvre_planner
 
-    park(level_scene(SCENE_LEVELS[-1], 0), manoeuvre_planner(agent))
+    park(level_scene(SCENE_LEVELS[-1], 0))

@@ -20,9 +20,7 @@ from parkenv.studies.simulate import FrameRecorder, Observer, Step, simulate
 from parkenv.studies.workers import SERIAL, Workers
 from parkenv.world.lot import ParkingLot
 from planners.agent import Agent
-from planners.driving.parking import ParkingMemory
-from planners.driving.parking_agents import make_parking_agent
-from planners.names import PARKING_PLANNER
+from planners.driving.parking import ParkingAgent, ParkingMemory
 
 CHUNK = 25  # episodes per task of a worker
 
@@ -143,9 +141,8 @@ def park_all(
     cases: Sequence[ParkingCase],
     seeds: Sequence[int],
     workers: Workers = SERIAL,
-    agent: str = PARKING_PLANNER,
 ) -> Iterator[list[Parking]]:
-    """Run every seed of every case with one agent; yield the parkings in order.
+    """Park with every seed of every case by the planner; yield the parkings in order.
 
     Results do not depend on the number of workers; only wall times differ from run to run.
 
@@ -153,14 +150,13 @@ def park_all(
         cases: the tasks.
         seeds: seeds of the tasks.
         workers: where the episodes run.
-        agent: a name for `planners.driving.parking_agents.make_parking_agent`.
     """
     parts = [seeds[i : i + CHUNK] for i in range(0, len(seeds), CHUNK)]
-    yield from workers.in_order([partial(_park_some, case, part, agent) for case in cases for part in parts])
+    yield from workers.in_order([partial(_park_some, case, part) for case in cases for part in parts])
 
 
-def _park_some(case: ParkingCase, seeds: Sequence[int], name: str) -> list[Parking]:
-    env, agent = case.environment(), make_parking_agent(name, case.vehicle)
+def _park_some(case: ParkingCase, seeds: Sequence[int]) -> list[Parking]:
+    env, agent = case.environment(), ParkingAgent(case.vehicle)
     return [park_once(env, agent, seed) for seed in seeds]
 
 

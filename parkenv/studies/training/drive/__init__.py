@@ -1,1 +1,0 @@
-"""Training of parking agents for `parkenv/Drive-v1`."""
