@@ -3,6 +3,7 @@
 Three things make it learn: the compact observation, `local`; the action mask; rewards near one (`reward_scale`).
 """
 
+import torch
 from sb3_contrib import MaskablePPO
 from stable_baselines3.common.evaluation import evaluate_policy
 
@@ -23,6 +24,7 @@ def total_times(name: str) -> list[float]:
     return [-value for value in returns]
 
 
+torch.set_num_threads(1)  # the network is small: more threads only wait for one another
 envs = SearchVecEnv(64, SCENARIO, reward_scale=0.01)
 model = MaskablePPO(
     "MultiInputPolicy", envs, 1e-3, n_steps=64, batch_size=1024, gamma=0.999, seed=0, device="cpu"

@@ -13,6 +13,7 @@ ENVS, STEPS, UPDATES, EPOCHS, MINIBATCHES = 256, 32, 40, 4, 4
 GAMMA, LAMBDA, CLIP, ENTROPY, VALUE, LEARNING_RATE, SCALE = 0.999, 0.95, 0.2, 0.01, 0.5, 1e-3, 0.01
 
 torch.manual_seed(0)
+torch.set_num_threads(1)  # the networks are small: more threads only wait for one another
 envs = gym.make_vec(
     "parkenv/Search-v2", ENVS, vectorization_mode="vector_entry_point", scenario="mini", observation="local",
     max_episode_steps=500, autoreset_mode=AutoresetMode.SAME_STEP,

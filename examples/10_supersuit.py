@@ -29,6 +29,7 @@ def flat_space(space):
 def main():
     """Train one network for all cars for a few seconds."""
     import supersuit
+    import torch
     from stable_baselines3 import PPO
     from stable_baselines3.common.utils import set_random_seed
 
@@ -39,6 +40,7 @@ def main():
     worlds = supersuit.pettingzoo_env_to_vec_env_v1(env)
     worlds = supersuit.concat_vec_envs_v1(worlds, 2, base_class="stable_baselines3")
     print(f"{worlds.num_envs} cars in two worlds, {worlds.observation_space}")
+    torch.set_num_threads(1)  # the network is small: more threads only wait for one another
     set_random_seed(0)  # SuperSuit's batch has no seed(), which PPO(seed=0) would call
     model = PPO("MlpPolicy", worlds, n_steps=128, batch_size=256, n_epochs=4, gamma=0.999, device="cpu")
     model.learn(4_096)

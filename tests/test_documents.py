@@ -107,6 +107,9 @@ FEWER = {
     r"range\(100, 200\)": "range(100, 110)",
     r"range\(1, 31\)": "range(1, 11)",
     r"(ROUNDS, DAYS, HOURS) = .*": r"\1 = 2, 1, '10:00-10:30'",
+    r"DECISIONS, TASKS = 20_000, 50": "DECISIONS, TASKS = 1_100, 2",
+    r"(DECISIONS, EPOCHS, BATCH, RATES) = 2_000, 8": r"\1 = 50, 2",
+    r"WORLDS = 40": "WORLDS = 2",
     r"model.learn\(4_096\)\n    observations": "model.learn(1_024)\n    observations",
 }
 """What is done often on a page or in an example, and how it is done less often here: the same code runs."""
