@@ -56,12 +56,14 @@ def test_the_drive_is_that_to_the_farthest_slot():
     ]  # fmt: skip
 
 
-def test_a_census_is_a_table(lots, tmp_path):
+def test_a_census_is_a_table_and_pictures(lots, tmp_path):
     out = tmp_path / "census"
     done = parkenv("lot", "census", lots, "--no-drive", "--out", out)
     assert (done.returncode, done.stderr) == (0, "")
     assert "3 lots, 140 slots: 3 clean" in done.stdout
-    assert sorted(path.name for path in out.iterdir()) == ["census.csv", "summary.json"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "census.csv", "census.png", "contact-sheet-1.png", "summary.json",
+    ]  # fmt: skip
     rows = json.loads((out / "summary.json").read_text())["rows"]
     assert [row["slots"] for row in rows] == [120, 10, 10], "the largest first"
     with (out / "census.csv").open() as file:
@@ -78,7 +80,7 @@ def test_what_is_no_lot_is_named_and_the_others_are_counted(lots, tmp_path):
     rows = json.loads((tmp_path / "census" / "summary.json").read_text())["rows"]
     assert [row["result"] for row in rows] == ["clean"] * 3 + ["invalid"]
     assert "not JSON" in rows[-1]["reason"]
-    assert count_lot(lots / "broken.geojson")["result"] == "invalid"
+    assert count_lot(lots / "broken.geojson")[1] is None
     for place, message in ((tmp_path / "none", "no such file or folder"), (tmp_path, "holds no lot")):
         with pytest.raises(InputError, match=message):
             lot_files([place])

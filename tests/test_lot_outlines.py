@@ -423,7 +423,7 @@ class TestTown:
         refused = next(row for row in rows if row["result"] == "refused")
         assert "way/1004: its outline is open" in refused["reason"]
         assert sorted(p.name for p in out.iterdir()) == sorted(
-            ["summary.json", *(f"{r['lot']}.geojson" for r in rows if r["slots"])]
+            ["summary.json", "contact-sheet-1.png", *(f"{r['lot']}.geojson" for r in rows if r["slots"])]
         )
         shown = parkenv("lot", "show", out / f"{rows[0]['lot']}.geojson", "--out", tmp_path / "lot.png")
         assert "guessed: entry at" in shown.stdout

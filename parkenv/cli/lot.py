@@ -165,7 +165,7 @@ def _point(text: str) -> str:
 class Import(Command):
     """Outlines of parking spaces are enough: without roads in the file, the import infers rows, aisles and connections.
 
-    With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`).
+    With --split, every car park of a town becomes a lot in a folder, with a table (`summary.json`) and a contact sheet.
     With --town, a whole town becomes one lot: streets, kerbs, car parks and garages with prices and rules, entries at
     its edge, and goals with weights of demand. A table of its facilities (.csv) gives name, kind, capacity, and the
     source of the capacity: the map (tag, drawn) or a rule.
@@ -366,14 +366,17 @@ class Import(Command):
 
         console = make_console(soft_wrap=True)
         with stages(console) as progress, write_together(self.out) as folder:
-            rows = import_town_lots(self.place, folder, self._options, self.least, progress)
-            save_summary(folder, None, rows)
-        print_rows(make_console(), "Car parks", rows, rows[0], _LOT_COLUMNS)
-        results = Counter(row["result"] for row in rows)
+            town = import_town_lots(self.place, folder, self._options, self.least, progress)
+            save_summary(folder, None, town.rows)
+        print_rows(make_console(), "Car parks", town.rows, town.rows[0], _LOT_COLUMNS)
+        results = Counter(row["result"] for row in town.rows)
         listed = ", ".join(f"{results[name]} {name}" for name in ("clean", "warnings", "refused"))
-        lots = plural(len(rows) - results["refused"], "lot")
+        lots = plural(len(town.rows) - results["refused"], "lot")
+        pictures = (
+            f" Pictures: {', '.join(str(self.out / p.name) for p in town.pictures)}" if town.pictures else ""
+        )
         console.print(
-            f"{plural(len(rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}."
+            f"{plural(len(town.rows), 'car park')} in {self.place}: {listed}. Wrote {lots} to {self.out}.{pictures}"
         )
 
 
@@ -397,7 +400,11 @@ class Census(Command):
         ..., "Lots (.geojson, .yml), and folders of lots (.geojson).", takes="FILE|DIR", argument=True
     )
     drive: bool = option(True, "Plan how the car drives into each kind of slot, as `parkenv lot check` does.")
-    out: Path = option(Path("results/census"), "Folder for census.csv and summary.json.", short="-o")
+    out: Path = option(
+        Path("results/census"),
+        "Folder for census.csv, summary.json, census.png and contact sheets.",
+        short="-o",
+    )
 
     def run(self) -> None:
         """See `Command`."""
@@ -413,7 +420,7 @@ class Census(Command):
         )
         slots = sum(row.get("slots", 0) for row in rows)
         make_console(soft_wrap=True).print(
-            f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. The table is in {self.out}"
+            f"{plural(len(rows), 'lot')}, {slots:,} slots: {listed}. Table and pictures are in {self.out}"
         )
         if results["invalid"]:
             raise Exit(2)

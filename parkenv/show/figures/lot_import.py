@@ -14,31 +14,16 @@ from matplotlib.patches import Patch
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.lots.draft import LotDraft
-from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
 from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.schematic import schematic
 from parkenv.show.painters.axes import paint
 from parkenv.show.plurals import plural
-from parkenv.show.scene import (
-    ARROWHEAD,
-    DISC,
-    STAR,
-    Areas,
-    Layer,
-    Lines,
-    Marks,
-    arrows_along,
-    building_layers,
-    posed,
-)
+from parkenv.show.scene import DISC, Areas, Marks, building_layers, posed
 from parkenv.world.lot import corner_points, is_building, mouth_points
 
 SOURCE_COLORS = ("#4477aa", "#66ccee", "#228833", "#aa3377", "#ccbb44", "#ee6677")
 AREA, AREA_EDGE = "#d9d3e3", "#8d7ca8"
-TWO_WAY, ONE_WAY, TIE = "#333a42", "#aa3377", "#9aa0a6"
-ARROW_EVERY = 15.0
-"""Distance between arrows on a one-way lane, m."""
-_TRIANGLE = np.array([[0.5, 0.0], [-0.5, 0.5], [-0.5, -0.5]])
 
 
 @mpl.rc_context(STYLE)
@@ -102,30 +87,14 @@ def _extent(draft: LotDraft) -> FloatArray:
 def _draw(draft: LotDraft, ax: Axes) -> None:
     slots, sources = draft.slots, _sources(draft)
     colors = [SOURCE_COLORS[sources.index(source) % len(SOURCE_COLORS)] for source in draft.slot_source]
-    corners = corner_points(slots.xy, slots.yaw, slots.length, slots.width)
-    layers: list[Layer] = [
+    mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
+    layers = [
         Areas([[outline] for outline in draft.outlines], AREA, AREA_EDGE),
         *building_layers([w for w in draft.walls if is_building(w)], draft.walls),
         Marks(posed(draft.loose), DISC, SOURCE_COLORS[0], px=5.0),
-        Areas([[slot] for slot in corners], colors, "white", 0.4),
-    ]
-    if draft.lanes and len(corners):
-        mouths = mouth_points(slots.xy, slots.yaw, slots.length, slots.width, slots.mouth)
-        ties = np.stack([mouths, nearest_on_lanes(draft.lanes, mouths)[0]], axis=1)
-        layers.append(Lines(list(ties), TIE, px=(0.5, 0.5)))
-    one_way, two_way = ([lane.points for lane in draft.lanes if lane.oneway == way] for way in (True, False))
-    layers += [
-        Lines(one_way, ONE_WAY, px=(1.2, 1.2)),
-        Lines(two_way, TWO_WAY, px=(1.2, 1.2)),
-        Marks(arrows_along(one_way, ARROW_EVERY), ARROWHEAD, ONE_WAY, px=7.0),
-        Marks(
-            posed(draft.entries.reshape(-1, 2), np.pi / 2),
-            _TRIANGLE,
-            "entry",
-            px=9.0,
-            edge="ink",
-            edge_px=0.6,
+        *schematic(
+            corner_points(slots.xy, slots.yaw, slots.length, slots.width), colors, mouths, draft.lanes,
+            draft.entries.reshape(-1, 2), draft.goals.reshape(-1, 2),
         ),
-        Marks(posed(draft.goals.reshape(-1, 2)), STAR, "goal", px=15.0, edge="paint", edge_px=0.6),
-    ]
+    ]  # fmt: skip
     paint(ax, layers, 0.5)

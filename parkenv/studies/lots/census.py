@@ -13,6 +13,7 @@ from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import read_lot
 from parkenv.lots.quality import QualityIssue, read_provenance
+from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability, manoeuvre_kinds
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
@@ -60,7 +61,7 @@ def lot_files(places: Sequence[Path]) -> list[Path]:
 def take_census(
     places: Sequence[Path], folder: Path, *, drive: bool = True, progress: Progress = lambda *_: None
 ) -> list[Row]:
-    """Count lots; write census.csv into a folder.
+    """Count lots; write census.csv, census.png and contact sheets into a folder.
 
     Args:
         places: lots, and folders of lots.
@@ -74,28 +75,42 @@ def take_census(
     Raises:
         InputError: see `lot_files`.
     """
+    from parkenv.show.figures.census import save_census
+    from parkenv.show.figures.contact_sheet import save_contact_sheets
+
     files = lot_files(places)
     make_folder(folder)
     done = counted(progress, "Checking", len(files))
-    rows = []
+    found = []
     for file in files:
-        rows.append(count_lot(file, drive=drive))
+        found.append(count_lot(file, drive=drive))
         done()
-    rows.sort(key=lambda row: -row.get("slots", 0))
+    found.sort(key=lambda one: -one[0].get("slots", 0))
+    rows = [row for row, _ in found]
     write_csv(folder / "census.csv", COLUMNS, rows)
+    if lots := [(row, lot) for row, lot in found if lot is not None]:
+        save_census([row for row, _ in lots], folder / "census.png")
+        drawn = [
+            (
+                f"{row['lot']}\n{plural(row['slots'], 'slot')}, error probability {row['error_probability']:.2f}",
+                lot,
+            )
+            for row, lot in lots
+        ]
+        save_contact_sheets(drawn, folder)
     return rows
 
 
-def count_lot(path: Path, *, drive: bool = True) -> Row:
-    """Return the row of a lot file in a census; that of a file that is no lot says why."""
+def count_lot(path: Path, *, drive: bool = True) -> tuple[Row, ParkingLot | None]:
+    """Return the row of a lot file in a census, and the lot; for a file that is no lot, its row says why, and None."""
     try:
         lot = read_lot(path)
         origin = read_provenance(path) if path.suffix == ".geojson" else None
     except InputError as error:
         reason = str(error).removeprefix(f"{path}: ")
-        return {"lot": path.stem, "file": str(path), "result": "invalid", "reason": reason}
+        return {"lot": path.stem, "file": str(path), "result": "invalid", "reason": reason}, None
     row = {"lot": lot.name, "file": str(path)}
-    return row | lot_columns(lot, origin.issues if origin is not None else (), drive=drive)
+    return row | lot_columns(lot, origin.issues if origin is not None else (), drive=drive), lot
 
 
 def lot_columns(lot: ParkingLot, issues: tuple[QualityIssue, ...] = (), *, drive: bool = True) -> Row:

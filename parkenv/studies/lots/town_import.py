@@ -1,16 +1,31 @@
-"""Import every car park of a town: a lot of each, and a table of what became of them."""
+"""Import every car park of a town: a lot of each, a table of what became of them, and contact sheets."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 from parkenv.lots import write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.osm.car_parks import LEAST_SPACES, import_car_parks
 from parkenv.lots.quality import Provenance
+from parkenv.show.figures.contact_sheet import save_contact_sheets
+from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability
 from parkenv.studies.results import Row
 from parkenv.studies.study import Progress, counted
+
+
+class TownLots(NamedTuple):
+    """The car parks of a town.
+
+    Attributes:
+        rows: a row for each: lot, spaces, slots, lanes, result, error_probability, reason.
+        pictures: contact sheets.
+    """
+
+    rows: list[Row]
+    pictures: list[Path]
 
 
 def import_town_lots(
@@ -19,7 +34,7 @@ def import_town_lots(
     options: ImportOptions,
     least: int = LEAST_SPACES,
     progress: Progress = lambda *_: None,
-) -> list[Row]:
+) -> TownLots:
     """Write a lot of every car park of a town into a folder.
 
     Args:
@@ -28,9 +43,6 @@ def import_town_lots(
         options: see `import_car_parks`.
         least: number of spaces of the smallest car park.
         progress: called as car parks are finished.
-
-    Returns:
-        A row for each: lot, spaces, slots, lanes, result, error_probability, reason.
 
     Raises:
         InputError: see `import_car_parks`.
@@ -47,16 +59,20 @@ def import_town_lots(
             drivability = check_drivability(lot, park.draft.issues)
             left = "; ".join(map(str, park.draft.left_out))
             problems = "; ".join(problem.message for problem in drivability.problems)
+            error = drivability.error_probability
             row |= {
                 "slots": lot.n_slots,
                 "lanes": len(lot.lanes),
                 "result": "warnings" if drivability.problems else "clean",
-                "error_probability": round(drivability.error_probability, 3),
+                "error_probability": round(error, 3),
                 "reason": problems or (f"left out: {left}" if left else ""),
             }
-            lots.append((lot, Provenance(place.name, park.draft.guesses, drivability.issues)))
+            lots.append((lot, Provenance(place.name, park.draft.guesses, drivability.issues), error))
         rows.append(row)
         done()
-    for lot, provenance in lots:
+    for lot, provenance, _ in lots:
         write_lot(lot, folder / f"{lot.name}.geojson", provenance)
-    return rows
+    drawn = [
+        (f"{lot.name}\n{plural(lot.n_slots, 'slot')}, error probability {p:.2f}", lot) for lot, _, p in lots
+    ]
+    return TownLots(rows, save_contact_sheets(drawn, folder))
