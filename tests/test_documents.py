@@ -203,3 +203,19 @@ def test_agents_in_the_table_are_the_agents_there_are():
 
     listed = re.findall(r"^\| `([a-z-]+)` \|", PAGES["docs/agents.md"], flags=re.MULTILINE)
     assert sorted(listed) == sorted(AGENTS)
+
+
+WORDS = {
+    "docs/results/": 1_500, "docs/environments/": 1_400, "docs/leaderboard/": 1_300, "docs/": 800,
+    "CONTRIBUTING.md": 1_200, "README.md": 1_000,
+}  # fmt: skip
+"""The most words of a page, by the first beginning of its name that fits; `budgets.toml` has those in all."""
+
+
+def test_pages_are_short():
+    for name, page in PAGES.items():
+        most = next(WORDS[part] for part in WORDS if name.startswith(part))
+        assert len(page.split()) <= most, f"{name}: {len(page.split())} words, at most {most}"
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert len(changes.split()) <= 900
+    assert len(changes.splitlines()) <= 60
