@@ -99,7 +99,7 @@ VOLATILE = re.compile(
 COMPARED = {".csv", ".gz", ".geojson", ".png", ".gif", ".jsonl", ".json"}
 LONG = 20_000
 """Characters of a summary from which on hashes of its tables are kept."""
-LEFT_OUT = {"timings.csv", "settings.json", "experiment.json", "counts.csv", "report.json"}
+LEFT_OUT = {"timings.csv", "settings.json", "experiment.json", "counts.csv", "report.json", "result.json"}
 
 
 def run(name: str, folder: Path) -> dict[str, Any]:
