@@ -201,44 +201,6 @@ class SensorRig:
             raise SensorError("the rig has no laser, want at least one")
         return SensorRig(lasers=self.lasers)
 
-    def joined(self, other: SensorRig) -> SensorRig:
-        """Return a rig with the sensors of both; a camera that is the left one of a stereo camera is drawn once.
-
-        `part_of` returns what each of them measures. Sensors with the same name must be the same.
-
-        Raises:
-            SensorError: a name stands for different sensors.
-
-        Examples:
-            >>> both = SensorRig.thesis().joined(SensorRig.stereo())
-            >>> len(both.cameras), len(both.stereo_cameras), len(both.lasers)
-            (0, 1, 1)
-        """
-        stereo = {name: (pair, mount) for rig in (self, other) for name, pair, mount in rig.stereo_cameras}
-        single = {name: (camera, mount) for rig in (self, other) for name, camera, mount in rig.cameras}
-        lasers = {name: (laser, mount) for rig in (self, other) for name, laser, mount in rig.lasers}
-        for rig in (self, other):
-            lefts = {name: (pair.camera, mount) for name, (pair, mount) in stereo.items()}
-            same = all((single | lefts)[name] == (camera, mount) for name, camera, mount in rig.cameras)
-            same = same and all(stereo[name] == (pair, mount) for name, pair, mount in rig.stereo_cameras)
-            if not (same and all(lasers[name] == (laser, mount) for name, laser, mount in rig.lasers)):
-                raise SensorError("rigs to join have different sensors of the same name")
-        return SensorRig(
-            tuple((name, *its) for name, its in single.items() if name not in stereo),
-            tuple((name, *its) for name, its in stereo.items()),
-            tuple((name, *its) for name, its in lasers.items()),
-        )
-
-    def part_of(self, capture: Capture) -> Capture:
-        """Return what this rig measures of the capture of a rig that it is a part of (`joined`)."""
-        images = capture.images | {name: pair.left for name, pair in capture.pairs.items()}
-        return Capture(
-            capture.pose,
-            {name: images[name] for name, _, _ in self.cameras},
-            {name: capture.pairs[name] for name, _, _ in self.stereo_cameras},
-            {name: capture.scans[name] for name, _, _ in self.lasers},
-        )
-
     def capture(
         self,
         scene: Sensed,

@@ -12,15 +12,19 @@ from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.files.images import images_in, read_image
+from parkenv.perception.car_datasets import (
+    Crops,
+    LabelledImage,
+    read_crop_folder,
+    read_uiuc_test,
+    read_uiuc_training,
+)
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.detector import GroundBand
+from parkenv.perception.detection_scores import matches, recall_on_crops, recall_precision, score_on
+from parkenv.perception.detector import Detections, GroundBand
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
-from parkenv.perception.lab.car_datasets import Crops, read_crop_folder, read_uiuc_test, read_uiuc_training
-from parkenv.perception.lab.cross_validation import cross_validated
-from parkenv.perception.lab.detection_scores import matches, recall_at, recall_precision
-from parkenv.perception.lab.made_photos import made_photos
-from parkenv.perception.lab.training import TrainingSettings, train
+from parkenv.perception.training import TrainingSettings, train
 
 
 def toy_car(rng, size=(100, 40)):
@@ -197,23 +201,6 @@ def test_parts_of_cars_are_mined_where_there_are_no_photographs(crops):
     assert closer.scores(cars).min() > closer.scores(windows).max()
 
 
-def test_made_photographs_hold_the_cars_where_they_say(crops):
-    cars = [np.full((40, 100), 250, np.uint8)] * 3
-    photos = made_photos(Crops(cars, [np.full((40, 100), 20, np.uint8)]), 30, seed=4)
-    widths = np.concatenate([photo.boxes[:, 2] - photo.boxes[:, 0] for photo in photos])
-    assert len(widths) >= 30
-    assert widths.min() >= 80
-    assert 180 < widths.max() <= 220
-    for photo in photos:
-        bright = np.zeros(photo.image.shape, bool)
-        for left, top, right, bottom in photo.boxes.astype(int):
-            bright[top:bottom, left:right] = True
-            assert photo.image[(top + bottom) // 2, (left + right) // 2] == 250
-        assert photo.image[~bright].max() == 20
-    again = made_photos(Crops(cars, [np.full((40, 100), 20, np.uint8)]), 30, seed=4)
-    assert all(np.array_equal(a.image, b.image) for a, b in zip(photos, again, strict=True))
-
-
 def test_recall_and_precision_of_a_known_case():
     truth = [np.array([[0, 0, 100, 40], [200, 0, 300, 40]], float), np.array([[0, 0, 100, 40]], float)]
     found = [
@@ -243,8 +230,45 @@ def test_the_ellipse_is_a_quarter_of_the_box():
     assert matches(np.array([[75, 100, 225, 140]], float), truth, scales=False)[0]
 
 
-def test_recall_at_a_rate_of_false_alarms():
-    assert recall_at(0.1, np.array([0.5, 2.0, 3.0]), np.arange(10) / 10.0) == pytest.approx(2 / 3)
+def test_a_wide_box_is_no_front_where_photographs_of_sides_are_judged():
+    class Fixed:
+        def detect(self, image):
+            boxes = np.array([[10, 10, 94, 40], [110, 5, 194, 80]], float)  # wide; as high as a front
+            return Detections(boxes, np.array([0.9, 0.8]), end_on=np.array([True, True]))
+
+    photo = LabelledImage("photo", np.zeros((90, 210), np.uint8), np.array([[8.0, 5.0, 98.0, 45.0]]))
+    score = score_on(Fixed(), [photo], "single")
+    assert (score.row["recall"], score.row["precision"]) == (1.0, 1.0)
+
+
+def test_crops_are_judged_by_a_box_in_their_middle(tmp_path):
+    """Grey levels say what the toy detector finds in a crop: nothing, a car, a small one, or one aside."""
+    places = {10: [4, 4, 60, 50], 20: [25, 25, 45, 45], 30: [-40, 0, 24, 60]}
+
+    class Toy:
+        def detect(self, image):
+            box = places.get(int(image[0, 0]))
+            if box is None:
+                return Detections(np.zeros((0, 4)), np.zeros(0))
+            return Detections(np.array([box], float), np.array([0.9]))
+
+    def crops(*levels):
+        return [np.full((64, 64), level, np.uint8) for level in levels]
+
+    cars, others = crops(*[10] * 30, *[20] * 15, *[30] * 15), crops(*[0] * 19, 10)
+    low, high = recall_on_crops(Toy(), Crops(cars, others))
+    assert (low["false_positives"], low["recall"], low["cars"], low["others"]) == (0.01, 0.0, 60, 20)
+    assert (high["recall"], high["interval"]) == (0.5, pytest.approx(1.96 * np.sqrt(7.5 / 29 / 30)))
+    with pytest.raises(InputError, match="20 crops of cars, want at least 30"):
+        recall_on_crops(Toy(), Crops(others, cars))
+    for name, images in (("positives", cars[:30]), ("negatives", others)):
+        (tmp_path / name).mkdir()
+        for i, image in enumerate(images):
+            cv2.imwrite(str(tmp_path / name / f"{i}.png"), image)
+    done = parkenv("evaluate-detector", "--crops", tmp_path, "--model", "front", "--out", tmp_path / "out")
+    assert done.returncode == 0, done.stderr
+    rows = json.loads((tmp_path / "out" / "summary.json").read_text())["rows"]
+    assert [row["cars"] for row in rows] == [30, 30]
 
 
 def write_uiuc(folder, rng):
@@ -360,18 +384,6 @@ def test_bad_detectors_are_named(model, settings, message):
 def test_a_model_wants_weights_of_its_window():
     with pytest.raises(InputError, match=r"weights are \(3,\), want finite \(8, 9, 16\)"):
         CarModel(Descriptor(), np.zeros(3, np.float32), 0.0, 2.5)
-
-
-@pytest.mark.slow
-def test_held_out_blocks_are_judged_once_each(crops, monkeypatch):
-    monkeypatch.setattr("parkenv.perception.lab.cross_validation.MADE_PHOTOS", 2)
-    scores = cross_validated(Crops(*crops), folds=2, seed=1, settings=TrainingSettings(rounds=0, jitter=0))
-    assert sum(s.n_cars for s in scores) == len(crops[0])
-    assert sum(s.n_others for s in scores) == len(crops[1])
-    assert min(s.auc for s in scores) > 0.8
-    assert min(s.equal_error for s in scores) > 0.5
-    with pytest.raises(InputError, match="folds is 1, want 2 to 30"):
-        cross_validated(Crops(*crops), folds=1)
 
 
 def test_a_detector_that_does_not_exist_is_named(tmp_path):

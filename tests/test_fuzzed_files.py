@@ -18,16 +18,14 @@ import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
 from test_csv_tables import SESSION
 from test_import_osm import car_park
-from tiny_networks import Tiny
 
 from parkenv.errors import InputError
 from parkenv.files.images import read_image
-from parkenv.files.onnx_file import read_onnx
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.mapping.store import MapStore, Session
+from parkenv.perception.car_datasets import read_uiuc_test
 from parkenv.perception.car_model import CarModel
-from parkenv.perception.lab.car_datasets import read_uiuc_test
 from parkenv.scenarios.build import build
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import ScenarioSpec
@@ -183,7 +181,6 @@ EXPERIMENT = {
     "seed": 1,
     "grid": {"failure_s": [10.0, 20.0], "occupancy_levels": [0.5]},
 }
-NETWORK = Tiny("yolo", names=("car",)).model().SerializeToString()
 MODEL = json.loads((ROOT / "world" / "sensor_models" / "laser.json").read_text())
 _HOURS = np.full(168, 1e-4)
 PROCESS = json.loads(written(OccupancyProcess(np.ones(3), _HOURS, np.ones(3), _HOURS).to_file))
@@ -358,7 +355,6 @@ FORMATS = [
     Format("log.csv.gz", LOG.encode(), mutated_bytes, OccupancyLog.read),
     Format("process.json", PROCESS, mutated_json, OccupancyProcess.from_file),
     Format("model.json", MODEL, mutated_json, sensor_model),
-    Format("network.onnx", NETWORK, mutated_bytes, read_onnx),
     Format("scenario.toml", SCENARIO, mutated_text, scenario),
     Format("scenario.json", tomllib.loads(SCENARIO), mutated_json, scenario),
     Format("experiment.json", EXPERIMENT, mutated_json, Comparison.read),

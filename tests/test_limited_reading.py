@@ -4,7 +4,6 @@ import gzip
 import io
 import os
 import struct
-import tarfile
 import zipfile
 import zlib
 from pathlib import Path
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 
 from parkenv.errors import InputError
-from parkenv.files.archives import MAX_MEMBERS, parse_arrays, parse_zip, read_arrays, tar_members
+from parkenv.files.archives import MAX_MEMBERS, parse_arrays, parse_zip, read_arrays
 from parkenv.files.images import decode_image, read_image
 from parkenv.files.limited_reading import (
     csv_records,
@@ -222,24 +221,6 @@ def test_an_image_is_measured_before_it_is_decoded(data, message):
 def test_an_image_is_read(tmp_path):
     (tmp_path / "a.png").write_bytes(png(10, 5, bytes(55)))
     assert read_image(tmp_path / "a.png").shape == (5, 10)
-
-
-def test_a_tar_archive_is_unpacked_within_limits(tmp_path):
-    path = tmp_path / "a.tar.gz"
-    with tarfile.open(path, "w:gz") as archive:
-        for name, size in (("x/a.pgm", 10), ("b.txt", 20), ("c.pgm", 3000)):
-            member = tarfile.TarInfo(name)
-            member.size = size
-            archive.addfile(member, io.BytesIO(bytes(size)))
-    assert [(name, len(data)) for name, data in tar_members(path, ".pgm")] == [
-        ("x/a.pgm", 10),
-        ("c.pgm", 3000),
-    ]
-    with pytest.raises(InputError, match="has more than 2,000 bytes"):
-        list(tar_members(path, ".pgm", 2000))
-    path.write_bytes(gzip.compress(b"no archive" * 100))
-    with pytest.raises(InputError, match="not a tar archive"):
-        list(tar_members(path, ".pgm"))
 
 
 def test_text_loses_its_byte_order_mark(tmp_path):

@@ -12,7 +12,7 @@ from parkenv import InputError
 from parkenv.files.videos import Video, film
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import Detections
-from parkenv.perception.lab.labelled_folders import crops_of, read_labels
+from parkenv.perception.labelled_folders import crops_of, read_labels
 
 SIZE = (160, 120)
 
@@ -277,4 +277,6 @@ def test_labels_of_few_cars_or_without_names_are_refused(tmp_path):
     done = parkenv("train-detector", "--labels", tmp_path, "--out", tmp_path / "m.npz")
     assert "has neither data.yaml with names nor classes.txt" in " ".join(done.stderr.split())
     done = parkenv("train-detector", "--uiuc", tmp_path, "--labels", tmp_path, "--out", tmp_path / "m.npz")
-    assert "--crops FOLDER, --labels FILE|FOLDER and --simulated N" in " ".join(done.stderr.split())
+    assert "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER" in " ".join(
+        done.stderr.split()
+    )

@@ -10,7 +10,7 @@ from command_line import parkenv
 from parkenv import InputError, OccupancyProcess, Traffic, make_scenario
 from parkenv.mapping.inference import SessionLog
 from parkenv.mapping.store import MapStore
-from parkenv.mapping.survey import Survey, SurveySettings, drive_together
+from parkenv.mapping.survey import Survey, SurveySettings
 from parkenv.mapping.survey_score import METHODS
 from parkenv.perception.pipeline import PerceptionPipeline
 from parkenv.scenarios.spec import scenario_spec
@@ -94,38 +94,6 @@ def test_a_survey_goes_on_where_it_was(tmp_path):
     run(study, tmp_path)
     with MapStore(tmp_path / "map.sqlite", study.built.lot, create=False) as store:
         assert len(store.sessions()) == len(SESSIONS.read(tmp_path)) == 2
-
-
-def test_detectors_that_drive_together_find_what_each_finds_alone():
-    scenario, _ = halves()
-    surveys = [
-        Survey(scenario, SurveySettings(weather="rain", every=10.0, detector=name)) for name in ("hog", "net")
-    ]
-    together = drive_together(surveys, 1)
-    for survey, result in zip(surveys, together, strict=True):
-        alone = survey.drive(1)
-        np.testing.assert_array_equal(result.session.p_occupied, alone.session.p_occupied)
-        assert repr(result.score.sightings.tolist()) == repr(alone.score.sightings.tolist())
-        assert result.session.key == alone.session.key
-    seen = together[0].score.sightings
-    parked = seen["slot"] >= 0
-    assert result.truth[seen["slot"][parked]].all()
-    assert (seen["visible"][parked] > 0).all()
-    other = Survey(scenario, SurveySettings(weather="sunny", every=10.0))
-    with pytest.raises(InputError, match="must differ in detectors, or rigs of the same route, alone"):
-        drive_together([surveys[0], other], 1)
-
-
-def test_rigs_that_drive_together_see_the_same_cars():
-    scenario, _ = halves()
-    surveys = [
-        Survey(scenario, SurveySettings(weather="sunny", every=8.0, rig=rig)) for rig in ("laser", "stereo")
-    ]
-    laser, stereo = (result.score.sightings for result in drive_together(surveys, 1))
-    for name in ("capture", "slot", "visible"):
-        np.testing.assert_array_equal(
-            laser[name][laser["visible"] > 0], stereo[name][stereo["visible"] > 0], name
-        )
 
 
 def test_the_maps_error_is_zero_where_it_is_right():

@@ -49,10 +49,8 @@ COMMANDS = {
     "sensors preview": Entry("Draw the sensor measurements on the way to the best slot.", "sensors:Preview"),
     "fit-sensor-model": Entry("Measure how often slots are seen right.", "sensors:FitSensorModel", SENSE),
     "detect": Entry("Find cars in photographs, videos and recorded drives.", "detect:Detect", SENSE),
-    "train-detector": Entry("Train a car model or a network.", "detect:TrainDetector", SENSE),
-    "evaluate-detector": Entry(
-        "Measure a detector on images, or on drives.", "detect:EvaluateDetector", SENSE
-    ),
+    "train-detector": Entry("Train a car model on photographs.", "detect:TrainDetector", SENSE),
+    "evaluate-detector": Entry("Measure a detector on labelled images.", "detect:EvaluateDetector", SENSE),
     "park": Entry("Evaluate agents that drive the car into a slot.", "drive:Park", DRIVE),
     "calibrate": Entry("Measure the costs of searches on whole driven trips.", "drive:Calibrate", DRIVE),
     "lot": Entry("Show, check, import, count and convert lots.", heading=DATA),

@@ -4,34 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self, get_args
+from typing import TYPE_CHECKING, Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from parkenv.cli.options import Command
-from parkenv.cli.study_command import StudyCommand
 from parkenv.cli.tables import make_console, make_table, print_rows, save_summary, stages
 from parkenv.errors import InputError
-from parkenv.files.known_names import RigName
-from parkenv.files.option import Inside, Option, option
-from parkenv.files.spec_file import Axis, DetectorName, Several
+from parkenv.files.option import option
+from parkenv.files.spec_file import DetectorName, Several
 from parkenv.show.plurals import plural
 from parkenv.show.report.tables import Column
-from parkenv.studies.fields import CaptureDistance, ScenarioItem, Seed
-from parkenv.studies.results import Row
-from parkenv.studies.sensing.detector_study import DetectorStudy
-from parkenv.studies.sensing.detector_training import DetectorTraining
-from parkenv.studies.study import ExecutionSpec, counted
+from parkenv.studies.fields import Seed
+from parkenv.studies.study import counted
 
 if TYPE_CHECKING:
-    from rich.console import Console
-    from rich.table import Table
-
+    from parkenv.perception.car_datasets import Crops, LabelledImage
     from parkenv.perception.car_model import CarModel
     from parkenv.perception.detector import Detector
-    from parkenv.perception.lab.cross_validation import CropScore
-    from parkenv.studies.runner import Result
 
 
 class Detect(Command):
@@ -125,15 +116,8 @@ class Detect(Command):
         return make_detector(self.detector, self.threshold)
 
 
-class TrainDetector(Command, DetectorTraining):
-    """A HOG model (.npz) learns from photographs with labelled boxes, or from aligned crops and images without cars.
-
-    A network like the packaged `net` (.onnx) learns from simulated pictures only.
-
-    With --folds, 30 blocks of consecutive files are held out in rotation: consecutive images often show the same car.
-    The held-out cars are also searched in composed photographs: pasted at 0.8 to 2.2 times their size into mosaics of
-    the held-out images without cars.
-    """
+class TrainDetector(Command):
+    """The model learns from photographs with labelled boxes, or from aligned crops and images without cars."""
 
     examples = """
         parkenv train-detector --uiuc CarData --out side.npz
@@ -142,302 +126,179 @@ class TrainDetector(Command, DetectorTraining):
         parkenv train-detector --crops kitti --front --out front.npz \\
             --normalization blocks --penalty 0.02 \\
             --jitter 0 --misaligned 0 --enlarged 0
-        parkenv train-detector --simulated 94 --out my-net.onnx
         """
 
-    out: Path = option(
-        ...,
-        "The file to write: a HOG model, or with --simulated a network.",
-        short="-o",
-        takes="FILE.npz|FILE.onnx",
+    uiuc: Path | None = option(None, "UIUC's folder: trains on TrainImages.", takes="DIR")
+    crops: Path | None = option(
+        None, "Instead: a folder with positives/, negatives/ (or vehicles/, non-vehicles/).", takes="DIR"
     )
+    labels: Path | None = option(
+        None,
+        "Instead: labelled photographs, a file of COCO, or a folder of YOLO (images/ and labels/, or .txt "
+        "beside the pictures; names in data.yaml or classes.txt).",
+        takes="FILE.json|DIR",
+    )
+    images: Path | None = option(None, "Folder of the pictures of COCO.", takes="DIR", default="the file's")
+    classes: Several[str] | None = option(
+        None,
+        "Classes of the labels that are cars.",
+        takes="NAME[,...]",
+        default="car, van, truck, bus and the like",
+        min_length=1,
+    )
+    front: bool = option(False, "Train a model of fronts and rears, with a square window.")
+    seed: Seed = Field(0, description="Seed of jitter and solver.")
+    normalization: Literal["neighbors", "cell", "blocks"] = option(
+        "neighbors", "neighbors, cell (the thesis's), or blocks.", takes="NAME"
+    )
+    penalty: float = option(0.03, "Penalty of the support vector machine.", takes="C")
+    rounds: int = option(3, "Rounds of hard-negative mining.", ge=0)
+    jitter: int = option(4, "Shifted copies of each car; 0 if the crops are not aligned.", ge=0)
+    misaligned: int = option(
+        2, "Misaligned crops of each car as negatives; 0 if the crops are not aligned.", ge=0
+    )
+    enlarged: float = option(
+        2.0,
+        "Factor by which crops are enlarged for further mining, so that parts of large cars "
+        "become negatives; 0: none, if the crops are not aligned. With --labels, the photographs "
+        "are mined instead.",
+    )
+    out: Path = option(..., "The file to write.", short="-o", takes="FILE.npz")
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Self:
+        if sum(source is not None for source in (self.uiuc, self.crops, self.labels)) != 1:
+            raise PydanticCustomError(
+                "whole", "give one of --uiuc FOLDER, --crops FOLDER and --labels FILE|FOLDER"
+            )
+        if self.labels is None and (self.images is not None or self.classes is not None):
+            raise PydanticCustomError("whole", "--images and --classes go with --labels")
+        return self
 
     def run(self) -> None:
         """See `Command`."""
+        from parkenv.files.atomic_write import check_writable
+        from parkenv.perception.car_regions import END, SIDE
+        from parkenv.perception.hog import Descriptor
+        from parkenv.perception.training import TrainingSettings, train
+
+        if self.out.suffix != ".npz":
+            raise InputError(f"--out {self.out}: want a name that ends in .npz")
+        check_writable(self.out)
+        window = END if self.front else SIDE
         console = make_console()
         with console.status("Training") as status:
-            trained = self.train(self.out, status.update)
-        if trained.scores:
-            console.print(_cross_validation_table(trained.scores))
-        written = ", ".join([str(self.out), *(file.name for file in trained.files[1:])])
-        console.print(f"Trained on {trained.trained_on}. Written: {written}")
+            data, photos = self._photographs()
+            aligned = {} if self.labels is None else {"region_aspect": window.aspect, "car": window.car}
+            model = train(
+                data.positives,
+                data.negatives,
+                photos=photos,
+                descriptor=Descriptor(*window.size, self.normalization),
+                end_on=self.front,
+                settings=TrainingSettings(
+                    self.penalty, self.rounds, self.jitter, self.misaligned, self.enlarged, self.seed
+                ),
+                trained_on=f"{len(data.positives)} crops and {len(data.negatives)} others in "
+                f"{self.uiuc or self.crops or self.labels}",
+                progress=status.update,
+                **aligned,
+            )
+            model.save(self.out)
+        console.print(f"Trained on {model.trained_on}. Written: {self.out}")
+
+    def _photographs(self) -> tuple[Crops, Sequence[LabelledImage]]:
+        """Return crops, and the photographs of labels."""
+        from parkenv.perception.car_datasets import read_crop_folder, read_uiuc_training
+        from parkenv.perception.labelled_folders import crops_of, read_labels
+
+        if self.labels is not None:
+            labelled = read_labels(self.labels, self.images, self.classes or ())
+            return crops_of(labelled, end_on=self.front, seed=self.seed)
+        if self.uiuc is not None:
+            return read_uiuc_training(self.uiuc), ()
+        return read_crop_folder(Path(str(self.crops))), ()
 
 
-def _cross_validation_table(scores: Sequence[CropScore]) -> Table:
-    from parkenv.perception.lab.cross_validation import FALSE_POSITIVES
-
-    def cells(part: str, cars: str, others: str, values: Sequence[float]) -> tuple[str, ...]:
-        return part, cars, others, *(f"{v:.4f}" for v in values)
-
-    values = [(s.auc, *s.recall, s.equal_error) for s in scores]
-    rows = [
-        cells(str(i + 1), str(s.n_cars), str(s.n_others), v)
-        for i, (s, v) in enumerate(zip(scores, values, strict=True))
-    ]
-    rows.append(cells("mean", "", "", [sum(column) / len(scores) for column in zip(*values, strict=True)]))
-    rates = [f"recall at {rate:.1%} false positives" for rate in FALSE_POSITIVES]
-    columns = ["part", "cars", "others", "AUC", *rates, "equal error, made photographs"]
-    return make_table("Held out", columns, rows)
-
-
-_PICTURES, _DRIVES = "On drives", "On whole drives"
-
-
-class EvaluateDetector(Command, ExecutionSpec):
+class EvaluateDetector(Command):
     """On UIUC's sets, by their matching rule, a HOG model (--model) is searched at the sizes of the set's cars.
 
     Any other detector works as in a survey; its boxes of other sizes, and of fronts and rears, are left out, as the
     sets label neither, and a box more than twice as wide as high is a side. On crops, the output gives the fraction of
-    cars found at 1 % and 10 % false positives, with intervals over 30 blocks of consecutive files. On pictures of
-    drives, the threshold of every detector is set to the same number of false positives; a car counts if it is within
-    20 m, 16 px high, and 30 % visible.
+    cars found at 1 % and 10 % false positives, with intervals over 30 blocks of consecutive files.
 
-    With --sessions, the command compares whole survey drives like those of `parkenv survey`: cars found, slots right,
-    error of the map, by weather, distance, and cause of a miss. All detectors process the same pictures. Each rig and
-    detector has a folder with its map. The same command continues after an interruption.
+    For whole drives see `parkenv survey --detector NAME`: cars detected, slots right, error of the map.
     """
 
     examples = """
         parkenv evaluate-detector --uiuc CarData --model side
         parkenv evaluate-detector --uiuc CarData --detector net
         parkenv evaluate-detector --crops kitti --detector net
-        parkenv evaluate-detector --drives campus --detector hog,net
-        parkenv evaluate-detector --drives campus --detector hog,net \\
-            --sessions 21 --rig laser,stereo --misses 8
         """
 
     uiuc: Path | None = option(None, "UIUC's folder as published (CarData).", takes="DIR")
-    model: str = option(
-        "side",
-        "side, front, or an .npz of `parkenv train-detector`; for other detectors use --detector.",
-        takes="NAME|FILE",
-    )
-    detectors: Axis[DetectorName] | None = option(
-        None,
-        "Instead of a model: hog, net, a network (.onnx), or your own MODULE:CLASS; with --drives "
-        "several, separated by commas.",
-        name="--detector",
-        takes="NAME|FILE|MODULE:CLASS",
-        default="none",
-    )
     crops: Path | None = option(
         None,
         "Instead of --uiuc: a folder with positives/, negatives/ (or vehicles/, non-vehicles/).",
         takes="DIR",
     )
-    drives: Annotated[ScenarioItem | None, Inside(only=())] = option(
+    model: str = option(
+        "side",
+        "side, front, or an .npz of `parkenv train-detector`; for other detectors use --detector.",
+        takes="NAME|FILE",
+    )
+    detector: DetectorName | None = option(
         None,
-        "Instead of --uiuc: pictures along the survey's route of a scenario, or whole drives.",
-        takes="SCENARIO",
-        panel=_PICTURES,
+        "Instead of a model: hog, net, a network (.onnx), or your own MODULE:CLASS.",
+        takes="NAME|FILE|MODULE:CLASS",
+        default="none",
     )
-    pictures: int = option(40, "Pictures in each of the five weathers.", panel=_PICTURES, ge=1)
-    false_positives: float = option(
-        0.1, "Boxes without a car in a picture, on average.", panel=_PICTURES, ge=0, le=100
-    )
-    seed: Annotated[Seed, Option(panel=_PICTURES)] = Field(0, description="Seed of cars, lighting and noise.")
-    sessions: int = option(0, "Survey drives for each rig; 0: only pictures.", panel=_DRIVES, ge=0)
-    rigs: Axis[RigName] | None = option(
-        None,
-        f"{', '.join(get_args(RigName))}.",
-        name="--rig",
-        takes="NAME[,...]",
-        panel=_DRIVES,
-        default="laser",
-    )
-    every: CaptureDistance = option(2.5, "Metres between captures.", takes="M", panel=_DRIVES)
-    misses: int = option(
-        0,
-        "Missed cars of each kind on a contact sheet for each rig and detector; 0: none.",
-        panel=_DRIVES,
-        ge=0,
-    )
-    out: Path = option(Path("results/detector"), "Folder for summary.json, tables and figures.", short="-o")
+    out: Path = option(Path("results/detector"), "Folder for summary.json and figures.", short="-o")
 
     @model_validator(mode="after")
-    def _fit_together(self) -> Self:
-        if sum(source is not None for source in (self.uiuc, self.crops, self.drives)) != 1:
-            raise PydanticCustomError(
-                "whole", "give one of --uiuc FOLDER, --crops FOLDER and --drives SCENARIO"
-            )
-        if not self.sessions and (self.rigs is not None or self.misses):
-            raise PydanticCustomError("whole", "--rig and --misses go with --sessions")
-        if self.sessions and self.drives is None:
-            raise PydanticCustomError("whole", "--sessions requires --drives")
-        if self.drives is None and len(self.detectors or ()) > 1:
-            raise PydanticCustomError("whole", "--detector names several, which requires --drives")
+    def _one_source(self) -> Self:
+        if (self.uiuc is None) == (self.crops is None):
+            raise PydanticCustomError("whole", "give one of --uiuc FOLDER and --crops FOLDER")
         return self
 
     def run(self) -> None:
         """See `Command`."""
-        if self.sessions:
-            names = [name for name in DetectorStudy.model_fields if name in type(self).model_fields]
-            fields = {name: getattr(self, name) for name in names}
-            fields |= {"scenario": self.drives, "detectors": self._names, "rigs": self.rigs or ("laser",)}
-            CompareDetectors(study=DetectorStudy.parse(fields, ""), out=self.out).run()
-        elif self.drives is not None:
-            self._on_drives()
-        elif self.crops is not None:
-            self._on_crops(self.crops)
-        elif self.uiuc is not None:
-            self._on_uiuc(self.uiuc)
+        from parkenv.files.atomic_write import make_folder
+        from parkenv.perception.car_datasets import read_crop_folder
+        from parkenv.perception.detection_scores import recall_on_crops, score_on_uiuc
+        from parkenv.show.figures.detectors import save_curves
 
-    @property
-    def _names(self) -> Sequence[str]:
-        return self.detectors or (self.model,)
+        detector, console = self._detector(), make_console()
+        if self.crops is not None:
+            crops = read_crop_folder(self.crops)
+            make_folder(self.out)
+            with stages(console, "crops") as progress:
+                advance = counted(progress, "Detecting", len(crops.positives) + len(crops.negatives))
+                rows = recall_on_crops(detector, crops, on_image=advance)
+            columns = {
+                key: Column(key, key.replace("_", " "), share=True) for key in ("false_positives", "recall")
+            }
+            shown = [
+                r | {"recall_ci95": [r["recall"] - r["interval"], r["recall"] + r["interval"]]} for r in rows
+            ]
+            print_rows(console, "Cars found in crops", shown, (*columns, "cars", "others"), columns)
+        elif self.uiuc is not None:
+            make_folder(self.out)
+            with stages(console, "images") as progress:
+                scores = score_on_uiuc(detector, self.uiuc, on_image=counted(progress, "Detecting"))
+            rows = [score.row for score in scores]
+            print_rows(console, "UIUC", rows, rows[0])
+            save_curves(scores, self.detector or self.model, self.out / "recall_precision.png")
+        save_summary(self.out, None, rows)
+        console.print(f"Written: {self.out / 'summary.json'}")
 
     def _detector(self) -> CarModel | Detector:
         from parkenv.perception.car_model import PACKAGED_MODELS, CarModel
         from parkenv.perception.detector_registry import make_detector
         from parkenv.perception.hog_detector import LEAST_SCORED
 
-        (name,) = self._names
-        if self.detectors is None and (name in PACKAGED_MODELS or name.lower().endswith(".npz")):
-            return CarModel.load(name)
-        return make_detector(name, LEAST_SCORED)
-
-    def _on_drives(self) -> None:
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.perception.detector_registry import make_detector
-        from parkenv.scenarios.build import build
-        from parkenv.studies.sensing.detector_drives import drive_pictures, score_on_drives
-
-        assert self.drives is not None
-        detectors = {name: make_detector(name, 0.01) for name in self._names}
-        its = build(self.drives)
-        make_folder(self.out)
-        console = make_console()
-        with stages(console, "pictures") as progress:
-            taken, drawn = [], counted(progress, "Drawing")
-            for picture in drive_pictures(its, self.pictures, self.seed):
-                taken.append(picture)
-                drawn()
-            advance = counted(progress, "Detecting", len(taken) * len(detectors))
-            rows = score_on_drives(detectors, taken, self.false_positives, advance)
-        columns = {name: Column(name, name, share=True) for name in detectors}
-        print_rows(console, "Cars found", rows, rows[0], columns)
-        save_summary(self.out, None, rows)
-        console.print(
-            f"Recall on {plural(len(taken), 'picture')} at {self.false_positives:g} false positives in a picture. "
-            f"Written: {self.out / 'summary.json'}"
-        )
-
-    def _on_crops(self, folder: Path) -> None:
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.perception.lab.car_datasets import read_crop_folder
-        from parkenv.studies.sensing.detector_scores import recall_on_crops
-
-        loaded, crops = self._detector(), read_crop_folder(folder)
-        make_folder(self.out)
-        console = make_console()
-        with stages(console, "crops") as progress:
-            advance = counted(progress, "Detecting", len(crops.positives) + len(crops.negatives))
-            rows = recall_on_crops(loaded, crops, on_image=advance)
-        columns = {
-            key: Column(key, key.replace("_", " "), share=True) for key in ("false_positives", "recall")
-        }
-        shown = [
-            r | {"recall_ci95": [r["recall"] - r["interval"], r["recall"] + r["interval"]]} for r in rows
-        ]
-        print_rows(console, "Cars found in crops", shown, (*columns, "cars", "others"), columns)
-        save_summary(self.out, None, rows)
-        console.print(f"Written: {self.out / 'summary.json'}")
-
-    def _on_uiuc(self, uiuc: Path) -> None:
-        from parkenv.files.atomic_write import make_folder
-        from parkenv.perception.car_model import CarModel
-        from parkenv.studies.sensing.detector_scores import save_curves, score_on_uiuc
-
-        loaded = self._detector()
-        make_folder(self.out)
-        console = make_console()
-        with stages(console, "images") as progress:
-            scores = score_on_uiuc(loaded, uiuc, on_image=counted(progress, "Detecting"))
-        rows = [score.row for score in scores]
-        print_rows(console, "UIUC", rows, rows[0])
-        kind = "model" if isinstance(loaded, CarModel) else "detector"
-        save_curves(scores, f"{kind} {self._names[0]}", self.out / "recall_precision.png")
-        save_summary(self.out, None, rows)
-        console.print(f"Written: {self.out / 'recall_precision.png'}, summary.json")
-
-
-class CompareDetectors(StudyCommand):
-    """The comparison of detectors on whole drives, as `evaluate-detector --sessions` and experiment files run it."""
-
-    examples = "parkenv evaluate-detector --drives campus --detector hog,net --sessions 21"
-
-    study: DetectorStudy = DetectorStudy()
-    out: Path
-
-    def show(self, console: Console, result: Result) -> None:
-        """Print the comparison of detectors, once all have driven."""
-        if result.complete:
-            for printed in _tables(result.rows, self.study.rigs, self.study.detectors):
-                console.print(printed)
-
-
-def _tables(table: Sequence[Row], rigs: Sequence[str], detectors: Sequence[str]) -> list[Table]:
-    """Return three tables: whole drives, drives by weather, and cars in pictures."""
-    names = [(rig, detector) for rig in rigs for detector in detectors]
-    headings = [f"{detector}, {rig}" for rig, detector in names]
-    rows = {(r["rig"], r["detector"], r["group"], r["part"]): r for r in table}
-    parts = list(dict.fromkeys((r["group"], r["part"]) for r in table))
-
-    def line(heading: str, part: tuple[str, str], measure: str) -> tuple[str, ...]:
-        return heading, *(_rate(rows[*name, *part], measure) for name in names)
-
-    def numbers(heading: str, column: str) -> tuple[str, ...]:
-        values = [rows[*name, "all", "all"][column] for name in names]
-        return heading, *("" if value is None else f"{value:.3f}" for value in values)
-
-    whole = ("all", "all")
-    drives = [
-        line("parked cars found", whole, "cars"),
-        line("cars in a picture found in it", whole, "in_pictures"),
-        line("boxes that are cars", whole, "boxes"),
-        line("slots right", whole, "slots"),
-        line("slots unknown: never in view", whole, "unknown"),
-        line("slots wrong", whole, "wrong"),
-        numbers("error of the place, m", "place_error_m"),
-        numbers("mean error of the map", "map_error"),
-    ]
-    weathers = [
-        line(f"{part}: {heading}".replace("_", " "), (group, part), measure)
-        for heading, measure in (
-            ("cars found", "cars"),
-            ("boxes that are cars", "boxes"),
-            ("slots right", "slots"),
-        )
-        for group, part in parts
-        if group == "weather"
-    ]
-    pictures = [
-        line(
-            f"{part} ({rows[*names[0], group, part]['in_pictures']:,})".replace("_", " "),
-            (group, part),
-            "in_pictures",
-        )
-        for group, part in parts
-    ]
-    precision = [
-        line(f"{part}: boxes that are cars", (group, part), "boxes")
-        for group, part in parts
-        if group == "distance"
-    ]
-    never = [
-        (f"{part}: cars never found", *(str(rows[*name, "cause", part]["cars"]) for name in names))
-        for group, part in parts
-        if group == "cause"
-    ]
-    return [
-        make_table("Whole drives", ["", *headings], drives),
-        make_table("By weather", ["", *headings], weathers),
-        make_table(
-            "Cars in a picture that are found in it", ["", *headings], [*pictures, *precision, *never]
-        ),
-    ]
-
-
-def _rate(row: Row, measure: str) -> str:
-    rate, low, high = (row[f"{measure}_{c}"] for c in ("rate", "low", "high"))
-    return "" if rate is None else f"{rate:.1%} [{100 * low:.1f}, {100 * high:.1f}]"
+        if self.detector is not None:
+            return make_detector(self.detector, LEAST_SCORED)
+        if self.model in PACKAGED_MODELS or self.model.lower().endswith(".npz"):
+            return CarModel.load(self.model)
+        return make_detector(self.model, LEAST_SCORED)

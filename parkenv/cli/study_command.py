@@ -129,7 +129,6 @@ COMMANDS = {
     "demand": "occupancy:Demand",
     "benchmark": "benchmark:RunSuite",
     "survey": "survey:Survey",
-    "detectors": "detect:CompareDetectors",
     "demo": "demo:Demo",
     "calibrate": "drive:Calibrate",
     "train": "train:Train",

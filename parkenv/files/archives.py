@@ -1,14 +1,12 @@
-"""Read zip and tar archives and NumPy's .npz within limits on their unpacked size."""
+"""Read zip archives and NumPy's .npz within limits on their unpacked size."""
 
 from __future__ import annotations
 
 import io
 import math
-import tarfile
 import tokenize
 import zipfile
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from parkenv.errors import InputError
-from parkenv.files.limited_reading import MAX_BYTES, open_limited, read_bytes
+from parkenv.files.limited_reading import MAX_BYTES, read_bytes
 
 MAX_MEMBERS = 10_000
 """Maximum number of files in an archive."""
@@ -82,23 +80,3 @@ def parse_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
         except (ValueError, LookupError, TypeError, SyntaxError, *_HEADER_ERRORS) as error:
             raise InputError(f"{name}: {member}: not an array of numbers: {error}") from error
     return arrays
-
-
-def tar_members(path: str | Path, suffix: str, most: int = MAX_BYTES) -> Iterator[tuple[str, bytes]]:
-    """Yield name and content of the files of a (gzipped) tar archive whose names end in `suffix`.
-
-    Raises:
-        InputError: not a whole tar archive, or more than `most` bytes unpacked; the message names it.
-    """
-    try:
-        with open_limited(path, most) as file, tarfile.open(fileobj=file, mode="r|") as archive:
-            for number, member in enumerate(archive):
-                if number == MAX_MEMBERS:
-                    raise InputError(f"{path}: holds more than {MAX_MEMBERS:,} files")
-                content = archive.extractfile(member) if member.name.endswith(suffix) else None
-                if content is not None:
-                    yield member.name, content.read()
-    except InputError:
-        raise
-    except (tarfile.TarError, EOFError, ValueError) as error:
-        raise InputError(f"{path}: not a tar archive that can be read: {error}") from error

@@ -6,7 +6,7 @@ import hashlib
 import math
 import os
 import sqlite3
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -207,9 +207,9 @@ class MapStore:
                     raise InputError(f"{self.path}: {error}") from error
         return found
 
-    def log(self, keys: Collection[str] | None = None) -> SessionLog:
-        """Return the sessions with these keys, or all, as a log for predictions."""
-        sessions = [session for session in self.sessions() if keys is None or session.key in keys]
+    def log(self) -> SessionLog:
+        """Return the sessions as a log for predictions."""
+        sessions = self.sessions()
         p = np.array([s.p_occupied for s in sessions]).reshape(len(sessions), self._lot.n_slots)
         known = np.isfinite(p)
         return SessionLog(np.array([s.time for s in sessions]), np.where(known, p, 0.0) > 0.5, known)

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import time as clock
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +19,7 @@ from parkenv.mapping.localisation import make_locate
 from parkenv.mapping.odometry import PoseNoise
 from parkenv.mapping.route import SurveyRoute, survey_route
 from parkenv.mapping.store import Session
-from parkenv.mapping.survey_score import SurveyScore, TrueBoxes, true_boxes
+from parkenv.mapping.survey_score import SurveyScore, true_boxes
 from parkenv.perception.detector_registry import DEFAULT_DETECTOR, detector_version
 from parkenv.perception.monocular import RangingErrors
 from parkenv.perception.pipeline import CameraView, PerceptionPipeline, PerceptionResult, localize_as_thesis
@@ -185,7 +185,13 @@ class Survey:
             pictures: number of results to keep for figures.
             on_frame: called after every capture.
         """
-        return drive_together([self], number, pictures=pictures, on_frame=on_frame)[0]
+        drive = self.draw(number)
+        session = _OpenSession(self, drive, number, pictures)
+        for i in range(len(drive.poses)):
+            frame = session.add(i, *drive.capture(i))
+            if on_frame is not None:
+                on_frame(frame)
+        return session.result()
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,53 +213,6 @@ class SurveyDrive:
         """Return the true scene at capture i, and the measurements; captures may be skipped, not repeated."""
         scene = self.scenes.at(float(self.times[i]), self.poses[i])
         return scene, self.rig.capture(scene, self.poses[i], self.weather, self.seeds[i])
-
-
-def drive_together(
-    surveys: Sequence[Survey],
-    number: int,
-    *,
-    pictures: int = 0,
-    on_frame: Callable[[SurveyFrame], None] | None = None,
-) -> list[SessionResult]:
-    """Drive a session of several surveys at once: every picture is drawn once, and all detectors look at it.
-
-    With rigs that differ, the laser rig gets the left picture of the stereo camera: as good a picture as in a survey
-    of its own, with other noise.
-
-    Args:
-        surveys: surveys of one scenario that differ in their detectors alone, or in rigs with the same route, too.
-        number: 0 or more; determines the session.
-        pictures: number of results to keep for figures.
-        on_frame: called after every capture and survey.
-
-    Raises:
-        InputError: the surveys differ in more than that.
-    """
-    first = surveys[0]
-    if any(
-        survey.scenario is not first.scenario
-        or replace(survey.settings, rig=first.settings.rig, detector="")
-        != replace(first.settings, detector="")
-        or not np.array_equal(survey.route.path, first.route.path)
-        for survey in surveys
-    ):
-        raise InputError(
-            "surveys that drive together must differ in detectors, or rigs of the same route, alone"
-        )
-    drive = first.draw(number)
-    for survey in surveys[1:]:
-        drive = replace(drive, rig=drive.rig.joined(survey.pipeline.rig))
-    sessions = [_OpenSession(survey, drive, number, pictures) for survey in surveys]
-    for i in range(len(drive.poses)):
-        scene, capture = drive.capture(i)
-        true = true_boxes(drive.rig, scene, capture)
-        parts = {survey.settings.rig: survey.pipeline.rig.part_of(capture) for survey in surveys}
-        for survey, session in zip(surveys, sessions, strict=True):
-            frame = session.add(i, scene, parts[survey.settings.rig], true)
-            if on_frame is not None:
-                on_frame(frame)
-    return [session.result() for session in sessions]
 
 
 class SessionMap:
@@ -316,7 +275,7 @@ class _OpenSession:
         # For each section of the route, the capture with the most cars.
         self._shown: dict[int, PerceptionResult] = {}
 
-    def add(self, i: int, scene: Scene, capture: Capture, true: TrueBoxes) -> SurveyFrame:
+    def add(self, i: int, scene: Scene, capture: Capture) -> SurveyFrame:
         """Process capture i; the true scene is only for figures and scores."""
         drive, slots, time = self._drive, self._map.slots, float(self._drive.times[i])
         slots.updated[:] = False
@@ -326,7 +285,8 @@ class _OpenSession:
         self._at += [i] * len(result.views)
         self._frame_s.append(clock.perf_counter() - begun)
         self._observed_at[slots.updated] = time
-        self._score.add(i, scene, result, [localize_as_thesis(view, vehicle) for view in result.views], true)
+        true = true_boxes(drive.rig, scene, capture)
+        self._score.add(scene, result, [localize_as_thesis(view, vehicle) for view in result.views], true)
         section = i * self._pictures // len(drive.poses)
         if self._pictures and (section not in self._shown or result.n_cars > self._shown[section].n_cars):
             self._shown[section] = result

@@ -21,28 +21,10 @@ MATCH = 0.3  # intersection over union from which a detection matches a car
 CLEAR = 0.6  # visible fraction of a car in an image from which a frame without its detection counts as a miss
 METHODS = ("fitted", "thesis")
 """Localisation methods: `localize_cars`, and the median range as in the thesis (`localize_as_thesis`)."""
-SIDES = ("left", "top", "right", "bottom")
 _GLIMPSE = 0.05  # visible fraction from which a box can match a car
 _TRUTH = LaserScanner()
 _LEAST_BEAMS = 3
 
-SIGHTING = np.dtype(
-    [
-        ("capture", np.int64),
-        ("camera", np.int64),  # its number in the rig
-        ("slot", np.int64),  # the slot in which the car is parked; -1 for a moving car, and without a car
-        (
-            "distance",
-            np.float64,
-        ),  # m, from the camera to the car's centre; of a box without a car as measured, or NaN
-        ("visible", np.float64),  # visible fraction of the car; 0 without a car
-        *((side, np.int64) for side in SIDES),  # px, the box of the whole car within the picture, or the box
-        ("view", np.int64),  # a `View`
-        ("boxes", np.int64),  # number of boxes that match the car: 0 if it is missed
-        ("placed", np.int64),  # 1 if a car was located in its slot, or by the box without a car in any slot
-    ]
-)
-"""A car in a picture, at least `_GLIMPSE` of it visible, or a box without a car."""
 TrueBoxes = dict[str, VehicleBoxes]
 """The vehicles in the image of each camera, by its name."""
 
@@ -78,12 +60,6 @@ class SurveyScore:
         self.in_frame = np.zeros((len(DISTANCE_ENDS), 2), dtype=np.int64)
         self._errors: dict[str, list[tuple[float, float, float]]] = {method: [] for method in METHODS}
         self._distance_std: list[float] = []
-        self._sightings: list[NDArray[np.void]] = []
-
-    @property
-    def sightings(self) -> NDArray[np.void]:
-        """A record (`SIGHTING`) for each car in each picture, and for each box without a car."""
-        return np.concatenate([np.empty(0, SIGHTING), *self._sightings])
 
     def errors(self, method: str) -> FloatArray:
         """Return the errors of parked cars located by one of `METHODS`, (k, 3): distance, m; position, m; heading, rad.
@@ -103,7 +79,6 @@ class SurveyScore:
 
     def add(
         self,
-        i: int,
         scene: Scene,
         result: PerceptionResult,
         by_median: Sequence[LocatedCars],
@@ -112,14 +87,13 @@ class SurveyScore:
         """Count one capture.
 
         Args:
-            i: its number in the drive.
             scene: the true scene.
             result: pipeline result for the capture.
             by_median: for each view, its cars located by the thesis's method.
             true: `true_boxes` of the capture.
         """
         pose = result.captured.capture.pose
-        for k, (view, median_cars) in enumerate(zip(result.views, by_median, strict=True)):
+        for view, median_cars in zip(result.views, by_median, strict=True):
             boxes = true[view.name]
             matched = _matched(view.detections.boxes, boxes)
             self.detections += len(matched)
@@ -127,7 +101,6 @@ class SurveyScore:
             slots = view.slots[view.slots >= 0]
             self.found[slots[np.isin(slots, scene.present)]] = True
             self._count(boxes, view, scene.n_vehicles, matched)
-            self._sightings.append(_sightings(i, k, boxes, view, scene.n_vehicles, matched))
             if (matched > 0).any():
                 exact, ids = _TRUTH.scan_with_ids(scene.scan_plane, view.mount.in_world(pose))
                 for method, cars in zip(METHODS, (view.cars, median_cars), strict=True):
@@ -166,29 +139,6 @@ class SurveyScore:
                     abs(turned),
                 )
             )
-
-
-def _sightings(
-    i: int, camera: int, boxes: VehicleBoxes, view: CameraView, n_parked: int, matched: IntArray
-) -> NDArray[np.void]:
-    """Return the `SIGHTING` records of one picture."""
-    seen, false = np.flatnonzero(boxes.visible_fraction > _GLIMPSE), np.flatnonzero(matched == 0)
-    rows = np.zeros(len(seen) + len(false), SIGHTING)
-    cars, others = rows[: len(seen)], rows[len(seen) :]
-    ids = boxes.ids[seen]
-    rows["capture"], rows["camera"] = i, camera
-    cars["slot"], others["slot"] = np.where(ids <= n_parked, ids - 1, -1), -1
-    cars["visible"], cars["view"] = boxes.visible_fraction[seen], boxes.view[seen]
-    cars["boxes"], others["boxes"] = (matched[:, None] == ids).sum(axis=0), 1
-    cars["placed"] = np.isin(cars["slot"], view.slots[view.slots >= 0])
-    for k, side in enumerate(SIDES):
-        cars[side], others[side] = boxes.box[seen, k], np.round(view.detections.boxes[false, k])
-    measured, slot = np.full(len(matched), np.nan), np.full(len(matched), -1)
-    away = view.cars.xy - [view.scan.x, view.scan.y]
-    measured[view.cars.detection], slot[view.cars.detection] = np.hypot(*away.T), view.slots
-    cars["distance"], others["distance"] = boxes.distance[seen], measured[false]
-    others["placed"] = slot[false] >= 0
-    return rows
 
 
 def _matched(found: NDArray[np.float32], boxes: VehicleBoxes) -> NDArray[np.int64]:

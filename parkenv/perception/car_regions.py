@@ -8,6 +8,8 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray
 
+END_BELOW = 1.8
+"""Width over height of a box below which it shows a front or rear."""
 END_WIDEST = 2.0
 """Width over height of a box above which no long lens shows a car's whole front or rear in it."""
 

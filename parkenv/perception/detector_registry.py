@@ -87,8 +87,8 @@ def detector_files(name: str) -> list[Path]:
     """Return the files that a name stands for: the model, and the settings beside a network; none for other names."""
     if name in DETECTORS or not is_there(name) or not Path(name).is_file():
         return []
-    beside = sidecar_of(name) if name.lower().endswith(".onnx") else None
-    return [Path(name)] + ([] if beside is None else [beside])
+    beside = [sidecar_of(name)] if name.lower().endswith(".onnx") else []
+    return [Path(name), *(file for file in beside if file.is_file())]
 
 
 def _class(name: str) -> Any:

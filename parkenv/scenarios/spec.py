@@ -734,9 +734,7 @@ class ScenarioSpec(Spec):
         files = super().files()
         if self.detector not in DETECTORS:
             detector = Path(self.detector)
-            beside = (
-                detector.with_suffix(s) for s in (".toml", ".json") if detector.suffix.lower() == ".onnx"
-            )
+            beside = [detector.with_suffix(".toml")] if detector.suffix.lower() == ".onnx" else []
             files += [detector, *(file for file in beside if is_there(file))]
         return list(dict.fromkeys(files))
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtri, stdtrit
+from scipy.special import stdtrit
 
 from parkenv.world.cost_terms import COST_FIELDS
 
@@ -104,41 +104,6 @@ def ratio_interval(values: ArrayLike, others: ArrayLike) -> tuple[float, float, 
     drawn = np.random.default_rng(0).integers(0, len(mine), (RESAMPLES, len(mine)))
     low, high = np.percentile(mine[drawn].sum(axis=1) / theirs[drawn].sum(axis=1), [2.5, 97.5])
     return float(mine.sum() / theirs.sum()), float(low), float(high)
-
-
-def rate_interval(right: ArrayLike, total: ArrayLike) -> tuple[float, float, float]:
-    """Compute a rate over clusters, such as drives, and its 95 % interval.
-
-    Wilson's interval for as many independent trials as tell as much as the clusters do: if rates of clusters differ by
-    more than chance, these are fewer (Korn and Graubard 1998). A single cluster counts as independent trials.
-
-    Args:
-        right: (n,) number of successes in each cluster.
-        total: (n,) number of trials in each cluster.
-
-    Returns:
-        Rate, lower and upper end; NaN without trials.
-
-    Examples:
-        >>> [round(x, 3) for x in rate_interval([5, 5], [10, 10])]
-        [0.5, 0.299, 0.701]
-        >>> [round(x, 3) for x in rate_interval([0, 10], [10, 10])]
-        [0.5, 0.055, 0.945]
-    """
-    hits, trials = np.asarray(right, dtype=np.float64), np.asarray(total, dtype=np.float64)
-    hits, trials = hits[trials > 0.0], trials[trials > 0.0]
-    if not len(trials):
-        return np.nan, np.nan, np.nan
-    k, every, rate = len(trials), trials.sum(), hits.sum() / trials.sum()
-    effective = every
-    if k > 1 and 0.0 < rate < 1.0:
-        variance = k / (k - 1) * float(((hits - rate * trials) ** 2).sum()) / every**2
-        effective = min(every, rate * (1.0 - rate) / max(variance, 1e-12))
-    z = float(ndtri(0.975))
-    middle = (rate + z * z / (2.0 * effective)) / (1.0 + z * z / effective)
-    half = z / (1.0 + z * z / effective)
-    half *= np.sqrt(rate * (1.0 - rate) / effective + (z / (2.0 * effective)) ** 2)
-    return float(rate), float(max(middle - half, 0.0)), float(min(middle + half, 1.0))
 
 
 class Estimate(NamedTuple):

@@ -41,7 +41,6 @@ STUDIES: Mapping[str, str] = {
     "demand": "parkenv.studies.fleet.demand_study:DemandStudy",
     "benchmark": "parkenv.studies.benchmark.study:Benchmark",
     "survey": "parkenv.studies.sensing.survey_study:SurveyStudy",
-    "detectors": "parkenv.studies.sensing.detector_study:DetectorStudy",
     "demo": "parkenv.studies.demo.study:Demo",
     "calibrate": "parkenv.studies.trips.calibration_study:CalibrationStudy",
     "train": "parkenv.studies.training.spec:TrainingSpec",

@@ -23,7 +23,7 @@ SESSION_COLUMNS = (
 
 
 SESSION_KINDS = {
-    **dict.fromkeys(("rig", "detector", "key", "weather"), TEXT),
+    **dict.fromkeys(("key", "weather"), TEXT),
     **dict.fromkeys(("parked", "found", "detections", "right"), WHOLE),
     **dict.fromkeys(("cars_in_frame", "cars_detected"), wholes(len(DISTANCE_ENDS))),
 }

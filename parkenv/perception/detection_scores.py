@@ -1,4 +1,4 @@
-"""Scores of a detector on labelled photographs."""
+"""Scores of a detector on labelled photographs: recall and precision by UIUC's matching rule, and recall on crops."""
 
 from __future__ import annotations
 
@@ -9,30 +9,104 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
+import cv2
 import numpy as np
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from parkenv.compiled.arrays import Image
+from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError
+from parkenv.perception.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.car_regions import END_WIDEST
 from parkenv.perception.detector import Detections, Detector
 from parkenv.perception.hog_detector import HogDetector
-from parkenv.perception.lab.car_datasets import UIUC_SIZE, UIUC_TESTS, Crops, LabelledImage, read_uiuc_test
-from parkenv.perception.lab.cross_validation import BLOCKS, scores_of
-from parkenv.perception.lab.detection_scores import RecallPrecision, recall_precision
-from parkenv.show.figures.picture_files import STYLE, save_picture
 
-_SMALLEST = {"single": 0.85, "multi": 0.8}
-_LARGEST = {"single": 1.2, "multi": 2.6}
+REACH = 0.25
+"""Semi-axes of the ellipse around a true box, as fractions of its width and height (README of the UIUC set)."""
+BLOCKS = 30
+"""Number of blocks of consecutive crops; images of the same car are neighbours and should share a block."""
+_SIZES = {"single": (0.85, 1.2), "multi": (0.8, 2.6)}
 """Range of searched sizes relative to UIUC's 100×40 box; all cars of the single-scale set have the same size, those of
 the multi-scale set are 0.89 to 2.12 times as large."""
 _TOLERANCE = 1.25  # of these sizes, for detectors
 _CROP_RATES = (0.01, 0.1)  # of false positives
 _CROP_MIDDLE, _CROP_WIDTH = 0.19, 0.45
 """Farthest a box's centre may be from its crop's, and least width, as fractions of the crop's sides."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecallPrecision:
+    """A recall-precision curve with one point per threshold, strictest first."""
+
+    recall: FloatArray  # (k,) float64, fraction of the cars that are found
+    precision: FloatArray  # (k,) float64, fraction of the detections that are cars
+
+    @property
+    def equal_error(self) -> float:
+        """Equal-error rate: the largest value that recall and precision both reach at one threshold."""
+        return min(self.at_equal_error)
+
+    @property
+    def average_precision(self) -> float:
+        """Area under the curve, with the best precision at this recall or a higher one."""
+        best = np.maximum.accumulate(self.precision[::-1])[::-1]
+        return float(np.sum(np.diff(self.recall, prepend=0.0) * best))
+
+    @property
+    def at_equal_error(self) -> tuple[float, float]:
+        """Recall and precision at the equal-error point; zeros without detections."""
+        if not len(self.recall):
+            return 0.0, 0.0
+        i = int(np.minimum(self.recall, self.precision).argmax())
+        return float(self.recall[i]), float(self.precision[i])
+
+
+def recall_precision(
+    boxes: Sequence[NDArray[np.floating]],
+    scores: Sequence[NDArray[np.floating]],
+    truth: Sequence[FloatArray],
+    *,
+    scales: bool = True,
+) -> RecallPrecision:
+    """Match detections to true boxes, best detection first, one per car, and return the curve.
+
+    Args:
+        boxes: for each image, (n, 4) left, top, right, bottom of the detections.
+        scores: for each image, (n,) scores of the detections.
+        truth: for each image, (m, 4) boxes of the cars.
+        scales: whether the width counts as a third axis, as in the multi-scale set.
+    """
+    cars = sum(len(t) for t in truth)
+    hits, values = [], []
+    for found, score, true in zip(boxes, scores, truth, strict=True):
+        order = np.argsort(-np.asarray(score), kind="stable")
+        hits.append(matches(np.asarray(found, dtype=np.float64)[order], true, scales=scales))
+        values.append(np.asarray(score, dtype=np.float64)[order])
+    hit, value = np.concatenate(hits), np.concatenate(values)
+    order = np.argsort(-value, kind="stable")
+    value, right = value[order], np.cumsum(hit[order])
+    # Detections with equal scores are accepted or rejected together.
+    last = np.flatnonzero(np.diff(value, append=-np.inf) != 0.0)
+    return RecallPrecision(right[last] / max(cars, 1), right[last] / (last + 1.0))
+
+
+def matches(found: FloatArray, true: FloatArray, *, scales: bool = True) -> NDArray[np.bool_]:
+    """Return which detections of an image, (n, 4), best first, match a car that no better one has matched."""
+    hit = np.zeros(len(found), dtype=np.bool_)
+    if not len(true):
+        return hit
+    size = true[:, 2:] - true[:, :2]
+    taken = np.zeros(len(true), dtype=np.bool_)
+    for i, box in enumerate(found):
+        away = ((box[:2] + box[2:] - true[:, :2] - true[:, 2:]) / 2.0 / (REACH * size)) ** 2
+        off = away.sum(axis=1)
+        if scales:
+            off += ((box[2] - box[0] - size[:, 0]) / (REACH * size[:, 0])) ** 2
+        off[taken] = np.inf
+        nearest = int(off.argmin())
+        if off[nearest] <= 1.0:
+            hit[i] = taken[nearest] = True
+    return hit
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +143,17 @@ def score_on(
 ) -> TestSetScore:
     """Measure recall and precision on labelled images, by UIUC's matching rule.
 
-    A model's windows are searched at the sizes of the set's cars. A detector looks as it does anywhere; its boxes of
+    A model's windows are searched at the sizes of the set's cars. A detector works as it does anywhere; its boxes of
     other sizes, and of fronts and rears, are left out, as the sets label neither. A box more than twice as wide as high
     is a side.
     """
-    detector = _searching(model, test_set) if isinstance(model, CarModel) else model
+    least, most = (size * UIUC_SIZE[1] for size in _SIZES[test_set])
+    is_model = isinstance(model, CarModel)
+    detector = HogDetector.for_evaluation(model, least, most) if isinstance(model, CarModel) else model
     found, begun = [], time.perf_counter()
     for labelled in images:
-        seen = detector.detect(labelled.image)
-        found.append(seen if isinstance(model, CarModel) else _of_the_set(seen, test_set))
+        detections = detector.detect(labelled.image)
+        found.append(detections if is_model else _of_the_set(detections, test_set))
         on_image()
     seconds = time.perf_counter() - begun
     curve = recall_precision(
@@ -86,7 +162,7 @@ def score_on(
         [i.boxes for i in images],
         scales=test_set == "multi",
     )
-    _, recall, precision = curve.at_equal_error() if len(curve.recall) else (0.0, 0.0, 0.0)
+    recall, precision = curve.at_equal_error
     row = {
         "test_set": test_set,
         "images": len(images),
@@ -102,15 +178,10 @@ def score_on(
 
 def _of_the_set(found: Detections, test_set: str) -> Detections:
     width = (found.regions[:, 2] - found.regions[:, 0]) / UIUC_SIZE[0]
-    least, most = _SMALLEST[test_set] / _TOLERANCE, _LARGEST[test_set] * _TOLERANCE
+    least, most = _SIZES[test_set]
     size = found.boxes[:, 2:] - found.boxes[:, :2]
     side = ~found.end_on | (size[:, 0] > END_WIDEST * size[:, 1])
-    return found.select(side & (width >= least) & (width <= most))
-
-
-def _searching(model: CarModel, test_set: str) -> HogDetector:
-    height = UIUC_SIZE[1]
-    return HogDetector.for_evaluation(model, _SMALLEST[test_set] * height, _LARGEST[test_set] * height)
+    return found.select(side & (width >= least / _TOLERANCE) & (width <= most * _TOLERANCE))
 
 
 def recall_on_crops(
@@ -147,7 +218,9 @@ def _crop_scores(
     model: CarModel | Detector, images: Sequence[Image], on_image: Callable[[], None]
 ) -> NDArray[np.float64]:
     if isinstance(model, CarModel):
-        return scores_of(model, images)
+        window = (model.descriptor.width, model.descriptor.height)
+        resized = np.stack([cv2.resize(i, window, interpolation=cv2.INTER_LINEAR) for i in images])
+        return model.scores(resized).astype(np.float64)
     scores = []
     for image in images:
         found, size = model.detect(image), np.array(image.shape[1::-1])
@@ -156,18 +229,3 @@ def _crop_scores(
         scores.append(found.probability[(off < _CROP_MIDDLE) & (wide > _CROP_WIDTH)].max(initial=0.0))
         on_image()
     return np.array(scores, dtype=np.float64)
-
-
-def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
-    """Plot recall against 1 - precision, as in the papers on these data sets."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.4, 4.4))
-        ax = figure.subplots()
-        for score in scores:
-            label = f"{score.row['test_set']}-scale: equal error at {score.row['eer']:.1%}"
-            ax.plot(1.0 - score.curve.precision, score.curve.recall, label=label)
-        ax.plot([0.0, 1.0], [1.0, 0.0], color="0.7", linewidth=0.8, linestyle=":")
-        ax.set(xlim=(0.0, 0.3), ylim=(0.7, 1.005), xlabel="1 - precision", ylabel="recall", title=title)
-        ax.legend(loc="lower right")
-        figure.tight_layout()
-        save_picture(figure, path)

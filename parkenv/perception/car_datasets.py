@@ -10,8 +10,7 @@ import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, Image
 from parkenv.errors import InputError, require_one_of
-from parkenv.files.archives import tar_members
-from parkenv.files.images import decode_image, images_in, natural_order, read_image
+from parkenv.files.images import images_in, read_image
 from parkenv.files.limited_reading import read_text
 from parkenv.perception.hog_detector import as_grey
 
@@ -42,19 +41,12 @@ class LabelledImage:
 
 
 def read_uiuc_training(folder: Path) -> Crops:
-    """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`, in a folder or in its `.tar.gz`.
+    """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`.
 
     Raises:
-        InputError: neither exists, or an image is missing or truncated.
+        InputError: there are none, or an image is truncated.
     """
-    archive = folder if folder.is_file() else folder / "TrainImages.tar.gz"
-    if (folder / "TrainImages").is_dir():
-        files = images_in(folder / "TrainImages")
-        images = {f.name: as_grey(read_image(f)) for f in files}
-    elif archive.is_file():
-        images = _images_of(archive)
-    else:
-        raise InputError(f"{folder}: holds neither TrainImages/ nor TrainImages.tar.gz")
+    images = {file.name: as_grey(read_image(file)) for file in images_in(folder / "TrainImages")}
     crops = Crops(
         *([im for name, im in images.items() if name.startswith(kind)] for kind in ("pos-", "neg-"))
     )
@@ -118,10 +110,3 @@ def read_crop_folder(folder: Path) -> Crops:
             raise InputError(f"{folder}: holds no folder {names[0]}/ (or {', '.join(names[1:])})")
         parts.append([as_grey(read_image(file)) for file in images_in(there[0])])
     return Crops(*parts)
-
-
-def _images_of(archive: Path) -> dict[str, Image]:
-    images = {
-        name: as_grey(decode_image(data, f"{archive}: {name}")) for name, data in tar_members(archive, ".pgm")
-    }
-    return {Path(name).name: images[name] for name in sorted(images, key=lambda n: natural_order(Path(n)))}

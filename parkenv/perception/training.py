@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array, Image
 from parkenv.errors import InputError, require_number, require_whole, with_extra
+from parkenv.perception.car_datasets import LabelledImage
 from parkenv.perception.car_model import CarModel
 from parkenv.perception.detector import overlaps
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.hog_detector import HogDetector, best_boxes
-from parkenv.perception.lab.car_datasets import LabelledImage
 
 Progress = Callable[[str], None]
 
@@ -23,6 +23,8 @@ CAR_OVERLAP = 0.25
 _LEAST = 20
 _PER_IMAGE = 5  # largest number of hard negatives from one image per round
 _FOLDS = 5
+_SHIFT = 0.015  # largest shift of a copy, as a fraction of the window
+_RESIZE = 0.025  # largest change of a copy's size, as a fraction
 _NO_CARS = np.empty((0, 4))
 
 
@@ -33,8 +35,6 @@ class TrainingSettings:
     penalty: float = 0.03  # C of the support vector machine
     rounds: int = 3  # rounds of hard-negative mining, each on another part of the images
     jitter: int = 4  # number of shifted and scaled copies of each positive
-    shift: float = 0.015  # largest shift of a copy, as a fraction of the window
-    resize: float = 0.025  # largest change of a copy's size, as a fraction
     misaligned: int = 2  # number of misaligned crops of each positive that become negatives
     enlarged: float = (
         2.0  # without photographs, crops enlarged so much take their place in the mining; 0: none do
@@ -47,8 +47,6 @@ class TrainingSettings:
             require_whole(name, getattr(self, name))
         if not (self.enlarged == 0.0 or 1.0 <= self.enlarged <= 8.0):
             raise InputError(f"enlarged is {self.enlarged}, want 0 or 1 to 8")
-        for name in ("shift", "resize"):
-            require_number(name, getattr(self, name), least=0.0, below=0.5)
 
 
 def train(
@@ -98,7 +96,7 @@ def train(
     size = (descriptor.width, descriptor.height)
 
     progress(f"describing {len(positives)} positives")
-    jittered = [_moved(p, size, rng, settings) for p in positives for _ in range(settings.jitter)]
+    jittered = [_moved(p, size, rng) for p in positives for _ in range(settings.jitter)]
     cars = [cv2.resize(p, size, interpolation=_how(p, size)) for p in positives] + jittered
     cars += [np.ascontiguousarray(c[:, ::-1]) for c in cars]
     beside = [_beside(p, size, rng) for p in positives for _ in range(settings.misaligned)]
@@ -247,10 +245,10 @@ def _shifted(crop: Image, size: tuple[int, int], dx: float, dy: float, grow: flo
     return _cut(crop, left_top, ((1.0 + dx + grow) * width, (1.0 + dy + grow) * height), size)
 
 
-def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator, settings: TrainingSettings) -> Image:
+def _moved(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:
     """Return a slightly shifted and scaled copy."""
-    dx, dy = rng.uniform(-settings.shift, settings.shift, 2)
-    return _shifted(crop, size, dx, dy, rng.uniform(-settings.resize, settings.resize) / 2.0)
+    dx, dy = rng.uniform(-_SHIFT, _SHIFT, 2)
+    return _shifted(crop, size, dx, dy, rng.uniform(-_RESIZE, _RESIZE) / 2.0)
 
 
 def _beside(crop: Image, size: tuple[int, int], rng: np.random.Generator) -> Image:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
@@ -13,23 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import AfterValidator, Strict
 
-from parkenv.compiled.arrays import FloatArray, Image
+from parkenv.compiled.arrays import Image
 from parkenv.errors import InputError, nearest
 from parkenv.files.images import SUFFIXES, files_in, images_in, read_image
 from parkenv.files.limited_reading import is_there, read_json, read_text, read_yaml
 from parkenv.files.spec_file import Several, Spec
-from parkenv.perception.car_regions import END, SIDE
+from parkenv.perception.car_datasets import Crops, LabelledImage
+from parkenv.perception.car_regions import END, END_BELOW, SIDE
 from parkenv.perception.hog_detector import as_grey
-from parkenv.perception.lab.car_datasets import Crops, LabelledImage
-from parkenv.perception.lab.training import cut_out
-from parkenv.perception.onnx_detector import CAR_NAMES
+from parkenv.perception.training import cut_out
 
 Box = tuple[float, float, float, float]
 
+CAR_NAMES = ("car", "cars", "van", "truck", "bus", "pickup", "suv", "vehicle", "automobile", "motor vehicle")
+"""Names of classes that count as cars: whatever takes a slot."""
 LEAST_WIDTH = 36
 """Least width of a car that is trained on, px."""
-END_BELOW = 1.8
-"""Width over height of a box below which it shows a front or rear."""
 LEAST_CARS = 20
 _WINDOWS = 3  # windows without cars from each picture
 _TOLERANCE = 2.0  # px that a box may reach outside its picture, by rounding
@@ -76,31 +75,30 @@ class LabelledPhoto:
 def read_labels(path: Path, images: Path | None = None, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
     """Read labelled photographs: a COCO file (`.json`), or a folder in YOLO's format.
 
+    Of YOLO, pictures are at any depth; labels are in text files of the same names, in `labels/` in place of `images/`,
+    or beside the pictures. A picture without one shows nothing. A line has the class and a box (centre, width, height)
+    or a polygon, as fractions of the picture. The names of the classes are in `data.yaml` (`names`) or `classes.txt`.
+
     Args:
         path: the file or folder.
         images: of COCO, the folder of the pictures; None: that of the file.
-        classes: names of the classes that are cars; empty: those whose names say so (car, van, truck, bus, ...).
+        classes: names of the classes that are cars; empty: `CAR_NAMES`.
 
     Raises:
-        InputError: see `read_coco` and `read_yolo`; or no picture shows a car.
+        InputError: a file of another format, an unknown class or picture, a missing picture, a label without a picture,
+            a box outside its picture, or no label of a car.
     """
     if path.is_dir() and images is not None:
         raise InputError(
             f"{path}: is a folder in YOLO's format, which has its pictures; --images is for COCO"
         )
-    photos = read_yolo(path, classes) if path.is_dir() else read_coco(path, images or path.parent, classes)
+    photos = _read_yolo(path, classes) if path.is_dir() else _read_coco(path, images or path.parent, classes)
     if not any(len(photo.single) for photo in photos):
         raise InputError(f"{path}: none of its {len(photos)} pictures has a label of a car")
     return photos
 
 
-def read_coco(path: Path, images: Path, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
-    """Read a COCO file of object detections and its pictures; see `read_labels`.
-
-    Raises:
-        InputError: the file is of another format; it names an unknown class or picture, a picture that is missing, or a
-            box outside its picture.
-    """
+def _read_coco(path: Path, images: Path, classes: Sequence[str]) -> list[LabelledPhoto]:
     content = read_json(path, finite=True)
     coco = _Coco.parse(content if isinstance(content, dict) else {}, str(path))
     names = {category.id: category.name for category in coco.categories}
@@ -123,17 +121,7 @@ def read_coco(path: Path, images: Path, classes: Sequence[str] = ()) -> list[Lab
     ]
 
 
-def read_yolo(folder: Path, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
-    """Read a folder in YOLO's format; see `read_labels`.
-
-    Pictures are at any depth. Labels are in text files of the same names, in `labels/` in place of `images/`, or beside
-    the pictures; a picture without one shows nothing. A line has the class and a box (centre, width, height) or a
-    polygon, as fractions of the picture. The classes' names are in `data.yaml` (`names`) or `classes.txt`.
-
-    Raises:
-        InputError: there are no names; a line is of another format; it has an unknown class or a box outside its
-            picture; or a label has no picture.
-    """
+def _read_yolo(folder: Path, classes: Sequence[str]) -> list[LabelledPhoto]:
     names = _yolo_names(folder)
     cars = _cars(names, classes, folder)
     pictures = {_label_of(file): file for file in images_in(folder)}
@@ -142,11 +130,9 @@ def read_yolo(folder: Path, classes: Sequence[str] = ()) -> list[LabelledPhoto]:
             raise InputError(f"{label}: labels a picture that is missing; want one of {', '.join(SUFFIXES)}")
     photos = []
     for label, file in pictures.items():
-        image = as_grey(read_image(file))
-        size = np.array([image.shape[1], image.shape[0]], dtype=np.float64)
-        lines = list(_yolo_lines(label, names)) if label.is_file() else []
-        boxes = [(where, _box(points * size), True) for where, its, points in lines if its in cars]
-        photos.append(_photo(file, boxes, str(file), image))
+        lines = _yolo_lines(label, names) if label.is_file() else ()
+        boxes = [(where, box, True) for where, class_id, box in lines if class_id in cars]
+        photos.append(_photo(file, boxes, str(file), fractions=True))
     return photos
 
 
@@ -201,14 +187,16 @@ def crops_of(
 
 
 def _photo(
-    file: Path, boxes: Sequence[tuple[str, Box, bool]], where: str, image: Image | None = None
+    file: Path, boxes: Sequence[tuple[str, Box, bool]], where: str, *, fractions: bool = False
 ) -> LabelledPhoto:
-    if image is None:
-        if not (is_there(file) and file.is_file()):
-            raise InputError(f"{where}: there is no picture at {file}")
-        image = as_grey(read_image(file))
+    if not (is_there(file) and file.is_file()):
+        raise InputError(f"{where}: there is no picture at {file}")
+    image = as_grey(read_image(file))
     height, width = image.shape
-    for label, (left, top, right, bottom), _ in boxes:
+    found = np.array([box for _, box, _ in boxes], dtype=np.float64).reshape(-1, 4)
+    if fractions:
+        found *= [width, height, width, height]
+    for (label, *_), (left, top, right, bottom) in zip(boxes, found.tolist(), strict=True):
         inside = (
             min(left, top) >= -_TOLERANCE and right <= width + _TOLERANCE and bottom <= height + _TOLERANCE
         )
@@ -217,7 +205,6 @@ def _photo(
                 f"{label}: box {left:.6g}, {top:.6g} to {right:.6g}, {bottom:.6g} is not inside {file.name} of "
                 f"{width}×{height} px"
             )
-    found = np.array([box for _, box, _ in boxes], dtype=np.float64).reshape(-1, 4)
     found = np.clip(found, 0.0, [width, height, width, height])
     single = np.array([alone for *_, alone in boxes], dtype=np.bool_)
     return LabelledPhoto(LabelledImage(file.name, image, found), single)
@@ -236,64 +223,53 @@ def _cars(names: dict[Any, str], classes: Sequence[str], source: Path) -> set[An
     return cars
 
 
-def _listed(names: Any) -> str:
-    some = [str(name) for name in names]
-    return ", ".join(some[:10]) + (", ..." if len(some) > 10 else "")
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(names)[:300]
 
 
 def _yolo_names(folder: Path) -> dict[Any, str]:
     """Return the names of the classes of a folder in YOLO's format."""
-    for file in (folder / "data.yaml", folder / "data.yml", folder / "dataset.yaml"):
-        if file.is_file():
-            content = read_yaml(file)
-            names = content.get("names") if isinstance(content, dict) else None
-            listed = dict(enumerate(names)) if isinstance(names, list) else names
-            if (
-                not isinstance(listed, dict)
-                or not listed
-                or not all(isinstance(k, int) and isinstance(v, str) for k, v in listed.items())
-            ):
-                raise InputError(f"{file}: names is {names!r:.60}, want a list of the classes' names")
-            return listed
-    for file in (folder / "classes.txt", folder / "labels" / "classes.txt"):
-        if file.is_file():
-            return dict(enumerate(line.strip() for line in read_text(file).splitlines() if line.strip()))
-    raise InputError(f"{folder}: has neither data.yaml with names nor classes.txt, want YOLO's format")
+    data, plain = folder / "data.yaml", folder / "classes.txt"
+    if plain.is_file() and not data.is_file():
+        return dict(enumerate(line.strip() for line in read_text(plain).splitlines() if line.strip()))
+    if not data.is_file():
+        raise InputError(f"{folder}: has neither data.yaml with names nor classes.txt, want YOLO's format")
+    content = read_yaml(data)
+    names = content.get("names") if isinstance(content, dict) else None
+    listed = dict(enumerate(names)) if isinstance(names, list) else names
+    if not (isinstance(listed, dict) and all(isinstance(name, str) for name in listed.values())):
+        raise InputError(f"{data}: names is {names!r:.60}, want a list of the classes' names")
+    return listed
 
 
 def _label_of(picture: Path) -> Path:
     """Return the label file of a picture: in `labels` in place of the last `images`, else beside it."""
-    parts = list(picture.with_suffix(".txt").parts)
-    for k in range(len(parts) - 2, -1, -1):
-        if parts[k] == "images":
-            there = Path(*parts[:k], "labels", *parts[k + 1 :])
-            return there if there.is_file() or not picture.with_suffix(".txt").is_file() else Path(*parts)
+    beside = picture.with_suffix(".txt")
+    parts = list(beside.parts)
+    if "images" in parts and not beside.is_file():
+        parts[len(parts) - 1 - parts[::-1].index("images")] = "labels"
     return Path(*parts)
 
 
-def _yolo_lines(label: Path, names: dict[Any, str]) -> Iterator[tuple[str, int, FloatArray]]:
-    """Yield where a line stands, its class, and the corners of its box or polygon, (k, 2), as fractions."""
+def _yolo_lines(label: Path, names: dict[Any, str]) -> Iterator[tuple[str, int, Box]]:
+    """Yield where a line stands, its class, and the box, or that around its polygon, as fractions."""
     for number, line in enumerate(read_text(label).splitlines(), start=1):
         words = line.split()
         if not words:
             continue
         where = f"{label}: line {number}"
         try:
-            its, values = int(words[0]), np.array([float(word) for word in words[1:]])
+            class_id, values = int(words[0]), np.array([float(word) for word in words[1:]])
         except ValueError:
-            its, values = -1, np.zeros(0)
+            class_id, values = -1, np.zeros(0)
         if len(values) not in (4, *range(6, 20_000, 2)) or not np.isfinite(values).all():
             raise InputError(f"{where}: {line!r:.60}, want class, x, y, width and height as fractions")
-        if its not in names:
+        if class_id not in names:
             known = _listed(f"{k} {v}" for k, v in names.items())
             raise InputError(f"{where}: class is {words[0]}, want one of {known}")
-        if len(values) == 4:
-            middle, half = values[:2], 0.5 * values[2:]
-            yield where, its, np.stack([middle - half, middle + half])
-        else:
-            yield where, its, values.reshape(-1, 2)
-
-
-def _box(points: FloatArray) -> Box:
-    (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
-    return left, top, right, bottom
+        points = values.reshape(-1, 2)
+        if len(points) == 2:
+            middle, half = points[0], 0.5 * points[1]
+            points = np.stack([middle - half, middle + half])
+        (left, top), (right, bottom) = points.min(axis=0).tolist(), points.max(axis=0).tolist()
+        yield where, class_id, (left, top, right, bottom)
