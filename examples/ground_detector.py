@@ -1,11 +1,17 @@
-"""A detector of your own: cars are what stands on the road, found by colour alone, without training.
+"""Detectors of your own: one by colour alone, without training, and one that runs a network of any layout.
 
-The road directly in front of the camera gives the colour of the ground. In each column of the image the lowest pixels
-of another colour are the foot of an obstacle; neighbouring columns with feet at the same height are one obstacle; and
-its foot tells its distance, hence its height in the image. After Ulrich and Nourbakhsh, "Appearance-based obstacle
-detection with monocular color vision" (AAAI 2000).
+`GroundDetector`: cars are what stands on the road. The road directly in front of the camera gives the colour of the
+ground. In each column of the image the lowest pixels of another colour are the foot of an obstacle; neighbouring
+columns with feet at the same height are one obstacle; and its foot tells its distance, hence its height in the image.
+After Ulrich and Nourbakhsh, "Appearance-based obstacle detection with monocular color vision" (AAAI 2000).
 
     parkenv survey --scenario mini --sessions 1 --detector examples.ground_detector:GroundDetector
+
+`NetworkDetector`: a network that parkenv does not read by itself, run by OpenCV; here one that suppresses non-maxima
+and puts out (1, n, 6): corners in px of the input, score and class (YOLO26, YOLOv10: `yolo export format=onnx`). For
+others change `boxes_of`.
+
+    parkenv detect photos/ --detector examples.ground_detector:NetworkDetector
 """
 
 import cv2
@@ -13,12 +19,15 @@ import numpy as np
 
 from parkenv import make_scenario
 from parkenv.mapping.survey import Survey, SurveySettings
-from parkenv.perception.detector import Detections
+from parkenv.perception.detector import LEAST_PROBABILITY, Detections
 
 SCALE = 4  # the image is searched at a quarter of its resolution
 FOOT_ROWS = 5  # pixels of another colour above each other that make an obstacle
 CAR_TOP = 0.15  # how far a car's roof is above the horizon, as a fraction of its foot's depth below it
 PROBABILITY = 0.5  # of every box: colour gives no degrees
+
+NETWORK, SIZE = "yolo26n.onnx", 640  # the network's file, and the side of its square input, px
+CARS = (2, 5, 7)  # the classes that are cars: COCO's car, bus and truck
 
 
 class GroundDetector:
@@ -65,6 +74,34 @@ def obstacles(foot, horizon):
             run.append(column)
     if run:
         yield run
+
+
+class NetworkDetector:
+    """Runs a network on one thread; the file is trusted."""
+
+    def __init__(self):
+        cv2.setNumThreads(1)
+        self.network = cv2.dnn.readNetFromONNX(NETWORK)
+
+    def detect(self, image):
+        """Find cars in an image, (h, w, 3) uint8 RGB."""
+        if image.ndim == 2:
+            image = cv2.cvtColor(image, cv2.COLOR_GRAY2RGB)
+        height, width = image.shape[:2]
+        scale = SIZE / max(height, width)
+        canvas = np.full((SIZE, SIZE, 3), 114, np.uint8)
+        small = cv2.resize(image, (round(width * scale), round(height * scale)))
+        canvas[: small.shape[0], : small.shape[1]] = small
+        self.network.setInput(canvas.transpose(2, 0, 1)[None].astype(np.float32) / 255)
+        boxes, score = self.boxes_of(self.network.forward())
+        width, height = (boxes[:, 2:] - boxes[:, :2]).T
+        return Detections(boxes / scale, score, end_on=width < 1.8 * height)
+
+    def boxes_of(self, output):
+        """Return left, top, right and bottom of cars, (n, 4) px of the input, and their probabilities, (n,)."""
+        rows = output[0]
+        rows = rows[np.isin(rows[:, 5].round(), CARS) & (rows[:, 4] > LEAST_PROBABILITY)]
+        return rows[:, :4], rows[:, 4]
 
 
 if __name__ == "__main__":

@@ -105,6 +105,8 @@ FEWER = {
     r"(UPDATES, EPOCHS, MINIBATCHES = 256, 32), 40": r"\1, 4",
     r"every=2\.5, windows": "every=8.0, windows",
     r"range\(100, 200\)": "range(100, 110)",
+    r"(STREETS, PICTURES =) 60, 12": r"\1 2, 3",
+    r"(STEPS, BATCH, RATE =) 3_000, 8": r"\1 4, 2",
     r"range\(1, 31\)": "range(1, 11)",
     r"(ROUNDS, DAYS, HOURS) = .*": r"\1 = 2, 1, '10:00-10:30'",
     r"DECISIONS, TASKS = 20_000, 50": "DECISIONS, TASKS = 1_100, 2",

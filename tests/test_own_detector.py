@@ -7,6 +7,7 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
+from onnx import TensorProto, helper, numpy_helper
 
 from parkenv import InputError, make_scenario
 from parkenv.mapping.survey import Survey, SurveySettings
@@ -101,6 +102,30 @@ def test_the_command_line_takes_it(tmp_path):
     (row,) = json.loads((out / "summary.json").read_text())["rows"]
     assert row["detector"] == OWN
     assert detector_version(OWN) in (out / "sessions.csv").read_text()
+
+
+@pytest.mark.usefixtures("in_examples")
+def test_a_class_of_ones_own_runs_a_network_of_another_layout(monkeypatch, tmp_path):
+    """The network puts out its only box: a car, a dog and a car that is unlikely."""
+    rows = [[64, 128, 192, 256, 0.9, 2], [0, 0, 90, 90, 0.9, 16], [0, 0, 90, 90, 0.01, 2]]
+    image = helper.make_tensor_value_info("images", TensorProto.FLOAT, [1, 3, 640, 640])
+    output = helper.make_tensor_value_info("output0", TensorProto.FLOAT, [1, 3, 6])
+    given = {"rows": np.array([rows], np.float32), "zero": np.zeros(1, np.float32)}
+    nodes = [
+        helper.make_node("GlobalMaxPool", ["images"], ["top"]),
+        helper.make_node("ReduceMax", ["top"], ["most"], axes=[1, 2], keepdims=0),
+        helper.make_node("Mul", ["most", "zero"], ["nothing"]),
+        helper.make_node("Add", ["rows", "nothing"], ["output0"]),
+    ]
+    tensors = [numpy_helper.from_array(value, name) for name, value in given.items()]
+    graph = helper.make_graph(nodes, "g", [image], [output], tensors)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 13)], ir_version=8)
+    (tmp_path / "a.onnx").write_bytes(model.SerializeToString())
+    detector = make_detector(OWN)  # the module
+    monkeypatch.setattr(sys.modules[type(detector).__module__], "NETWORK", str(tmp_path / "a.onnx"))
+    found = make_detector("ground_detector:NetworkDetector").detect(np.zeros((480, 1280, 3), np.uint8))
+    assert found.boxes.tolist() == [[128, 256, 384, 512]]
+    assert (found.probability.tolist(), found.end_on.tolist()) == ([pytest.approx(0.9)], [True])
 
 
 def test_detectors_are_made_by_name(tmp_path):
