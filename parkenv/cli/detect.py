@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 from pydantic import Field, model_validator
 from pydantic_core import PydanticCustomError
@@ -189,7 +189,9 @@ class TrainDetector(Command):
         console = make_console()
         with console.status("Training") as status:
             data, photos = self._photographs()
-            aligned = {} if self.labels is None else {"region_aspect": window.aspect, "car": window.car}
+            aligned: dict[str, Any] = (
+                {} if self.labels is None else {"region_aspect": window.aspect, "car": window.car}
+            )
             model = train(
                 data.positives,
                 data.negatives,

@@ -126,7 +126,8 @@ class OnnxDetector:
             require_runs(data, name, empty.shape)
         shape = self._run(empty).shape
         # OpenCV runs a network with an input of another shape, and tells of its own in a description alone.
-        fixed = _INPUT.search(self._net.dump())
+        net: Any = self._net
+        fixed = _INPUT.search(net.dump())
         if fixed and fixed[1] != " x ".join(map(str, empty.shape)):
             raise InputError(
                 f"{name}: its input is {fixed[1]}, and size and channels in {sidecar_of(name)} (or their defaults) are "

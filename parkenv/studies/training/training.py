@@ -270,7 +270,7 @@ class Training:
             seed=seed,
             device="cpu",
             tensorboard_log=str(folder / "tensorboard") if self.spec.tensorboard else None,
-            **config.settings
+            **dict(config.settings)
             | {"learning_rate": LinearSchedule(rate, rate * config.final_learning_rate, 1.0)},
         )
         if not self.spec.tensorboard:
