@@ -13,12 +13,14 @@ PARKENV = [sys.executable, "-c", "from parkenv.__main__ import main; main()"]
 """The command in a separate process."""
 
 
-def parkenv(*arguments, cwd=None):
+def parkenv(words, *arguments, cwd=None):
     """Run the command in this process, which has everything imported and compiled code loaded.
+
+    `words` are separated by spaces; further arguments may have any in them.
 
     Returns a `CompletedProcess` with `returncode`, `stdout` and `stderr`, as `subprocess.run` does.
     """
-    argv = ["parkenv", *map(str, arguments)]
+    argv = ["parkenv", *str(words).split(), *map(str, arguments)]
     out, err = io.StringIO(), io.StringIO()
 
     def show(message, category, filename, lineno, file=None, line=None):

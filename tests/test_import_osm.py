@@ -1,11 +1,9 @@
 """Lots made from OpenStreetMap: what is read, what by rule, what is refused."""
 
 import bz2
-import copy
 import gzip
 import json
 import re
-from contextlib import suppress
 
 import numpy as np
 import pytest
@@ -17,7 +15,6 @@ from made_maps import AISLE, FREIBURG, SERVICE, SPACE, STREET, Map
 from pictures import shows_color
 from typer.testing import CliRunner
 
-from parkenv import make_scenario
 from parkenv.cli import app
 from parkenv.errors import InputError
 from parkenv.lots import packaged_lot, read_lot, write_lot
@@ -27,9 +24,8 @@ from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.lot_files import import_lot
 from parkenv.lots.osm import elements
 from parkenv.lots.slot_polygons import nearest_on_lanes
-from parkenv.show.figures.lot_import import SOURCE_COLORS, save_import_picture
+from parkenv.show.figures.lot_import import SOURCE_COLORS
 from parkenv.show.figures.schematic import TWO_WAY
-from parkenv.studies.compare.cases import Case
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
 
@@ -77,9 +73,6 @@ def reasons(draft):
 def in_map_metres(draft, xy):
     """Points of a draft in the metres that the map was drawn in."""
     return FREIBURG.to_xy(draft.frame.to_lonlat(xy))
-
-
-# ---- formats ----
 
 
 def test_all_formats_give_the_same_lot(tmp_path):
@@ -148,9 +141,6 @@ def test_there_and_back_on_the_globe_is_less_than_a_centimetre(lon, lat, x, y):
     np.testing.assert_allclose(frame.to_xy(frame.to_lonlat([[x, y]])), [[x, y]], atol=0.01)
 
 
-# ---- mapped spaces ----
-
-
 def test_mapped_spaces_become_slots_at_their_place(tmp_path):
     draft = car_park().draft(tmp_path)
     lot = draft.lot()
@@ -191,16 +181,6 @@ def test_spaces_that_not_everyone_may_use_are_left_out(tmp_path, tags, reason):
     assert (number in draft.slot_ids) == (reason is None)
     if reason:
         assert number in reasons(draft)[reason]
-
-
-def test_spaces_alone_lack_an_aisle(tmp_path):
-    place = Map()
-    for i in range(3):
-        place.box(2.5 * i, 0, 2.5 * i + 2.5, 5, {"amenity": "parking_space"})
-    (tmp_path / "turbo.geojson").write_text(place.geojson())
-    draft = import_lot(tmp_path / "turbo.geojson")
-    with pytest.raises(InputError, match="no "):
-        draft.lot()
 
 
 def test_spaces_in_private_parking_are_private(tmp_path):
@@ -271,9 +251,6 @@ def test_points_without_an_outline_are_listed(tmp_path):
     left = reasons(draft)
     assert left["amenity=parking without an outline"] == (f"node/{len(car_park().nodes) + 1}",)
     assert "amenity=parking_space without an outline" in left
-
-
-# ---- outlines filled by rule ----
 
 
 def test_an_outline_is_filled_with_rows_on_both_sides_of_its_aisle(tmp_path):
@@ -356,9 +333,6 @@ def test_areas_that_are_no_open_parking_are_listed(tmp_path, tags, reason):
 def test_an_area_without_an_aisle_is_listed(tmp_path):
     draft = outline_alone().box(100, 100, 120, 120, {"amenity": "parking"}).draft(tmp_path)
     assert reasons(draft)["parking areas without a road along which a slot fits"] == ("way/6",)
-
-
-# ---- kerbs ----
 
 
 def test_kerbs_hold_a_slot_every_six_metres_on_the_tagged_side(tmp_path):
@@ -519,9 +493,6 @@ def test_rows_follow_bends_without_overlaps(tmp_path):
     assert 26 <= lot.n_slots <= 32
 
 
-# ---- lanes, entries, goals ----
-
-
 def test_entries_are_where_service_roads_meet_the_street(tmp_path):
     draft = car_park().draft(tmp_path)
     np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, -20]], atol=0.02)
@@ -616,9 +587,7 @@ def test_without_goal_or_entry_it_refuses_and_says_how_to_give_one(tmp_path):
     draft = place.draft(tmp_path)
     assert len(draft.slots) == 2
     assert len(draft.missing) == 2
-    with pytest.raises(
-        InputError, match=r"no entry: .*--entry LAT,LON; lanes end at .*no goal: .*--goal LAT,LON"
-    ):
+    with pytest.raises(InputError, match=r"no entry: .*--entry LAT,LON; lanes end at .*no goal: .*--goal"):
         draft.lot()
     problems = check_lot(tmp_path / "place.osm")
     assert [p.message.split(":")[0] for p in problems if p.severity == "error"] == ["no entry", "no goal"]
@@ -655,15 +624,10 @@ def test_a_crossing_of_six_lanes_can_be_driven(tmp_path):
     assert np.isfinite(shortest(lot)).all()
 
 
-# ---- faults ----
-
-
 def with_text(change):
     return lambda: change(car_park().xml())
 
 
-PARKING_AREA = {"type": "multipolygon", "amenity": "parking"}
-NO_LINE = {"type": "way", "ref": 3, "role": "outer", "geometry": []}
 BOMB = (
     '<?xml version="1.0"?><!DOCTYPE lolz [<!ENTITY a "aaaaaaaaaa">'
     + "".join(f'<!ENTITY {chr(98 + k)} "{10 * f"&{chr(97 + k)};"}">' for k in range(9))
@@ -695,11 +659,7 @@ FAULTS = [
     ),
     ("a.osm", lambda: "<osm version='0.6'/>", "no parking in it"),
     ("a.osm", lambda: Map().way([(0, 0), (9, 0)], STREET).xml(), "no parking in it"),
-    (
-        "a.osm",
-        lambda: car_park().way([(1, 1), (4, 4), (4, 1), (1, 4), (1, 1)], SPACE).xml(),
-        "way/30: its outline is not a simple one: Self-intersection",
-    ),
+    ("a.osm", lambda: car_park().way([(1, 1), (4, 4), (4, 1), (1, 4), (1, 1)], SPACE).xml(), "way/30: its outline"),
     (
         "a.geojson",
         lambda: car_park().geojson().replace('"Polygon", "coordinates": [[', '"Polygon", "coordinates": [[], [', 1),
@@ -741,54 +701,12 @@ def test_faults_are_named_in_one_line(tmp_path, name, text, message):
         assert problem.severity == "error"
 
 
-@settings(max_examples=25)
-@given(data=st.data(), kind=st.sampled_from(["overpass", "geometry", "geojson"]))
-def test_no_content_brings_the_import_down(tmp_path, data, kind):
-    place = car_park().area([30], [], amenity="parking").box(60, 0, 80, 30, {})
-    document = json.loads(
-        place.geojson() if kind == "geojson" else place.overpass(geometry=kind == "geometry")
-    )
-    odd = [
-        None,
-        True,
-        0,
-        -1,
-        1e308,
-        float("nan"),
-        "x",
-        "way/1",
-        "yes",
-        [],
-        {},
-        [[]],
-        [7.85, 48.0],
-        [[7.8, 48.0]],
-    ]
-    for _ in range(data.draw(st.integers(1, 4))):
-        at = document
-        while True:
-            key = data.draw(st.sampled_from(list(at) if isinstance(at, dict) else range(len(at))))
-            if isinstance(at[key], dict | list) and at[key] and data.draw(st.integers(0, 4)):
-                at = at[key]
-                continue
-            at[key] = copy.deepcopy(data.draw(st.sampled_from(odd)))
-            break
-    path = tmp_path / ("a.geojson" if kind == "geojson" else "a.json")
-    path.write_text(json.dumps(document), encoding="utf-8")
-    with suppress(InputError):
-        assert import_lot(path).lot().n_slots > 0
-    check_lot(path)
-
-
 def test_every_cut_of_a_map_is_refused(tmp_path):
     whole = car_park().xml()
     for length in range(0, len(whole), 397):
         (tmp_path / "a.osm").write_text(whole[:length])
         with pytest.raises(InputError, match=r"not XML: line \d+, column \d+"):
             import_lot(tmp_path / "a.osm")
-
-
-# ---- clipped and packed extracts ----
 
 
 def clipped(place, x):
@@ -870,11 +788,6 @@ def test_a_map_of_too_many_elements_is_refused(tmp_path, monkeypatch):
         car_park().draft(tmp_path)
 
 
-def test_a_file_that_is_not_there_is_named(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
-        import_lot(tmp_path / "a.osm")
-
-
 def test_elements_may_stand_twice_with_and_without_tags(tmp_path):
     """As Overpass writes them for `out body; >; out skel qt;`."""
     text = car_park().xml()
@@ -893,9 +806,6 @@ def test_deleted_elements_are_not_there(tmp_path):
     draft = import_lot(tmp_path / "a.osm")
     assert len(draft.slots) == 21
     assert "way/4" not in draft.slot_ids
-
-
-# ---- invariants ----
 
 
 @settings(max_examples=25)
@@ -934,27 +844,6 @@ def test_every_slot_is_tied_to_a_lane_before_its_mouth(tmp_path, turn, aisle, n,
     assert not shapely.intersects(
         boxes, shapely.union_all([shapely.LineString(lane.points) for lane in lot.lanes])
     ).any()
-
-
-# ---- a search there ----
-
-PLACES = {
-    "spaces": car_park,
-    "outline": outline_alone,
-    "kerbs": lambda: crossing_streets(highway="residential"),
-}
-
-
-@pytest.mark.parametrize("name", PLACES)
-def test_a_search_runs_on_what_was_imported(tmp_path, name):
-    write_lot(PLACES[name]().draft(tmp_path).lot(), tmp_path / "lot.geojson")
-    assert check_lot(tmp_path / "lot.geojson") == []
-    lot = read_lot(tmp_path / "lot.geojson")
-    scenario = make_scenario(lot)
-    for agent in ("mdp", "greedy-drive"):
-        rows = Case(scenario, agent).run(range(4))
-        assert all(row["parked"] for row in rows)
-        assert all(row["drive_s"] > 0.0 and row["walk_s"] > 0.0 for row in rows)
 
 
 def test_the_command_line_imports_draws_and_checks(tmp_path):
@@ -1004,12 +893,3 @@ def test_no_output_is_written_if_one_cannot_be(tmp_path, out, picture, message):
     done = parkenv("lot", "import", "place.osm", "--out", out, "--picture", picture, cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (2, "", f"parkenv: error: {message}\n")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["place.osm", "taken.geojson"]
-
-
-def test_pictures_are_drawn_of_whatever_was_found(tmp_path):
-    for name, draft in (
-        ("all", car_park().draft(tmp_path)),
-        ("nothing", outline_alone(access="private").draft(tmp_path)),
-    ):
-        save_import_picture(draft, tmp_path / f"{name}.png")
-        assert shows_color(tmp_path / f"{name}.png", SOURCE_COLORS[0]) == (name == "all")

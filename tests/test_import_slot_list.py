@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 
 from parkenv import make_scenario
 from parkenv.errors import InputError
-from parkenv.lots import grid_lot, read_lot, write_lot
+from parkenv.lots import grid_lot, read_lot
 from parkenv.lots.checks import check_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.generators import BAY_SIZE, Slots, bay_row
@@ -44,9 +44,6 @@ def of_lot(tmp_path, lot, *, with_yaw=False, **options):
 
 def row(n, y, *, x=0.0, pitch=2.5):
     return [(x + pitch * k, y) for k in range(n)]
-
-
-# ---- what follows from centres ----
 
 
 @pytest.mark.parametrize("with_yaw", [False, True])
@@ -184,8 +181,6 @@ def test_inexact_lists_give_lots_in_which_every_slot_opens_to_a_lane(tmp_path, s
     assert ((mouth - found.slot_xy) * to_lane).sum(axis=1).min() > 0.0
 
 
-# ---- when it is not sure ----
-
 REFUSED = {
     "between spacings": (row(8, 0, pitch=4.2) + row(8, 11, pitch=4.2), "a slot every 4.20 m, too wide"),
     "millimetres": (row(8, 0, pitch=2500.0) + row(8, 11e3, pitch=2500.0), "2500.00 m apart, want 1.8 to 8 m"),
@@ -284,8 +279,6 @@ def test_parking_costs_and_zones_stay_with_their_slots(tmp_path):
             assert getattr(drawn, column).tolist() == [listed[name] for name in drawn.slot_ids]
 
 
-# ---- faults ----
-
 FAULTS = [
     ("", r"columns are '', want x,y or lat,lon"),
     ("x,y", "no slot below the line of columns"),
@@ -317,21 +310,3 @@ def test_faults_are_named_in_one_line(tmp_path, text, message):
     assert "\n" not in str(caught.value)
     (problem,) = check_lot(path)
     assert problem.severity == "error"
-
-
-def test_files_that_cannot_be_read_are_named(tmp_path):
-    with pytest.raises(InputError, match="No such file"):
-        import_lot(tmp_path / "slots.csv")
-    (tmp_path / "slots.csv").write_bytes(b"x,y\n\xff,2")
-    with pytest.raises(InputError, match="not UTF-8 text"):
-        import_lot(tmp_path / "slots.csv")
-
-
-def test_a_search_runs_on_a_list_of_slots(tmp_path):
-    lot = grid_lot(4, 8)
-    draft = of_lot(tmp_path, lot, entries=(tuple(lot.entries[0]),), goals=(tuple(lot.goals[0]),))
-    write_lot(draft.lot(), tmp_path / "lot.geojson")
-    assert check_lot(tmp_path / "lot.geojson") == []
-    scenario = make_scenario(read_lot(tmp_path / "lot.geojson"))
-    rows = Case(scenario, "mdp").run(range(4))
-    assert all(r["parked"] and r["walk_s"] > 0.0 for r in rows)

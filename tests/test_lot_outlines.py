@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_outlines import document, double_row, kerb, row, town, write
 from pictures import shows_color
+from small_lots import features
 
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
@@ -126,9 +127,7 @@ class TestLayouts:
         ]
 
     def test_a_car_park_of_landlocked_spaces_is_refused(self, tmp_path):
-        with pytest.raises(
-            InputError, match="32 of 64 spaces have no aisle: spaces that only another space leads to"
-        ):
+        with pytest.raises(InputError, match="32 of 64 spaces have no aisle: spaces that only another space"):
             imported(tmp_path, [row((0.0, 5.0 * k), 0.0, 16) for k in range(4)])
 
     def test_no_lane_leads_over_a_building(self, tmp_path):
@@ -233,55 +232,52 @@ class TestInvariance:
         assert one == other
 
 
-def spoiled(made, kind):
-    """Spoil a document in one place."""
-    ring = made["features"][5]["geometry"]["coordinates"][0]
-    if kind == "same id":
-        made["features"][5]["id"] = made["features"][5]["properties"]["@id"] = "way/9"
-    elif kind == "open":
-        ring.pop()
-    elif kind == "crossing":
-        ring[1], ring[2] = ring[2], ring[1]
-    elif kind == "swapped":
-        made["features"][5]["geometry"]["coordinates"] = [[[lat, lon] for lon, lat in ring]]
-    elif kind == "all swapped":
-        for each in made["features"]:
-            each["geometry"]["coordinates"] = [
-                [[lat, lon] for lon, lat in each["geometry"]["coordinates"][0]]
-            ]
-    elif kind == "flat":
-        ring[1:4] = [ring[0]] * 3
-    elif kind == "huge":
-        corner, other = ring[0], ring[2]
-        scale = 6.0
-        made["features"][5]["geometry"]["coordinates"] = [
-            [[corner[0] + scale * (p[0] - corner[0]), corner[1] + scale * (p[1] - corner[1])] for p in ring]
-        ]
-        assert other
-    elif kind == "twice":
-        made["features"].append(copy.deepcopy(made["features"][5]))
-        made["features"][-1]["id"] = made["features"][-1]["properties"]["@id"] = "way/77"
-    return made
+def with_ring(change):
+    """Change the outline of one space of a document."""
+    return lambda made: change(made["features"][5]["geometry"]["coordinates"][0])
+
+
+def named(made, k, name):
+    made["features"][k]["id"] = made["features"][k]["properties"]["@id"] = name
+
+
+def swapped(*features):
+    for each in features:
+        each["geometry"]["coordinates"][0] = [p[::-1] for p in each["geometry"]["coordinates"][0]]
+
+
+def six_times_as_large(ring):
+    ring[:] = [[a + 6.0 * (b - a) for a, b in zip(ring[0], p, strict=True)] for p in ring]
+
+
+def twice(made):
+    made["features"].append(copy.deepcopy(made["features"][5]))
+    named(made, -1, "way/77")
 
 
 class TestFaults:
     @pytest.mark.parametrize(
-        ("kind", "says"),
+        ("spoil", "says"),
         [
-            ("same id", "way/9 appears twice"),
-            ("open", "way/6: its outline is open"),
-            ("crossing", "way/6: its outline is not a simple one"),
-            ("swapped", "latitude and longitude swapped"),
-            ("all swapped", "latitude and longitude swapped"),
-            ("flat", "way/6: .*(outline|0.0 m²)"),
-            ("huge", "way/6: a parking space of 450.0 m²|way/6: .*m²"),
-            ("twice", "way/77: lies on way/6"),
+            (lambda made: named(made, 5, "way/9"), "way/9 appears twice"),
+            (with_ring(lambda ring: ring.pop()), "way/6: its outline is open"),
+            (with_ring(lambda ring: ring.insert(1, ring.pop(2))), "way/6: its outline is not a simple one"),
+            (lambda made: swapped(made["features"][5]), "latitude and longitude swapped"),
+            (lambda made: swapped(*made["features"]), "latitude and longitude swapped"),
+            (
+                with_ring(lambda ring: ring.__setitem__(slice(1, 4), [ring[0]] * 3)),
+                "way/6: .*(outline|0.0 m²)",
+            ),
+            (with_ring(six_times_as_large), "way/6: .*m²"),
+            (twice, "way/77: lies on way/6"),
         ],
+        ids=range(8),
     )
-    def test_each_is_said_in_a_line_and_nothing_is_written(self, tmp_path, kind, says):
-        path = write(tmp_path / "made.geojson", spoiled(document(double_row()), kind))
-        out = tmp_path / "lot.geojson"
-        done = parkenv("lot", "import", path, "--entry", "auto", "--goal", "auto", "--out", out)
+    def test_each_is_said_in_a_line_and_nothing_is_written(self, tmp_path, spoil, says):
+        made = document(double_row())
+        spoil(made)
+        path, out = write(tmp_path / "made.geojson", made), tmp_path / "lot.geojson"
+        done = parkenv("lot import --entry auto --goal auto", path, "--out", out)
         assert done.returncode == 2
         assert done.stderr.count("\n") == 1
         assert re.search(says, done.stderr), done.stderr
@@ -361,13 +357,13 @@ class TestSurvey:
 
     def test_one_way_lanes_without_a_loop(self):
         mini = packaged_lot("mini")
-        lot = ParkingLot(**{**columns(mini), "lanes": (Lane(mini.lanes[0].points, oneway=True),)})
+        lot = ParkingLot(**{**features(mini), "lanes": (Lane(mini.lanes[0].points, oneway=True),)})
         assert any("form no loop" in p.message for p in check_drivability(lot, drive=False).problems)
 
     def test_a_lane_over_a_slot(self):
         mini = packaged_lot("mini")
         over = Lane(np.array([mini.lanes[0].points[1], mini.slot_xy[0]]))
-        lot = ParkingLot(**{**columns(mini), "lanes": (*mini.lanes, over)})
+        lot = ParkingLot(**{**features(mini), "lanes": (*mini.lanes, over)})
         survey = check_drivability(lot, drive=False)
         assert any("leaves less than 1 m to the slot" in p.message for p in survey.problems)
         assert survey.error_probability >= 0.5
@@ -376,7 +372,7 @@ class TestSurvey:
         mini = packaged_lot("mini")
         width = mini.slot_width.copy()
         width[3] = 1.7
-        lot = ParkingLot(**{**columns(mini), "slot_width": width})
+        lot = ParkingLot(**{**features(mini), "slot_width": width})
         path = tmp_path / "lot.geojson"
         write_lot(lot, path)
         said = parkenv("lot", "check", path).stdout
@@ -385,21 +381,6 @@ class TestSurvey:
         assert "error probability 0.2" in said
         undriven = parkenv("lot", "check", path, "--no-drive")
         assert (undriven.returncode, "gets into no" in undriven.stdout) == (0, False)
-
-
-def columns(lot):
-    names = (
-        "slot_ids",
-        "slot_xy",
-        "slot_yaw",
-        "slot_length",
-        "slot_width",
-        "slot_mouth",
-        "lanes",
-        "entries",
-        "goals",
-    )
-    return {name: getattr(lot, name) for name in ("name", *names)}
 
 
 class TestTown:
@@ -435,17 +416,17 @@ class TestTown:
         path = Path(__file__).parents[1] / "examples" / "outlined_town.geojson"
         assert json.loads(path.read_text(encoding="utf-8")) == town()
 
-    def test_split_takes_no_single_entry(self, tmp_path):
+    @pytest.mark.parametrize(
+        ("words", "says"),
+        [
+            ("--entry 0,0", "--split finds entries"),
+            ("--least 50", "in groups of at most 24, want a group of 50"),
+        ],
+    )
+    def test_what_cannot_be_split_is_refused(self, tmp_path, words, says):
         path = write(tmp_path / "town.geojson", self.town())
-        done = parkenv("lot", "import", path, "--split", "--entry", "0,0", "--out", tmp_path / "lots")
-        assert done.returncode == 2
-        assert "--split finds entries" in done.stderr
-
-    def test_no_group_large_enough(self, tmp_path):
-        path = write(tmp_path / "town.geojson", self.town())
-        done = parkenv("lot", "import", path, "--split", "--least", "50", "--out", tmp_path / "lots")
-        assert done.returncode == 2
-        assert "in groups of at most 24, want a group of 50" in done.stderr
+        done = parkenv(f"lot import --split {words}", path, "--out", tmp_path / "lots")
+        assert (done.returncode, says in done.stderr) == (2, True)
         assert not (tmp_path / "lots").exists()
 
     def test_a_folder_that_cannot_be_made_is_named_before_the_work(self, tmp_path):

@@ -23,7 +23,7 @@ from parkenv.world.demand import ConstantTime, Demand, ListedArrivals, PoissonAr
 from planners.agent import make_agent
 
 IMPORTED = str(Path(parkenv.__file__).parent / "lots" / "places" / "place-01.geojson")
-LOTS = pytest.mark.parametrize("scenario", ["mini", "campus", IMPORTED], ids=["mini", "campus", "imported"])
+LOTS = pytest.mark.parametrize("scenario", ["mini", IMPORTED], ids=["mini", "imported"])
 # PettingZoo knows by name which environments may have dictionaries as observations.
 pytestmark = [
     pytest.mark.filterwarnings("ignore:Observation is not a NumPy array"),
@@ -38,12 +38,6 @@ pytestmark = [
 def test_pettingzoo_s_tests_of_the_interface(scenario, options):
     api_test(lot_v0.env(scenario=scenario, **options), num_cycles=100)
     parallel_api_test(lot_v0.parallel_env(scenario=scenario, tick_s=5.0, **options), num_cycles=300)
-
-
-@pytest.mark.slow
-def test_a_town_passes_them_too():
-    api_test(lot_v0.env(scenario="town"), num_cycles=20)
-    parallel_api_test(lot_v0.parallel_env(scenario="town", tick_s=5.0), num_cycles=20)
 
 
 @LOTS

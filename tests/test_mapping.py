@@ -33,9 +33,6 @@ from sim_sensors.rig import Mount
 LASER, MOUNT = LaserScanner(), Mount(z=0.5)
 
 
-# The grid (T §3.3.1)
-
-
 def test_a_look_frees_cells_before_a_car_and_leaves_those_behind_it():
     grid = OccupancyGrid((0.0, -5.0), (12.0, 5.0), 0.25)
     grid.update((0.1, 0.1), 0.0, math.radians(30.0), np.array([[0.0, 5.0]]), 10.0, car=4.0)
@@ -66,14 +63,6 @@ def test_looks_from_anywhere_stay_within_the_grid(x, y, yaw, half):
     grid.update((x, y), yaw, half, np.array([[0.1, 3.0]]), 6.0)
     assert np.isfinite(grid.log_odds).all()
     assert (grid.log_odds[~grid.seen] == 0.0).all()
-
-
-def test_a_grid_without_area_is_refused():
-    with pytest.raises(InputError, match="want an area and a cell size"):
-        OccupancyGrid((0.0, 0.0), (0.0, 5.0))
-
-
-# Slots (T §3.3.2)
 
 
 @pytest.fixture(scope="module")
@@ -151,17 +140,6 @@ def test_bad_scans_are_named(scan, message):
         scan_from_laser(LASER, MOUNT, np.zeros(3), scan)
 
 
-def test_a_scan_without_a_return_sees_through_everything(mini):
-    slots = SlotFilter(mini)
-    pose = np.array([*mini.vertex_xy[0], 0.0])
-    slots.update_from_scan(scan_from_laser(LASER, MOUNT, pose, np.full(LASER.n_beams, np.inf, np.float32)))
-    assert slots.in_view[0]
-    assert not slots.states().occupied.any()
-
-
-# Inference over sessions (T §3.3.3)
-
-
 def sessions(times, occupied, known=None):
     occupied = np.array(occupied, bool)
     known = np.ones_like(occupied) if known is None else np.array(known, bool)
@@ -233,14 +211,6 @@ def test_a_map_is_a_prior_of_a_search():
     assert even.min() > observation["p_occupied"][1::2].max()
     forecast = MapPrior(log).forecast(Arrival(40_000.0))
     assert (forecast.decay_rate > 0).all()
-
-
-def test_an_empty_map_predicts_nothing():
-    with pytest.raises(InputError, match="the map holds no session"):
-        predict(sessions([], np.empty((0, 3))))
-
-
-# The map file
 
 
 def session(lot, key, p=0.9):
@@ -388,13 +358,6 @@ def test_a_strangers_journal_removes_no_file(mini, tmp_path):
     assert mine.read_text() == "mine"
 
 
-def test_a_session_is_written_once(mini, tmp_path):
-    with MapStore(tmp_path / "m", mini) as store:
-        store.add(session(mini, "a"))
-        with pytest.raises(InputError, match="'a' already"):
-            store.add(session(mini, "a"))
-
-
 _WRITER = """
 import sys, numpy as np
 from pathlib import Path
@@ -436,9 +399,6 @@ def test_a_kill_leaves_whole_sessions_only(mini, tmp_path):
     for one in there:
         assert len(one.cars) == 50
         assert np.isfinite(one.p_occupied).all()
-
-
-# Discovered slots, and pose errors
 
 
 def test_slots_are_found_where_cars_stand_again_and_again():

@@ -17,8 +17,7 @@ from planners import make_agent
 from planners.heuristics.policies import POLICIES
 
 NOISY = SensorModel(
-    view_range=9.0,
-    bands=(SensorBand(4.0, True, 0.9, 0.9, 0.1), SensorBand(9.0, False, 0.6, 0.8, 0.3)),
+    view_range=9.0, bands=(SensorBand(4.0, True, 0.9, 0.9, 0.1), SensorBand(9.0, False, 0.6, 0.8, 0.3))
 )
 SENSORS = {"exact": SensorModel(view_range=6.0), "noisy": NOISY}
 START = {"entry": 0, "arrival": "Tue 09:10"}

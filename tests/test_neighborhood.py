@@ -1,11 +1,10 @@
 """Planning on a part of a large lot: which part, that the rest does not matter, and how the part moves."""
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import dijkstra
 
-from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
+from parkenv import OccupancyProcess, Scenario, make_scenario
 from parkenv.lots import city_lot, grid_lot
 from parkenv.studies.compare.cases import at_occupancy
 from parkenv.studies.episodes import EpisodeRunner
@@ -107,26 +106,3 @@ def test_where_a_part_is_full_the_search_goes_on_beyond_it(name):
     assert row["parked"]
     assert row["failed_parks"] == 0
     assert not np.isin(near.slots, free).any()
-
-
-def test_a_bad_size_is_refused():
-    with pytest.raises(InputError, match="most_vertices is 3"):
-        make_agent("belief", make_scenario("campus"), most_vertices=3)
-    with pytest.raises(InputError, match="most_vertices is 40000"):
-        make_agent("mdp-tuned", make_scenario("campus"), most_vertices=40_000)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["belief", "mdp-tuned"])
-def test_a_city_of_100_000_slots(name):
-    scenario = at_occupancy(make_scenario(city_lot(100_000)), 0.95)
-    agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v2", scenario=scenario)
-    for seed in range(2):
-        observation, _ = env.reset(seed=seed)
-        memory, over = None, False
-        while not over:
-            action, memory = agent.predict(observation, memory)
-            observation, _, terminated, truncated, info = env.step(action)
-            over = terminated or truncated
-        assert info["parked"]
-        assert info["failed_parks"] == 0

@@ -38,13 +38,6 @@ def constant_process(n, arrival, departure):
     return OccupancyProcess(np.ones(n), np.full(168, arrival), np.ones(n), np.full(168, departure))
 
 
-def naive_rates(looks):
-    """Flips over the time spent in the state that they leave."""
-    dt = looks.end - looks.start
-    flipped = looks.before != looks.after
-    return [np.sum(flipped & (looks.before == x)) / dt[looks.before == x].sum() for x in (False, True)]
-
-
 @pytest.mark.parametrize("every_s", [300.0, 1800.0])
 def test_constant_rates_are_recovered_however_coarse_the_looks(every_s):
     arrival, departure = 1 / 1500, 1 / 3000
@@ -73,14 +66,6 @@ def test_constant_rates_are_recovered_from_a_log_of_each_change():
     assert fitted == pytest.approx(truth, rel=0.06)
 
 
-def test_counting_flips_of_coarse_looks_misses_half_of_them():
-    truth = np.array([1 / 1500, 1 / 3000])
-    looks = simulated_log(constant_process(60, *truth), 2, 1800.0).intervals()
-    fitted = np.array(fit_constant_rates(looks.end - looks.start, looks.before, looks.after))
-    assert np.all(np.array(naive_rates(looks)) < 0.65 * truth)
-    assert np.all(np.abs(fitted - truth) < 0.06 * truth)
-
-
 def test_constant_rates_solve_the_closed_form_for_equal_gaps():
     # With one gap the fit is saturated: both transition probabilities are matched exactly.
     start, end = np.repeat([0, 0, 1, 1], [70, 30, 40, 60]), np.repeat([0, 1, 0, 1], [70, 30, 40, 60])
@@ -88,12 +73,6 @@ def test_constant_rates_solve_the_closed_form_for_equal_gaps():
     total = -np.log(1 - 0.3 - 0.4) / 600
     assert arrival == pytest.approx(total * 3 / 7, rel=1e-4)
     assert departure == pytest.approx(total * 4 / 7, rel=1e-4)
-
-
-def test_what_never_happens_gets_the_lowest_rate():
-    arrival, departure = fit_constant_rates([600.0] * 3, [0, 0, 1], [0, 1, 1])
-    assert arrival > 1e-5
-    assert departure == pytest.approx(1e-9, rel=1e-2)
 
 
 @pytest.mark.parametrize(
@@ -169,13 +148,6 @@ def test_profiles_and_factors_are_recovered_within_their_standard_errors(hourly,
     assert error[seen].max() < 0.6
 
 
-def test_factors_have_the_geometric_mean_one(hourly):
-    _, fit = hourly
-    assert np.log(fit.process.factors).mean(axis=1) == pytest.approx([0, 0], abs=1e-9)
-    assert fit.slot_ids[:2] == ("s0", "s1")
-    assert fit.n_intervals == 40 * 84 * 23
-
-
 def test_the_fitted_process_forecasts_the_morning_although_nights_were_not_seen(hourly):
     truth, fit = hourly
     assert np.isnan(fit.arrival_profile_se[:7]).all()
@@ -215,22 +187,6 @@ def test_nothing_to_fit_is_refused():
         fit_process(log)
     with pytest.raises(InputError, match=r"prior_sd is 0\.0"):
         fit_process(log, prior_sd=0.0)
-
-
-@pytest.mark.slow
-def test_the_real_logs_process_follows_the_day_and_survives_its_file(tmp_path):
-    if not REAL_LOG.exists():
-        pytest.skip("the CNRPark-EXT log is not in shared/data")
-    log = OccupancyLog.read(REAL_LOG)
-    fit = fit_process(log)
-    for kind, day in (("weekday", 2), ("weekend", 5)):
-        recorded = np.array([np.nanmean(log.mean_occupancy(kind, (h, h + 1))) for h in range(7, 17)])
-        fitted = np.array(
-            [fit.process.marginal(day * DAY_S + (h + 0.5) * HOUR_S).mean() for h in range(7, 17)]
-        )
-        assert np.abs(recorded - fitted).mean() < 0.05
-    fit.process.to_file(tmp_path / "cnr.json")
-    assert np.array_equal(OccupancyProcess.from_file(tmp_path / "cnr.json").factors, fit.process.factors)
 
 
 def seen_in_worlds(log, process, seed):

@@ -47,9 +47,6 @@ def at(day, hour):
     return Arrival(weekday_of(day) * DAY_S + hour * HOUR_S, day)
 
 
-# Reading
-
-
 @pytest.mark.parametrize("name", ["log.csv", "log.csv.gz"])
 def test_a_log_is_read(tmp_path, name):
     text = HEADER + (
@@ -80,14 +77,10 @@ def test_several_logs_are_one_by_date(tmp_path):
     assert log.day.tolist() == [0, 0, 1, 1]
     assert log.slot.tolist() == [0, 1, 0, 1]
     assert log.occupied.tolist() == [True, False, False, True]
-    with pytest.raises(
-        InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, want different days"
-    ):
+    with pytest.raises(InputError, match=r"first.csv: 2024-01-01 is also in .*first.csv, want different"):
         OccupancyLog.read_all([first, first])
     other = write(tmp_path, HEADER + "2024-01-03 07:00,1,c,sunny,0\n", "other.csv")
-    with pytest.raises(
-        InputError, match=r"other.csv: slot_id: 'a' is in one of this log and .* only, want the same"
-    ):
+    with pytest.raises(InputError, match=r"other.csv: slot_id: 'a' is in one of this log and .* only"):
         OccupancyLog.read_all([first, other])
 
 
@@ -102,10 +95,7 @@ def test_camera_and_weather_may_be_absent_and_the_later_of_two_cameras_stands(tm
     [
         ("", "empty, want a header"),
         (HEADER, "no observations"),
-        (
-            "datetime,slot_id,occupied,colour\n",
-            "column 'colour' is unknown, want some of datetime, camera,",
-        ),
+        ("datetime,slot_id,occupied,colour\n", "column 'colour' is unknown, want some of datetime, camera,"),
         ("datetime,slot_id\n", "column 'occupied' is missing"),
         ("datetime,slot_id,slot_id,occupied\n", "column 'slot_id' stands there twice"),
         (HEADER + "2024-01-01 07:00,1,a,sunny,2\n", "line 2: occupied is '2', want 0 or 1"),
@@ -165,9 +155,6 @@ def test_a_bad_log_object_is_refused(fields, message):
     }
     with pytest.raises(InputError, match=message):
         OccupancyLog(**(good | fields))
-
-
-# The replay
 
 
 def replay_of(seconds, states, max_gap_s=7200.0):
@@ -235,9 +222,6 @@ def test_mean_occupancy_weighs_time_between_the_first_and_the_last_look():
     assert np.isnan(log.mean_occupancy("weekend")).all()
     with pytest.raises(InputError, match="class of day is 'sunday'"):
         log.mean_occupancy("sunday")
-
-
-# A log on a lot
 
 
 def test_the_fullest_log_slots_stand_nearest_to_the_goal():
@@ -359,19 +343,13 @@ def test_copies_of_a_world_answer_alike():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (
-            lambda m: m.draw_arrival(ArrivalWindow.parse("08:00-09:00", "tue,sun"), 0),
-            "no recorded day is one of tue,sun",
-        ),
+        (lambda m: m.draw_arrival(ArrivalWindow.parse("08:00-09:00", "tue,sun"), 0), "no recorded day"),
         (lambda m: m.world(0, Arrival(0.0)), "Arrival.day is '', want a recorded day"),
         (lambda m: m.world(0, Arrival(DAY_S, MONDAYS[0])), "Arrival.time is 86400.0"),
         (lambda m: m.world(0, at(MONDAYS[0], 9)).occupied([0], 8 * HOUR_S), "time is 28800.0"),
         (lambda m: RecordedOccupancy(m.log, [math.nan]), "walk_m has shape"),
         (lambda m: RecordedOccupancy(m.log, [1.0], mapping=[9]), "mapping: want"),
-        (
-            lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"),
-            "forecast_from is 'past', want replay_from with it",
-        ),
+        (lambda m: RecordedOccupancy(m.log, [1.0], forecast_from="past"), "forecast_from is 'past'"),
         (
             lambda m: RecordedOccupancy(m.log, [1.0], None, date(2024, 1, 1), "rolling").mapped_log(
                 MONDAYS[0]
@@ -403,15 +381,6 @@ def test_what_a_log_cannot_serve_is_refused_in_words(make, message):
         make(RecordedOccupancy(random_log(), np.arange(4.0)))
 
 
-def test_a_slot_that_is_not_there_is_an_index_error():
-    world = RecordedOccupancy(random_log(), np.arange(4.0)).world(0, at(MONDAYS[0], 9))
-    with pytest.raises(IndexError, match="slot index out of range"):
-        world.occupied([4], 9 * HOUR_S)
-
-
-# Mapping files
-
-
 def test_a_mapping_is_read_and_used(tmp_path):
     log = random_log()
     path = write(tmp_path, "log_slot_id,slot_id\ns3,B\ns0,A\ns3,C\n", "mapping.csv")
@@ -435,9 +404,6 @@ def test_a_mapping_is_read_and_used(tmp_path):
 def test_a_bad_mapping_is_refused(tmp_path, text, message):
     with pytest.raises(InputError, match=rf"mapping\.csv: {message}"):
         read_mapping(write(tmp_path, text, "mapping.csv"), ["A", "B"], random_log())
-
-
-# The real log
 
 
 @pytest.fixture(scope="module")

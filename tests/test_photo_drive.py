@@ -152,9 +152,6 @@ def test_slots_where_no_car_is_found_are_free_as_far_as_the_picture_shows():
     assert slots.states().p_occupied[slot] == pytest.approx(0.1 / 1.1, abs=0.01)
 
 
-# Poses
-
-
 def test_tables_and_tracks_say_the_same(tmp_path):
     frame, xy = LocalFrame(7.85, 48.0), np.column_stack([np.linspace(0.0, 9.0, 10), np.zeros(10)])
     lonlat = frame.to_lonlat(xy)

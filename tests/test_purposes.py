@@ -170,12 +170,6 @@ def test_bad_tables_are_named(changes, named):
     assert "\n" not in str(error.value)
 
 
-def test_somebody_has_to_arrive():
-    tables = TABLES | {"demand": {"shoppers": {"arrivals_per_hour": 0, "parked": 3}}}
-    with pytest.raises(InputError, match="nobody arrives"):
-        make_scenario(ScenarioSpec.parse(tables, "town.toml"))
-
-
 def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
     lot = make_scenario("mini").lot
     zones = np.where(np.arange(10) < 5, "kerb", "residents")
@@ -226,18 +220,6 @@ def test_in_a_town_the_way_to_the_goal_takes_no_patience():
         assert car["patience_s"] == pytest.approx(1.0 + way_s)
         assert car["slot"] >= 0 or car["ended_at"] - car["arrival"] >= car["patience_s"]
     assert np.mean(fleet.cars["slot"] >= 0) > 0.2  # those whose goal has a free space beside it
-
-
-@pytest.mark.slow
-def test_hardly_anybody_who_drives_as_usual_gives_up_before_the_town_is_full():
-    town = make_scenario("town")
-    fleet = Fleet(town, town.demand.scaled(1.5), drivers=[DriverKind(policy=POLICIES["usual"])])
-    fleet.reset(1)
-    fleet.run(until=fleet.begin + 5 * 3600.0)
-    assert 0.8 < fleet.counts().sum() / town.lot.capacity.sum() < 0.95
-    fleet.run()
-    arrived = fleet.cars[fleet.cars["parked_at"] < 0]
-    assert np.mean(arrived["slot"] < 0) < 0.01
 
 
 def test_recorded_days_are_the_world_of_single_searches(tmp_path):

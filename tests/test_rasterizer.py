@@ -11,7 +11,7 @@ from toy_scene import box_mesh, parked_cars, random_boxes, ray_depth, toy_scene
 
 from sim_sensors.camera.models import PinholeCamera, camera_pose
 from sim_sensors.camera.projection import NEAR, project
-from sim_sensors.camera.rasterizer import FAR, interleaved, rasterize
+from sim_sensors.camera.rasterizer import FAR, rasterize
 from sim_sensors.mesh import Material
 
 
@@ -124,14 +124,6 @@ def test_glass_is_found_apart_from_what_is_behind():
     assert seen.pane[60, 0] == -1
 
 
-def test_glass_behind_a_wall_is_not_seen():
-    pane = box_mesh(0.01, 2.0, 2.0, Material.GLASS)
-    wall = box_mesh(0.5, 9.0, 9.0, Material.STONE)
-    scene = toy_scene([pane, wall], [(0, 8.0, 0.0, 0.2, 0.0), (1, 6.25, 0.0, 0.0, 0.0)], [1, 0])
-    _, seen = plain_camera().visibility(scene, camera_pose(0.0, 0.0, 1.2, 0.0))
-    assert (seen.pane == -1).all()
-
-
 def test_same_result_on_any_number_of_threads():
     scene, camera = random_boxes(2, count=80), plain_camera(320, 240)
     pose = camera_pose(0.0, 0.0, 1.4, 0.5)
@@ -171,18 +163,3 @@ def test_far_instances_are_drawn_coarse():
     all_fine = project(scene.pool, scene.instances, pose, camera.intrinsics, size, math.inf)
     assert (near_fine.instance == 1).sum() < (all_fine.instance == 1).sum()
     assert (near_fine.instance == 0).sum() == (all_fine.instance == 0).sum()
-
-
-def test_what_is_out_of_view_is_culled():
-    scene = toy_scene(
-        [box_mesh(4.0, 2.0, 1.5)], [(0, -10.0, 0.0, 0.0, 0.0), (0, 0.0, 30.0, 0.0, 0.0)], [1, 2]
-    )
-    camera = plain_camera()
-    size = (camera.width, camera.height)
-    triangles = project(scene.pool, scene.instances, camera_pose(0.0, 0.0, 1.4, 0.0), camera.intrinsics, size)
-    assert len(triangles.corners) == 0
-
-
-@pytest.mark.parametrize("n", [1, 2, 3, 8, 30, 31])
-def test_interleaving_is_a_permutation(n):
-    assert sorted(interleaved(n)) == list(range(n))

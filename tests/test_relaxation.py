@@ -68,11 +68,6 @@ def test_it_is_never_above_the_optimum_and_far_closer_than_the_clairvoyant_bound
     require_below(range(24))
 
 
-@pytest.mark.slow
-def test_it_is_never_above_the_optimum_of_200_small_lots():
-    require_below(range(24, 224))
-
-
 def test_coarser_groups_give_a_lower_bound_that_still_holds():
     problem, p_taken, entry = small_lot(4, SHAPES)
     exact, fine, clairvoyant = means(problem, p_taken, entry)

@@ -11,7 +11,6 @@ import parkenv  # noqa: F401  (registers the environments)
 from parkenv import make_scenario
 from parkenv.lots import city_lot
 from parkenv.show.colors import PALETTE, belief_colors
-from parkenv.show.frames.lot import clock
 from parkenv.show.frames.search import SearchRenderer
 from parkenv.show.frames.window import Window
 from parkenv.world.lot import PARK, Lane, ParkingLot
@@ -196,21 +195,6 @@ def test_text_tells_place_time_and_surroundings():
     assert marks.count("G") == marks.count("E") == 1
     assert sum(marks.count(m) for m in "<>^v") == 1
     assert sum(marks.count(m) for m in "o#.:%") == 10
-
-
-def test_text_of_a_large_lot_fits_the_terminal_too():
-    env = gym.make("parkenv/Search-v2", scenario=make_scenario(city_lot(4000, seed=2)), render_mode="ansi")
-    env.reset(seed=0)
-    lines = env.render().splitlines()
-    assert len(lines) <= 22
-    assert max(map(len, lines)) <= 78
-
-
-@pytest.mark.parametrize(
-    ("time", "text"), [(0.0, "Mon 00:00:00"), (604_799.9, "Sun 23:59:59"), (604_800.0, "Mon 00:00:00")]
-)
-def test_clock(time, text):
-    assert clock(time) == text
 
 
 def test_frames_of_an_episode_can_be_collected():

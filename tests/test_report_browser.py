@@ -1,7 +1,6 @@
 """The report in a real browser: it loads without errors, plays, steps, sorts, and shows the summary's numbers."""
 
 import json
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,9 +12,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
 from selenium.webdriver.support.ui import WebDriverWait
 
-from parkenv.cli.report import make_report
 from parkenv.lots import packaged_lot, write_lot
-from parkenv.studies.study import ExecutionSpec
 from parkenv.world.facility import Facility
 from parkenv.world.tariff import Price, Zone
 
@@ -24,14 +21,10 @@ pytestmark = [SOCKETS, pytest.mark.slow]
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A comparison in two settings."""
+    """A comparison in two settings, and its report."""
     out = tmp_path_factory.mktemp("browser") / "compare"
-    command = [
-        "compare", "--scenario", "mini", "--agents", "mdp,first-free,greedy-goal,oracle", "--failure-cost", "10,30",
-        "-n", "6", "--occupancy-levels", "none", "--jobs", "1", "--out", str(out),
-    ]  # fmt: skip
-    assert parkenv(*command).returncode == 0
-    make_report(out, ExecutionSpec(jobs=1))
+    command = "compare --scenario mini --agents mdp,first-free,greedy-goal,oracle --failure-cost 10,30 -n 6"
+    assert parkenv(f"{command} --occupancy-levels none --jobs 1 --report --out", out).returncode == 0
     return out
 
 
@@ -82,42 +75,6 @@ def test_tables_sort_by_click_and_by_enter(page):
     assert heading.get_attribute("aria-sort") == "none"
 
 
-def test_a_table_that_does_not_fit_says_so_and_keeps_its_agents_in_sight(page):
-    box, hint = one(page, "#tables .scroll"), one(page, "#tables .more")
-    assert page.execute_script("return arguments[0].scrollWidth > arguments[0].clientWidth", box)
-    assert hint.is_displayed()
-    left = one(page, 'td[data-key="agent"]').rect["x"]
-    page.execute_script("arguments[0].scrollLeft = 300", box)
-    assert one(page, 'td[data-key="agent"]').rect["x"] <= left
-    assert one(page, 'td[data-key="agent"]').rect["x"] >= box.rect["x"]
-
-
-def test_it_says_which_worlds_it_replays(page):
-    data = json.loads(one(page, "#report-data").get_attribute("textContent"))
-    seeds = sorted({world["seed"] for world in data["worlds"]})
-    assert f"Seeds {', '.join(map(str, seeds))} of this run" in one(page, "#search-replay .quiet").text
-
-
-def test_a_setting_can_be_looked_at_alone(page):
-    chips = every(page, "#tables .chips button")
-    assert len(chips) == 3
-    chips[2].click()
-    assert len(cells(page, "agent")) == 4
-    chips[0].click()
-    assert len(cells(page, "agent")) == 8
-
-
-def test_it_plays_and_pauses(page):
-    assert seconds(page) == 0.0
-    play = one(page, "#replay .play")
-    play.click()
-    WebDriverWait(page, 60).until(lambda _: seconds(page) > 0.5)
-    play.click()
-    stopped = seconds(page)
-    time.sleep(0.3)
-    assert seconds(page) == stopped
-
-
 def test_the_keyboard_plays_and_steps(page, run):
     data = json.loads(one(page, "#report-data").get_attribute("textContent"))
     shown = {panel.get_attribute("data-agent") for panel in every(page, "#replay .panel")}
@@ -162,47 +119,30 @@ def test_the_end_of_a_replay_is_the_end_of_the_search(page):
     )
 
 
-def test_one_to_four_agents_stand_side_by_side(page):
-    names = ["mdp", "first-free", "greedy-goal", "oracle"]
-    for name in names[2:]:
-        one(page, f'#replay .chip[data-agent="{name}"]').click()
-    assert [p.get_attribute("data-agent") for p in every(page, "#replay .panel")] == names
-    assert painted(page, "#replay .panel canvas") > 20
-    for name in names:
-        one(page, f'#replay .chip[data-agent="{name}"]').click()
-    # The last one stays.
-    assert [p.get_attribute("data-agent") for p in every(page, "#replay .panel")] == ["oracle"]
+def opened(browser, page, *size, **look):
+    screen(browser, *size, **look)
+    browser.get(page.as_uri())
+    return json.loads(one(browser, "#report-data").get_attribute("textContent"))
 
 
-def test_another_world_can_be_chosen(page):
-    data = json.loads(one(page, "#report-data").get_attribute("textContent"))
-    last = len(data["worlds"]) - 1
-    choice = one(page, "#world")
-    choice.find_elements(By.TAG_NAME, "option")[last].click()
-    panel = one(page, "#replay .panel")
-    (search,) = [
-        s for s in data["worlds"][last]["searches"] if s["agent"] == panel.get_attribute("data-agent")
-    ]
-    assert float(panel.get_attribute("data-total")) == search["total_s"]
+def fits_a_phone(browser, page, canvas, dark):
+    opened(browser, page, 390, 844, dark=dark)
+    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
+    assert painted(browser, canvas) > 20
+    assert browser.get_log("browser") == []
 
 
-@pytest.mark.slow
 def test_a_day_with_many_cars_is_played(browser, tmp_path):
-    command = ["fleet", "--scenario", "mini", "--hours", "08:00-08:30", "--arrivals-per-hour", "40", "--knows",
-               "own,reserve", "-n", "1", "--jobs", "1", "--report", "--out", str(tmp_path)]  # fmt: skip
-    assert parkenv(*command).returncode == 0
-    screen(browser, 1400)
-    browser.get((tmp_path / "report.html").as_uri())
-    days = json.loads(one(browser, "#report-data").get_attribute("textContent"))["fleets"]
+    command = (
+        "fleet --scenario mini --hours 08:00-08:30 --arrivals-per-hour 40 --knows own,reserve -n 1 --jobs 1"
+    )
+    assert parkenv(f"{command} --report --out", tmp_path).returncode == 0
+    days = opened(browser, tmp_path / "report.html", 1400)["fleets"]
     assert [p.get_attribute("data-setting") for p in every(browser, "#crowd .panel")] == ["own", "reserve"]
-    assert painted(browser, "#crowd .panel canvas") > 20
     slider = one(browser, "#crowd input[type=range]")
     for seconds in (0.0, 700.0, 1500.0, 300.0):
-        browser.execute_script(
-            "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'));",
-            slider,
-            seconds,
-        )
+        script = "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('input'));"
+        browser.execute_script(script, slider, seconds)
         for day, counts in zip(days, every(browser, "#crowd .counts"), strict=True):
             now = 100 * float(slider.get_attribute("value"))
             cars = list(zip(day["arrival"], day["ended"], day["slot"], day["leaves"], strict=True))
@@ -214,22 +154,9 @@ def test_a_day_with_many_cars_is_played(browser, tmp_path):
             assert "as in days.csv" in counts.text
     one(browser, "#crowd .play").click()
     WebDriverWait(browser, 30).until(lambda _: float(slider.get_attribute("value")) > 310.0)
-    one(browser, "#crowd .play").click()
-    one(browser, "#crowd .chip[data-setting=reserve]").click()
-    assert [p.get_attribute("data-setting") for p in every(browser, "#crowd .panel")] == ["own"]
-    screen(browser, 390, 844, dark=True)
-    browser.get((tmp_path / "report.html").as_uri())
-    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
-    assert len(every(browser, "#crowd .panel")) == 1
-    # A parked car stands out from its slot in the dark, too.
-    colors = [
-        browser.execute_script(CHANNELS, name) for name in ("--asphalt", "--other", "--resident", "--parked")
-    ]
-    assert all(abs(car - colors[0]) > 50 for car in colors[1:])
-    assert browser.get_log("browser") == []
+    fits_a_phone(browser, tmp_path / "report.html", "#crowd .panel canvas", dark=True)
 
 
-@pytest.mark.slow
 def test_a_day_on_a_map_is_played_and_its_blocks_tell_their_day(browser, tmp_path):
     lot = packaged_lot("campus")
     near = np.argsort(lot.walk_m())
@@ -241,29 +168,19 @@ def test_a_day_on_a_map_is_played_and_its_blocks_tell_their_day(browser, tmp_pat
         "zone_rules": {"inner": Zone("inner", Price(2.0)), "other": Zone("other")},
     }
     write_lot(replace(lot, **supply), tmp_path / "town.geojson")
-    command = ["fleet", "--lot", "town.geojson", "--hours", "08:00-11:00", "--arrivals-per-hour", "60,120", "--knows",
-               "own", "-n", "1", "--jobs", "1", "--out", "out"]  # fmt: skip
-    assert parkenv(*command, cwd=tmp_path).returncode == 0
-    screen(browser, 1280)
-    browser.get((tmp_path / "out" / "fleet.html").as_uri())
-    data = json.loads(one(browser, "#report-data").get_attribute("textContent"))
+    command = (
+        "fleet --lot town.geojson --hours 08:00-11:00 --arrivals-per-hour 60,120 --knows own -n 1 --jobs 1"
+    )
+    assert parkenv(f"{command} --out out", cwd=tmp_path).returncode == 0
+    page = tmp_path / "out" / "fleet.html"
+    data = opened(browser, page, 1280)
     town, shown = data["towns"][0], data["maps"][0]
     canvas = one(browser, "canvas.town")
-    assert painted(browser, "canvas.town") > 20
 
     def heading():
         return one(browser, ".about h3").text
 
     assert heading() == town["name"]
-
-    def told(block):
-        cells = [cell.text for cell in every(browser, ".about tbody td:nth-child(3)")]
-        cars = [
-            row[hour] for hour in range(len(shown["hours"])) for row in [shown["blocks"]["arrivals"][block]]
-        ]
-        return cells == [f"{value:.0f}" for value in cars]
-
-    # A click on a block, and one beside all of them.
     x0, y0, x1, y1 = town["bounds"]
     width, height = canvas.rect["width"], canvas.rect["height"]
     scale = min(width / (x1 - x0 + 10), height / (y1 - y0 + 10))
@@ -272,107 +189,40 @@ def test_a_day_on_a_map_is_played_and_its_blocks_tell_their_day(browser, tmp_pat
         across, up = scale * (x - (x0 + x1) / 2), scale * (y - (y0 + y1) / 2)
         ActionChains(browser).move_to_element_with_offset(canvas, round(across), round(-up)).click().perform()
         assert heading() == town["blocks"][block]["name"]
-        assert told(block)
-    assert one(browser, ".about .quiet").text == "lot · zone other · 40 spaces"
-    # The keyboard chooses, zooms, moves and steps; the hour at hand is marked.
-    choice = one(browser, "#map-block")
-    choice.send_keys("Mill")
+        cells = [cell.text for cell in every(browser, ".about tbody td:nth-child(3)")]
+        assert cells == [f"{cars:.0f}" for cars in shown["blocks"]["arrivals"][block]]
+    # The keyboard chooses, zooms and moves; the hour at hand is marked.
+    one(browser, "#map-block").send_keys("Mill")
     assert heading() == "Mill Street"
-    assert "2 an hour" in one(browser, ".about .quiet").text
     canvas.send_keys("0")
     whole = painted_bytes(browser)
     canvas.send_keys("+" + Keys.ARROW_RIGHT)
     assert painted_bytes(browser) != whole
-    canvas.send_keys("0")
-    assert painted_bytes(browser) == whole
     canvas.send_keys(Keys.ESCAPE)
     assert heading() == town["name"]
-    slider = one(browser, "#town input[type=range]")
     one(browser, "#town button[title^='To the start']").click()
     for hour in range(3):
         one(browser, "#town .step-on").click()
-        assert float(slider.get_attribute("value")) == 3600 * (hour + 0.5)
         assert one(browser, ".about tr.now td").text == f"{8 + hour:02}:00"
-        searching = shown["states"]["searching"][hour]
-        assert f"{searching:.0f} searching" in one(browser, "#town .counts").text
-    assert painted_bytes(browser) != whole
-    # Another setting, and revenue instead of occupancy.
-    one(browser, "#map-setting").send_keys("120")
-    before = painted_bytes(browser)
-    one(browser, "#map-measure").send_keys("rev")
-    assert painted_bytes(browser) != before
-    for dark in (False, True):
-        screen(browser, 390, 844, dark=dark)
-        browser.get((tmp_path / "out" / "fleet.html").as_uri())
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
-        assert painted(browser, "canvas.town") > 20
-        # The slider is below the map, before the block.
-        assert one(browser, "#town .time").rect["y"] < one(browser, ".about").rect["y"]
-    assert browser.get_log("browser") == []
+        assert f"{shown['states']['searching'][hour]:.0f} searching" in one(browser, "#town .counts").text
+    for choice, key in (("#map-setting", "120"), ("#map-measure", "rev")):
+        before = painted_bytes(browser)
+        one(browser, choice).send_keys(key)
+        assert painted_bytes(browser) != before
+    fits_a_phone(browser, page, "canvas.town", dark=False)
 
 
 def painted_bytes(page):
     return page.execute_script("return document.querySelector('canvas.town').toDataURL()")
 
 
-CHANNELS = """
-const hex = getComputedStyle(document.documentElement).getPropertyValue(arguments[0]).trim();
-return [1, 3, 5].reduce((sum, i) => sum + parseInt(hex.slice(i, i + 2), 16) / 3, 0);
-"""
-"""Brightness of a colour of the style sheet, 0 to 255."""
-
-
-@pytest.mark.slow
-def test_a_phone_shows_every_number_of_a_table(browser, tmp_path):
-    wide = {"name": "wide", "lot": {"grid": {"rows": 2, "columns": 6}}, "arrivals": {"hours": "08:00-08:30"}}
-    (tmp_path / "wide.json").write_text(json.dumps(wide))
-    command = ["fleet", "--scenario", "mini,wide.json", "--hours", "08:00-08:30", "--arrivals-per-hour", "20",
-               "--knows", "own,reserve", "-n", "5", "--jobs", "1", "--report", "--out", "out"]  # fmt: skip
-    assert parkenv(*command, cwd=tmp_path).returncode == 0
-    screen(browser, 390, 844)
-    browser.get((tmp_path / "out" / "report.html").as_uri())
-    assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
-    # Every number of a table can be read: a row is a card, its columns are labelled, and further ones unfold.
-    hidden = one(browser, 'table[data-table="rows"] td[data-key="clairvoyant_s"]')
-    assert not hidden.is_displayed()
-    button = one(browser, 'table[data-table="rows"] td.all button')
-    browser.execute_script("arguments[0].click()", button)
-    assert hidden.is_displayed()
-    for cell in every(browser, "table.rows td"):
-        assert cell.rect["x"] + cell.rect["width"] <= 390
-    screen(browser, 1280, 900)
-    browser.get((tmp_path / "out" / "report.html").as_uri())
-    assert [p.get_attribute("data-setting") for p in every(browser, "#crowd .panel")] == [
-        "mini, own",
-        "wide, own",
-    ]
-    assert browser.get_log("browser") == []
-
-
-@pytest.mark.slow
 def test_a_survey_drive_is_shown_in_step(browser, tmp_path):
-    command = [
-        "survey",
-        "--scenario",
-        "mini",
-        "--sessions",
-        "1",
-        "--every",
-        "4",
-        "--jobs",
-        "1",
-        "--report",
-        "--out",
-        str(tmp_path),
-    ]
-    assert parkenv(*command).returncode == 0
-    screen(browser, 1400)
-    browser.get((tmp_path / "report.html").as_uri())
-    (drive,) = json.loads(one(browser, "#report-data").get_attribute("textContent"))["drives"]
+    assert (
+        parkenv("survey --scenario mini --sessions 1 --every 4 --jobs 1 --report --out", tmp_path).returncode
+        == 0
+    )
+    (drive,) = opened(browser, tmp_path / "report.html", 1400)["drives"]
     slider = one(browser, "#drive input[type=range]")
-    cars = [len(frame["cars"]) for frame in drive["frames"]]
-    shown = min(frame["t"] for frame in drive["frames"] if len(frame["cars"]) == max(cars[len(cars) // 3 :]))
-    assert float(slider.get_attribute("value")) >= shown - 0.006
     one(browser, "#drive button[title^='To the start']").click()
     for k in range(1, len(drive["frames"])):
         one(browser, "#drive .step-on").click()
@@ -385,9 +235,6 @@ def test_a_survey_drive_is_shown_in_step(browser, tmp_path):
     # The camera's frame is decoded and drawn; so are three pictures of the lot.
     WebDriverWait(browser, 60).until(lambda _: painted(browser, "#drive .panel canvas") > 500)
     assert len(every(browser, "#drive canvas")) == 4
-    (row,) = json.loads((tmp_path / "summary.json").read_text())["rows"]
-    cell = one(browser, 'table[data-table="survey"] td[data-key="car_detection_rate"]')
-    assert json.loads(cell.get_attribute("data-value")) == row["car_detection_rate"]
     assert browser.get_log("browser") == []
 
 
@@ -408,25 +255,3 @@ def test_it_fits_a_phone_and_follows_the_theme(browser, run, dark):
     one(browser, "#theme").click()
     assert browser.execute_script("return document.documentElement.dataset.theme") != before
     assert browser.get_log("browser") == []
-
-
-def test_of_many_zones_those_with_the_most_cars_are_shown_first(browser, tmp_path):
-    lot = packaged_lot("campus")
-    zones = np.array([f"Z{14 * i // lot.n_slots:02d}" for i in range(lot.n_slots)])
-    write_lot(replace(lot, slot_zone=zones), tmp_path / "zones.geojson")
-    command = ["fleet", "--lot", "zones.geojson", "--hours", "08:00-09:00", "--arrivals-per-hour", "90", "--knows",
-               "own", "-n", "1", "--jobs", "1", "--no-figures", "--out", "out"]  # fmt: skip
-    assert parkenv(*command, cwd=tmp_path).returncode == 0
-    make_report(tmp_path / "out", ExecutionSpec(jobs=1))
-    screen(browser, 390)
-    browser.get((tmp_path / "out" / "report.html").as_uri())
-
-    def cars(shown):
-        rows = every(browser, "table[data-table=zones] tbody tr")
-        cells = [one(row, "td[data-key=parked_a_day]") for row in rows if row.is_displayed() == shown]
-        return [json.loads(cell.get_attribute("data-value")) for cell in cells]
-
-    assert (len(cars(True)), len(cars(False))) == (10, 4)
-    assert min(np.ravel(its)[0] for its in cars(True)) >= max(np.ravel(its)[0] for its in cars(False))
-    one(browser, ".chips.after button").click()
-    assert len(cars(True)) == 14

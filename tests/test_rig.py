@@ -40,17 +40,6 @@ def test_mounts_turn_with_the_vehicle():
     assert mount.in_world(np.array([10.0, 20.0, math.pi / 2])) == pytest.approx((9.5, 21.0, 0.0))
 
 
-def test_the_thesis_rig_has_camera_and_laser_on_one_axis():
-    rig = SensorRig.thesis()
-    (_, _, camera), (_, laser, scanner) = rig.cameras[0], rig.lasers[0]
-    assert (camera.x, camera.y) == (scanner.x, scanner.y)
-    assert camera.yaw - scanner.yaw == RIGHT
-    assert scanner.z == 0.5
-    assert laser.n_beams == 1081
-    assert len(SensorRig.both_sides().cameras) == 2
-    assert not SensorRig.stereo().lasers
-
-
 def test_smaller_pictures_show_the_same(scene, pose):
     large, small = SensorRig.thesis(), SensorRig.thesis().resized(320)
     (_, camera, _), (_, half, _) = large.cameras[0], small.cameras[0]
@@ -146,8 +135,3 @@ def test_a_drive_captures_along_its_path(scene):
 def test_wrong_rigs_are_refused(make, message):
     with pytest.raises(SensorError, match=message):
         make()
-
-
-def test_a_pose_that_is_not_finite_is_refused(scene):
-    with pytest.raises(SensorError, match="vehicle pose"):
-        SensorRig.thesis().capture(scene, [0.0, math.nan, 0.0])

@@ -236,22 +236,3 @@ def test_logs_and_maps(tmp_path):
 )  # fmt: skip
 def test_bad_files_are_refused_in_one_line(tmp_path, text, message):
     assert message in refusal(tmp_path, text)
-
-
-def test_files_that_are_none(tmp_path):
-    with pytest.raises(
-        InputError, match="unknown scenario 'campsu', and no such file; did you mean 'campus'"
-    ):
-        make_scenario("campsu")
-    with pytest.raises(InputError, match=r"nothing.toml: No such file"):
-        make_scenario(tmp_path / "nothing.toml")
-    (tmp_path / "mine.toml").write_bytes(b"\xff\xfe")
-    with pytest.raises(InputError, match="not UTF-8 text"):
-        make_scenario(tmp_path / "mine.toml")
-    with pytest.raises(InputError, match="has more than 1,000,000 bytes"):
-        make_scenario(written(tmp_path, " " * 5_000_000))
-    (tmp_path / "deep.json").write_text("[" * 100_000)
-    with pytest.raises(InputError, match="not JSON"):
-        make_scenario(tmp_path / "deep.json")
-    with pytest.raises(InputError, match="scenario is a int, want"):
-        make_scenario(5)

@@ -9,7 +9,6 @@ from shapely.geometry import LineString, Polygon
 from sim_sensors.errors import SensorError
 from sim_sensors.laser.footprints import ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
-from sim_sensors.mesh import Material
 from sim_sensors.scene import OverlapWarning, Scene, overlapping
 from sim_sensors.scenery import (
     building_mesh,
@@ -20,7 +19,7 @@ from sim_sensors.scenery import (
     tree_mesh,
     wall_mesh,
 )
-from sim_sensors.slot_scenes import ParkingManners, SlotLot, scene_of_slots, vehicle_library
+from sim_sensors.slot_scenes import ParkingManners, SlotLot, scene_of_slots
 from sim_sensors.surroundings import Surroundings
 from sim_sensors.vehicles.vehicle import VehicleModel
 
@@ -43,9 +42,6 @@ def rows_of_slots(n=20):
 def lot(n=20, **options):
     xy, yaw = rows_of_slots(n)
     return SlotLot(xy, yaw, 5.0, 2.5, **options)
-
-
-# --- from plain arrays -------------------------------------------------------------------------------
 
 
 def test_a_scene_holds_what_it_was_given():
@@ -117,9 +113,6 @@ def test_an_empty_scene_is_a_scene():
     assert len(scene.instances.mesh) == 0
     assert scene.footprints().corners.shape[0] == 0
     assert len(scene.instances.ids) == 0
-
-
-# --- changing one vehicle ----------------------------------------------------------------------------
 
 
 def test_changing_one_slot_leaves_every_other_array_as_it_was():
@@ -199,17 +192,6 @@ def test_a_model_that_the_fleet_lacks_is_added_behind_the_others():
         np.testing.assert_array_equal(getattr(changed.pool, name), getattr(whole.pool, name))
 
 
-def test_cars_of_a_lot_of_200_come_and_go_one_at_a_time():
-    parking = lot(100, seed=1)
-    scene = parking.scene(np.ones(200, bool))
-    for k in range(20):
-        changed = parking.filled(scene.without_vehicle(k), k, 3)
-        assert len(changed.instances.ids) == 200
-
-
-# --- lots --------------------------------------------------------------------------------------------
-
-
 def test_cars_park_as_the_manners_say():
     xy = 50.0 * np.column_stack([np.arange(1500), np.zeros(1500)])
     parking = SlotLot(xy, np.zeros(1500), 6.5, 3.4, seed=2)
@@ -252,9 +234,6 @@ def test_a_lot_becomes_a_scene_in_one_call():
     assert len(scene.footprints().walls) == 8
 
 
-# --- scenery -----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(
     "mesh",
     [
@@ -277,22 +256,12 @@ def test_scenery_is_turned_the_right_way_round(mesh):
     assert mesh.vertices[:, 2].min() > -0.02
 
 
-def test_facades_have_depth():
-    mesh = building_mesh([[0, 0], [30, 0], [30, 10], [0, 10]], 9.0, 1)
-    front = mesh.vertices[np.abs(mesh.vertices[:, 1]) < 0.3]
-    assert len(np.unique(np.round(front[:, 1], 2))) >= 4
-    assert np.sum(mesh.material == Material.GLASS) > 40
-
-
 def test_people_have_their_legs_inside_their_footprint():
     for phase in (0.0, 0.25, 0.6):
         mesh = pedestrian_mesh(phase, 4)
         knee = mesh.vertices[(mesh.vertices[:, 2] > 0.45) & (mesh.vertices[:, 2] < 0.55), :2]
         shape = Polygon(pedestrian_footprint(phase)).buffer(0.03)
         assert all(shape.contains(LineString([p, p + 1e-6])) for p in knee)
-
-
-# --- bad input ---------------------------------------------------------------------------------------
 
 
 def test_overlapping_cars_are_allowed_and_warned_of():
@@ -322,10 +291,7 @@ def test_overlap_is_told_apart_from_closeness():
         (lambda: Scene.from_arrays([[0, 0, 0]], [1], ["van", "van"]), "bodies"),
         (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(1), "place is 1, want 0 to 0"),
         (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(0, pose=(0, 0, np.inf)), "pose"),
-        (
-            lambda: Scene.from_arrays([[0, 0, 0]], [1]).without_vehicle(0).with_vehicle(0),
-            "model: place 0 is empty",
-        ),
+        (lambda: Scene.from_arrays([[0, 0, 0]], [1]).without_vehicle(0).with_vehicle(0), "model: place 0"),
         (lambda: Scene.from_arrays([[0, 0, 0]], [1]).with_vehicle(0, pose=(0, 0)), "pose"),
         (lambda: lot().scene(np.ones(3, bool)), r"occupied .*want \(40,\) bool"),
         (lambda: lot().scene(np.ones(40)), "occupied"),
@@ -341,10 +307,7 @@ def test_overlap_is_told_apart_from_closeness():
         (lambda: Surroundings(trees=[[0, 0]]), "trees has shape"),
         (lambda: Surroundings(trees=[[0, 0, 0.2]]), "trees .*want heights"),
         (lambda: Surroundings(buildings=[[[0, 0], [1, 0]]]), "buildings"),
-        (
-            lambda: Surroundings(buildings=[[[0, 0], [1, 0], [2, 0]]]),
-            "buildings .*want an outline with an area",
-        ),
+        (lambda: Surroundings(buildings=[[[0, 0], [1, 0], [2, 0]]]), "buildings .*want an outline"),
         (lambda: Surroundings(building_heights=[4]), "building_heights"),
         (lambda: Surroundings(seed=-2), "seed"),
     ],
@@ -353,8 +316,3 @@ def test_bad_input_is_refused_with_one_clear_line(call, match):
     with pytest.raises(SensorError, match=match) as caught:
         call()
     assert "\n" not in str(caught.value)
-
-
-def test_the_library_has_every_body_but_rare_ones():
-    bodies = {m.body for m in vehicle_library()}
-    assert bodies >= {"hatchback", "sedan", "estate", "suv", "van"}

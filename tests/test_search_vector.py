@@ -124,24 +124,6 @@ def test_different_lots_in_one_batch(observation):
     assert set(assert_parity(places, observation, n=8)) == {"log", "mini", "jam", "street"}
 
 
-def test_different_lots_share_one_space():
-    small, large = make_scenario("mini"), make_scenario("street")
-    envs = make_batch(16, [small, large], max_episode_steps=LIMIT)
-    observation, _ = envs.reset(seed=0)
-    was_large = np.zeros(16, dtype=bool)
-    for _ in range(3 * LIMIT):
-        in_small = envs.place_of == 0
-        padding = observation["p_occupied"][in_small, small.lot.n_slots :]
-        assert (padding == 1.0).all()
-        padding = observation["belief"].reshape(16, 4, -1)[in_small, :, small.lot.n_slots :]
-        assert (padding == np.array([1.0, 0.0, 1.0, -1.0])[:, None]).all()
-        assert envs.observation_space.contains(observation)
-        was_large |= ~in_small
-        observation, *_ = envs.step(np.random.default_rng(0).integers(0, 4, 16))
-    assert (was_large & in_small).any(), "a small lot after a large one"
-    assert envs.single_observation_space["vertex"].n == max(small.lot.n_vertices, large.lot.n_vertices)
-
-
 def test_occupancy_is_the_full_observation_without_what_it_was_computed_from():
     full, lean = (make_batch(3, "mini", observation=name) for name in ("full", "occupancy"))
     assert set(full.observation_space) - set(lean.observation_space) == {"belief", "step_observed"}
@@ -285,7 +267,7 @@ def test_what_is_handed_out_is_not_live_unless_asked():
 
 
 @pytest.mark.parametrize("mode", [AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED])
-@pytest.mark.parametrize("kept", [0, 1, 2, 6])
+@pytest.mark.parametrize("kept", [0, 2])
 def test_held_observations_stay_and_equal_those_that_are_overwritten(mode, kept):
     """Memory that the caller let go of is used again; views and slices count as held."""
     rng = np.random.default_rng(kept)
@@ -402,10 +384,7 @@ def test_the_caller_of_reset_may_choose_place_entry_and_time_in_single_environme
         ({"place": 2}, "option place is 2, want a whole number from 0 to 1"),
         ({"entry": 0}, "option place is None, want one of mini, street"),
         ({"place": 0, "entry": 9}, "option entry is 9, want a whole number from 0 to 0"),
-        (
-            {"place": 0, "arrival": "sun 10:00"},
-            "day of option arrival is 'sun', want one of mon, tue",
-        ),
+        ({"place": 0, "arrival": "sun 10:00"}, "day of option arrival is 'sun', want one of mon, tue"),
         ({"place": 0, "arrival": -1}, "option arrival is -1, want a finite number at least 0"),
         *(
             ({"place": 0, "arrival": text}, f"option arrival is '{text}', want seconds since Monday 00:00")

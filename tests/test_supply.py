@@ -239,12 +239,6 @@ def test_a_wrong_town_is_refused_in_one_line(tmp_path, message):
     assert any(message in str(problem) for problem in check_lot(path))
 
 
-def test_a_facility_is_entered_at_a_point():
-    for xy in ((1.0, 2.0, 3.0), 5.0):
-        with pytest.raises(InputError, match="xy is"):
-            Facility("P", capacity=3, xy=xy)
-
-
 def test_a_facility_that_no_entry_leads_to_is_named():
     away = replace(packaged_lot("mini").lanes[0], points=np.array([[0.0, 100.0], [30.0, 100.0]]))
     lot = packaged_lot("mini")

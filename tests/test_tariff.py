@@ -73,19 +73,6 @@ def test_wrong_prices_are_named(costs, message):
         make_scenario(ScenarioSpec.parse({"lot": "mini", "costs": costs}, "town"))
 
 
-def test_a_price_of_a_zone_that_the_lot_lacks_is_refused_in_python_too():
-    lot = zoned(grid_lot(1, 4))
-    with pytest.raises(InputError, match="no zone 'center'; did you mean 'centre'"):
-        make_scenario(lot, tariff=Tariff({"center": 1.0}))
-    with pytest.raises(InputError, match="price of zone 'centre' is nan"):
-        Tariff({"centre": np.nan})
-    with pytest.raises(InputError, match="control characters"):
-        replace(lot, slot_zone=["a\x1b"] * 4)
-
-
-# ---- fleets: each car pays for its own stay
-
-
 def cars_of(scenario, policy="greedy-total", cars=12):
     its = Fleet(
         scenario,

@@ -59,9 +59,6 @@ def test_a_ratio_above_one_means_faster():
     assert len(calls) == 6
 
 
-# ---- parts at small size, without peers that may be installed
-
-
 def rows_of(part):
     if part == "sensors":
         rows = sensors.laser_rows(seconds=0.0) + sensors.camera_rows(seconds=0.0)
@@ -93,9 +90,6 @@ def test_parts_have_rows(part, parts, missing, monkeypatch):
     assert len(absent) == missing
     assert all(case.endswith(": not installed") for case in absent)
     assert all(row["value"] > 0 for row in rows if row["value"] is not None)
-
-
-# ---- peers are given the same job
 
 
 @pytest.mark.parametrize(
@@ -146,9 +140,6 @@ def test_the_measured_drive_ends_and_sees_each_slot_once():
             seen.append(int(slot[0]))
             repair(graph, labels, slot, p_free)
         assert len(seen) == len(set(seen)) > 0
-
-
-# ---- the same day in SUMO
 
 
 STREET = make_scenario("street")

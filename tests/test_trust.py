@@ -119,20 +119,16 @@ def test_a_world_of_ones_own_is_named_on_the_command_line_and_by_no_scenario_fil
     )
     assert not mark.exists()
     own = (
-        "--scenario",
-        "mini",
-        "--occupancy",
+        *"--scenario mini --occupancy".split(),
         f"{module}:Timetable(taken_s=1100)",
-        "--jobs",
-        1,
-        "--no-figures",
+        *"--jobs 1 --no-figures".split(),
     )
     done = parkenv("compare", *own, "--agents", "first-free,oracle", "-n", 3, "--out", out)
     assert done.returncode == 0, done.stderr
     first_free, oracle = json.loads((out / "summary.json").read_text())["rows"]
     assert first_free["total_s"] > oracle["total_s"]
     driven = parkenv(
-        "fleet", *own, "--arrivals-per-hour", 10, "--knows", "own", "-n", 1, "--out", tmp_path / "fleet"
+        "fleet", *own, *"--arrivals-per-hour 10 --knows own -n 1 --out".split(), tmp_path / "fleet"
     )
     assert driven.returncode == 0, driven.stderr
     mark.unlink()

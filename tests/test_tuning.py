@@ -79,15 +79,6 @@ def test_it_is_the_planner_of_the_thesis_at_the_chosen_cost():
         assert row == plain
 
 
-def test_a_forecast_is_simulated_once():
-    scenario = make_scenario("mini")
-    agent = make_agent("mdp-tuned", scenario)
-    entry = int(scenario.lot.entry_vertices[0])
-    p = np.full(scenario.lot.n_slots, 0.7)
-    assert agent.tuning(p, entry) is agent.tuning(p + 0.001, entry)
-    assert agent.tuning(p, entry) is not agent.tuning(p + 0.02, entry)
-
-
 def test_what_cannot_be_simulated_is_refused():
     problem, p, entry = small_lot(0)
     with pytest.raises(InputError, match="worlds is 0"):

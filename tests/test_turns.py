@@ -92,24 +92,13 @@ def test_the_shortest_way_goes_round_what_is_forbidden(turns, wanted):
     assert metres(blocks(turns)) == pytest.approx(wanted)
 
 
-def test_a_lot_without_turns_has_one_vertex_a_junction_and_each_turn_adds_at_most_one():
-    plain = blocks()
-    assert blocks([turn("west", "north"), turn("west", "west")]).n_vertices == plain.n_vertices + 1
-    assert blocks([turn("west", "north"), turn("east", "north")]).n_vertices == plain.n_vertices + 2
-    assert plain == blocks([])
-    assert plain != blocks([turn("west", "north")])
-
-
 @pytest.mark.parametrize(
     ("points", "message"),
     [
         ([(-50, 0), (3, 0), (50, 0)], r"turn 0: has no junction or end of a lane at \(3.0, 0.0\) m"),
         ([(-50, -50), (0, 0), (50, 0)], "turn 0: has no lane by which cars come from"),
         ([(-50, 0), (0, 0), (50, 50)], "turn 0: has no lane by which cars leave"),
-        (
-            [(-100, 0), (-150, 0), (-100, 0)],
-            r"turn 0: prohibits the last turn that cars may make at \(-150.0, 0.0\) m",
-        ),
+        ([(-100, 0), (-150, 0), (-100, 0)], r"turn 0: prohibits the last turn that cars may make"),
         ([(-50, 0), (0, 0)], r"turn points: shape \(2, 2\), want \(3, 2\)"),
     ],
 )
@@ -273,9 +262,6 @@ def connections(lot, monkeypatch):
         for a, b in ((one.get("from"), one.get("to")) for one in files["lot.con.xml"])
         if nodes[ends[a][1]] == (0.0, 0.0)
     }
-
-
-# ---- imports ----
 
 
 def crossing(**relation):

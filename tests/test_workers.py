@@ -1,6 +1,5 @@
 """Tasks give the same results wherever they run, and a dead worker loses its own task only."""
 
-import json
 import os
 import subprocess
 import sys
@@ -10,7 +9,6 @@ from pathlib import Path
 
 import killed_once
 import pytest
-from command_line import parkenv
 
 from parkenv.errors import InputError
 from parkenv.studies.workers import SERIAL, Workers, kill_workers
@@ -152,34 +150,3 @@ def test_an_address_where_nobody_listens_is_refused_at_once(backend, address, wa
     with pytest.raises(InputError, match=wanted), Workers(2, backend, address):
         pass
     assert time.monotonic() - start < 15.0
-
-
-def test_the_command_says_so_before_it_writes_anything(tmp_path):
-    out, address = tmp_path / "out", "tcp://127.0.0.1:9"
-    done = parkenv("compare", "--scenario", "mini", "--out", out, "--backend", "dask", "--address", address)
-    assert done.returncode == 2
-    assert "no cluster answers" in " ".join(done.stderr.split())
-    assert not (out / "episodes.csv").exists()
-
-
-@pytest.mark.slow
-def test_a_comparison_is_the_same_on_processes_ray_and_dask(tmp_path):
-    for backend in CLUSTERS:
-        of(backend)
-    summaries, episodes = [], []
-    for backend in ("loky", *CLUSTERS):
-        out = tmp_path / backend
-        done = parkenv(
-            "compare", "--scenario", "mini,campus", "--agents", "mdp,greedy-goal,oracle", "--episodes", 12,
-            "--occupancy-levels", "none", "--no-figures", "--jobs", 2, "--out", out, "--backend", backend,
-        )  # fmt: skip
-        assert done.returncode == 0, done.stderr
-        summary = json.loads((out / "summary.json").read_text())
-        assert backend in summary.pop("command")
-        for row in summary["rows"]:  # wall time is the machine's
-            del row["decision_ms"], row["decision_ms_p99"]
-        summaries.append(summary)
-        episodes.append((out / "episodes.csv").read_bytes())
-    assert summaries[0]["complete"]
-    assert summaries[0] == summaries[1] == summaries[2]
-    assert episodes[0] == episodes[1] == episodes[2]
