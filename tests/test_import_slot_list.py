@@ -97,14 +97,6 @@ def test_kerbside_rows_stand_as_traffic_runs(tmp_path):
     np.testing.assert_allclose(lot.lanes[0].points[:, 1], 0.0, atol=1e-6)
 
 
-def test_a_road_leads_through_a_gap_in_the_rows(tmp_path):
-    xy = [p for y in (-5.5, 5.5, 10.5, 21.5) for p in row(6, y) + row(6, y, x=21.0)]
-    draft = listed(tmp_path, np.array(xy), entries=((-5.0, 0.0),), goals=((20.0, 40.0),))
-    crossing = [lane for lane in draft.lanes if np.ptp(lane.points[:, 0]) < 0.01]
-    assert sorted(round(float(lane.points[0, 0]), 2) for lane in crossing) == [-4.25, 16.75, 37.75]
-    assert draft.lot().n_slots == 48
-
-
 def test_latitudes_and_longitudes_are_metres_after_all(tmp_path):
     lot = grid_lot(4, 8)
     frame = LocalFrame(lon=-122.25, lat=37.87)
@@ -125,14 +117,6 @@ def test_bounds_keep_a_part(tmp_path):
     assert len(draft.slots) == 20
     with pytest.raises(InputError, match="no slot within the bounds"):
         of_lot(tmp_path, lot, bounds=((1000.0, 0.0), (1010.0, 50.0)))
-
-
-def test_stray_slots_are_left_out_and_listed(tmp_path):
-    lot = grid_lot(4, 8)
-    xy = np.vstack([lot.slot_xy, [[60.0, 60.0]]])
-    draft = listed(tmp_path, xy, entries=((-3.0, 0.0),), goals=((9.0, 9.0),))
-    assert [str(left) for left in draft.left_out] == ["slots in no row: 1 (s32)"]
-    assert draft.lot().n_slots == 32
 
 
 @settings(max_examples=20)
@@ -246,13 +230,6 @@ def test_parallel_cars_have_the_lane_on_their_left(tmp_path):
     assert lot.slot_mouth.tolist() == [Mouth.RIGHT] * 6 + [Mouth.LEFT] * 6
 
 
-def test_cars_that_would_drive_in_through_the_next_row_are_refused(tmp_path):
-    xy = np.array(row(8, 0) + row(8, 5) + row(8, 16))
-    yaw = np.repeat([np.pi / 2, np.pi / 2, np.pi / 2], 8)
-    with pytest.raises(InputError, match="8 of 24 spaces have no aisle"):
-        listed(tmp_path, xy, yaw=yaw).lot()
-
-
 def test_it_says_how_to_give_an_entry_and_a_goal(tmp_path):
     draft = of_lot(tmp_path, grid_lot(2, 8))
     with pytest.raises(InputError, match=r"give one by --entry X,Y, .*; no goal: .*--goal X,Y"):
@@ -282,16 +259,11 @@ def test_parking_costs_and_zones_stay_with_their_slots(tmp_path):
 FAULTS = [
     ("", r"columns are '', want x,y or lat,lon"),
     ("x,y", "no slot below the line of columns"),
-    ("x,z\n1,2", "columns are 'x,z', want x,y or lat,lon"),
-    ("x\n1", "columns are 'x'"),
     ("x,y,lat,lon\n1,2,3,4", "columns are 'x,y,lat,lon'"),
     ("x,x,y\n1,1,2", "columns are 'x,x,y'"),
     ("x,y\n1,2\n3", "line 3: has 1 fields, want 2"),
     ("x,y\n1,2\n3,nan", "row 3: y is 'nan', want a number"),
-    ("x,y\n1,2\n3,four", "row 3: y is 'four', want a number"),
-    ("x,y\n1,2\n3,inf", "row 3: y is 'inf', want a number"),
     ("lat,lon\n91,2", "row 2: lat is '91', want a number from -90 to 90"),
-    ("lat,lon\n1,-181", "row 2: lon is '-181', want a number from -180 to 180"),
     ("x,y,yaw\n1,2,", "row 2: yaw is '', want a number"),
     ("x,y,parking_cost_s\n1,2,-3", "row 2: parking_cost_s is '-3', want a number from 0 to 1e\\+08"),
     ("id,x,y\na,1,2\na,9,2", "row 3: id 'a' appears already in row 2"),

@@ -52,16 +52,12 @@ def test_a_slot_knows_its_corners_and_its_mouth():
         ({"slot_xy": [["east", 0.0]]}, "slot_xy is .*, want numbers"),
         ({"slot_yaw": [np.nan]}, r"slot_yaw\[0\] is nan, want a finite number"),
         ({"goals": [[1e300, 0.0]]}, r"goals\[0, 0\] is 1e\+300, want a finite number, at most 1e\+08"),
-        ({"goals": [[0.0, np.inf]]}, r"goals\[0, 1\] is inf"),
         ({"slot_length": [0.0]}, "slot_length 0 m, want at least 0.1"),
-        ({"slot_width": [-2.5]}, "slot_width -2.5 m"),
         ({"slot_mouth": [3]}, "slot_mouth must hold 1 values"),
         ({"lanes": ()}, "has no lane"),
         ({"entries": np.empty((0, 2))}, "has no entry"),
         ({"goals": np.empty((0, 2))}, "has no goal"),
         ({"slot_parking_cost_s": [-1.0]}, "slot_parking_cost_s -1 s, want at least 0"),
-        ({"slot_parking_cost_s": [np.inf]}, r"slot_parking_cost_s\[0\] is inf, want a finite number"),
-        ({"slot_parking_cost_s": [1.0, 2.0]}, r"slot_parking_cost_s has shape \(2,\), want \(1,\)"),
         ({"walls": ([[0.0, 0.0]],)}, "a wall has shape"),
         ({"slot_xy": [[10.0, 50.0]]}, "slot 0: is on no lane: the nearest is 47.5 m from its mouth"),
         ({"entries": [[10.0, -40.0]]}, "entry 0: is 40.0 m from the nearest lane"),
@@ -129,9 +125,7 @@ def test_grid_is_laid_out_as_documented():
     ("arguments", "message"),
     [
         ({"rows": 0, "columns": 3}, "rows is 0"),
-        ({"rows": 2, "columns": 2.5}, "columns is 2.5"),
         ({"rows": 2, "columns": 2, "aisle": 1.0}, "aisle is 1.0, want a finite number from 3 to 16"),
-        ({"rows": 2, "columns": 2, "pitch": float("nan")}, "pitch is nan"),
     ],
 )
 def test_grid_that_cannot_be_is_refused(arguments, message):

@@ -236,34 +236,10 @@ def test_longitude_and_latitude_become_metres(tmp_path):
     np.testing.assert_array_equal(lot.neighbors, known.neighbors)
 
 
-def test_a_lot_on_the_date_line_stays_in_one_piece(tmp_path):
-    doc = document()
-    del doc["frame"]
-
-    def to_globe(xy):
-        if isinstance(xy[0], list):
-            return [to_globe(part) for part in xy]
-        lon = 180.0 + (xy[0] - 20.0) / 111_319.5
-        return [lon - 360.0 if lon > 180.0 else lon, xy[1] / 110_574.0]
-
-    for f in doc["features"]:
-        f["geometry"]["coordinates"] = to_globe(f["geometry"]["coordinates"])
-    lot = read(tmp_path, doc)
-    assert lot.slot_xy[1, 0] - lot.slot_xy[0, 0] == pytest.approx(10.0, abs=0.01)
-
-
 def test_a_polygon_may_lie_a_centimetre_off_its_properties(tmp_path):
     doc = document()
     with_exact(doc["features"][0], center=[11.255, 5.5])
     assert read(tmp_path, doc).slot_xy[0, 0] == 11.255
-
-
-def test_ids_may_stand_elsewhere_or_nowhere(tmp_path):
-    doc = document()
-    del doc["features"][0]["properties"]["id"]
-    doc["features"][0]["id"] = 17
-    del doc["features"][1]["properties"]["id"]
-    assert read(tmp_path, doc).slot_ids == ("17", "1")
 
 
 needs_dragon_lake = pytest.mark.skipif(
@@ -319,14 +295,6 @@ def test_dragon_lake_rows_open_to_their_own_aisles():
     assert x["B-0-0"] < x["B-0-1"]
 
 
-@needs_dragon_lake
-def test_dragon_lake_goes_through_the_native_format(tmp_path):
-    lot = read_lot(DRAGON_LAKE)
-    write_lot(lot, tmp_path / "dlp.geojson")
-    assert read_lot(tmp_path / "dlp.geojson") == lot
-    assert check_lot(tmp_path / "dlp.geojson") == []
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -375,7 +343,6 @@ FAULTS = [
     (lambda d: d.update(type="Feature"), None, "type is 'Feature', want a GeoJSON 'FeatureCollection'"),
     (lambda d: d.update(features={}), None, "features is {}, want a list of features"),
     (lambda d: d["parkenv"].update(version=2), None, "parkenv.version is 2, want 1: made by a newer parkenv"),
-    (lambda d: d["parkenv"].update(version="1"), None, "parkenv.version is '1', want 1"),
     (
         lambda d: d.update(parkenv={"format": "map", "version": 1}),
         None,
@@ -399,10 +366,6 @@ FAULTS = [
     ),
     (set_feature(3, "entry", "Point", [0, float("nan")]), 3, "entry: position [0, nan], want two finite"),
     (set_feature(4, "goal", "Point", [float("inf"), 0]), 4, "goal: position [inf, 0], want two finite"),
-    (set_feature(4, "goal", "Point", ["45", 0]), 4, "goal: position ['45', 0], want two finite numbers"),
-    (set_feature(4, "goal", "Point", [True, 0]), 4, "goal: position [True, 0], want two finite numbers"),
-    (set_feature(4, "goal", "Point", [10**200, 0]), 4, "want two finite numbers"),
-    (set_feature(4, "goal", "Point", 7), 4, "goal: position 7, want two finite numbers"),
     (set_feature(2, "lane", "LineString", [[0, 0]]), 2, "want at least 2 positions"),
     (set_feature(2, "lane", "LineString", [[0, 0], [0, 0]]), 2, "are equal, want different points"),
     (set_feature(2, "lane", "LineString", [[0, 0], [40, 0]], oneway="no"), 2, "oneway is 'no', want true"),
@@ -420,9 +383,7 @@ FAULTS = [
     (set_feature(0, "slot", "Polygon", box(10, 3, 12.5, 8), id=[1]), 0, "slot: id is [1], want a text"),
     (exact(center=[11.3, 5.5]), 0, "slot 'a': the polygon lies 0.05 m from what center, yaw, length"),
     (exact(width=float("nan")), 0, "slot 'a': width is nan, want at least 0.1 m"),
-    (exact(length=-5.0), 0, "slot 'a': length is -5.0, want at least 0.1 m"),
     (exact(yaw="north"), 0, "slot 'a': yaw is 'north', want a finite number"),
-    (exact(center=[1.0]), 0, "slot 'a': center is [1.0], want two finite numbers"),
     (exact(mouth="front"), 0, "slot 'a': mouth is 'front', want one of rear, left, right"),
     (lambda d: d["features"][0]["properties"].update(yaw=0.0), 0, "slot 'a': no center, want all of center"),
     (set_feature(1, "slot", "Polygon", box(20, 30, 22.5, 35), id="b"), 1, "slot 'b' is on no lane:"),
@@ -437,8 +398,6 @@ FAULTS = [
     ),
     (lambda d: d.update(features=d["features"][2:]), None, "no slot: an empty lot"),
     (lambda d: d["features"].pop(2), None, "no lane: an empty lot"),
-    (lambda d: d["features"].pop(3), None, "no entry: an empty lot"),
-    (lambda d: d["features"].pop(4), None, "no goal: an empty lot"),
 ]
 
 
@@ -461,7 +420,6 @@ def test_faults_are_named(tmp_path, change, number, message):
         ("", "not JSON: EOF .* at line 1 column 0"),
         ('{"type": "FeatureCollection",\n "features": [', "not JSON: EOF .* at line 2 column 14"),
         ("[1, 2]", "type is 'list', want a GeoJSON 'FeatureCollection'"),
-        ("[" * 100_000, "not JSON"),
         ("9" * 5000, "a number of more than 300 digits"),
     ],
 )
@@ -641,18 +599,6 @@ def test_slots_that_cannot_be_reached_or_left_are_warned_of(tmp_path):
         (9, "slot 'upstream': cannot be reached from an entry"),
         (7, "slot 'trap': no other slot can be reached from it"),
     ]
-
-
-def test_entries_that_lead_to_no_slot_are_warned_of(tmp_path):
-    doc = document()
-    # Cars that come in behind the end of a one-way lane can only turn round.
-    doc["features"] += [
-        feature("lane", "LineString", [[40, 0], [80, 0]], oneway=True),
-        feature("lane", "LineString", [[80, 0], [99, 0]]),
-        feature("entry", "Point", [99, 0]),
-    ]
-    problems = check_lot(written(tmp_path, doc))
-    assert [(p.feature, p.message) for p in problems] == [(8, "entry: no slot can be reached from it")]
 
 
 def test_lanes_that_share_a_point_are_not_warned_of(tmp_path):

@@ -166,20 +166,6 @@ def test_a_reward_is_the_sum_of_its_terms_and_returns_are_total_times():
         assert returns[agent] == pytest.approx(-total)
 
 
-def test_cars_under_way_are_masked_and_their_actions_ignored():
-    environment = lot_v0.parallel_env(scenario="mini", cars=3)
-    observations, _ = environment.reset(seed=0)
-    assert environment.agents == ["car_0", "car_1", "car_2"]
-    under_way = 0
-    for _ in range(20):
-        deciding = [a for a in environment.agents if observations[a]["action_mask"].any()]
-        under_way += len(environment.agents) - len(deciding)
-        if not environment.agents:
-            break
-        observations, *_ = environment.step(dict.fromkeys(deciding, 3))
-    assert under_way > 0
-
-
 def test_demand_decides_which_cars_there_are():
     demand = Demand(PoissonArrivals(60.0, 9 * 3600.0, 9.5 * 3600.0))
     environment = lot_v0.raw_env(scenario="campus", demand=demand, max_cycles=5)

@@ -232,9 +232,7 @@ def change(**fields):
         (lambda c: {k: v for k, v in c.items() if k != "arrival_factor"}, "missing or unknown fields"),
         (change(arrival_profile=[1e-4]), r"arrival_profile has shape \(1,\), want \(168,\)"),
         (change(arrival_factor=[1.0] * 19 + [-1.0]), r"arrival_factor\[19\] is -1.0, want a finite number"),
-        (change(departure_factor=[1.0, math.nan] * 10), r"departure_factor\[1\] is nan"),
         (change(arrival_factor=[[1.0], 2.0]), "arrival_factor: .*want numbers"),
-        (change(arrival_factor=[]), r"arrival_factor has shape \(0,\)"),
         (change(arrival_factor=[1e12] * 20), "want factor .* profile <= 1000"),
         (lambda c: [], "want an occupancy process, a JSON object"),
     ],
@@ -281,10 +279,8 @@ def test_window_parse():
     ("make", "message"),
     [
         (lambda: ArrivalWindow.parse("8-13"), "arrival hours are '8-13', want HH:MM-HH:MM"),
-        (lambda: ArrivalWindow.parse("13:00-08:00"), "end_s is 28800.0"),
         (lambda: ArrivalWindow.parse("25:00-26:00"), "start_s is 90000.0"),
         (lambda: ArrivalWindow.parse("08:00-09:00", "monday"), "arrival days are 'monday', want weekdays"),
-        (lambda: ArrivalWindow.parse("08:00-09:00", "mon,mon"), "weekdays is"),
         (lambda: ArrivalWindow(weekdays=()), "weekdays is"),
         (lambda: ArrivalWindow(start_s=math.nan), "start_s is nan"),
         (lambda: busy_process().at_mean_occupancy(1.0, 0.0), "is 1.0, want a finite number above 0"),
@@ -292,7 +288,6 @@ def test_window_parse():
         (lambda: OccupancyProcess.from_demand([1.0], np.zeros(168), -1.0), "mean_stay_s is -1.0"),
         (lambda: OccupancyProcess.from_demand([math.nan], np.zeros(168)), "attraction: want finite logits"),
         (lambda: busy_process().world(KEY, NINE).occupied([0], 0.0), "time is 0.0, want finite seconds"),
-        (lambda: busy_process().world(KEY, NINE).occupied([0], math.inf), "time is inf"),
         (lambda: busy_process().world(KEY, Arrival(math.nan)), "Arrival.time is nan"),
     ],
 )

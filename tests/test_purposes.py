@@ -153,12 +153,10 @@ def test_a_scenario_file_has_purposes():
     ("changes", "named"),
     [
         ({"arrivals_per_hour": [1.0] * 23}, "demand.shoppers.arrivals_per_hour"),
-        ({"arrivals_per_hour": -1.0}, "demand.shoppers.arrivals_per_hour"),
         ({"arrivals": 3}, "unknown key 'arrivals'"),
         ({"classes": {"permit-a": 1.5}}, "demand.shoppers.classes.permit-a"),
         ({"stay_law": "weibull"}, "demand.shoppers.stay_law"),
         ({"goals": [1.0, 2.0]}, "demand.shoppers.goals has 2 numbers, the lot has 1"),
-        ({"goals": [0.0]}, "goal_weights"),
         ({"parked": -3}, "demand.shoppers.parked"),
     ],
 )

@@ -244,16 +244,6 @@ def test_state_deepcopy_and_pickle_bring_an_episode_back():
         gym.make("parkenv/Search-v2", scenario="mini").unwrapped.set_state(saved)
 
 
-def test_observations_are_not_live_buffers():
-    env = gym.make("parkenv/Search-v2", scenario="campus").unwrapped
-    before, _ = env.reset(seed=0)
-    kept = copy.deepcopy(before)
-    for _ in range(10):
-        env.step(3)
-    for key, value in kept.items():
-        np.testing.assert_array_equal(before[key], value)
-
-
 @pytest.mark.parametrize("noisy", [False, True])
 def test_the_observed_belief_explains_p_occupied(noisy):
     """`belief` holds all that `p_occupied` is computed from, and its constants are those of the forecast."""
@@ -293,22 +283,6 @@ def test_old_ids_are_not_registered():
             gym.make(f"parkenv/{name}-v{version - 1}")
 
 
-def test_only_slots_in_view_are_observed():
-    """The belief of a slot that was never in view stays at its forecast, whether it is taken or not."""
-    scenario = make_scenario("campus", sensor_model=SensorModel(view_range=6.0))
-    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
-    observation, _ = env.reset(seed=0)
-    lot, forecast = scenario.lot, env.state.belief.forecast
-    np.testing.assert_array_equal(observation["p_occupied"], forecast.astype(np.float32))
-    in_view = np.zeros(lot.n_slots, dtype=bool)
-    for _ in range(40):
-        observation, *_ = env.step(int(np.flatnonzero(observation["action_mask"][:PARK])[-1]))
-        away = np.hypot(*(lot.vertex_xy[: lot.n_slots] - lot.vertex_xy[observation["vertex"]]).T)
-        in_view |= away <= 6.0
-    np.testing.assert_array_equal(observation["p_occupied"][~in_view], forecast.astype(np.float32)[~in_view])
-    assert in_view.any()
-
-
 def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
     said = bayes_update(0.6, True, 0.9, 0.2)
     assert said == pytest.approx(0.9 * 0.6 / (0.9 * 0.6 + 0.2 * 0.4))
@@ -325,58 +299,6 @@ def test_a_sighting_is_bayes_rule_and_relaxes_exponentially():
 @given(x=st.floats(0.0, 600.0))
 def test_decay_is_the_exponential(x):
     assert decay_factor(x) == pytest.approx(np.exp(-x), rel=1e-14)
-
-
-def test_the_belief_in_a_slot_left_behind_decays():
-    lot = grid_lot(1, 12)
-    process = OccupancyProcess.from_demand(np.zeros(12), np.zeros(168), 600.0)
-    scenario = Scenario(name="a", lot=lot, occupancy=process, sensor_model=SensorModel(view_range=0.0))
-    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
-    observation, _ = env.reset(seed=0)
-    rng = np.random.default_rng(0)
-    last = {}
-    for _ in range(200):
-        observation, *_ = env.step(rng.choice(np.flatnonzero(observation["action_mask"][:PARK])))
-        slot, now = int(observation["vertex"]), env.state.time
-        if slot < lot.n_slots:
-            last[slot] = now, float(env.state.world.occupied([slot], now)[0])
-        belief = env.state.belief
-        for s, (then, taken) in last.items():
-            expected = belief.forecast[s] + (taken - belief.forecast[s]) * np.exp((then - now) * 2 / 600)
-            assert belief.p_occupied[s] == pytest.approx(expected)
-        np.testing.assert_array_equal(observation["p_occupied"], belief.p_occupied.astype(np.float32))
-        assert set(np.flatnonzero(belief.observed)) == set(last)
-    assert len(last) > 5
-
-
-def test_a_seed_holds_after_going_on_from_another_search():
-    one, other = (gym.make("parkenv/Search-v2", scenario="mini").unwrapped for _ in range(2))
-    wanted, _ = one.reset(seed=1)
-    other.reset(seed=2)
-    one.set_state(other.get_state())
-    again, _ = one.reset(seed=1)
-    np.testing.assert_array_equal(again["time"], wanted["time"])
-
-
-def test_noisy_sight_errs_as_often_as_stated():
-    lot = grid_lot(4, 25)
-    taken = np.arange(lot.n_slots) % 2 == 0
-    scenario = Scenario(
-        name="noisy",
-        lot=lot,
-        occupancy=always(lot, taken),
-        sensor_model=SensorModel(view_range=1e3, hit_rate=0.8, false_alarm_rate=0.3),
-    )
-    env = gym.make("parkenv/Search-v2", scenario=scenario).unwrapped
-    looks_taken = np.zeros(lot.n_slots)
-    seeds = 100
-    for seed in range(seeds):
-        env.reset(seed=seed)
-        env.step(0)
-        looks_taken += env.state.belief.p_occupied > env.state.belief.forecast
-    per_seed = looks_taken / seeds
-    assert per_seed[taken].mean() == pytest.approx(0.8, abs=0.02)
-    assert per_seed[~taken].mean() == pytest.approx(0.3, abs=0.02)
 
 
 def test_sight_differs_by_distance_and_side():
@@ -418,15 +340,11 @@ def test_sight_differs_by_distance_and_side():
     ("changes", "message"),
     [
         ({"v_walk": -1.0}, "v_walk is -1.0"),
-        ({"v_drive": 0.0}, "v_drive"),
-        ({"v_drive": float("nan")}, "v_drive"),
         ({"failure_s": -2.0}, "failure_s"),
-        ({"failure_s": "10"}, "failure_s"),
         ({"goal": 9}, "goal is 9"),
         ({"entry": -1}, "entry"),
         ({"sensor_model": 3}, "SensorModel"),
         ({"scenario": "moon"}, "unknown scenario 'moon', and no such file; known: campus"),
-        ({"scenario": 3}, "want a Scenario"),
         ({"render_mode": "hologram"}, "render_mode"),
     ],
 )

@@ -1,45 +1,12 @@
 import json
 from pathlib import Path
 
-import numpy as np
 import pytest
 from command_line import parkenv
-from test_slot_days import simulated
 
-from parkenv.forecast.slot_comparison import OURS, compare_slot_days
+from parkenv.forecast.slot_comparison import OURS
 
 REAL_LOG = Path(__file__).parents[2] / "shared" / "data" / "cnr_ext" / "occupancy_15_days.csv.gz"
-
-
-@pytest.mark.slow
-def test_ours_is_first_where_slots_have_habits_and_the_lot_drifts():
-    weekdays, _ = simulated(20, 0.6, seed=5, drift=0.06)
-    weekend, _ = simulated(5, 0.6, seed=6)
-    first, done = int(weekdays.days.number[14]), []
-    rows = compare_slot_days([weekdays, weekend], first, lambda: done.append(1))
-    assert rows[0].model == OURS
-    means = [row.scores.means() for row in rows]
-    assert {len(row.days) for row in rows} == {6} == {len(done)} == {row["days"] for row in means}
-    assert {row["car_parks"] for row in means} == {1}
-    for row, theirs in zip(rows[1:], means[1:], strict=True):
-        # The slots of this lot differ in one thing only, which suits gradient boosting.
-        margin = 0.02 if row.model == "gradient-boosting" else 0.0
-        assert means[0]["log_loss"] < (1 + margin) * theirs["log_loss"]
-        assert means[0]["brier"] < (1 + margin) * theirs["brier"]
-        assert means[0]["crps"] < 1.1 * theirs["crps"]
-    assert means[0]["coverage_90"] >= 4 / 6
-    numbers = [day.number for day in rows[0].days]
-    assert numbers == sorted(numbers)
-    ours = rows[0].scores
-    for bands in (ours.coverage_by_band(), ours.coverage_by_band(observed=True)):
-        assert sum(band["days"] for band in bands) == 6
-    forecast, observed, weight = ours.reliability()
-    assert weight.sum() == pytest.approx(sum(day.seen.sum() for day in rows[0].days))
-    # Over all slots and half-hours, six days of one level each are not far from their forecast.
-    assert abs(np.average(forecast - observed, weights=weight)) < 0.1
-    mean, low, high = rows[1].scores.log_loss_beyond(ours, np.random.default_rng(0))
-    assert low < mean < high
-    assert mean == pytest.approx(means[1]["log_loss"] - means[0]["log_loss"])
 
 
 @pytest.mark.slow  # fits five models to ten days of a real log

@@ -206,12 +206,6 @@ def test_a_folder_has_one_writer(tmp_path):
     assert not list(out.iterdir())
 
 
-def test_an_invalid_command_leaves_no_folder(tmp_path):
-    out = tmp_path / "results" / "compare"
-    assert parkenv("compare", "--scenario", "mini", "--agents", "nobody", "--out", out).returncode == 2
-    assert not out.parent.exists()
-
-
 def test_a_file_system_that_is_read_only_is_named(tmp_path, monkeypatch):
     def refuse(self, *_, **__):
         raise OSError(errno.EROFS, os.strerror(errno.EROFS), str(self))

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from functools import partial
 from pathlib import Path
 
 import pytest
@@ -15,7 +14,6 @@ from toy_study import Toy
 from parkenv import InputError
 from parkenv.studies import study as studies
 from parkenv.studies.runner import Interrupted, open_run, run
-from parkenv.studies.workers import Workers
 
 TOY = Toy(jobs=1)
 
@@ -152,10 +150,3 @@ def test_errors_of_a_task_leave_what_was_finished(tmp_path, monkeypatch):
     assert len((tmp_path / "powers.csv").read_text().splitlines()) == 7
     monkeypatch.undo()
     assert run(TOY, tmp_path, resume=True).rows[1]["sum"] == 225
-
-
-def test_workers_may_be_shared():
-    with Workers(2) as workers:
-        results = [run(TOY.changed(offset=offset), workers=workers) for offset in (0, 1)]
-        assert list(workers.in_order([partial(int, 3)])) == [3]
-    assert [result.rows[0]["sum"] for result in results] == [55, 61]

@@ -216,7 +216,6 @@ ERRORS = {
         d, "facility", capacty=1
     ),
     "id 'P1' appears already": lambda d: broken(d, "slot", id="P1"),
-    "weights": lambda d: broken(d, "goal", weights={"shop": -1}),
     "m from the nearest lane, want at most 150 m": lambda d: [
         f["geometry"].update(coordinates=[500.0, 20.0])
         for f in d["features"]

@@ -42,8 +42,7 @@ from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleContro
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
-from planners.driving.car_path import CarPath
-from planners.driving.lane_keeping import LaneKeeper, joined, rounded
+from planners.driving.lane_keeping import LaneKeeper, rounded
 from planners.driving.path_tracking import TrackingSettings
 from sim_sensors.rig import SensorRig
 
@@ -168,14 +167,6 @@ def test_a_rounded_polyline_ends_where_the_polyline_does_and_turns_no_tighter_th
     )
     assert np.abs(curvature).max() <= 1.0 / min(radius, room) + 1e-9
     assert path.driven_m <= leg * (len(turns) + 1) + 1e-9
-
-
-def test_joined_paths_are_one_after_the_other():
-    first = CarPath(np.zeros(3), np.array([5.0]), np.array([0.0]), margin=0.2)
-    second = CarPath(np.array([5.0, 0.0, 0.0]), np.array([3.0]), np.array([0.1]), margin=0.1)
-    both = joined(first, second)
-    np.testing.assert_allclose(both.sampled()[0][-1], second.sampled()[0][-1])
-    assert (both.driven_m, both.margin) == (8.0, 0.1)
 
 
 @given(speed=st.floats(0.0, 4.0), turn=st.floats(-1.4, 1.4))
@@ -357,11 +348,6 @@ def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, c
         lost -= quiet.lanes_s + quiet.manoeuvre_s + quiet.costs["failed_s"]
     assert waited > 0.0
     assert lost > 0.0
-
-
-def test_a_crowd_is_refused():
-    with pytest.raises(InputError, match="has 201 cars and pedestrians; a driven trip takes at most 200"):
-        DrivenSearch(busy("mini", 1, 200))
 
 
 class StandingTraffic:

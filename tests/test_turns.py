@@ -2,8 +2,6 @@
 
 import itertools
 import json
-from pathlib import Path
-from xml.etree import ElementTree
 
 import gymnasium as gym
 import numpy as np
@@ -14,8 +12,6 @@ from hypothesis import strategies as st
 from made_maps import STREET, Map
 from scipy.sparse.csgraph import dijkstra
 
-from benchmarks import sumo
-from benchmarks.town import blocks_of
 from parkenv import make_agent, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
@@ -219,49 +215,6 @@ def test_turns_come_back_from_a_file_and_faults_are_named(tmp_path):
     assert told(type="Point", coordinates=[0, 0]) == "turn: geometry is 'Point', want LineString"
     assert "shape (2, 2), want (3, 2)" in told(coordinates=[[0, 0], [1, 0]])
     assert "has no junction" in told(coordinates=[[0, 0], [1, 0], [2, 0]])
-
-
-def test_sumo_gets_the_turns_that_are_left(monkeypatch):
-    plain, lot = (
-        blocks(every=20.0),
-        blocks([turn("west", "north"), turn("north", "east", only=True)], every=20.0),
-    )
-    assert connections(plain, monkeypatch) - connections(lot, monkeypatch) == {
-        ("west", "north"), ("north", "south"), ("north", "west"), ("north", "north"),
-    }  # fmt: skip
-
-
-def connections(lot, monkeypatch):
-    """The turns at the middle that SUMO gets, by names of arms."""
-    district = blocks_of(lot)
-    demand = Demand(PoissonArrivals(60.0, 8 * 3600, 9 * 3600), ExponentialTime(3600.0))
-    kind = DriverKind(policy=POLICIES["greedy-drive"])
-    fleet = Fleet(make_scenario(district), demand, background="none", drivers=[kind], leave_full_lot=False)
-    fleet.reset(0)
-    files = {}
-
-    def run(command):
-        for option, path in itertools.pairwise(map(str, command)):
-            if option in ("-n", "-e", "-x") and Path(path).exists():
-                files[Path(path).name] = ElementTree.parse(path).getroot()
-        if "--stop-output" in map(str, command):
-            Path(str(command[list(map(str, command)).index("--stop-output") + 1])).write_text("<stops/>")
-        return ""
-
-    monkeypatch.setattr(sumo, "_run", run)
-    sumo.run_sumo(fleet, Path("/nowhere"), 1.0, 7200.0)
-    nodes = {node.get("id"): (float(node.get("x")), float(node.get("y"))) for node in files["lot.nod.xml"]}
-    assert len(set(nodes.values())) == len(nodes)
-    ends = {edge.get("id"): (edge.get("from"), edge.get("to")) for edge in files["lot.edg.xml"]}
-
-    def arm(node):
-        return max(ARMS, key=lambda name: float(np.array(nodes[node]) @ np.array(ARMS[name])))
-
-    return {
-        (arm(ends[a][0]), arm(ends[b][1]))
-        for a, b in ((one.get("from"), one.get("to")) for one in files["lot.con.xml"])
-        if nodes[ends[a][1]] == (0.0, 0.0)
-    }
 
 
 def crossing(**relation):

@@ -122,7 +122,6 @@ def test_an_arc_in_pieces_is_the_same_arc(curvature, way, pieces):
         ({"wheelbase": 4.0}, "want both within the length"),
         ({"max_steering": 1.6}, "below a right angle"),
         ({"max_speed": 50.0}, "half a length in a step"),
-        ({"max_braking": "much"}, "vehicle max_braking is 'much'"),
     ],
 )
 def test_a_car_that_cannot_be_is_refused(change, message):
