@@ -114,7 +114,7 @@ def fit(network, data, rate, seed=0):
         loss.backward()
         optimizer.step()
         schedule.step()
-    return float(loss)
+    return float(loss.detach())
 
 
 def main():

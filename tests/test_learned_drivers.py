@@ -37,7 +37,8 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
     agent = make_agent(f"{name}:{path}", MINI)
     policy, none = policy_of(AgentSpec(name=f"{name}:{path}"), MINI)
     assert none is None
-    assert policy.sampled == (algorithm is not DQN), "policies draw their actions in fleets"
+    drawn = policy.data_for([MINI]).record["sampled"]
+    assert drawn == (algorithm is not DQN), "policies draw their actions in fleets"
     policy = network_policy(model.policy, 5)
     found = []
     for kind, agents in ((DriverKind(policy=policy), None), (DriverKind(), [agent])):

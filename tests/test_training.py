@@ -337,7 +337,7 @@ def test_only_models_that_can_be_described_are_saved(tmp_path):
         with pytest.raises(InputError, match=wanted):
             save_model(model, tmp_path / "m.safetensors")
     plain = PPO("MultiInputPolicy", gym.make("parkenv/Search-v2", scenario="mini"), n_steps=8, batch_size=8)
-    with pytest.raises(InputError, match="observes neither `local`"):
+    with pytest.raises(InputError, match="does not observe `local`"):
         save_model(plain, tmp_path / "m.safetensors")
     assert local_space(7)["local"].shape == (FIXED_NUMBERS + 7 * NUMBERS_PER_SLOT,)
 
