@@ -11,8 +11,10 @@ picture and lot. A change of results on purpose is recorded in a commit of its o
 from __future__ import annotations
 
 import argparse
+import csv
 import gzip
 import hashlib
+import io
 import json
 import os
 import re
@@ -93,9 +95,10 @@ CASES: dict[str, tuple[str, ...]] = {
 """Commands of each golden, in a folder of their own with `counts.csv` and `crops`; `{data}` is that of real data."""
 
 VOLATILE = re.compile(
-    r"^(decision_ms.*|seconds.*|.*_seconds|compile.*|command|version|date|commit|findings|most_balked)$"
+    r"^(decision_ms.*|seconds.*|.*_seconds|compile.*|planning_s.*|planning_ms.*|wall_s|steps_per_s|command|version|date|"
+    r"commit|findings|most_balked|settings)$"
 )
-"""Members of summaries that differ from run to run, or are texts."""
+"""Members of summaries and columns that differ from run to run, are texts, or repeat the specification."""
 COMPARED = {".csv", ".gz", ".geojson", ".png", ".gif", ".jsonl", ".json"}
 LONG = 20_000
 """Characters of a summary from which on hashes of its tables are kept."""
@@ -128,6 +131,12 @@ def run(name: str, folder: Path) -> dict[str, Any]:
             )
         else:
             content = gzip.decompress(path.read_bytes()) if path.suffix == ".gz" else path.read_bytes()
+            content = content.replace(str(ROOT).encode(), b"")
+            if path.suffix == ".csv" and any(
+                map(VOLATILE.match, content.decode().split("\n")[0].strip().split(","))
+            ):
+                rows = [_lasting(row) for row in csv.DictReader(io.StringIO(content.decode()))]
+                content = json.dumps(rows).encode()
             results[key] = _hash(content)
     return results
 

@@ -68,9 +68,9 @@ class Demo(CaseStudy):
 
     kind: Literal["demo"] = "demo"
     scenario: Annotated[OneScenario, Inside(only=())] = scenario_spec("campus")
-    sessions: int = option(4, "Survey drives.", ge=1, le=100_000)
+    sessions: int = option(3, "Survey drives.", ge=1, le=100_000)
     episodes: int = option(
-        6, "Searches of each agent through the sensors.", short="-n", ge=2, le=MAX_EPISODES
+        4, "Searches of each agent through the sensors.", short="-n", ge=2, le=MAX_EPISODES
     )
     more: int = option(
         200,
@@ -80,7 +80,7 @@ class Demo(CaseStudy):
         le=MAX_EPISODES,
     )
     every: CaptureDistance = option(
-        2.5, "Metres between captures, in the survey and in the searches.", takes="M", panel="Sensors"
+        4.0, "Metres between captures, in the survey and in the searches.", takes="M", panel="Sensors"
     )
     detector: Detector = None
     seed: Seed = Field(0, description="Seed of drives and searches.")
