@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.rows import Row, duration, median_of, rate
-from benchmarks.sumo import sumo_rows
+from benchmarks.sumo_days import sumo_rows
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import city_lot, grid_lot
 from parkenv.scenarios.build import make_scenario

@@ -22,7 +22,7 @@ import sys
 from importlib import import_module
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # a script's own folder stands there
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # a script has its own folder there only
 
 from parkenv.studies.results import write_summary
 from parkenv.version import __version__

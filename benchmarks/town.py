@@ -10,7 +10,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from benchmarks.rows import Row, duration, equal, peak_memory_gib
-from benchmarks.sumo import streets_of, sumo_rows
+from benchmarks.sumo_days import streets_of, sumo_rows
 from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.fleet import DriverKind, Fleet, drive_times
 from parkenv.lots import city_lot

@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 
-from benchmarks.sumo import run_fleet, run_sumo, sumo_folder
+from benchmarks.sumo_days import run_fleet, run_sumo, sumo_folder
 from benchmarks.town import SHIFT, SPEED, blocks_of
 from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet

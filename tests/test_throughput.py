@@ -10,7 +10,8 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from benchmarks import env, fleet, planning, sensors, sumo, town
+from benchmarks import env, fleet, planning, sensors, town
+from benchmarks import sumo_days as sumo
 from parkenv import make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import city_lot, grid_lot
