@@ -8,7 +8,6 @@ import pytest
 import shapely
 from hypothesis import given
 from hypothesis import strategies as st
-from PIL import Image
 from scipy.sparse.csgraph import connected_components, dijkstra
 from typer.testing import CliRunner
 
@@ -20,7 +19,6 @@ from parkenv.lots import city_lot, grid_lot, import_lot, packaged_lot, read_lot,
 from parkenv.lots.checks import check_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.show.figures.lot import save_lot_picture
 from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 DRAGON_LAKE = Path(__file__).parents[2] / "shared" / "data" / "dlp" / "parking_map.yml"
@@ -132,23 +130,6 @@ def test_parking_costs_need_no_exact_shape_and_stand_with_their_slot(tmp_path):
     slots = [f["properties"] for f in json.loads((tmp_path / "again.geojson").read_text())["features"][:2]]
     assert "parking_cost_s" not in slots[0]  # files of lots without costs stay as they are
     assert slots[1]["parking_cost_s"] == 120.0
-
-
-def test_a_lot_is_written_whole_or_not_at_all(tmp_path, monkeypatch):
-    path = tmp_path / "lot.geojson"
-    path.write_text("before")
-
-    def full_disk(self, *arguments, **options):
-        with self.open("w") as file:
-            file.write("half")
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full_disk)
-    with pytest.raises(InputError, match="cannot be written: No space left on device"):
-        write_lot(packaged_lot("mini"), path)
-    monkeypatch.undo()
-    assert path.read_text() == "before"
-    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_lot_is_not_written_where_it_could_not_be_read(tmp_path):
@@ -617,10 +598,3 @@ def test_commands_state_parking_costs_and_draw_them(tmp_path):
         told = CliRunner().invoke(app, ["lot", words[0], str(tmp_path / "priced.geojson"), *words[1:]])
         assert told.exit_code == 0, told.output
         assert "parking costs 0 to 90 s (3 slots above 0)" in told.output
-    save_lot_picture(packaged_lot("mini"), tmp_path / "plain.png")
-    pictures = [
-        np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB")) for name in ("priced", "plain")
-    ]
-    # Three differently coloured slots on asphalt that is grey everywhere on the plain lot.
-    vivid = [int((np.ptp(picture.astype(int), axis=2) > 60).sum()) for picture in pictures]
-    assert vivid[0] > 3 * vivid[1]

@@ -19,7 +19,7 @@ from parkenv.world.drive_graph import (
     GraphError,
     build_drive_graph,
 )
-from parkenv.world.lot import MOVES, Lane, Mouth, ParkingLot
+from parkenv.world.lot import Lane, Mouth, ParkingLot
 
 TWO_WAY, ONE_WAY = False, True
 
@@ -121,12 +121,6 @@ def test_entry_in_the_middle_of_a_lane_becomes_a_junction():
     assert entry >= 2
 
 
-def test_two_entries_at_one_place_share_a_vertex():
-    graph = graph_of([([(0, 0), (40, 0)], TWO_WAY)], entries=[(20, 0), (20, 1), (40, 0)])
-    first, second, last = graph.entry_vertices
-    assert first == second != last
-
-
 def test_points_closer_than_the_tolerance_are_one_junction_wherever_they_lie():
     # 0.0005 m is where rounding to the tolerance would part the two points.
     near = 0.0005
@@ -149,14 +143,6 @@ def test_columns_are_the_best_assignment_of_bearings(bearings):
     spot = graph.vertex_xy[graph.neighbors[hub, used]]
     got = (1.0 - np.cos(np.arctan2(spot[:, 1], spot[:, 0]) - wanted[used])).sum()
     assert got == pytest.approx(misfit[linear_sum_assignment(misfit)].sum(), abs=1e-9)
-
-
-def test_up_down_left_right_mean_what_they_say():
-    arms = {"up": (0, 50), "down": (0, -50), "left": (-50, 0), "right": (50, 0)}
-    graph = graph_of([([(0, 0), end], TWO_WAY) for end in arms.values()])
-    for column, name in enumerate(MOVES):
-        there = graph.neighbors[graph.entry_vertices[0], column]
-        np.testing.assert_allclose(graph.vertex_xy[there], arms[name])
 
 
 def test_five_lanes_out_of_one_junction_are_refused():

@@ -174,15 +174,7 @@ def test_scenes_are_planned_driven_and_judged(tmp_path):
     (tmp_path / "scenes" / "slot.csv").write_text(
         tpcap_text((3e6, 3.0, 0.0), (3e6 + 9.0, 0.0, 0.0), [np.add(BLOCKS[0], [3e6, 0.0])])
     )
-    done = parkenv(
-        "park",
-        "--cases",
-        str(tmp_path / "scenes"),
-        "--out",
-        str(out),
-        *"--jobs 1 --report".split(),
-        cwd=tmp_path,
-    )
+    done = parkenv("park --jobs 1 --report --cases", tmp_path / "scenes", "--out", out)
     assert done.returncode == 0, done.stderr
     summary = json.loads((out / "summary.json").read_text())
     (row,) = summary["rows"]

@@ -205,14 +205,8 @@ def test_the_replay_agrees_with_its_rule(looks, time):
 
 
 def test_mean_occupancy_weighs_time_between_the_first_and_the_last_look():
-    log = OccupancyLog(
-        ("a", "b"),
-        MONDAYS[:1],
-        [0, 0, 0, 1],
-        [0] * 4,
-        [7 * HOUR_S, 7.5 * HOUR_S, 9 * HOUR_S, 0.0],
-        [1, 0, 1, 1],
-    )
+    seconds = [7 * HOUR_S, 7.5 * HOUR_S, 9 * HOUR_S, 0.0]
+    log = OccupancyLog(("a", "b"), MONDAYS[:1], [0, 0, 0, 1], [0] * 4, seconds, [1, 0, 1, 1])
     assert log.mean_occupancy("weekday") == pytest.approx([0.25, math.nan], nan_ok=True)
     assert log.mean_occupancy("weekday", (7, 8))[0] == pytest.approx(0.5)
     assert np.isnan(log.mean_occupancy("weekend")).all()

@@ -51,17 +51,7 @@ def parked_at(agent, scenario):
 
 @pytest.mark.parametrize(
     "name",
-    [
-        "mdp",
-        "mdp-static",
-        "mdp-tuned",
-        "belief",
-        "exact",
-        "oracle",
-        "greedy-goal",
-        "greedy-total",
-        "first-free",
-    ],
+    "mdp mdp-static mdp-tuned belief exact oracle greedy-goal greedy-total first-free".split(),
 )
 def test_agents_park_elsewhere_where_that_pays(name):
     lot = packaged_lot("mini")

@@ -57,14 +57,8 @@ def test_names_files_folders_and_sequences_of_them_are_scenarios(folder):
     assert [spec.title for spec in scenario_specs(folder)] == in_folder, "lot2 is that of a scenario"
     assert [one.name for one in make_scenarios(str(folder))] == in_folder
     several = ["mini", folder / "lot1.geojson", scenario_spec("jam"), PLACES[0], LOTS[1], folder]
-    assert [one.name for one in make_scenarios(several)] == [
-        "mini",
-        "lot1",
-        "jam",
-        "lot0",
-        "grid",
-        *in_folder,
-    ]
+    names = ["mini", "lot1", "jam", "lot0", "grid", *in_folder]
+    assert [one.name for one in make_scenarios(several)] == names
     assert {one.failure_s for one in make_scenarios(several, failure_s=7.0)} == {7.0}
     # Experiment files and the command line say it in the same way.
     spec = Comparison.parse({"scenarios": ["mini", "."]}, "test", folder)

@@ -226,9 +226,10 @@ def test_recorded_days_are_the_world_of_single_searches(tmp_path):
     write_lot(lot, tmp_path / "mini.geojson")
     spec = ScenarioSpec.parse(TABLES | {"lot": str(tmp_path / "mini.geojson")}, "town.toml")
     log = tmp_path / "days.csv.gz"
-    record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=2, seed=0)
+    how = {"agent": AgentSpec(name="usual"), "days": 2, "rounds": 1, "seed": 0}
+    record_days(spec, log, **how | {"rounds": 2})
     content = log.read_bytes()
-    record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=2, seed=0)
+    record_days(spec, log, **how | {"rounds": 2})
     assert log.read_bytes() == content
     searched = make_scenario(spec.changed(occupancy={"log": str(log), "mapping": "same"}))
     earlier = make_scenario(spec.changed(occupancy="typical"))
@@ -236,7 +237,7 @@ def test_recorded_days_are_the_world_of_single_searches(tmp_path):
     fleet = Fleet(
         earlier, earlier.demand, drivers=[DriverKind(policy=POLICIES["usual"])], leave_full_lot=False
     )
-    record_days(spec, log, agent=AgentSpec(name="usual"), days=2, rounds=1, seed=0)
+    record_days(spec, log, **how)
     searched = make_scenario(spec.changed(occupancy={"log": str(log), "mapping": "same"}))
     fleet.reset(0, 0)
     day = searched.occupancy.arrival_days(searched.arrival)[0]
@@ -246,14 +247,7 @@ def test_recorded_days_are_the_world_of_single_searches(tmp_path):
         taken = searched.occupancy.world(world_key(0, 0), arrival).occupied(np.arange(10), arrival.time)
         assert np.count_nonzero(taken != fleet.taken()) <= 1  # times are whole seconds
     with pytest.raises(InputError, match="has no demand"):
-        record_days(
-            ScenarioSpec.parse({"lot": "mini"}, "x"),
-            log,
-            agent=AgentSpec(name="usual"),
-            days=2,
-            rounds=1,
-            seed=0,
-        )
+        record_days(ScenarioSpec.parse({"lot": "mini"}, "x"), log, **how)
 
 
 def test_cars_of_a_town_choose_entries_and_goals_by_its_weights():

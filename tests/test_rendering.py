@@ -201,11 +201,8 @@ def test_obstacles_stand_out_of_a_drive_more_than_anything_painted_on_the_ground
 
     def luminance(name):
         part = np.array(PALETTE[name]) / 255
-        return np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4) @ [
-            0.2126,
-            0.7152,
-            0.0722,
-        ]
+        linear = np.where(part <= 0.04045, part / 12.92, ((part + 0.055) / 1.055) ** 2.4)
+        return linear @ [0.2126, 0.7152, 0.0722]
 
     env = gym.make("parkenv/Drive-v1", lot=lot, render_mode="rgb_array")
     env.reset(seed=3)

@@ -95,17 +95,6 @@ def test_without_points_the_pose_follows_the_odometry(drive):
     np.testing.assert_allclose(matcher.locate(poses[0], []), poses[0])
 
 
-def test_a_few_stray_points_do_not_move_the_pose(drive):
-    lot, poses, scans = drive
-    rng = np.random.default_rng(2)
-    few = []
-    for scan in scans[:60]:
-        distance = np.full(len(scan.angle), np.inf)
-        distance[rng.integers(0, len(distance), 3)] = rng.uniform(1.0, 20.0, 3)
-        few.append(RangeScan(0.0, 0.0, scan.angle, distance, scan.max_range))
-    assert position_error(located(lot, poses[:60], few), poses[:60]).max() < 1e-9
-
-
 def test_moving_cars_do_not_carry_the_pose_along(drive):
     lot, poses, scans = drive
     odometry = PoseNoise(drift=0.02).estimated(poses, np.random.default_rng(4))

@@ -218,15 +218,6 @@ def test_a_sequence_of_seeds_and_resets_without_one():
     assert kept["time"][0, 0] != first["time"][0, 0]
 
 
-def test_without_a_seed_every_search_has_a_world_of_its_own():
-    worlds = set()
-    for _ in range(2):
-        envs = make_batch(3, "mini")
-        first, _ = envs.reset(seed=[None, 5, None])
-        worlds |= set(first["time"][:, 0].tolist())
-    assert len(worlds) == 5
-
-
 def test_a_generator_that_was_set_by_hand_is_drawn_from():
     times = []
     for make in (

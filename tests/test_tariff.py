@@ -157,12 +157,8 @@ def test_revenue_is_price_times_stay_of_the_parked_cars(tmp_path):
         revenue.append(3.0 * parked["stay_s"][inside].sum() / 3600.0)
         cars_in.append([inside.sum(), (~inside).sum()])
     centre, other = found.summary["zones"]
-    assert (centre["zone"], centre["slots"], other["zone"], other["paid_a_day"]) == (
-        "centre",
-        5,
-        NO_ZONE,
-        0.0,
-    )
+    assert (centre["zone"], centre["slots"]) == ("centre", 5)
+    assert (other["zone"], other["paid_a_day"]) == (NO_ZONE, 0.0)
     assert centre["paid_a_day"] == pytest.approx(np.mean(revenue))
     assert [centre["parked_a_day"], other["parked_a_day"]] == np.mean(cars_in, axis=0).tolist()
     of_cars = [paid / len(its) for paid, its in zip(revenue, days, strict=True)]

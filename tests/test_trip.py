@@ -616,13 +616,11 @@ def test_the_commands_calibrate_and_compare(tmp_path):
     assert summary["calibrated"] == dataclasses.asdict(made)
     assert (out / "calibration_mini.png").stat().st_size > 10_000
     assert 5.0 < made.failure_s < 40.0
-    measured = ("--calibrated", out / "calibrated.json", *"--occupancy-levels none -n 4 --no-figures".split())
-    done = parkenv(
-        "compare --scenario mini --agents mdp,greedy-goal", *measured, *"-j 1 --out".split(), compared
-    )
+    measured = f"--calibrated {out / 'calibrated.json'} --occupancy-levels none -n 4 --no-figures"
+    done = parkenv(f"compare --scenario mini --agents mdp,greedy-goal {measured} -j 1 --out", compared)
     assert done.returncode == 0, done.stderr
     rows = json.loads((compared / "summary.json").read_text())["rows"]
     assert [r["failure_cost_s"] for r in rows] == [10.0, 10.0, made.failure_s, made.failure_s]
     assert {r["agent"] for r in rows[2:]} == {"mdp", "greedy-goal"}
-    refused = parkenv("compare", "--scenario", "campus", *measured, "--out", tmp_path / "x")
+    refused = parkenv(f"compare --scenario campus {measured} --out", tmp_path / "x")
     assert "was measured on 'mini'" in refused.stderr
