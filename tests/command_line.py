@@ -1,7 +1,9 @@
 """Run the command line for tests: in this process, or in a separate one that can be killed."""
 
 import contextlib
+import csv
 import io
+import json
 import subprocess
 import sys
 import warnings
@@ -41,3 +43,28 @@ def parkenv(words, *arguments, cwd=None):
         except SystemExit as end:
             code = end.code
     return subprocess.CompletedProcess(argv, code or 0, out.getvalue(), err.getvalue())
+
+
+def ran(*arguments, cwd=None):
+    """Run a command that ends well."""
+    done = parkenv(*arguments, cwd=cwd)
+    assert done.returncode == 0, (done.stdout, done.stderr)
+    return done
+
+
+def refused(*arguments, cwd=None):
+    """Run a command that is refused in one line, and return this line."""
+    done = parkenv(*arguments, cwd=cwd)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), (done.stdout, done.stderr)
+    return done.stderr
+
+
+def summary_of(folder):
+    """The summary in the folder of a run."""
+    return json.loads((folder / "summary.json").read_text())
+
+
+def rows_in(file):
+    """The rows of a CSV file, as texts by column."""
+    with file.open(newline="") as lines:
+        return list(csv.DictReader(lines))

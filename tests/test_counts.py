@@ -51,56 +51,27 @@ def test_clean_counts_are_kept(tmp_path):
     assert (faults_of(counts), counts.idle()) == ({}, {})
 
 
-def change(free, what):
-    """Put a fault into the free places of days 40 and later; return the expected number and states."""
-    if what == "negative":
-        free[40, 10:13] = -3
-        return 3, 1.0
-    if what == "far below 0":
-        free[40, 10:13] = -50
-        return 3, np.nan
-    if what == "above_capacity":
-        free[40, 10:13] = CAPACITY + 5
-        return 3, 0.0
-    if what == "far above the capacity":
-        free[40, 10:13] = 9999
-        return 3, np.nan
-    if what == "gap":
-        free[40, 10:13] = np.nan
-        return 3, np.nan
-    if what == "a week stuck":
-        free[40:47] = 97
-        return 7 * 24, np.nan
-    if what == "hours stuck":
-        free[40, 8:20] = 97
-        return 12, np.nan
-    if what == "a week stuck at full":
-        free[40:47] = 0
-        return 7 * 24, np.nan
-    raise ValueError(what)
+MORNING, WEEK = (40, slice(10, 13)), slice(40, 47)
+FAULTS = {
+    # Where days from 40 on have which free places, how many hours that is, by which rule, and what it becomes.
+    "negative": (MORNING, -3, 3, "negative", 1.0),
+    "far below 0": (MORNING, -50, 3, "negative", np.nan),
+    "above the capacity": (MORNING, CAPACITY + 5, 3, "above_capacity", 0.0),
+    "far above the capacity": (MORNING, 9999, 3, "above_capacity", np.nan),
+    "gap": (MORNING, np.nan, 3, "gap", np.nan),
+    "a week stuck": (WEEK, 97, 7 * 24, "stuck", np.nan),
+    "hours stuck": ((40, slice(8, 20)), 97, 12, "stuck", np.nan),
+    "a week stuck at full": (WEEK, 0, 7 * 24, "stuck", np.nan),
+}
 
 
-@pytest.mark.parametrize(
-    ("what", "rule"),
-    [
-        ("negative", "negative"),
-        ("far below 0", "negative"),
-        ("above_capacity", "above_capacity"),
-        ("far above the capacity", "above_capacity"),
-        ("gap", "gap"),
-        ("a week stuck", "stuck"),
-        ("hours stuck", "stuck"),
-        ("a week stuck at full", "stuck"),
-    ],
-)
-def test_each_fault_is_cleaned_and_counted(tmp_path, what, rule):
-    free = free_places()
-    expected, becomes = change(free, what)
+@pytest.mark.parametrize("what", FAULTS)
+def test_each_fault_is_cleaned_and_counted(tmp_path, what):
+    free, (where, value, expected, rule, becomes) = free_places(), FAULTS[what]
+    free[where] = value
     counts = read(tmp_path, rows_of(free))
-    assert faults_of(counts, *({"gap"} - {rule}))[rule] in (
-        expected,
-        expected + 1,
-    )  # a neighbour may be equal
+    # A neighbour may be equal.
+    assert faults_of(counts, *({"gap"} - {rule}))[rule] in (expected, expected + 1)
     np.testing.assert_array_equal(counts.occupied[0, 40, 10:13], becomes)
     np.testing.assert_allclose(counts.occupied[0, :40], 1 - free[:40] / CAPACITY)
     np.testing.assert_allclose(counts.occupied[0, 48:], 1 - free[48:] / CAPACITY)
@@ -181,21 +152,18 @@ def test_car_parks_without_use_are_named(tmp_path):
     }  # fmt: skip
 
 
+HEADER = "car_park,capacity,hour,free\n"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         ("a,b\n1,2\n", "want the columns car_park,capacity,hour,free"),
-        ("car_park,capacity,hour,free\n", "has no readings"),
-        ("car_park,capacity,hour,free\na,100,yesterday,5\n", "line 2 is .*, want an ISO time and numbers"),
-        (
-            "car_park,capacity,hour,free\na,100,2024-01-01T00,five\n",
-            "line 2 is .*, want an ISO time and numbers",
-        ),
-        (
-            "car_park,capacity,hour,free\na,100,0001-01-01,5\na,100,9999-12-31,5\n",
-            "over 3,652,059 days, want at",
-        ),
-        ("car_park,capacity,hour,free\n\x1bred,100,2024-01-01,5\n", "want a printable name"),
+        (HEADER, "has no readings"),
+        (HEADER + "a,100,yesterday,5\n", "line 2 is .*, want an ISO time and numbers"),
+        (HEADER + "a,100,2024-01-01T00,five\n", "line 2 is .*, want an ISO time and numbers"),
+        (HEADER + "a,100,0001-01-01,5\na,100,9999-12-31,5\n", "over 3,652,059 days, want at"),
+        (HEADER + "\x1bred,100,2024-01-01,5\n", "want a printable name"),
     ],
 )
 def test_other_files_are_refused(tmp_path, text, message):

@@ -1,12 +1,11 @@
 """Curves: what searches are like as a function of occupancy, fitted over zones, held out, called and written."""
 
-import csv
 import dataclasses
 import json
 
 import numpy as np
 import pytest
-from command_line import parkenv as run
+from command_line import ran, refused, rows_in, summary_of
 from small_lots import features
 
 import parkenv
@@ -205,10 +204,9 @@ WORDS = ("--agents", "greedy-drive", "--arrivals-per-hour", "30,80", "--bootstra
 
 
 def test_the_command_writes_what_other_models_read(district, tmp_path):
-    done = run("curve", district, *WORDS, "-n", 2, "--jobs", 1, "--out", tmp_path / "a")
-    assert done.returncode == 0, done.stderr
+    ran("curve", district, *WORDS, "-n", 2, "--jobs", 1, "--out", tmp_path / "a")
     assert (tmp_path / "a" / "curve.png").exists()
-    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "a")
     assert summary["zones"] == {"district": 6}
     for name, columns in {
         "activitysim.csv": {"zone_id", "TERMINAL", "TERMINAL_AM"},
@@ -224,7 +222,7 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
         },
         "held_out.csv": {"measured", "predicted"},
     }.items():
-        rows = list(csv.DictReader((tmp_path / "a" / name).open()))
+        rows = rows_in(tmp_path / "a" / name)
         assert columns <= set(rows[0]), name
         if name == "matsim.csv":
             assert sum(int(row["onstreet_spots"]) for row in rows) == 60
@@ -233,9 +231,7 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
     assert "slots taken" in [column["label"] for column in rows["columns"]]
     curves = parkenv.load_curves(tmp_path / "a")
     its = curves.curves["district", "0", "all", "8"]  # its own demand is 70 cars an hour
-    (row,) = (
-        row for row in csv.DictReader((tmp_path / "a" / "activitysim.csv").open()) if row["zone_id"] == "0"
-    )
+    (row,) = (row for row in rows_in(tmp_path / "a" / "activitysim.csv") if row["zone_id"] == "0")
     assert float(row["TERMINAL_AM"]) == pytest.approx(
         (its["search_s"][1] + its["walk_s"][1]) / 60.0, abs=0.01
     )
@@ -253,13 +249,10 @@ def test_a_run_that_goes_on_is_as_one_in_a_piece(district, tmp_path):
         ("--resume", "-n", 3, "--out", tmp_path / "a"),
         (district, *WORDS, "-n", 3, "--jobs", 1, "--out", tmp_path / "b"),
     ):
-        done = run("curve", *words, "--no-figures")
-        assert done.returncode == 0, done.stderr
+        ran("curve", *words, "--no-figures")
     for name in ("curve.json", "curve.csv", "held_out.csv", "zones.jsonl"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
 def test_a_curve_is_of_equal_drivers(tmp_path):
-    done = run("curve", "town", "--agents", "usual,greedy-total", "--out", tmp_path / "a")
-    assert done.returncode == 2
-    assert "agents" in done.stderr
+    assert "agents" in refused("curve", "town", "--agents", "usual,greedy-total", "--out", tmp_path / "a")

@@ -1,9 +1,7 @@
 """The demo: from a survey to a film, in one command."""
 
-import json
-
 import pytest
-from command_line import parkenv
+from command_line import ran, summary_of
 from PIL import Image
 
 from parkenv.scenarios.spec import scenario_spec
@@ -15,9 +13,8 @@ from parkenv.studies.demo.study import AGENTS, QUICK, Demo
 def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     out = tmp_path / "demo"
     shorter = ("--more", 10, "--every", 8)
-    done = parkenv("demo", "--scenario", "mini", "--quick", *shorter, "--jobs", 1, "--out", out)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((out / "summary.json").read_text())
+    done = ran("demo", "--scenario", "mini", "--quick", *shorter, "--jobs", 1, "--out", out)
+    summary = summary_of(out)
     assert [row["agent"] for row in summary["rows"]] == 2 * list(AGENTS)
     through_sensors, without_images = summary["rows"][: len(AGENTS)], summary["rows"][len(AGENTS) :]
     assert {row["episodes"] for row in through_sensors} == {QUICK["episodes"]}

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jsonschema
 import pytest
-from command_line import parkenv
+from command_line import parkenv, ran, refused, summary_of
 
 from parkenv import InputError
 from parkenv.files.option import parse_call
@@ -46,23 +46,15 @@ def sweep(tmp_path):
 
 
 def refusal(folder, text):
-    file = folder / "bad.toml"
-    file.write_text(text)
-    done = parkenv("run", file, "--out", folder / "out")
-    assert done.returncode == 2, done.stdout + done.stderr
-    assert done.stderr.count("\n") == 1, done.stderr
+    (folder / "bad.toml").write_text(text)
+    said = refused("run", folder / "bad.toml", "--out", folder / "out")
     assert not (folder / "out").exists()
-    return done.stderr
-
-
-def summary_of(out):
-    return json.loads((out / "summary.json").read_text())
+    return said
 
 
 def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     out = tmp_path / "out"
-    done = parkenv("run", sweep, "--out", out)
-    assert done.returncode == 0, done.stderr
+    ran("run", sweep, "--out", out)
     rows = summary_of(out)["rows"]
     assert len(rows) == 3 * 3 * 2 * 2
     assert {row["agent"] for row in rows} == {"first-free", "mdp(failure_s=90)", "mdp"}
@@ -77,18 +69,16 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     (out / "summary.json").rename(out / "summary.partial.json")
     episodes = (out / "episodes.csv").read_text()
     (out / "episodes.csv").write_text("\n".join(episodes.splitlines()[:20]) + "\n")
-    assert parkenv("run", out, "--resume").returncode == 0
+    ran("run", out, "--resume")
     assert (out / "episodes.csv").read_text() == episodes
     assert summary_of(out)["command"] == begun_by, "the command of the run, not the one that resumed it"
-    assert parkenv("compare", "--resume", "-n", 5, "--out", out).returncode == 0
+    ran("compare", "--resume", "-n", 5, "--out", out)
     assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
     assert Comparison.read(out / SPEC_FILE) == kept.changed(episodes=5)
 
     # A changed file of the experiment is detected.
     (tmp_path / "own.toml").write_text('lot = "mini"\ncosts = { give_up_s = 70 }\n')
-    again = parkenv("run", sweep, "--out", out, "--resume")
-    assert again.returncode == 2
-    assert "own.costs.give_up_s was 60.0" in again.stderr
+    assert "own.costs.give_up_s was 60.0" in refused("run", sweep, "--out", out, "--resume")
 
 
 def test_what_the_world_charges_and_what_a_planner_assumes_are_two_things(sweep):
@@ -99,12 +89,11 @@ def test_what_the_world_charges_and_what_a_planner_assumes_are_two_things(sweep)
 
 def test_options_build_the_same_specification_as_a_file(tmp_path, sweep):
     out = tmp_path / "out"
-    done = parkenv(
+    ran(
         "compare", "--scenario", f"mini,{tmp_path / 'own.toml'}", "--agents", "first-free,mdp(failure_s=90)", "-n", 2,
         "--failure-cost", "5,60", "--v-walk-kmh", "4", "--occupancy-levels", "none", "--jobs", 1, "--no-figures",
         "--out", out,
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     text = SWEEP.replace(', { name = "inline", lot = { grid = { rows = 2, columns = 6 } } }', "")
     text = text.replace(', "mdp"]', "]").replace("v_drive_kmh = [10, 15]", "").replace("seed = 7", "")
     sweep.write_text(text.replace("episodes = 4", "episodes = 2"))
@@ -171,11 +160,9 @@ def test_agents_with_options_are_read_from_words_and_tables():
         ("agents = ['mdp(failre_s=9)']", "agent 'mdp' has no option 'failre_s'"),
         ("agents = ['belief']\ngrid = { blind = true }", "all agents plan on observations: belief"),
         ("episodes = 2000000", "agents x scenarios x grid x episodes is 16000000 searches, want at most 10000000"),
-        ("episodes = 'many'", "episodes is 'many', want a whole number"),
         ("grid = { v_walk_kmh = [4, -4] }", "grid.v_walk_kmh.1 is -4, want a number of at least 0.1"),
         ("grid = { failure_s = [nan] }", "grid.failure_s.0 is nan, want a finite number"),
         ("grid = { failure_s = [1, 1] }", "grid.failure_s is [1, 1], want different values; 1.0 is repeated"),
-        ("seed = -1", "seed is -1, want a number of at least 0"),
         ("kind = 'comparison'", "kind is 'comparison'; did you mean 'compare'?"),
         ("kind = { a = 1 }", "kind is {'a': 1}; "),
         ("backend = 'spark'", "backend is 'spark', want 'loky', 'ray' or 'dask'"),
@@ -207,10 +194,9 @@ def test_a_grid_without_bounds_is_refused_before_any_work(tmp_path):
 )  # fmt: skip
 def test_bad_scenario_files_are_refused_in_one_line(tmp_path, text, message):
     (tmp_path / "own.toml").write_text(f'lot = "mini"\n{text}\n')
-    done = parkenv("plan", "--scenario", tmp_path / "own.toml", "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert done.stderr.count("\n") == 1
-    assert f"own.toml: {message}" in done.stderr
+    assert f"own.toml: {message}" in refused(
+        "plan", "--scenario", tmp_path / "own.toml", "--out", tmp_path / "out"
+    )
 
 
 def test_the_example_of_the_documentation_has_a_cell_for_every_combination():

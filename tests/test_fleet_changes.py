@@ -1,11 +1,10 @@
 """Before and after: the same cars in several scenarios, and with other guidance."""
 
-import json
 import math
 
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import parkenv, summary_of
 from small_lots import features
 
 from parkenv import ParkingLot
@@ -105,7 +104,7 @@ def test_the_command_compares_lots_and_goes_on_with_another(tmp_path):
     assert (more.returncode, more.stderr, done.stderr) == (0, "", "")
     for file in ("days.csv", "cars.csv"):
         assert (out / file).read_bytes() == (whole / file).read_bytes()
-    summary = json.loads((whole / "summary.json").read_text())
+    summary = summary_of(whole)
     (change,) = summary["changes"]
     first, second = summary["rows"]
     assert change["change_s"] == pytest.approx(second["total_s"] - first["total_s"])

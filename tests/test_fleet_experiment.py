@@ -1,12 +1,10 @@
 """Experiments with many cars: settings, measures, summary, figure and command."""
 
-import csv
-import json
 import math
 
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import parkenv, ran, refused, rows_in, summary_of
 from pictures import shows_color
 
 from parkenv.errors import InputError
@@ -150,7 +148,7 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
     words += ("--share", "0.5,1", "--jobs", 1)
     done = parkenv("fleet", *words, "--out", tmp_path / "a")
     assert (done.returncode, done.stderr) == (0, "")
-    summary = json.loads((tmp_path / "a" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "a")
     rows = summary["rows"]
     assert len(rows) == 2 * 7
     wanted = (
@@ -158,13 +156,11 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
     )
     assert {*wanted.split(), "price_of_anarchy", "price_of_anarchy_ci95"} <= rows[0].keys()
     assert shows_color(tmp_path / "a" / "fleet.png", KNOWLEDGE_COLORS["reserve"])
-    with (tmp_path / "a" / "days.csv").open() as file:
-        days = list(csv.DictReader(file))
+    days = rows_in(tmp_path / "a" / "days.csv")
     assert len(days) == 2 * len(rows)
     assert done.stdout.count("reserve ") >= 4
     assert [path.name for path in open_run(tmp_path / "a").figures()] == ["fleet.png"]
-    again = parkenv("fleet", *words, "--out", tmp_path / "b")
-    assert again.returncode == 0
+    ran("fleet", *words, "--out", tmp_path / "b")
     assert (tmp_path / "b" / "days.csv").read_bytes() == (tmp_path / "a" / "days.csv").read_bytes()
 
 
@@ -174,33 +170,21 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
         (("--knows", "own,al"), "--knows is 'al', want 'own', 'shared', 'reserve' or 'full'"),
         (("--knows", "own,own"), "--knows is ['own', 'own'], want different values; 'own' is repeated"),
         (("--share", "0.5,1.5"), "--share is 1.5, want a number of at most 1"),
-        (("--share", "nan"), "--share is nan, want a finite number"),
         (("--share", ""), "--share is [], want at least 1 values"),
         (("--arrivals-per-hour", "0"), "--arrivals-per-hour is '0', want a number above 0"),
-        (("--stay-min", "0"), "--stay-min is 0.0, want a number of at least 1"),
         (("--stay-min", "inf"), "--stay-min is 'inf', want a number"),
         (
             ("--hours", "08:00-08:00"),
             "the arrivals of 'mini' are at one time, want hours in which cars arrive",
         ),
-        (
-            ("--decision-limit", "1", "--backend", "dask"),
-            "decision_limit_s requires the backend loky or ray",
-        ),
-        (("-n", "0"), "--episodes is 0, want a number of at least 1"),
-        (("--manoeuvre", "-1"), "--manoeuvre is -1.0, want a number of at least 0"),
-        (("--leaving-soon", "nan"), "--leaving-soon is nan, want a finite number"),
-        (("--decision-limit", "0"), "--decision-limit is 0.0, want a number of at least 0.01"),
+        (("--decision-limit", "1", "--backend", "dask"), "decision_limit_s requires the backend loky or ray"),
         (("--calibrated", "nothing.json"), "nothing.json"),
         (("--arrivals-per-hour", "1e6"), "cars arrive in the window, want at most 1,000,000"),
         (("--agents", "oracle"), "agent 'oracle' knows the future of single searches"),
-        (("--agents", "greedy"), "unknown agent 'greedy'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_run(words, message, tmp_path):
-    done = parkenv("fleet", "--scenario", "mini", *words, "--out", tmp_path / "out")
-    assert done.returncode == 2
-    assert message in done.stderr
+    assert message in refused("fleet", "--scenario", "mini", *words, "--out", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -209,7 +193,7 @@ def test_an_experiment_without_bounds_is_refused():
         experiment(days=10_000, arrivals_per_hour=tuple(map(float, range(1, 1001))))
 
 
-WORDS = (
+WORDS = [
     "--scenario",
     "mini",
     "--hours",
@@ -218,20 +202,20 @@ WORDS = (
     "30",
     "--knows",
     "own,reserve",
-)
+]
 
 
 def test_a_finished_run_is_extended_and_not_mixed_with_another(tmp_path):
     out, whole = tmp_path / "out", tmp_path / "whole"
-    assert parkenv("fleet", *WORDS, "-n", 1, "--no-figures", "--out", out).returncode == 0
+    ran("fleet", *WORDS, "-n", 1, "--no-figures", "--out", out)
     for words, message in (
         (("--stay-min", "30"), "--resume: stay_s was 3600.0"),
         (("--hours", "08:00-10:00"), "--resume: mini.arrivals.hours was '08:00-09:00'"),
     ):
-        assert message in parkenv("fleet", "--resume", *words, "--out", out).stderr
+        assert message in refused("fleet", "--resume", *words, "--out", out)
     done = parkenv("fleet", "--resume", "-n", 2, "--share", "0.5,1", "--out", out)
     assert (done.returncode, done.stderr) == (0, "")
-    assert parkenv("fleet", *WORDS, "-n", 2, "--share", "0.5,1", "--out", whole).returncode == 0
+    ran("fleet", *WORDS, "-n", 2, "--share", "0.5,1", "--out", whole)
     assert (out / "days.csv").read_bytes() == (whole / "days.csv").read_bytes()
 
 
@@ -290,9 +274,7 @@ def test_an_agent_that_fails_is_named_with_setting_day_and_car_and_earlier_days_
     out = tmp_path / "out"
     words = (*WORDS[:4], "--arrivals-per-hour", "3", "--knows", "own", "-n", 30)
     words += ("--decision-limit", "0.5")
-    done = parkenv("fleet", "--agents", f"{module}:Failing", *words, "--jobs", 1, "--out", out, cwd=tmp_path)
-    assert done.returncode == 2
-    assert len(done.stderr.splitlines()) == 1
-    assert message in done.stderr
-    assert f"{module}:Failing, own, share 0, 3 cars an hour, day" in done.stderr
+    said = refused("fleet", "--agents", f"{module}:Failing", *words, "--jobs", 1, "--out", out, cwd=tmp_path)
+    assert message in said
+    assert f"{module}:Failing, own, share 0, 3 cars an hour, day" in said
     assert len((out / "days.csv").read_text().splitlines()) > 1

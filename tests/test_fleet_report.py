@@ -5,7 +5,7 @@ import shutil
 
 import numpy as np
 import pytest
-from command_line import parkenv
+from command_line import parkenv, ran
 from test_report import data_of
 
 from parkenv import make_scenario
@@ -21,11 +21,10 @@ from parkenv.studies.study import ExecutionSpec
 def run(tmp_path_factory):
     """Two days on a small lot, with their report."""
     out = tmp_path_factory.mktemp("report") / "fleet"
-    done = parkenv(
+    ran(
         "fleet", "--scenario", "mini", "--hours", "08:00-08:30", "--arrivals-per-hour", "20,40", "--share", "0.5,1",
         "--knows", "own,reserve", "-n", 2, "--jobs", 1, "--out", out, "--report",
     )  # fmt: skip
-    assert done.returncode == 0, done.stderr
     return out
 
 
@@ -115,8 +114,7 @@ def test_a_day_that_differs_from_the_results_is_noted(run, tmp_path):
     cells = days[1].split(",")
     cells[days[0].split(",").index("total_s")] = "1.0"
     (copy / "days.csv").write_text("\n".join([days[0], ",".join(cells), *days[2:]]) + "\n")
-    done = parkenv("report", copy, "--episodes", 1, "--jobs", 1)
-    assert done.returncode == 0
+    done = ran("report", copy, "--episodes", 1, "--jobs", 1)
     assert "days.csv says 1.00 s" in " ".join(done.stdout.split())
 
 

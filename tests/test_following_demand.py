@@ -1,11 +1,9 @@
 """Demand with which a lot becomes as full as counted, recorded or expected."""
 
-import json
-
 import numpy as np
 import pytest
 from car_park_counts import CURVE, write_counts
-from command_line import parkenv
+from command_line import parkenv, summary_of
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -136,7 +134,7 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     words += ("--replay-from", "2024-01-20", "--hours", "07:00-12:30", "-n", 6, "--knows", "own", "--jobs", 1)
     done = parkenv("fleet", *words, "--out", tmp_path / "out")
     assert (done.returncode, done.stderr) == (0, "")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "out")
     (row,) = summary["rows"]
     assert row["arrivals_per_hour"] == "counted"
     assert row["occupancy"] == pytest.approx(row["counted_occupancy"], abs=0.03)
@@ -147,5 +145,5 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
         assert its["occupancy"] == pytest.approx(its["counted_occupancy"], abs=0.05)
     few = parkenv("fleet", "--resume", "--arrivals-per-hour", "counted,20", "--out", tmp_path / "out")
     assert (few.returncode, few.stderr) == (0, "")
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    summary = summary_of(tmp_path / "out")
     assert min(its["excess_ci95"][1] for its in summary["hours"] if its["arrivals_per_hour"] == 20.0) < -0.05

@@ -13,11 +13,16 @@ COMMAND = [PARKENV[0], "-P", *PARKENV[1:]]
 """The command as it is installed: Python does not look for modules in the working folder."""
 
 
+MODULES = (
+    "pickle", "socket", "queue", "numpy", "numba", "yaml", "cloudpickle", "sitecustomize", "parkenv", "matplotlib",
+)  # fmt: skip
+
+
 @pytest.fixture
 def folder(tmp_path):
     """A folder with modules that leave a mark, and settings of libraries that stop or mislead them."""
     ran = tmp_path / "ran"
-    for name in (
+    for name in [
         "pickle",
         "socket",
         "queue",
@@ -27,27 +32,12 @@ def folder(tmp_path):
         "cloudpickle",
         "sitecustomize",
         "parkenv",
-    ):
+        "matplotlib",
+    ]:
         (tmp_path / f"{name}.py").write_text(f"open({str(ran)!r}, 'a').write({name!r})")
     (tmp_path / ".numba_config.yaml").write_text(f"cache_dir: {tmp_path / 'theirs'}\ndisable_jit: 1\n")
     (tmp_path / "matplotlibrc").write_bytes(b"text.usetex: True\n\xff\xfe\n")
     return tmp_path
-
-
-def run(folder, *arguments, **environment):
-    return subprocess.run(
-        [*COMMAND, *arguments], cwd=folder, capture_output=True, text=True, env={**os.environ, **environment}
-    )
-
-
-@pytest.mark.slow
-def test_a_comparison_with_workers_and_figures_takes_nothing_from_the_folder(folder):
-    arguments = ["--scenario", "mini", "--agents", "greedy-goal,first-free", "-n", "2", "--jobs", "2"]
-    done = run(folder, "compare", *arguments, "--occupancy-levels", "none", "--out", "out", "--report")
-    assert done.returncode == 0, done.stderr
-    assert (folder / "out" / "report.html").is_file()
-    assert not (folder / "ran").exists()
-    assert not (folder / "theirs").exists()
 
 
 PATIENT = """
@@ -68,15 +58,19 @@ class Patient(SearchAgent):
 
 
 @pytest.mark.slow
-def test_a_users_class_is_found_by_workers_and_no_other_module_beside_it(folder):
-    for name in ("matplotlib", "typing_extensions", "my_agents"):
-        (folder / f"{name}.py").write_text(f"open({str(folder / 'ran')!r}, 'a').write({name!r})\n")
+def test_a_comparison_with_workers_and_figures_takes_a_users_class_and_nothing_else_from_the_folder(folder):
     (folder / "my_agents.py").write_text(PATIENT)
-    arguments = ["--scenario", "mini", "--agents", "my_agents:Patient", "-n", "2", "--jobs", "2"]
-    done = run(folder, "compare", *arguments, "--out", "out")
+    words = (
+        "compare --scenario mini --agents my_agents:Patient,first-free -n 2 --jobs 2 --occupancy-levels none"
+    )
+    done = subprocess.run(
+        [*COMMAND, *words.split(), "--out", "out", "--report"], cwd=folder, capture_output=True, text=True
+    )
     assert done.returncode == 0, done.stderr
     assert ",patient," in (folder / "out" / "episodes.csv").read_text()
+    assert (folder / "out" / "report.html").is_file()
     assert not (folder / "ran").exists()
+    assert not (folder / "theirs").exists()
 
 
 def test_a_users_class_is_found_after_everything_else(folder):

@@ -46,12 +46,8 @@ def png(width, height, rows=b""):
         return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
 
     head = struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", head)
-        + chunk(b"IDAT", zlib.compress(rows))
-        + chunk(b"IEND", b"")
-    )
+    chunks = {b"IHDR": head, b"IDAT": zlib.compress(rows), b"IEND": b""}
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(*its) for its in chunks.items())
 
 
 BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
@@ -181,20 +177,11 @@ def test_arrays_are_read_as_numpy_wrote_them(tmp_path):
 @pytest.mark.parametrize(
     "member",
     [
-        npy(shape="(100000000000,)"),
-        npy(shape="(1000000, 1000000)"),
-        npy(shape="(-1, -2)"),
-        npy(shape="(3,)"),
-        npy("'|O'"),
-        npy("'V0'", "(10**30,)"),
-        npy("'nonsense'"),
-        npy(version=b"\x09\x00"),
-        npy(shape="(" * 5000),
-        npy(shape="-" * 8000 + "1"),
-        np.lib.format.magic(1, 0),
-        b"",
+        npy(shape="(100000000000,)"), npy(shape="(1000000, 1000000)"), npy(shape="(-1, -2)"), npy(shape="(3,)"),
+        npy("'|O'"), npy("'V0'", "(10**30,)"), npy("'nonsense'"), npy(version=b"\x09\x00"), npy(shape="(" * 5000),
+        npy(shape="-" * 8000 + "1"), np.lib.format.magic(1, 0), b"",
     ],
-)
+)  # fmt: skip
 def test_an_array_is_as_large_as_its_header_says(member):
     with pytest.raises(InputError, match=r"a\.npz: a\.npy: not an array of numbers"):
         parse_arrays(zipped(**{"a.npy": member}), "a.npz")

@@ -1,6 +1,6 @@
 """The counts of Aachen's car parks as `parkenv occupancy` reads them, and the list of these car parks.
 
-`python tests/aachen.py DATA FOLDER` writes `counts.csv.gz` and `car_parks.csv` from `car_parks.csv` and all
+`python benchmarks/aachen.py DATA FOLDER` writes `counts.csv.gz` and `car_parks.csv` from `car_parks.csv` and all
 `free_15min*.csv.gz` in DATA. Car parks that the list lacks are left out, and named.
 """
 

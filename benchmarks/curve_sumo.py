@@ -1,4 +1,4 @@
-"""Curves of made networks against SUMO on others: `python tests/curve_sumo.py [SEED ...]`, where SUMO is installed.
+"""Curves of made networks against SUMO on others: `python benchmarks/curve_sumo.py [SEED ...]`, where SUMO is installed.
 
 Curves are fitted to days of fleets on ten networks, and predict the search times that SUMO has on three more, hour by
 hour, from how full these are there. Cars, arrivals, stays and entries are equal in both; drivers are `greedy-drive`.
@@ -6,8 +6,11 @@ hour, from how full these are there. Cars, arrivals, stays and entries are equal
 
 import dataclasses
 import sys
+from pathlib import Path
 
 import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))  # a script's own folder stands there
 
 from benchmarks.sumo_days import run_fleet, run_sumo, sumo_folder
 from benchmarks.town import SHIFT, SPEED, blocks_of
