@@ -1,4 +1,4 @@
-"""Curves of made networks against SUMO on others: `python benchmarks/curve_sumo.py [SEED ...]`, where SUMO is installed.
+"""Curves of made networks against SUMO on others: `python benchmarks/curve_sumo.py [SEED ...]` with SUMO installed.
 
 Curves are fitted to days of fleets on ten networks, and predict the search times that SUMO has on three more, hour by
 hour, from how full these are there. Cars, arrivals, stays and entries are equal in both; drivers are `greedy-drive`.
@@ -30,6 +30,7 @@ TRAINED, HELD_OUT = range(10, 20), range(3)
 
 
 def fleet_on(seed, rate):
+    """Cars on a made network, at a rate of arrivals."""
     lot = blocks_of(city_lot(SPACES, seed))
     begin = 8 * 3600.0
     arrivals = PoissonArrivals(rate * float(lot.capacity.sum()), begin, begin + HOURS * 3600.0)
@@ -64,6 +65,7 @@ def row_of(fleet, day):
 
 
 def town_on(seed, run):
+    """The days of a network as zones of a town."""
     days = []
     for rate in RATES:
         fleet = fleet_on(seed, rate)
@@ -72,11 +74,13 @@ def town_on(seed, run):
 
 
 def in_sumo(fleet, day):
+    """The same day in SUMO."""
     fleet.reset(0, day)
     return run_sumo(fleet, sumo_folder(), 0.5, (HOURS + 1) * 3600.0)
 
 
 def main(held_out):
+    """Fit the curves, and print how far off they are in SUMO."""
     towns = {f"ours {seed}": town_on(seed, lambda fleet, day: run_fleet(fleet, 0, day)) for seed in TRAINED}
     for seed in held_out:
         towns[f"ours {seed}"] = town_on(seed, lambda fleet, day: run_fleet(fleet, 0, day))

@@ -4,9 +4,9 @@ import json
 from dataclasses import dataclass, field
 from xml.sax.saxutils import quoteattr
 
+from parkenv import import_lot
 from parkenv.lots.draft import ImportOptions
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.lot_files import import_lot
 
 FREIBURG = LocalFrame(lon=7.85, lat=48.0)
 AISLE = {"highway": "service", "service": "parking_aisle"}

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from parkenv import OccupancyProcess
 from parkenv.compiled.keyed_random import (
     DAY_STREAM,
     ENTRY_STREAM,
@@ -16,7 +17,6 @@ from parkenv.compiled.keyed_random import (
 from parkenv.world.lot import PARK
 from parkenv.world.occupancy.centred_logits import centred_logits
 from parkenv.world.occupancy.log import weekday_of
-from parkenv.world.occupancy.process import OccupancyProcess
 
 
 def day_factor(process, key, slot, p):

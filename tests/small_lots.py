@@ -4,9 +4,8 @@ from dataclasses import fields
 
 import numpy as np
 
-from parkenv import Lane, OccupancyProcess, ParkingLot, Scenario, SensorModel
+from parkenv import Lane, OccupancyProcess, ParkingLot, Scenario, SearchProblem, SensorModel
 from parkenv.lots import grid_lot
-from parkenv.world.scenario import SearchProblem
 
 CAR_PARKS = ("campus", "jam", "street", "mini")
 """Packaged scenarios of one car park each: the town takes too long for every test."""
@@ -85,3 +84,10 @@ def full_lot(lot):
     logits = np.random.default_rng(0).normal(1.5, 1.0, n)
     forecast = OccupancyProcess.from_demand(logits, np.zeros(168), 3600.0)
     return Scenario(name="full", lot=lot, occupancy=taken, prior=forecast)
+
+
+def driven(fleet, *day, agents=None):
+    """A fleet at the end of a day, which a seed and a number name."""
+    fleet.reset(*day)
+    fleet.run(agents)
+    return fleet

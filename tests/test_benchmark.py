@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_line import parkenv
 
-from parkenv.errors import InputError
+from parkenv import InputError
 from parkenv.lots import read_lot
 from parkenv.lots.lot_files import PLACES
 from parkenv.lots.quality import combined_error_probability, read_provenance

@@ -28,9 +28,7 @@ def run(tmp_path_factory):
                 "P1", "garage", "centre", capacity=2, xy=(10.0, 14.0), gate_s=5.0, inside_s=(10.0, 30.0)
             ),
         ),
-        "slot_facility": np.where(
-            np.cumsum(zone == "centre") <= 3, np.where(zone == "", "", "Mill Street"), ""
-        ),
+        "slot_facility": np.where((zone == "centre") & (np.cumsum(zone == "centre") <= 3), "Mill Street", ""),
     }
     write_lot(ParkingLot(**features(plain) | {"slot_zone": zone} | supply), folder / "zoned.geojson")
     spec = {

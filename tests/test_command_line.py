@@ -11,11 +11,11 @@ import typer
 from annotated_types import Ge
 from command_line import parkenv
 
+from parkenv import InputError
 from parkenv.cli import COMMANDS as LISTED
 from parkenv.cli import app
 from parkenv.cli.compare import LEVELS, Compare
 from parkenv.cli.options import command_class, field_options, made
-from parkenv.errors import InputError
 from parkenv.files.known_names import SCENARIO_NAMES, WEATHERS, RigName
 from planners.names import AGENTS
 from sim_sensors.camera.weather import PRESETS

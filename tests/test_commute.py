@@ -8,8 +8,7 @@ import pytest
 from command_line import ran, rows_in, summary_of
 from pictures import shows_color
 
-from parkenv import make_scenario
-from parkenv.errors import InputError
+from parkenv import ArrivalWindow, InputError, OccupancyLog, RecordedOccupancy, make_scenario
 from parkenv.files.spec_file import read_tables
 from parkenv.mapping.learned_map import LearnedMap
 from parkenv.mapping.store import MapStore
@@ -19,9 +18,6 @@ from parkenv.studies.commute.runs import TRIP, CommuteRun, calendar
 from parkenv.studies.commute.study import Commute
 from parkenv.studies.results import DECISIONS
 from parkenv.studies.runner import run
-from parkenv.world.occupancy.arrival_window import ArrivalWindow
-from parkenv.world.occupancy.log import OccupancyLog
-from parkenv.world.occupancy.recorded import RecordedOccupancy
 
 SMALL = {
     "scenarios": ["mini"],

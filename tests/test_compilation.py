@@ -69,13 +69,9 @@ def start(own, cache, program=PROGRAM, **environment):
         "NUMBA_CACHE_DIR": str(cache), **environment,
     }  # fmt: skip
     return subprocess.Popen(
-        [sys.executable, "-c", program],
-        env=variables,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        cwd=own.parent,
-    )
+        [sys.executable, "-c", program], env=variables, cwd=own.parent, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE,
+    )  # fmt: skip
 
 
 def ended(process):

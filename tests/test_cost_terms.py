@@ -6,7 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode
-from small_lots import features
+from small_lots import driven, features
 
 from parkenv import ParkingLot, lot_v0, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
@@ -143,9 +143,9 @@ def test_many_cars_as_agents(scenario):
 
 
 def test_cars_of_compiled_drivers(scenario):
-    fleet = Fleet(scenario, Demand(Headways(6)), drivers=[DriverKind(policy=POLICIES["greedy-drive"])])
-    fleet.reset(seed=0)
-    fleet.run()
+    fleet = driven(
+        Fleet(scenario, Demand(Headways(6)), drivers=[DriverKind(policy=POLICIES["greedy-drive"])]), 0
+    )
     cars = fleet.cars
     np.testing.assert_allclose(sum(cars[name] for name in COST_FIELDS), cars["total_s"])
     parked = cars[cars["slot"] >= 0]

@@ -6,16 +6,16 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from scipy.stats import binom, poisson
+from small_lots import driven
 from test_supply import GARAGE, town
 
-from parkenv import make_scenario
+from parkenv import make_scenario, simulate
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.kernel import p_full
 from parkenv.engine.records import GAVE_UP, PARKED, SEARCHING
 from parkenv.lots import grid_lot
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import policy_of
-from parkenv.studies.simulate import simulate
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, ListedArrivals, PoissonArrivals
 from parkenv.world.lot import PARK, ParkingLot
 from parkenv.world.occupancy.process import Arrival
@@ -42,10 +42,7 @@ def garage_alone(**facility):
 
 
 def run(scenario, demand, kind=GREEDY, **options):
-    fleet = Fleet(scenario, demand, background="none", drivers=[kind], **options)
-    fleet.reset(seed=3)
-    fleet.run()
-    return fleet
+    return driven(Fleet(scenario, demand, background="none", drivers=[kind], **options), 3)
 
 
 def parked_in(fleet, slot):
@@ -144,9 +141,9 @@ def test_nobody_parks_where_the_driver_may_not(agent):
         PoissonArrivals(60.0, 8 * 3600.0, 10 * 3600.0), ExponentialTime(900.0), ConstantTime(600.0)
     )
     policy, own = policy_of(AgentSpec(name=agent), scenario)
-    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=policy)])
-    fleet.reset(seed=1)
-    fleet.run([own])
+    fleet = driven(
+        Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=policy)]), 1, agents=[own]
+    )
     zones = np.array(scenario.lot.zones)[scenario.lot.zone_of_slot[fleet.cars["slot"]]]
     parked = fleet.cars["slot"] >= 0
     assert parked.sum() > 20

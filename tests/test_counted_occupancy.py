@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.special import expit, logit
 
-from parkenv import make_scenario
+from parkenv import ArrivalWindow, InputError, make_scenario
 from parkenv.envs.search_vector import ParkSearchVectorEnv
-from parkenv.errors import InputError
 from parkenv.scenarios.spec import ScenarioSpec
-from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.counted import CountedOccupancy, level_of_mean, process_of_curve
 from parkenv.world.occupancy.process import Arrival
 

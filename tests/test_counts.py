@@ -5,7 +5,7 @@ from datetime import date, datetime, timedelta
 import numpy as np
 import pytest
 
-from parkenv.errors import InputError
+from parkenv import InputError
 from parkenv.forecast.counts import Counts, is_counts
 
 CAPACITY = 200

@@ -9,8 +9,7 @@ from command_line import ran, refused, rows_in, summary_of
 from small_lots import features
 
 import parkenv
-from parkenv import ParkingLot
-from parkenv.errors import InputError
+from parkenv import InputError, ParkingLot
 from parkenv.lots import grid_lot, write_lot
 from parkenv.studies.curve.curves import Curves
 from parkenv.studies.curve.fit import (
@@ -240,18 +239,6 @@ def test_the_command_writes_what_other_models_read(district, tmp_path):
     assert (low <= value).all()
     assert (value <= high).all()
     assert set(OUTCOMES) <= set(next(iter(curves.curves.values())))
-
-
-@pytest.mark.slow  # the command three times
-def test_a_run_that_goes_on_is_as_one_in_a_piece(district, tmp_path):
-    for words in (
-        (district, *WORDS, "-n", 2, "--out", tmp_path / "a"),
-        ("--resume", "-n", 3, "--out", tmp_path / "a"),
-        (district, *WORDS, "-n", 3, "--jobs", 1, "--out", tmp_path / "b"),
-    ):
-        ran("curve", *words, "--no-figures")
-    for name in ("curve.json", "curve.csv", "held_out.csv", "zones.jsonl"):
-        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes(), name
 
 
 def test_a_curve_is_of_equal_drivers(tmp_path):

@@ -179,12 +179,8 @@ def test_the_score_of_a_sample_is_that_of_its_definition():
 
 def test_reliability_and_bands_of_a_known_forecast():
     counts, _ = car_parks(2, 30)
-    half = DayForecast(
-        0,
-        np.zeros((2, 30, 24)),
-        np.tile(np.eye(24, dtype=np.float32), (2, 30, 1, 1)),
-        np.full((2, 30, 24), 0.5),
-    )
+    covariance = np.tile(np.eye(24, dtype=np.float32), (2, 30, 1, 1))
+    half = DayForecast(0, np.zeros((2, 30, 24)), covariance, np.full((2, 30, 24), 0.5))
     scores = Scores.of(half, with_values(counts, np.full((2, 30, 24), 0.3)))
     np.testing.assert_allclose(scores.reliability(), [[0.5], [0.3], [2 * 30 * 24.0]])
     assert mean_where(scores.log_loss) == pytest.approx(-np.log(0.5))

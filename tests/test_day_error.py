@@ -110,13 +110,8 @@ def test_a_process_keeps_its_day_error_in_files_parts_and_other_lots(tmp_path):
     days.to_file(tmp_path / "days.json")
     again = OccupancyProcess.from_file(tmp_path / "days.json")
     mapped = days.mapped_to_lot(np.arange(8.0))
-    others = [
-        again,
-        days.take([3, 1]),
-        mapped,
-        days.at_mean_occupancy(0.4, 0.0),
-        pickle.loads(pickle.dumps(days)),
-    ]
+    copy = pickle.loads(pickle.dumps(days))
+    others = [again, days.take([3, 1]), mapped, days.at_mean_occupancy(0.4, 0.0), copy]
     assert {other.day_error for other in others} == {DayError(0.8, 0.3)}
     assert [other.nearness.tolist() for other in others[:2]] == [days.nearness.tolist(), [-0.5, 1.0]]
     assert mapped.nearness.tolist() == nearness(np.arange(8.0)).tolist()

@@ -63,7 +63,7 @@ STILL = np.zeros(2, dtype=np.float32)
 CROWD = Traffic(cars=6, pedestrians=8)
 
 
-@pytest.mark.parametrize("lot", LOTS)
+@pytest.mark.parametrize("lot", ["campus", "street"])
 @pytest.mark.parametrize(
     "extras",
     [{}, {"laser": True, "obstacle_map": True, "reward": "dense", "traffic": Traffic(cars=2, pedestrians=2)}],
@@ -239,7 +239,7 @@ def drive_on(lot, traffic, number):
 
 
 @given(seed=st.integers(0, 500), lot=st.sampled_from(LOTS), traffic=st.sampled_from([None, CROWD]))
-@settings(max_examples=40)
+@settings(max_examples=24)
 def test_a_state_brought_back_goes_on_the_same(seed, lot, traffic):
     env, other = drive_on(lot, traffic, 0), drive_on(lot, traffic, 1)
     random_drive(env, seed, 10)
@@ -350,7 +350,7 @@ def test_the_obstacle_map_holds_everything_near_in_the_frame_of_the_slot():
 def test_others_move_keep_off_a_standing_car_and_are_seen():
     env = make("campus", traffic=CROWD, obstacle_map=True, laser=LaserScanner(noise_sd=0.0, dropout=0.0))
     moved, nearest = np.zeros(14), np.inf
-    for seed in range(4):
+    for seed in range(2):
         before = env.reset(seed=seed)[0]["movers"]
         assert before.shape == (14, 24, 2)
         for _ in range(150):
@@ -374,13 +374,11 @@ def test_running_into_one_who_moves_is_a_contact(number, word):
     assert env.step(STILL)[4]["contact"] == word
 
 
-@pytest.mark.parametrize("lot", LOTS)
-def test_frames_are_drawn_and_show_that_the_car_moves(lot):
-    env = make(lot, render_mode="rgb_array")
+def test_frames_are_drawn_and_show_that_the_car_moves():
+    env = make("campus", render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
-    env.step(np.array([1.0, 0.0], dtype=np.float32))
-    for _ in range(5):
+    for _ in range(6):
         if not env.unwrapped.state.over:
             env.step(np.array([1.0, 0.0], dtype=np.float32))
     frame = env.render()

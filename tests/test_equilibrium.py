@@ -6,14 +6,12 @@ from functools import partial
 import numpy as np
 import pytest
 
-from parkenv import make_scenario
+from parkenv import OccupancyProcess, SensorModel, make_scenario
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import grid_lot
 from parkenv.world.demand import ConstantTime, Demand, ListedArrivals
 from parkenv.world.lot import PARK
-from parkenv.world.occupancy.process import OccupancyProcess
-from parkenv.world.sensor_model import SensorModel
 from planners import make_agent
 
 LOT = grid_lot(1, 3, pitch=12.0)
@@ -41,13 +39,9 @@ def scenario(p_taken, taken, v_walk):
     occupancy = OccupancyProcess.from_demand(np.where(taken, 25.0, -25.0), np.zeros(168), 1e9)
     logit = np.log(p_taken / (1.0 - p_taken))
     prior = OccupancyProcess.from_demand(np.full(3, logit), np.zeros(168), 600.0)
+    blind = SensorModel(view_range=0.0)
     return make_scenario(
-        LOT,
-        occupancy=occupancy,
-        prior=prior,
-        sensor_model=SensorModel(view_range=0.0),
-        v_walk=v_walk,
-        give_up_s=120.0,
+        LOT, occupancy=occupancy, prior=prior, sensor_model=blind, v_walk=v_walk, give_up_s=120.0
     )
 
 

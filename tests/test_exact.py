@@ -16,14 +16,14 @@ from parkenv import (
     OccupancyProcess,
     ParkingLot,
     Scenario,
+    SearchProblem,
     SensorModel,
     make_scenario,
+    simulate,
 )
 from parkenv.lots import packaged_lot
 from parkenv.studies.episodes import EpisodeRunner
-from parkenv.studies.simulate import simulate
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.scenario import SearchProblem
 from planners import make_agent
 from planners.bounds.exact import ExactSolution
 
@@ -33,18 +33,11 @@ BLIND = SensorModel(view_range=0.0)
 def one_way_line(n, goal_x, pitch=10.0):
     """Slots along a one-way lane, from west to east; a passed slot cannot be reached again."""
     xy = np.column_stack([np.arange(1, n + 1) * pitch, np.full(n, -3.0)])
+    lane = Lane(np.array([[0.0, 0.0], [(n + 1) * pitch, 0.0]]), oneway=True)
     return ParkingLot(
-        name="line",
-        slot_ids=tuple(map(str, range(n))),
-        slot_xy=xy,
-        slot_yaw=np.zeros(n),
-        slot_length=np.full(n, 5.0),
-        slot_width=np.full(n, 2.0),
-        slot_mouth=np.full(n, Mouth.LEFT, dtype=np.int8),
-        lanes=(Lane(np.array([[0.0, 0.0], [(n + 1) * pitch, 0.0]]), oneway=True),),
-        entries=np.array([[0.0, 0.0]]),
-        goals=np.array([[goal_x, 0.0]]),
-    )
+        "line", tuple(map(str, range(n))), xy, np.zeros(n), np.full(n, 5.0), np.full(n, 2.0),
+        np.full(n, Mouth.LEFT, dtype=np.int8), (lane,), entries=np.zeros((1, 2)), goals=np.array([[goal_x, 0.0]]),
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("p_free", [0.05, 0.2, 0.5, 0.9])

@@ -8,11 +8,9 @@ from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from PIL import Image
 
-from parkenv import make_scenario
-from parkenv.errors import InputError
+from parkenv import InputError, make_scenario
 from parkenv.lots import grid_lot
 from parkenv.show.figures import times as time_figures
-from parkenv.show.figures.forecast import save_rates
 from parkenv.show.figures.picture_files import CAPTION, INK, save_picture
 from parkenv.show.figures.searches import BELIEF_MAP, draw_search, draw_searches
 from parkenv.show.figures.times import (
@@ -26,9 +24,7 @@ from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.figures import FIGURES, ComparisonResults, draw_figures, remove_figures
 from parkenv.studies.episodes import EpisodeRunner
 from parkenv.studies.results import EPISODES
-from parkenv.world.occupancy.process import OccupancyProcess
-from planners.agent import make_agent
-from planners.names import AGENT_NAMES
+from planners import AGENT_NAMES, make_agent
 
 
 def row(agent="mdp", drive=30.0, failed=5.0, walk=60.0, price=0.0, gave_up=0.0, **more):
@@ -69,7 +65,7 @@ LAID_OUT = {
 }
 
 
-@pytest.mark.parametrize("panels", [1, 2, 4, 7])
+@pytest.mark.parametrize("panels", [1, 2, 5])
 @pytest.mark.parametrize("kind", LAID_OUT)
 def test_any_number_of_panels_is_laid_out(tmp_path, kind, panels):
     figure = LAID_OUT[kind](panels)
@@ -100,10 +96,6 @@ def test_bars_stack_the_terms_and_an_agent_off_the_scale_is_cut():
     assert [text.get_weight() for text in ax.texts] == ["bold", "normal", "normal"]
     assert [label.get_text() for label in ax.get_yticklabels()] == ["mdp", "greedy-goal", "mdp-static"]
     assert ax.get_xlim() == (0, limit)
-
-
-def test_nothing_is_cut_where_agents_are_alike():
-    assert time_figures._limit([row("mdp"), row("oracle", drive=90.0)]) > 155.0
 
 
 @pytest.mark.parametrize("interval", [[None, None], [float("nan"), float("nan")]])
@@ -215,12 +207,6 @@ def test_titles_fit_lots_of_any_shape(lot):
     figure.draw_without_rendering()
     title = ax.get_tightbbox()
     assert title.x1 <= figure.bbox.x1 + 1
-
-
-def test_rates_are_drawn(tmp_path):
-    process = OccupancyProcess.from_demand(np.zeros(3), np.sin(np.arange(168) / 4))
-    save_rates(process, tmp_path / "rates.png")
-    picture(tmp_path / "rates.png")
 
 
 @pytest.mark.parametrize("draw", [draw_time_split, draw_time_against_occupancy, draw_searches])

@@ -3,8 +3,6 @@
 import itertools
 import math
 import pickle
-import subprocess
-import sys
 import warnings
 
 import gymnasium as gym
@@ -14,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from ordered_entry import ORDERED_ENTRY
-from small_lots import small_lot
+from small_lots import driven, small_lot
 
 import parkenv
 from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
@@ -260,9 +258,7 @@ def test_the_first_car_at_a_slot_has_it_and_the_second_fails():
 
     scenario = parkenv.make_scenario("mini")
     demand = Demand(ListedArrivals((36000.0, 36000.0)), ConstantTime(15.0))
-    fleet = Fleet(scenario, demand, background="none")
-    fleet.reset(0)
-    fleet.run([Park()])
+    fleet = driven(Fleet(scenario, demand, background="none"), 0, agents=[Park()])
     first, second = fleet.cars
     assert (first["failed_parks"], second["failed_parks"]) == (0, 2)
     assert first["slot"] == second["slot"] == 0
@@ -283,9 +279,7 @@ def test_residents_leave_and_do_not_come_back():
 def test_a_car_without_patience_goes_elsewhere():
     demand = Demand(Headways(4), patience=ConstantTime(20.0))
     scenario = parkenv.make_scenario("jam", give_up_s=500.0)
-    fleet = Fleet(scenario, demand, drivers=[DriverKind(policy=POLICIES["random"])])
-    fleet.reset(0)
-    fleet.run()
+    fleet = driven(Fleet(scenario, demand, drivers=[DriverKind(policy=POLICIES["random"])]), 0)
     cars = fleet.cars[np.array(fleet.state_names()) == "balked"]
     assert len(cars)
     assert (cars["gave_up_s"] == 500.0).all()
@@ -317,24 +311,6 @@ def test_more_drivers_of_a_kind_are_those_before_and_others():
     assert kinds[1].mean() == pytest.approx(0.5, abs=0.1)
 
 
-def test_ordered_entry_loses_as_erlang_says():
-    # M/M/c/c: 8 slots, load 5; blocking B(8, 5) = 0.07005.
-    from parkenv.lots import grid_lot
-
-    lot = grid_lot(1, 8)
-    n = lot.n_slots
-    process = OccupancyProcess.from_demand(np.zeros(n), np.zeros(168))
-    scenario = Scenario(lot=lot, name="row", occupancy=process)
-    demand = Demand(PoissonArrivals(500.0, 0.0, 40 * 3600.0), ExponentialTime(36.0))
-    fleet = Fleet(scenario, demand, background="none", drivers=[DriverKind(policy=ORDERED_ENTRY)])
-    fleet.reset(0)
-    fleet.run()
-    load, blocking = 5.0, 1.0
-    for c in range(1, n + 1):
-        blocking = load * blocking / (c + load * blocking)
-    assert np.mean(np.array(fleet.state_names()) == "balked") == pytest.approx(blocking, rel=0.15)
-
-
 def test_a_forecast_computed_in_python_reaches_every_car():
     scenario = parkenv.make_scenario("mini")
 
@@ -354,20 +330,6 @@ def test_a_forecast_computed_in_python_reaches_every_car():
         if len(seen) == 3:
             break
     assert seen == {0, 1, 2}
-
-
-@pytest.mark.slow
-def test_another_process_gives_the_same_run():
-    program = (
-        "from parkenv.engine.fleet import *; from planners.heuristics import *;"
-        "from parkenv.world.demand import *;"
-        "f = Fleet('campus', Demand(Headways(40)), drivers=[DriverKind(policy=POLICIES['greedy-drive'])]);"
-        "f.reset(5); f.run(); print(f.cars['slot'].tolist(), f.cars['ended_at'].tolist())"
-    )
-    runs = {
-        subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout for _ in "ab"
-    }
-    assert len(runs) == 1
 
 
 def test_a_copy_is_a_fleet_before_its_first_reset():
@@ -434,14 +396,3 @@ def test_an_agent_that_raises_stops_the_run_and_names_the_car():
     assert fleet.next_decision() == 0
     with pytest.raises(InputError, match="action is 7"):
         fleet.act(7)
-
-
-def test_more_cars_than_slots_for_ever_end_all_the_same():
-    demand = Demand(Headways(40, 1.0), ConstantTime(math.inf))
-    fleet = Fleet("mini", demand, background="none", drivers=[GREEDY])
-    fleet.reset(0)
-    fleet.run()
-    names = fleet.state_names()
-    assert names.count("parked") == fleet.scenario.lot.n_slots
-    assert names.count("gave_up") == 40 - fleet.scenario.lot.n_slots
-    assert (fleet.cars["gave_up_s"] > 0).sum() == names.count("gave_up")

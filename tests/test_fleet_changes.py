@@ -4,13 +4,11 @@ import math
 
 import numpy as np
 import pytest
-from command_line import parkenv, summary_of
+from command_line import ran, summary_of
 from small_lots import features
 
-from parkenv import ParkingLot
-from parkenv.errors import InputError
+from parkenv import InputError, ParkingLot, make_scenario
 from parkenv.lots.formats.geojson import write_lot
-from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.fleet.setting import NOWHERE
 from parkenv.studies.fleet.study import FleetStudy
@@ -92,19 +90,12 @@ def test_only_equal_hours_have_the_same_cars():
         study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
 
 
-def test_the_command_compares_lots_and_goes_on_with_another(tmp_path):
+def test_the_command_compares_lots(tmp_path):
     for spec in (BEFORE, AFTER):
         ScenarioSpec.parse(spec, "").write(tmp_path / f"{spec['name']}.json")
     words = ("--arrivals-per-hour", "12", "--knows", "own", "-n", 2, "--jobs", 1, "--no-figures")
-    out, whole = tmp_path / "out", tmp_path / "whole"
-    assert parkenv("fleet", "--scenario", "before.json", *words, "--out", out, cwd=tmp_path).returncode == 0
-    both = ("--scenario", "before.json,after.json")
-    more = parkenv("fleet", "--resume", *both, "--out", out, cwd=tmp_path)
-    done = parkenv("fleet", *both, *words, "--out", whole, cwd=tmp_path)
-    assert (more.returncode, more.stderr, done.stderr) == (0, "", "")
-    for file in ("days.csv", "cars.csv"):
-        assert (out / file).read_bytes() == (whole / file).read_bytes()
-    summary = summary_of(whole)
+    done = ran("fleet", "--scenario", "before.json,after.json", *words, "--out", "out", cwd=tmp_path)
+    summary = summary_of(tmp_path / "out")
     (change,) = summary["changes"]
     first, second = summary["rows"]
     assert change["change_s"] == pytest.approx(second["total_s"] - first["total_s"])
@@ -116,11 +107,13 @@ def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
         "shoppers": {"arrivals_per_hour": (30.0,) * 24, "stay_s": 900.0},
         "commuters": {"arrivals_per_hour": (15.0,) * 24, "stay_s": 7200.0},
     }
-    specs = [
+    after = {"name": "after", "costs": {"give_up_s": 60.0}}
+    its = study(
         BEFORE | {"demand": demand},
-        BEFORE | {"name": "after", "costs": {"give_up_s": 60.0}, "demand": demand},
-    ]
-    its = study(*specs, knows=("own",), arrivals_per_hour=None)
+        BEFORE | after | {"demand": demand},
+        knows=("own",),
+        arrivals_per_hour=None,
+    )
     days = [[its.run_day(one, day) for day in range(4)] for one in its.fleet_settings]
     whole, *parts = without_nan(summarize_changes(days, purposes={"before": list(demand)}))
     assert [row["purpose"] for row in parts] == list(demand)
@@ -158,17 +151,10 @@ def test_prices_of_zones_change_what_is_paid_and_who_wins(tmp_path):
     assert whole["paid_change"] == pytest.approx(np.mean(changes))
     assert sum(row["cars_a_day"] for row in by_zone) == pytest.approx(whole["cars_a_day"])
     parts = "parking_cost_change_s", "gave_up_change_s"
-    assert [whole[name] for name in parts] == pytest.approx(
-        [
-            np.mean(
-                [
-                    a[name.replace("_change", "")] - b[name.replace("_change", "")]
-                    for a, b in zip(after, before, strict=True)
-                ]
-            )
-            for name in parts
-        ]
-    )
+    for name in parts:
+        measure = name.replace("_change", "")
+        changed = [a[measure] - b[measure] for a, b in zip(after, before, strict=True)]
+        assert whole[name] == pytest.approx(np.mean(changed))
     assert whole["prices"] == "near 1 → 1.2 an hour"
     for day in before:
         day["zone"] = " ".join(["0", *day["zone"].split()[1:]])

@@ -7,9 +7,8 @@ import pytest
 from command_line import parkenv, ran, refused, rows_in, summary_of
 from pictures import shows_color
 
-from parkenv.errors import InputError
+from parkenv import InputError, SearchProblem, make_scenario, open_run
 from parkenv.lots import grid_lot
-from parkenv.scenarios.build import make_scenario
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.show.figures.fleet import KNOWLEDGE_COLORS
@@ -18,8 +17,6 @@ from parkenv.studies.fleet.measures import Roads, gini, looks_s
 from parkenv.studies.fleet.setting import MEASURES, Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import summarize_days
-from parkenv.studies.runner import open_run
-from parkenv.world.scenario import SearchProblem
 
 
 def experiment(**changes):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from small_lots import driven
 
 from parkenv import OccupancyProcess, Scenario, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
@@ -151,9 +152,7 @@ def test_cars_see_others_in_view_and_where_one_stands():
 def test_queues_keep_to_ticks(tick_s):
     demand = Demand(Headways(30, 3.0))
     kinds = [DriverKind(policy=POLICIES["greedy-drive"])]
-    fleet = Fleet("mini", demand, drivers=kinds, tick_s=tick_s, manoeuvre_s=7.7, background="none")
-    fleet.reset(0)
-    fleet.run()
+    fleet = driven(Fleet("mini", demand, drivers=kinds, tick_s=tick_s, manoeuvre_s=7.7, background="none"), 0)
     ticks = (fleet.cars["ended_at"] - fleet.begin) / tick_s
     np.testing.assert_allclose(ticks, np.round(ticks), atol=1e-6)
     assert (fleet.cars["queued_s"] > 0).any()

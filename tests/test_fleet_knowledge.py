@@ -5,6 +5,7 @@ from itertools import permutations
 
 import numpy as np
 import pytest
+from small_lots import driven
 
 import parkenv
 from parkenv import SensorModel, make_scenario
@@ -18,7 +19,7 @@ from parkenv.world.demand import (
     ListedArrivals,
     PoissonArrivals,
 )
-from planners.agent import make_agent
+from planners import make_agent
 from planners.heuristics import POLICIES
 
 TWO = Demand(ListedArrivals((36000.0, 36060.0)))
@@ -83,9 +84,7 @@ def test_what_a_car_is_told_at_its_arrival_counts_as_an_observation_then():
 def test_many_reports_wait_for_their_delay():
     demand = Demand(PoissonArrivals(400.0, 36000.0, 43200.0), ExponentialTime(600.0), ConstantTime(600.0))
     kinds = [DriverKind(policy=POLICIES["random"], knows="shared", shares=True)]
-    fleet = Fleet("mini", demand, drivers=kinds, delay_s=1800.0)
-    fleet.reset(0)
-    fleet.run()
+    fleet = driven(Fleet("mini", demand, drivers=kinds, delay_s=1800.0), 0)
     assert fleet.records["report_capacity"][0] > 4096
     assert fleet.records["n_reports"][0] < fleet.records["report_capacity"][0]
 
@@ -133,8 +132,7 @@ def test_reservations_are_exclusive_and_cost_the_least_in_total():
 @pytest.mark.parametrize("name", ["belief", "mdp", "greedy-goal", "first-free"])
 def test_every_agent_drives_to_its_reserved_slot(name):
     fleet = Fleet("campus", Demand(Headways(6, 20.0)), drivers=[DriverKind(knows="reserve")])
-    fleet.reset(3)
-    fleet.run([make_agent(name, fleet.scenario)])
+    driven(fleet, 3, agents=[make_agent(name, fleet.scenario)])
     assert set(fleet.state_names()) <= {"parked", "left"}
     assert (fleet.cars["failed_parks"] == 0).all()
 
@@ -170,9 +168,7 @@ def test_others_may_take_a_reserved_slot():
         DriverKind(0.5, POLICIES["greedy-drive"], knows="reserve"),
         DriverKind(0.5, POLICIES["greedy-drive"]),
     ]
-    fleet = Fleet("campus", demand, drivers=kinds, leave_full_lot=False)
-    fleet.reset(0)
-    fleet.run()
+    fleet = driven(Fleet("campus", demand, drivers=kinds, leave_full_lot=False), 0)
     members = fleet.cars["kind"] == 0
     parked = fleet.cars["slot"] >= 0
     assert (parked & members).any()
@@ -185,9 +181,7 @@ def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
     kinds = [DriverKind(policy=POLICIES["greedy-drive"], knows=knows)]
     searched = {}
     for leave in (True, False):
-        fleet = Fleet("mini", demand, background="none", drivers=kinds, leave_full_lot=leave)
-        fleet.reset(0)
-        fleet.run()
+        fleet = driven(Fleet("mini", demand, background="none", drivers=kinds, leave_full_lot=leave), 0)
         names = np.array(fleet.state_names())
         n = fleet.scenario.lot.n_slots
         assert (names == "parked").sum() == n

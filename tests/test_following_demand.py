@@ -8,16 +8,13 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from parkenv import ArrivalWindow, OccupancyLog, RecordedOccupancy, make_scenario
 from parkenv.engine.fleet import Fleet
-from parkenv.scenarios.build import make_scenario
 from parkenv.studies.fleet.setting import rate_of
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, FollowingArrivals
-from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.counted import process_of_curve
 from parkenv.world.occupancy.day_error import DayError
-from parkenv.world.occupancy.log import OccupancyLog
 from parkenv.world.occupancy.process import Arrival, ArrivalDay, OccupancyModel, OccupancyProcess
-from parkenv.world.occupancy.recorded import RecordedOccupancy
 
 TUESDAY = ArrivalDay(1)
 MORNING = ArrivalWindow((1,), 7 * 3600.0, 14.5 * 3600.0)
@@ -143,7 +140,3 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     assert hours[0]["counted_occupancy"] < 0.3 < 0.7 < hours[4]["counted_occupancy"]
     for its in hours:
         assert its["occupancy"] == pytest.approx(its["counted_occupancy"], abs=0.05)
-    few = parkenv("fleet", "--resume", "--arrivals-per-hour", "counted,20", "--out", tmp_path / "out")
-    assert (few.returncode, few.stderr) == (0, "")
-    summary = summary_of(tmp_path / "out")
-    assert min(its["excess_ci95"][1] for its in summary["hours"] if its["arrivals_per_hour"] == 20.0) < -0.05

@@ -18,7 +18,7 @@ from file_mutations import mutated_bytes, mutated_json, mutated_text
 from test_csv_tables import EPISODE, SESSION
 from test_import_osm import car_park
 
-from parkenv.errors import InputError
+from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel
 from parkenv.files.images import read_image
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
 from parkenv.lots.draft import ImportOptions
@@ -39,9 +39,6 @@ from parkenv.studies.results import EPISODES, Results, decision_s
 from parkenv.studies.sensing.sessions import SESSIONS
 from parkenv.studies.sensing.surveys import detection_by_distance
 from parkenv.studies.trips.calibration_study import CalibrationStudy
-from parkenv.world.occupancy.log import OccupancyLog
-from parkenv.world.occupancy.process import OccupancyProcess
-from parkenv.world.sensor_model import SensorModel
 
 MINI = packaged_lot("mini")
 ROOT = Path(__file__).parents[1] / "parkenv"
@@ -212,27 +209,6 @@ SUMMARY = {
     "command": ["parkenv", "compare", "--episodes", "2"], "version": "0.1.0", "seed": 0,
     "rows": [SUMMARY_ROW, SUMMARY_ROW | {"agent": "random", "total_s": 70.0}],
 }  # fmt: skip
-SURVEY_SUMMARY = {
-    "command": ["parkenv", "survey"], "version": "0.1.0", "seed": 0,
-    "rows": [
-        {
-            "scenario": "mini", "sessions": 1, "slots": 10, "car_detection_rate": 0.6, "slot_accuracy": 1.0,
-            "unknown_fraction": 0.0, "range_abs_error_m": {"median": 0.002, "p95": 0.003},
-            "by_weather": {"dusk": {"sessions": 1, "car_detection_rate": 0.6, "slot_accuracy": 1.0}},
-            "detection_by_distance": [
-                {"weather": "dusk", "distance_m": [0.0, 4.0], "in_frame": 2, "detected": 2, "rate_ci95": [0.3, 1.0]}
-            ],
-        }
-    ],
-}  # fmt: skip
-COMMUTE_ROW = {
-    "scenario": "mini", "map": "none", "agent": "first-free", "courses": 1, "total_s": 31.3,
-    "total_s_ci95": [None, None], "forecast_error": None, "forecast_error_ci95": [None, None],
-}  # fmt: skip
-COMMUTE_SUMMARY = {
-    "command": ["parkenv", "commute"], "version": "0.1.0", "seed": 0, "complete": True,
-    "rows": [COMMUTE_ROW | {"day": 1}], "weeks": [COMMUTE_ROW | {"days": "1-2", "difference_s": 0.0}],
-}  # fmt: skip
 FLEET_SETTING = {
     "scenario": "mini", "agents": "random", "knows": "own", "share": 0.0, "arrivals_per_hour": 20.0,
 }  # fmt: skip
@@ -307,8 +283,6 @@ FORMATS = {
     "trueLocations.txt": Format("0: (-5,30)\n1: (2,3) (4,5)\n", mutated_text, true_locations),
     "result.json": Format(RESULT, mutated_json, benchmark),
     "summary.json": Format(SUMMARY, mutated_json, reported),
-    "survey.json": Format(SURVEY_SUMMARY, mutated_json, reported_kind),
-    "commute.json": Format(COMMUTE_SUMMARY, mutated_json, reported_kind),
     "fleet.json": Format(FLEET_SUMMARY, mutated_json, reported_kind),
     "days.csv": Format(DAY_ROWS, mutated_text, days),
     "sessions.csv": Format(SESSION_ROWS, mutated_text, sessions),
@@ -327,7 +301,6 @@ BESIDE = {
     "timings.csv": {"settings.json": '{"seed": 0, "agents": {}}', "episodes.csv": EPISODE_ROWS},
     "trips.jsonl": {"settings.json": '{"seed": 0}'},
     "summary.json": {"episodes.csv": EPISODE_ROWS},
-    "survey.json": {"sessions.csv": SESSION_ROWS},
 }
 """Other files that stand in the folder of a file."""
 
@@ -375,9 +348,6 @@ FOUND = [
     ("summary.json", b'{"command": 5, "version": "0.1.0", "rows": []}'),
     ("summary.json", json.dumps(SUMMARY | {"seed": 1e300, "rows": [SUMMARY_ROW | {"drive_s": 1e300}]}).encode()),
     ("summary.json", json.dumps(SUMMARY).replace("30.0", "1e999").encode()),
-    ("survey.json", json.dumps(SURVEY_SUMMARY).replace('"dusk", "distance_m"', '"dusk"}, 7, {"distance_m"').encode()),
-    ("survey.json", json.dumps(SURVEY_SUMMARY).replace('[{"weather"', '{"weather"').replace("}]}", "}}").encode()),
-    ("commute.json", json.dumps(COMMUTE_SUMMARY | {"weeks": [[COMMUTE_ROW]]}).encode()),
     ("sessions.csv", SESSION_ROWS.replace("2 1 0", "seed0 1 0").encode()),
     ("settings.json", json.dumps({"seed": "x" * 5000}).encode()),
     ("timings.csv", TIMING_ROWS.replace("12 3", "12 <").encode()),

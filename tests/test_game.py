@@ -22,7 +22,7 @@ from parkenv.show.report import page as pages
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.play import game_data
 from parkenv.world.occupancy.process import World
-from planners.agent import make_agent
+from planners import make_agent
 
 pytestmark = SOCKETS
 SCRIPTS = Path(pages.__file__).parent

@@ -9,15 +9,13 @@ import pytest
 from small_lots import cut_in_two, small_lot
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv import InputError, OccupancyProcess, Scenario, SearchProblem, SensorBand, SensorModel, simulate
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.studies.simulate import simulate
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
 from parkenv.world.lot import PARK, ParkingLot
-from parkenv.world.scenario import SearchProblem
 from parkenv.world.tariff import Zone
-from planners.agent import make_agent
+from planners import make_agent
 from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
 

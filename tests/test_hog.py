@@ -24,12 +24,8 @@ def plain_histograms(image):
             for dk, wk in ((0, 1 - (place[y, x] - k)), (1, place[y, x] - k)):
                 for dr, wr in ((0, 1 - (row - np.floor(row))), (1, row - np.floor(row))):
                     for dc, wc in ((0, 1 - (column - np.floor(column))), (1, column - np.floor(column))):
-                        where = (
-                            int(np.floor(row)) + dr + 1,
-                            (k + dk) % ORIENTATIONS,
-                            int(np.floor(column)) + dc + 1,
-                        )
-                        cells[where] += wk * wr * wc * magnitude[y, x]
+                        r, c = int(np.floor(row)) + dr + 1, int(np.floor(column)) + dc + 1
+                        cells[r, (k + dk) % ORIENTATIONS, c] += wk * wr * wc * magnitude[y, x]
     return cells[1:-1, :, 1:-1]
 
 
@@ -109,10 +105,7 @@ def test_a_window_in_the_middle_is_the_crops_own_description():
         (lambda: Descriptor(100, 64), "width is 100 px, want a multiple of 8"),
         (lambda: Descriptor(128, 8), "height is 8 px"),
         (lambda: Descriptor(128, 64, "l1"), "normalization is 'l1'"),
-        (
-            lambda: Descriptor().describe(np.zeros((64, 64), np.uint8)),
-            r"crop is \(64, 64\), want \(64, 128\)",
-        ),
+        (lambda: Descriptor().describe(np.zeros((64, 64), np.uint8)), r"crop is \(64, 64\), want"),
         (lambda: cell_histograms(np.zeros((8, 8), np.float32)), "float32, want"),
     ],
 )

@@ -9,10 +9,9 @@ from scipy.sparse.csgraph import dijkstra
 from small_lots import CAR_PARKS
 from value_iteration import value_iteration
 
-from parkenv import InputError, make_scenario
+from parkenv import InputError, make_scenario, simulate
 from parkenv.belief.slot_belief import SlotBelief
 from parkenv.lots import city_lot, grid_lot
-from parkenv.studies.simulate import simulate
 from parkenv.world.lot import PARK
 from planners import ParkingMDP, label_setting, make_agent, policy_iteration
 from planners.thesis.label_repair import repair

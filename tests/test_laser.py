@@ -1,4 +1,4 @@
-"""The laser: against its definition, against pymunk, at the edges of its domain, and its noise."""
+"""The laser: against its definition, at the edges of its domain, and its noise."""
 
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -6,12 +6,11 @@ from dataclasses import replace
 
 import laser_reference
 import numpy as np
-import pymunk
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_sensors.errors import SensorError
+from sim_sensors import SensorError
 from sim_sensors.laser.footprints import NO_RETURN, WALL, ScanPlane
 from sim_sensors.laser.scanner import LaserScanner
 
@@ -102,41 +101,6 @@ def test_a_lot_far_from_the_origin_is_seen_as_exactly():
     shift = np.array([413_000.25, 5_320_000.5])
     far = ScanPlane(corners + shift, n_corners, near.walls + shift)
     assert compare(LASER, far, (*shift, 0.3)) < 10
-
-
-def test_pymunk_sees_the_same():
-    rng = np.random.default_rng(3)
-    plane = random_plane(rng, 120, 8, 40.0)
-    space = static_space(plane)
-    wrong = 0
-    for pose in rng.uniform((-30, -30, -4), (30, 30, 4), (10, 3)):
-        ranges = LASER.scan(plane, pose)
-        if not ranges.any():
-            continue
-        seen = pymunk_scan(space, LASER, pose)
-        wrong += int((np.abs(np.minimum(ranges, 99) - np.minimum(seen, 99)) > TOLERANCE_M).sum())
-    assert wrong <= 10  # beams at edges
-
-
-def static_space(plane):
-    space = pymunk.Space()
-    corners, n_corners = plane.footprints
-    for polygon, k in zip(corners, n_corners, strict=True):
-        space.add(pymunk.Poly(space.static_body, polygon[:k].tolist()))
-    for a, b in plane.walls.tolist():
-        space.add(pymunk.Segment(space.static_body, a, b, 0.0))
-    return space
-
-
-def pymunk_scan(space, scanner, pose):
-    x, y, yaw = map(float, pose)
-    ranges = np.full(scanner.n_beams, np.inf)
-    for i, angle in enumerate((yaw + scanner.angles).tolist()):
-        end = (x + scanner.max_range * math.cos(angle), y + scanner.max_range * math.sin(angle))
-        hit = space.segment_query_first((x, y), end, 0.0, pymunk.ShapeFilter())
-        if hit is not None:
-            ranges[i] = hit.alpha * scanner.max_range
-    return ranges
 
 
 @pytest.mark.parametrize("yaw", np.linspace(-math.pi, math.pi, 17))
@@ -241,19 +205,6 @@ def test_orientation_and_corners_on_a_straight_edge_do_not_matter():
     np.testing.assert_allclose(LASER.scan(ScanPlane([with_midpoints]), pose), wanted, atol=1e-6)
 
 
-@pytest.mark.slow
-def test_thousands_of_footprints():
-    x, y = np.meshgrid(np.arange(100) * 2.5, np.arange(50) * 8.0)
-    rectangles = np.column_stack([x.ravel(), y.ravel()])[:, None] + [
-        [-0.9, -2.2],
-        [0.9, -2.2],
-        [0.9, 2.2],
-        [-0.9, 2.2],
-    ]
-    plane = ScanPlane(rectangles)
-    assert compare(LASER, plane, (120.3, 204.0, 0.1)) < 10
-
-
 def test_noise_has_the_spread_and_the_losses_that_were_asked_for():
     plane = ScanPlane(np.empty((0, 4, 2)), walls=[[[5, -90], [5, 90]]])
     scanner = LaserScanner(n_beams=201, start=-0.5, step=0.005, noise_sd=0.03, dropout=0.1)
@@ -301,10 +252,7 @@ def test_equal_seeds_give_equal_scans_on_any_number_of_threads():
         (lambda: ScanPlane([SQUARE, SQUARE * [1, 0]]), r"footprints\[1\] .*want "),
         (lambda: ScanPlane([[[0, 0], [1, 1], [2, 2]]]), r"footprints\[0\] .*want an area above zero"),
         (lambda: ScanPlane([[[0, 0], [4, 0], [1, 1], [0, 4]]]), r"footprints\[0\] .*want a convex outline"),
-        (
-            lambda: ScanPlane([regular_polygon(5)[[0, 2, 4, 1, 3]]]),
-            r"footprints\[0\] .*want a convex outline",
-        ),
+        (lambda: ScanPlane([regular_polygon(5)[[0, 2, 4, 1, 3]]]), r"footprints\[0\] .*want a convex"),
         (lambda: ScanPlane([SQUARE], [2]), r"n_corners\[0\] .*want 3 to 4"),
         (lambda: ScanPlane([SQUARE], [4, 4]), r"n_corners .*want \(1,\) integers"),
         (lambda: ScanPlane([SQUARE], ids=[-3]), "ids is -3, want 0 or more"),
@@ -315,10 +263,7 @@ def test_equal_seeds_give_equal_scans_on_any_number_of_threads():
         (lambda: ScanPlane([SQUARE]).replace(0, regular_polygon(9)), "corners has 9 rows, want at most 4"),
         (lambda: LASER.scan(ScanPlane([SQUARE]), (0, math.nan, 0)), "pose .*want finite x, y and yaw"),
         (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0)), r"pose has shape \(2,\), want \(3,\)"),
-        (
-            lambda: LASER.scan_batch(ScanPlane([SQUARE]), (0, 0, 0)),
-            r"poses has shape \(3,\), want \(b, 3\)",
-        ),
+        (lambda: LASER.scan_batch(ScanPlane([SQUARE]), (0, 0, 0)), r"poses has shape \(3,\), want"),
         (lambda: LASER.scan_batch(ScanPlane([SQUARE]), [(0, 0, math.inf)]), "poses .*want finite"),
         (lambda: LASER.scan(ScanPlane([SQUARE]), (0, 0, 0), exclude=1.5), "exclude .*want an id"),
         (lambda: LaserScanner(n_beams=0), "n_beams is 0, want an integer of 1 or more"),

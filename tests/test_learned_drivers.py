@@ -5,17 +5,17 @@ import pickle
 import numpy as np
 import pytest
 from sb3_contrib import MaskablePPO
+from small_lots import driven
 from stable_baselines3 import DQN, PPO
 
-from parkenv import make_scenario
+from parkenv import InputError, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.network import NetworkPolicy
 from parkenv.envs.sb3 import SearchVecEnv
-from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import network_policy, policy_of
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
-from planners.agent import make_agent
+from planners import make_agent
 from planners.model_file import save_model
 
 MINI = make_scenario("mini")
@@ -42,9 +42,9 @@ def test_a_compiled_network_drives_as_its_model_does(algorithm, tmp_path):
     policy = network_policy(model.policy, 5)
     found = []
     for kind, agents in ((DriverKind(policy=policy), None), (DriverKind(), [agent])):
-        fleet = Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False)
-        fleet.reset(3)
-        fleet.run(agents)
+        fleet = driven(
+            Fleet(MINI, DEMAND, drivers=[kind], max_steps=60, leave_full_lot=False), 3, agents=agents
+        )
         found.append(np.array([fleet.cars["total_s"], fleet.cars["n_steps"], fleet.cars["slot"]]))
     np.testing.assert_array_equal(*found)
 

@@ -6,9 +6,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from parkenv import make_scenario
+from parkenv import InputError, SearchProblem, SensorModel, make_scenario, simulate
 from parkenv.compiled.keyed_random import episode_key, seed_state
-from parkenv.errors import InputError
 from parkenv.forecast.logistic_normal import EVEN
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior
 from parkenv.mapping.inference import MapPrior, SessionLog
@@ -16,13 +15,10 @@ from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap,
 from parkenv.mapping.store import VERSION, MapStore
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.studies.episodes import TripRecorder
-from parkenv.studies.simulate import simulate
 from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival, Forecast
-from parkenv.world.scenario import SearchProblem
-from parkenv.world.sensor_model import SensorModel
 from parkenv.world.week import DAY_S, HOUR_S
-from planners.agent import make_agent
+from planners import make_agent
 
 MORNING = Arrival(9 * HOUR_S)
 GRID = np.linspace(-15.0, 15.0, 1201)

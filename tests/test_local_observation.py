@@ -7,12 +7,11 @@ import pytest
 from small_lots import CAR_PARKS
 
 import parkenv  # noqa: F401 - registers the ids
-from parkenv import InputError, OccupancyProcess, Scenario, make_scenario
+from parkenv import InputError, OccupancyProcess, Scenario, SensorModel, make_scenario
 from parkenv.engine.local_observation import FIRST_NEAR, HERE, PER_MOVE, PER_NEAR
 from parkenv.envs.local_observation import LocalObservation
 from parkenv.lots import grid_lot
 from parkenv.world.lot import MOVES, PARK
-from parkenv.world.sensor_model import SensorModel
 
 K = 4
 

@@ -205,6 +205,12 @@ ERRORS = {
     "no member 'per_hours' of price; did you mean 'per_hour'": lambda d: d["zones"]["inner"].update(
         price={"per_hours": 1}
     ),
+    "per_hour is nan": lambda d: d["zones"]["inner"]["price"].update(per_hour=float("nan")),
+    "hours has the day 'Xx'": lambda d: d["zones"]["inner"].update(hours="Xx 08:00-09:00"),
+    "max_stay_s is 0": lambda d: d["zones"]["inner"].update(max_stay_s=0),
+    "capacity is 2.5": lambda d: broken(d, "facility", capacity=2.5),
+    "gate_s is -1": lambda d: broken(d, "facility", gate_s=-1),
+    "inside_s is ": lambda d: broken(d, "facility", inside_s=[100]),
     "zone 'inner': users is 'all'": lambda d: d["zones"]["inner"].update(users="all"),
     "facility 'P1': capacity is -3": lambda d: broken(d, "facility", capacity=-3),
     "facility 'P1': type is 'silo', want one of kerb": lambda d: broken(d, "facility", type="silo"),
