@@ -15,7 +15,7 @@ PARKENV = [sys.executable, "-c", "from parkenv.__main__ import main; main()"]
 """The command in a separate process."""
 
 
-def parkenv(words, *arguments, cwd=None):
+def parkenv(words="", *arguments, cwd=None):
     """Run the command in this process, which has everything imported and compiled code loaded.
 
     `words` are separated by spaces; further arguments may have any in them.

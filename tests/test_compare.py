@@ -1,7 +1,6 @@
 """`parkenv compare` and related commands: results, resuming, errors."""
 
 import csv
-import dataclasses
 import json
 import re
 from pathlib import Path
@@ -128,23 +127,6 @@ def test_agents_may_be_given_maps_that_are_wrong(tmp_path):
     assert len({total[name, "mdp"] for name in worlds}) > 1, "the maps are not"
     assert (tmp_path / "time_against_map_mini.png").exists()
     assert not (tmp_path / "time_split_mini-constant-forecast-1.png").exists()
-
-
-def test_parking_costs_of_a_lot_file_reach_rows_table_and_figures(tmp_path):
-    lot = packaged_lot("mini")
-    write_lot(
-        dataclasses.replace(lot, slot_parking_cost_s=np.full(lot.n_slots, 12.5)), tmp_path / "lot.geojson"
-    )
-    done = ran(
-        "compare", "--lot", tmp_path / "lot.geojson", "--agents", "mdp,first-free", "-n", 4, "--jobs", 1,
-        "--occupancy-levels", "none", "--out", tmp_path / "out",
-    )  # fmt: skip
-    assert "parking" in done.stdout.replace(str(tmp_path), ""), "a column of the table"
-    for row in summary_of(tmp_path / "out")["rows"]:
-        assert row["parking_cost_s"] == pytest.approx(12.5 * row["parked_fraction"])
-        parts = ("drive_s", "failed_s", "walk_s", "parking_cost_s", "gave_up_s")
-        assert row["total_s"] == pytest.approx(sum(row[name] for name in parts))
-        assert row["regret_s"] >= -1e-6
 
 
 def test_where_the_optimum_is_known_the_table_says_how_far_off_others_are(tmp_path):

@@ -64,10 +64,15 @@ def test_a_file_is_run_and_its_folder_says_what_was_run(tmp_path, sweep):
     kept = Comparison.read(out / SPEC_FILE)
     assert kept == Comparison.read(sweep)
 
-    # The folder alone is enough to extend it.
+    # The folder alone is enough to resume the run and to extend it.
     begun_by = summary_of(out)["command"]
-    ran("compare", "--resume", "-n", 5, "--out", out)
+    (out / "summary.json").rename(out / "summary.partial.json")
+    episodes = (out / "episodes.csv").read_text()
+    (out / "episodes.csv").write_text("\n".join(episodes.splitlines()[:20]) + "\n")
+    ran("run", out, "--resume")
+    assert (out / "episodes.csv").read_text() == episodes
     assert summary_of(out)["command"] == begun_by, "the command of the run, not the one that resumed it"
+    ran("compare", "--resume", "-n", 5, "--out", out)
     assert {row["episodes"] for row in summary_of(out)["rows"]} == {5}
     assert Comparison.read(out / SPEC_FILE) == kept.changed(episodes=5)
 

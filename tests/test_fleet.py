@@ -300,17 +300,6 @@ def test_goals_and_entries_are_drawn_by_weight():
     assert np.mean(fleet.cars["place"] == n_goals - 1) == pytest.approx(2 / (n_goals + 1), abs=0.1)
 
 
-def test_more_drivers_of_a_kind_are_those_before_and_others():
-    kinds = []
-    for share in (0.25, 0.5):
-        drivers = [DriverKind(share, POLICIES["random"]), DriverKind(1.0 - share, POLICIES["greedy-drive"])]
-        fleet = Fleet("mini", Demand(Headways(200)), drivers=drivers)
-        fleet.reset(4)
-        kinds.append(fleet.cars["kind"] == 0)
-    assert not (kinds[0] & ~kinds[1]).any()
-    assert kinds[1].mean() == pytest.approx(0.5, abs=0.1)
-
-
 def test_a_forecast_computed_in_python_reaches_every_car():
     scenario = parkenv.make_scenario("mini")
 

@@ -161,20 +161,6 @@ def test_knowing_more_helps_and_guidance_helps_most():
     assert own > late > shared > full > reserve
 
 
-@pytest.mark.slow
-def test_others_may_take_a_reserved_slot():
-    demand = Demand(PoissonArrivals(240.0, 32400.0, 36000.0), ExponentialTime(3600.0), ConstantTime(600.0))
-    kinds = [
-        DriverKind(0.5, POLICIES["greedy-drive"], knows="reserve"),
-        DriverKind(0.5, POLICIES["greedy-drive"]),
-    ]
-    fleet = driven(Fleet("campus", demand, drivers=kinds, leave_full_lot=False), 0)
-    members = fleet.cars["kind"] == 0
-    parked = fleet.cars["slot"] >= 0
-    assert (parked & members).any()
-    assert (parked & ~members).any()
-
-
 @pytest.mark.parametrize("knows", ["own", "full", "reserve"])
 def test_a_full_lot_is_left_at_once_or_searched_until_patience_ends(knows):
     demand = Demand(Headways(25, 1.0), ConstantTime(math.inf), ConstantTime(300.0))

@@ -9,7 +9,7 @@ import pytest
 from small_lots import cut_in_two, small_lot
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, Scenario, SearchProblem, SensorBand, SensorModel, simulate
+from parkenv import OccupancyProcess, Scenario, SearchProblem, SensorBand, SensorModel
 from parkenv.belief.slot_belief import OBSERVED_FREE, OBSERVED_TAKEN, SlotBelief
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
@@ -230,23 +230,6 @@ def test_a_compiled_policy_decides_as_its_agent_in_every_situation(name):
     assert decisions > 5000
 
 
-@pytest.mark.parametrize("name", COMPILED)
-@pytest.mark.parametrize("source", ["mini", "campus", "jam"])
-def test_a_fleet_of_one_car_with_a_policy_is_the_search_of_its_agent(name, source):
-    scenario = parkenv.make_scenario(source)
-    fleet = Fleet(
-        scenario, Demand(Headways(1)), background="process", drivers=[DriverKind(policy=POLICIES[name])]
-    )
-    agent, env = make_agent(name, scenario), gym.make("parkenv/Search-v2", scenario=scenario)
-    for seed in range(10):
-        fleet.reset(seed)
-        fleet.run()
-        (car,) = fleet.cars
-        episode = simulate(env, agent, seed)
-        for field in ("drive_s", "failed_s", "walk_s", "driven_m", "failed_parks"):
-            assert car[field] == episode.info[field]
-
-
 def test_a_policy_takes_the_options_of_its_agent():
     scenario = parkenv.make_scenario("campus")
     agent = make_agent("first-free", scenario, within_m=150.0)
@@ -257,8 +240,3 @@ def test_a_policy_takes_the_options_of_its_agent():
         fleet.run(agents)
         slots.append(fleet.cars["slot"].tolist())
     assert slots[0] == slots[1]
-
-
-def test_a_kind_of_driver_wants_a_compiled_policy():
-    with pytest.raises(InputError, match=r"DriverKind\.policy"):
-        DriverKind(policy="greedy-drive")

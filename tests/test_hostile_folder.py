@@ -101,20 +101,6 @@ def test_a_signal_before_anything_is_imported_ends_the_command(tmp_path, command
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
 
-def test_compiled_code_is_kept_where_the_environment_says_and_nowhere_else(folder, tmp_path):
-    code = (
-        "import parkenv.compiled.code_files as files, numba\n"
-        "numba.njit(lambda x: x)(1)\n"
-        "print(files.cache_folder(), [numba.config.CACHE_DIR, numba.config.DISABLE_JIT])"
-    )
-    environment = {**os.environ, "NUMBA_CACHE_DIR": "", "XDG_CACHE_HOME": str(tmp_path / "home")}
-    done = subprocess.run(
-        [sys.executable, "-P", "-c", code], cwd=folder, capture_output=True, text=True, env=environment
-    )
-    assert done.stdout.endswith("['', 0]\n"), done.stderr
-    assert "theirs" not in done.stdout
-
-
 def test_an_import_changes_no_settings_of_a_users_own_process(folder):
     (folder / "matplotlibrc").write_text("text.usetex: True\n")
     for module in folder.glob("*.py"):

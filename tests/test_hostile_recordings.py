@@ -111,12 +111,3 @@ def test_columns_that_are_computed_are_refused(tmp_path):
     for path in (file, folder):
         with pytest.raises(InputError, match="column 'data' of 'messages' is computed"):
             sizes(path)
-
-
-def test_aliases_in_the_metadata_are_not_followed(tmp_path):
-    folder = bag(tmp_path / "bag", size=10)
-    file = folder / "metadata.yaml"
-    levels = "".join(f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]\n" for i in range(1, 9))
-    file.write_text(f"a0: &a0 [x, x]\n{levels}{file.read_text().replace('mcap', '*a8', 1)}")
-    with pytest.raises(InputError, match="aliases"):
-        sizes(folder)

@@ -264,17 +264,6 @@ def test_both_solvers_lead_to_the_same_actions(name, failure_s):
     assert replans > 0, "on an empty day a search ends without any"
 
 
-def test_the_plan_is_expected_to_take_the_same_time_by_either_solver():
-    scenario = make_scenario("campus")
-    belief = np.random.default_rng(0).uniform(0.5, 1.0, scenario.lot.n_slots)
-    for name in ("mdp", "mdp-static"):
-        times = [
-            make_agent(name, scenario, solver=s).expected_time(belief)
-            for s in ("label_setting", "policy_iteration")
-        ]
-        np.testing.assert_allclose(times[0], times[1], atol=1e-7)
-
-
 def test_agents_say_what_is_wrong():
     scenario = make_scenario("mini")
     with pytest.raises(InputError, match="solver is 'lp', want one of label_setting, policy_iteration"):

@@ -6,16 +6,15 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from parkenv import InputError, SearchProblem, SensorModel, make_scenario, simulate
+from parkenv import InputError, SensorModel, make_scenario, simulate
 from parkenv.compiled.keyed_random import episode_key, seed_state
 from parkenv.forecast.logistic_normal import EVEN
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior
 from parkenv.mapping.inference import MapPrior, SessionLog
-from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, ReversedMap, map_prior
+from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, map_prior
 from parkenv.mapping.store import VERSION, MapStore
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.studies.episodes import TripRecorder
-from parkenv.world.occupancy.day_error import DayError
 from parkenv.world.occupancy.process import Arrival, Forecast
 from parkenv.world.week import DAY_S, HOUR_S
 from planners import make_agent
@@ -373,14 +372,3 @@ def test_wrong_trips_and_maps_are_refused():
         LearnedMap(EmptyMap(3_001), np.arange(3_001))
     with pytest.raises(InputError, match="memory_days is 0"):
         MapErrorPrior(1.0, 1.0, 1.0, 1.0, 1.0, 0.0)
-
-
-def test_the_reversed_map_is_wrong():
-    scenario = make_scenario("campus")
-    right, wrong = (
-        m.forecast(MORNING) for m in (scenario.occupancy, ReversedMap(scenario.occupancy, scenario.walk_s))
-    )
-    near = scenario.walk_s < np.median(scenario.walk_s)
-    assert wrong.p_occupied[near].mean() == pytest.approx(right.p_occupied[~near].mean(), abs=0.02)
-    assert isinstance(wrong.day_error, DayError)
-    assert isinstance(scenario.public(), SearchProblem)
