@@ -95,7 +95,7 @@ CASES: dict[str, tuple[str, ...]] = {
 """Commands of each golden, in a folder of their own with `counts.csv` and `crops`; `{data}` is that of real data."""
 
 VOLATILE = re.compile(
-    r"^(decision_ms.*|seconds.*|.*_seconds|compile.*|planning_s.*|planning_ms.*|wall_s|steps_per_s|command|version|date|"
+    r"^(decision_ms.*|seconds.*|.*_seconds|compile.*|.*planning_m?s.*|wall_s|steps_per_s|command|version|date|"
     r"commit|findings|most_balked|settings)$"
 )
 """Members of summaries and columns that differ from run to run, are texts, or repeat the specification."""
