@@ -110,7 +110,7 @@ def test_names_are_those_of_the_modules_behind_them():
         (("plan", "--scenario", "mini,jam"), "--scenario names 2 scenarios, want one"),
         (("plan", "--scenario", "mini", "--agents", "mdp,oracle"), "--agents names 2 agents, want one"),
         (("run", "nowhere.toml"), "nowhere.toml: No such file or directory"),
-        (("train", "sarsa"), "algorithm is 'sarsa', want 'ppo', 'maskable-ppo', 'recurrent-ppo' or 'dqn'"),
+        (("train", "sarsa"), "ALGORITHM is 'sarsa', want 'ppo', 'maskable-ppo', 'recurrent-ppo' or 'dqn'"),
         (("map",), "Missing argument 'FILE'; see parkenv map --help"),
     ],
 )
