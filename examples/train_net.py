@@ -252,7 +252,7 @@ def write(network, file):
 
 if __name__ == "__main__":
     torch.manual_seed(SEED)
-    torch.set_num_threads(2)
+    torch.set_num_threads(1)
     pictures = [picture for street in range(STREETS) for picture in pictures_of_a_street(street)]
     write(train(pictures), FILE)
     detector, found, cars = make_detector(str(FILE)), 0, 0
