@@ -11,11 +11,9 @@ import pytest
 from command_line import parkenv
 
 from parkenv import InputError
-from parkenv.files.images import images_in, read_image
 from parkenv.perception.car_datasets import (
     Crops,
     LabelledImage,
-    read_crop_folder,
     read_uiuc_test,
     read_uiuc_training,
 )
@@ -23,7 +21,7 @@ from parkenv.perception.car_model import CarModel
 from parkenv.perception.detection_scores import matches, recall_on_crops, recall_precision, score_on
 from parkenv.perception.detector import Detections, GroundBand
 from parkenv.perception.hog import Descriptor
-from parkenv.perception.hog_detector import HogDetector, as_grey, best_boxes
+from parkenv.perception.hog_detector import HogDetector, best_boxes
 from parkenv.perception.training import TrainingSettings, train
 
 
@@ -163,10 +161,6 @@ def test_any_size_and_colour_is_looked_at(model):
     for bad in (np.zeros((9, 9), np.uint16), np.zeros((9, 9, 4), np.uint8), np.zeros((0, 9), np.uint8)):
         with pytest.raises(InputError, match="image is"):
             detector.detect(bad)
-
-
-def test_grey_weighs_colours_as_eyes_do():
-    assert as_grey(np.full((2, 2, 3), (255, 0, 0), np.uint8))[0, 0] == pytest.approx(76, abs=1)
 
 
 def test_of_boxes_that_overlap_the_best_is_kept():
@@ -326,36 +320,6 @@ def test_a_damaged_set_is_named(tmp_path, break_it, message):
         read_uiuc_test(tmp_path, "single")
 
 
-def test_images_of_all_kinds(tmp_path):
-    rng = np.random.default_rng(1)
-    color = rng.integers(0, 256, (20, 30, 3), dtype=np.uint8)
-    cv2.imwrite(str(tmp_path / "rgb.png"), color[..., ::-1])
-    cv2.imwrite(str(tmp_path / "rgba.png"), np.dstack([color[..., ::-1], np.full((20, 30), 7, np.uint8)]))
-    cv2.imwrite(str(tmp_path / "deep.png"), color[..., 0].astype(np.uint16) * 256)
-    (tmp_path / "torn.png").write_bytes((tmp_path / "rgb.png").read_bytes()[:400])
-    np.testing.assert_array_equal(read_image(tmp_path / "rgb.png"), color)
-    np.testing.assert_array_equal(read_image(tmp_path / "rgba.png"), color)
-    for name, message in (
-        ("deep.png", "has more than 8 bits a channel"),
-        ("torn.png", "is not a complete image"),
-        ("none.png", "No such file"),
-    ):
-        with pytest.raises(InputError, match=message):
-            read_image(tmp_path / name)
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="holds no images"):
-        images_in(tmp_path / "empty")
-    with pytest.raises(InputError, match="holds no folder positives/"):
-        read_crop_folder(tmp_path / "empty")
-
-
-def test_numbers_in_names_are_counted(tmp_path):
-    for n in (10, 9, 1):
-        cv2.imwrite(str(tmp_path / f"pos-{n}.pgm"), np.zeros((4, 4), np.uint8))
-    cv2.imwrite(str(tmp_path / "pos-²a.pgm"), np.zeros((4, 4), np.uint8))
-    assert [f.stem for f in images_in(tmp_path)][:3] == ["pos-1", "pos-9", "pos-10"]
-
-
 def test_too_little_to_train_on_is_said(crops):
     with pytest.raises(InputError, match="3 positives and 60 negatives, want at least 20 and 1"):
         train(crops[0][:3], crops[1])
@@ -408,18 +372,6 @@ def grey_image(path):
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(cv2.imencode(path.suffix, np.zeros((70, 140), np.uint8))[1].tobytes())
     return path
-
-
-def test_every_image_has_a_picture_of_its_own(tmp_path):
-    photos, out = tmp_path / "photos", tmp_path / "out"
-    for name in ("a.png", "b.png", "b.jpg", "more/b.jpg"):
-        grey_image(photos / name)
-    done = parkenv("detect", photos, "--model", "side", "--out", out)
-    assert done.returncode == 0, done.stderr
-    names = sorted(path.name for path in out.glob("*.png"))
-    assert names[:3] == ["a_cars.png", "b.jpg_cars.png", "b.png_cars.png"]
-    assert names[3].startswith("more_b.jpg_cars-")
-    assert len(names) == 4
 
 
 def test_a_picture_never_replaces_an_image_that_is_searched(tmp_path):

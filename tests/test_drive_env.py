@@ -104,16 +104,6 @@ def test_equal_seeds_give_equal_trajectories(lot):
     assert not np.array_equal(one.reset(seed=1)[0]["observation"], one.reset(seed=2)[0]["observation"])
 
 
-def test_later_resets_go_through_other_tasks_of_the_same_seed():
-    env = make()
-    runs = []
-    for _ in range(2):
-        env.reset(seed=4)
-        runs.append([env.reset()[0]["observation"].tolist() for _ in range(3)])
-    assert runs[0] == runs[1]
-    assert len({tuple(r) for r in runs[0]}) == 3
-
-
 @pytest.mark.parametrize("dense", [False, True])
 def test_rewards_of_batches_are_those_of_the_steps(dense):
     env = make("mini", reward="dense" if dense else "sparse")
@@ -372,20 +362,6 @@ def test_running_into_one_who_moves_is_a_contact(number, word):
     state.vehicle[:] = [x - CAR.middle, y, 0.0, 0.0, 0.0, 0.0]
     env.unwrapped.set_state((episode, state))
     assert env.step(STILL)[4]["contact"] == word
-
-
-def test_frames_are_drawn_and_show_that_the_car_moves():
-    env = make("campus", render_mode="rgb_array")
-    env.reset(seed=0)
-    first = env.render()
-    for _ in range(6):
-        if not env.unwrapped.state.over:
-            env.step(np.array([1.0, 0.0], dtype=np.float32))
-    frame = env.render()
-    assert frame.shape == (480, 640, 3)
-    assert frame.dtype == np.uint8
-    assert (frame != first).any()
-    np.testing.assert_array_equal(env.render(), frame)
 
 
 @pytest.mark.parametrize(

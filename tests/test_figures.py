@@ -1,5 +1,3 @@
-from dataclasses import replace
-
 import cv2
 import numpy as np
 import pytest
@@ -9,7 +7,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from parkenv import InputError, make_scenario
-from parkenv.lots import grid_lot
 from parkenv.show.figures import times as time_figures
 from parkenv.show.figures.picture_files import CAPTION, INK, save_picture
 from parkenv.show.figures.searches import BELIEF_MAP, draw_search, draw_searches
@@ -19,7 +16,6 @@ from parkenv.show.figures.times import (
     draw_time_distribution,
     draw_time_split,
 )
-from parkenv.studies.compare import figures as comparison_figures
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.compare.figures import FIGURES, ComparisonResults, draw_figures, remove_figures
 from parkenv.studies.episodes import EpisodeRunner
@@ -108,14 +104,6 @@ def test_a_single_search_without_a_bound_has_no_interval(tmp_path, interval):
         picture(tmp_path / "figure.png")
 
 
-def test_legends_of_long_names_are_within_the_figure():
-    names = [f"my_agents:{'Long' * k}(retry_s=300)" for k in range(1, 7)]
-    figure = draw_time_distribution({"mini": {name: np.array([30.0, 40.0]) for name in names}})
-    figure.draw_without_rendering()
-    (legend,), width = figure.legends, figure.bbox.width
-    assert 0.0 <= legend.get_window_extent().x0 < legend.get_window_extent().x1 <= width
-
-
 def test_lines_against_occupancy_are_labelled_where_they_end(tmp_path):
     levels = (0.5, 0.8, 0.95)
     rows = [row(name, drive=d * o, occupancy=o) for name, d in (("mdp", 30), ("oracle", 20)) for o in levels]
@@ -182,33 +170,6 @@ def test_the_path_is_numbered_and_the_policy_drawn_where_there_is_one():
     assert marks["greedy-goal"] == 0
 
 
-def test_a_search_that_gave_up_or_never_moved_is_drawn(tmp_path):
-    scenario = make_scenario("mini")
-    n, entry = scenario.lot.n_slots, int(scenario.lot.entry_vertices[0])
-    metrics = dict.fromkeys(("drive_s", "failed_s", "walk_s", "parking_cost_s"), 0.0) | {
-        "total_s": 1800.0, "gave_up_s": 1800.0, "parked": False,
-    }  # fmt: skip
-    still = replace(
-        trace("random", scenario), path=[entry], occupied=np.ones(n, bool), policy=None, metrics=metrics
-    )
-    save_picture(draw_searches([still]), tmp_path / "search.png")
-    picture(tmp_path / "search.png")
-    ax = axes()
-    draw_search(still, ax)
-    assert "1800 give-up penalty" in ax.get_title(loc="left").replace("\n", " ")
-
-
-@pytest.mark.parametrize("lot", [grid_lot(12, 3), grid_lot(2, 40)], ids=["high", "wide"])
-def test_titles_fit_lots_of_any_shape(lot):
-    searched = trace("first-free", make_scenario(lot))
-    figure = Figure(figsize=(3, 8) if lot.n_slots == 36 else (9, 3))
-    ax = figure.add_axes((0, 0, 1, 0.8))
-    draw_search(searched, ax)
-    figure.draw_without_rendering()
-    title = ax.get_tightbbox()
-    assert title.x1 <= figure.bbox.x1 + 1
-
-
 @pytest.mark.parametrize("draw", [draw_time_split, draw_time_against_occupancy, draw_searches])
 def test_nothing_to_draw_is_refused(draw):
     with pytest.raises(InputError, match="no "):
@@ -264,29 +225,6 @@ def test_every_registered_figure_can_be_drawn_and_only_those_are_removed(tmp_pat
     (tmp_path / "map.png").touch()
     remove_figures(tmp_path)
     assert [file.name for file in tmp_path.iterdir()] == ["map.png"]
-
-
-def test_the_fastest_agent_and_belief_are_among_the_searches_drawn(monkeypatch):
-    names = ["greedy-goal", "random", "mdp-static", "first-free", "mdp-tuned", "belief", "oracle"]
-    mini = make_scenario("mini")
-    cases = [(Case(mini, name), range(1)) for name in names]
-    table = [row(name, scenario="mini", drive=10.0 if name == "mdp-tuned" else 30.0) for name in names]
-    monkeypatch.setattr(comparison_figures, "draw_searches", lambda records: [its.agent for its in records])
-    drawn = comparison_figures.searches(ComparisonResults(cases, {}, table))
-    assert [agents for *_, agents in drawn] == [["greedy-goal", "mdp-tuned", "belief", "oracle"]]
-
-
-def test_a_single_search_has_no_band():
-    ax = axes()
-    rows = [
-        row("mdp", occupancy=o) | {"total_s_ci95": ci}
-        for o, ci in ((0.5, [None, None]), (0.8, [80.0, 110.0]))
-    ]
-    time_figures._draw_lines(
-        ax, [*rows, row("mdp", occupancy=0.9)], 200.0, lambda row: 100.0 * row["occupancy"]
-    )
-    (band,) = ax.collections
-    assert min(path.vertices[:, 0].min() for path in band.get_paths()) == 80.0
 
 
 def test_only_asked_for_figures_are_drawn(tmp_path):

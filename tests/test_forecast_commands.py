@@ -76,17 +76,6 @@ def test_a_fit_states_day_errors_drift_and_faults(tmp_path):
     assert summary["typical_week"] is None, "60 days are too few"
 
 
-@pytest.mark.slow  # fits the model of days, too
-def test_a_fit_of_half_a_year_has_the_week(tmp_path):
-    counts = write(tmp_path / "counts.csv", 160)
-    assert parkenv("occupancy", "fit", counts, "--out", tmp_path / "out").stderr == ""
-    week = summary_of(tmp_path / "out")["typical_week"]
-    assert len(week["occupied"]) == 7
-    assert {len(day) for day in week["occupied"]} == {24}
-    assert week["levels"]["0.5"] == pytest.approx(0.0, abs=1e-9)
-    assert week["day_error"] == pytest.approx(0.4, abs=0.2)
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -9,11 +9,8 @@ from pathlib import Path
 import gymnasium as gym
 import numpy as np
 import pytest
-from chromium import SOCKETS, every, one, painted, screen
+from chromium import SOCKETS, screen
 from command_line import ran, refused, summary_of
-from selenium.webdriver.common.action_chains import ActionChains
-from selenium.webdriver.common.keys import Keys
-from selenium.webdriver.support.ui import WebDriverWait
 from test_search_reference import SENSORS, random_scenario
 from timetable_world import Timetable
 
@@ -202,23 +199,6 @@ def test_damaged_scores_are_refused(scores, tmp_path, change, field):
         make_agent(saved(changed(scores, **change), tmp_path), make_scenario("mini"))
 
 
-MOVES = [Keys.ARROW_UP, Keys.ARROW_DOWN, Keys.ARROW_LEFT, Keys.ARROW_RIGHT]
-
-
-def steps(page):
-    """Steps of the search so far, once the car stands."""
-    canvas = one(page, "#lot")
-    return int(WebDriverWait(page, 60).until(lambda _: canvas.get_attribute("data-steps")))
-
-
-def results(page):
-    """Rows of the table of worlds."""
-    return [
-        [cell.text for cell in row.find_elements("css selector", "th, td")]
-        for row in every(page, "#result tbody tr")
-    ]
-
-
 def test_the_page_searches_as_python_does(browser, game):
     screen(browser, 1280, 800)
     browser.get(game.as_uri())
@@ -228,73 +208,4 @@ def test_the_page_searches_as_python_does(browser, game):
         [[w, its[0]] for w, its in searches],
     )
     require_equal(searches, found)
-    assert browser.get_log("browser") == []
-
-
-def touch(page, *points):
-    """A finger goes down at the first point, moves through the others, and goes up."""
-    for kind, at in zip(["touchStart", *["touchMove"] * len(points[1:])], points, strict=True):
-        page.execute_cdp_cmd(
-            "Input.dispatchTouchEvent", {"type": kind, "touchPoints": [{"x": at[0], "y": at[1]}]}
-        )
-    page.execute_cdp_cmd("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
-
-
-def on_canvas(page, place):
-    corner, (x, y) = one(page, "#lot").rect, page.execute_script("return game.toPixels(arguments[0])", place)
-    return corner["x"] + x, corner["y"] + y
-
-
-def button(page, css):
-    box = one(page, css).rect
-    assert box["height"] >= 44
-    touch(page, (box["x"] + box["width"] / 2, box["y"] + box["height"] / 2))
-
-
-@pytest.mark.slow
-def test_keys_and_fingers_play_on_a_phone_and_python_counts_the_scores(browser, game, tmp_path):
-    screen(browser, 390, 844, dark=True)
-    browser.execute_cdp_cmd("Emulation.setTouchEmulationEnabled", {"enabled": True})
-    browser.get(game.as_uri())
-    data = data_of(game)
-    lot, worlds = data["problem"]["lot"], data["worlds"]
-    *moves, _ = worlds[0]["actions"][1]
-    for n, action in enumerate(moves, start=1):
-        ActionChains(browser).send_keys(MOVES[int(action)]).perform()
-        assert steps(browser) == n
-    ActionChains(browser).send_keys(" ").perform()
-    WebDriverWait(browser, 60).until(lambda _: one(browser, "#result").is_displayed())
-    assert [name.text for name in every(browser, "#result .who")] == ["you", "belief", "oracle"]
-    assert results(browser)[0][1] == results(browser)[0][3], "the oracle's actions were repeated"
-    assert painted(browser, "#lot") > 20
-    for number, world in list(enumerate(worlds))[1:]:
-        button(browser, "#result .first")
-        # A drag forward, up on the screen in this lot, drives one step; then a tap drives to the oracle's slot.
-        assert not one(browser, "#park").is_enabled()
-        touch(browser, (195, 400), (195, 370))
-        assert steps(browser) == 1
-        end = browser.execute_script(
-            "return game.take(arguments[0], arguments[1]).vertex", number, world["actions"][1]
-        )
-        corners = lot["slots"][end]
-        touch(browser, on_canvas(browser, [(corners[0] + corners[4]) / 2, (corners[1] + corners[5]) / 2]))
-        assert steps(browser) > 1
-        assert lot["slot_ids"][end] in one(browser, "#park").text
-        # It may be taken by now: then it takes another attempt.
-        while not one(browser, "#result").is_displayed():
-            before = steps(browser)
-            button(browser, "#park")
-            WebDriverWait(browser, 60).until(lambda _, before=before: steps(browser) > before)
-        assert browser.execute_script("return document.documentElement.scrollWidth") <= 390
-    rows = results(browser)
-    assert [row[0] for row in rows] == ["1", "2", "3", "Mean"]
-    # The file that the page saves is a row of a comparison.
-    browser.execute_script(
-        "URL.createObjectURL = (blob) => { blob.text().then((text) => { window.saved = text; }); return '#'; }"
-    )
-    button(browser, "#result .go .first")
-    scores = tmp_path / "scores.json"
-    scores.write_text(browser.execute_script("return window.saved"))
-    human = compared(f"oracle,human:{scores}", tmp_path / "out", "--occupancy-levels", "none")["rows"][1]
-    assert rows[-1][1] == f"{human['total_s']:.1f}"
     assert browser.get_log("browser") == []

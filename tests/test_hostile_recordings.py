@@ -79,13 +79,6 @@ def test_a_packed_file_grows_a_hundredfold_at_most(tmp_path):
         sizes(path)
 
 
-def test_chunks_that_overlap_in_time_are_held_up_to_a_limit(tmp_path, monkeypatch):
-    monkeypatch.setattr(recordings, "MAX_MERGED_BYTES", 2 * LARGE)
-    assert sizes(bag(tmp_path / "later", stamps=(1, 2, 3, 4))) == [LARGE] * 4
-    with pytest.raises(InputError, match="overlap in time"):
-        sizes(bag(tmp_path / "alike", stamps=(1, 1, 1, 1)))
-
-
 @pytest.mark.parametrize("name", ["a.mcap", "a.db3", "a.bag", "bag/bag.mcap", "bag/metadata.yaml"])
 def test_a_pipe_is_not_waited_for(tmp_path, name):
     path = tmp_path / name

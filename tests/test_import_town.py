@@ -10,9 +10,9 @@ from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from made_maps import AISLE, FREIBURG, SERVICE, SPACE, STREET, Map
-from parking_rules import fit_kerbs, kerb_table
 from scipy.sparse.csgraph import dijkstra
 
+from benchmarks.parking_rules import fit_kerbs, kerb_table
 from parkenv import make_scenario
 from parkenv.lots import import_town, read_lot, write_lot
 from parkenv.lots.infer.network import limit_junctions

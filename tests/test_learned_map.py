@@ -1,7 +1,5 @@
 """A map that learns from trips: what observations say about its error, trips in the map file, and their forecast."""
 
-import sqlite3
-
 import gymnasium as gym
 import numpy as np
 import pytest
@@ -12,7 +10,7 @@ from parkenv.forecast.logistic_normal import EVEN
 from parkenv.forecast.map_error import Evidence, MapError, MapErrorPrior
 from parkenv.mapping.inference import MapPrior, SessionLog
 from parkenv.mapping.learned_map import GIVEN_MAP, NO_MAP, EmptyMap, LearnedMap, map_prior
-from parkenv.mapping.store import VERSION, MapStore
+from parkenv.mapping.store import MapStore
 from parkenv.mapping.trips import DayMemory, Trip, state_likelihoods
 from parkenv.studies.episodes import TripRecorder
 from parkenv.world.occupancy.process import Arrival, Forecast
@@ -318,16 +316,6 @@ def test_sessions_forecast_new_days_better_than_their_counts(name, n):
     assert log_loss(map_prior(log, (), walk), new_days) < log_loss(MapPrior(log), new_days)
 
 
-def test_more_sessions_make_a_surer_map():
-    scenario = make_scenario("campus")
-    walk, levels = scenario.lot.walk_m(scenario.goal), []
-    for n in (1, 4, 12):
-        forecast = map_prior(surveyed(scenario, range(n)), (), walk).forecast(MORNING)
-        levels.append(forecast.day_error.level)
-    # What is left is the day's own error.
-    assert levels[0] > levels[1] > levels[2] > 0.8
-
-
 def test_trips_correct_what_sessions_said():
     log = SessionLog(np.full(3, 9 * HOUR_S), np.zeros((3, 4), bool), np.ones((3, 4), bool))
     walk = np.arange(4.0)
@@ -344,23 +332,6 @@ def test_large_lots_count_their_sessions_and_an_empty_map_is_refused():
     empty = SessionLog(np.empty(0), np.empty((0, 4), bool), np.empty((0, 4), bool))
     with pytest.raises(InputError, match="the map holds no session"):
         map_prior(empty, (), np.arange(4.0))
-
-
-def test_map_files_of_version_1_are_read_and_gain_trips(tmp_path):
-    lot, path = make_scenario("mini").lot, tmp_path / "map.sqlite"
-    MapStore(path, lot).close()
-    with sqlite3.connect(path) as db:
-        db.executescript("DROP TABLE observation; DROP TABLE trip; PRAGMA user_version = 1")
-    db.close()
-    with MapStore(path, lot, create=False) as store:
-        assert store.trips() == []
-    with MapStore(path, lot) as store:
-        store.add_trip(trip("a", 0, [1], [True]))
-    with MapStore(path, lot, create=False) as store:
-        assert [one.key for one in store.trips()] == ["a"]
-    with sqlite3.connect(path) as db:
-        assert db.execute("PRAGMA user_version").fetchone() == (VERSION,)
-    db.close()
 
 
 def test_wrong_trips_and_maps_are_refused():

@@ -228,16 +228,6 @@ def test_the_fullest_log_slots_stand_nearest_to_the_goal():
         assert replayed == log.occupied[looks & (log.second >= arrival.time)].tolist()
 
 
-def test_no_two_slots_of_a_larger_lot_share_a_record():
-    log = random_log(n_slots=4)
-    model = RecordedOccupancy(log, np.arange(13.0))
-    for day in MONDAYS:
-        mapped = model.mapped_log(day)
-        assert len(set(mapped.record.tolist())) == 13
-        assert np.bincount(mapped.log_slot).tolist().count(3) == 3
-        assert len(mapped.held_out) == 4
-
-
 def test_a_day_on_which_a_slot_was_not_seen_is_passed_over():
     log = random_log(n_slots=2, days=MONDAYS)
     seen = ~((log.slot == 1) & (log.day == 0))

@@ -1,24 +1,16 @@
 """`benchmarks/run.py`: its rows, and that the peers do the same job."""
 
-import itertools
 import json
 import subprocess
 import sys
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 import pytest
 
-from benchmarks import env, fleet, planning, sensors, town
+from benchmarks import env, fleet, planning, sensors
 from benchmarks import sumo_days as sumo
-from parkenv import make_scenario
-from parkenv.engine.fleet import DriverKind, Fleet
-from parkenv.lots import city_lot, grid_lot
-from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
-from planners.heuristics import POLICIES
-from planners.thesis.label_repair import repair
-from planners.thesis.label_setting import StoppingGraph, set_labels
+from parkenv.lots import grid_lot
 from sim_sensors.laser.scanner import LaserScanner
 
 PROGRAM = Path(__file__).parents[1] / "benchmarks" / "run.py"
@@ -96,15 +88,6 @@ def test_peers_measure_what_the_laser_measures(scanner, tolerance):
     np.testing.assert_array_equal(peer(poses), np.concatenate([peer(pose[None]) for pose in poses]))
 
 
-def test_a_peer_that_sees_something_else_is_not_compared(monkeypatch):
-    def blind(plane, laser):
-        return lambda poses: np.zeros((len(poses), laser.n_beams))
-
-    monkeypatch.setattr(sensors, "pymunk_scanner", blind)
-    with pytest.raises(AssertionError, match="pymunk segment_query_first differs from the laser on 100%"):
-        sensors.laser_rows(seconds=0.0)
-
-
 def test_solvers_are_given_the_same_process():
     mdp = planning.forecast_process(grid_lot(2, 6), 0)
     p = planning.transitions(mdp)
@@ -113,98 +96,3 @@ def test_solvers_are_given_the_same_process():
     values = np.random.default_rng(0).normal(size=n)
     ahead = (p @ np.append(values, 0.0))[:-1].reshape(n, 5)
     np.testing.assert_allclose(mdp.rewards() + mdp.gamma * ahead, mdp.action_values(values))
-
-
-def test_the_measured_drive_ends_and_sees_each_slot_once():
-    lot = grid_lot(4, 10)
-    mdp = planning.forecast_process(lot, 0)
-    graph = StoppingGraph.of(mdp)
-    for seed in range(5):
-        labels = set_labels(graph, mdp.p_free.copy())
-        seen = []
-        for slot, p_free in planning.drive(graph, labels, lot.n_slots, np.random.default_rng(seed)):
-            seen.append(int(slot[0]))
-            repair(graph, labels, slot, p_free)
-        assert len(seen) == len(set(seen)) > 0
-
-
-STREET = make_scenario("street")
-
-
-def test_streets_hold_every_slot_once_and_have_the_lengths_of_the_lot():
-    lot = STREET.lot
-    streets = sumo.streets_of(lot)
-    slots = [slot for street in streets for slot, _ in street.slots]
-    assert sorted(slots) == list(range(lot.n_slots))
-    assert sum(street.length for street in streets) == pytest.approx(
-        lot.edge_length[lot.neighbors >= 0].sum()
-    )
-    for street in streets:
-        along = [at for _, at in street.slots]
-        assert along == sorted(along)
-        assert all(0.0 < at < street.length for at in along)
-        assert min(street.start, street.end) >= lot.n_slots
-
-
-def test_sumo_gets_the_cars_of_the_fleet_and_its_stops_are_read(monkeypatch):
-    demand = Demand(PoissonArrivals(60.0, 8 * 3600, 9 * 3600), ExponentialTime(3600.0))
-    kind = DriverKind(policy=POLICIES["greedy-drive"])
-    fleet = Fleet(STREET, demand, background="none", drivers=[kind], leave_full_lot=False)
-    fleet.reset(0)
-    arrival_s = fleet.cars["arrival"] - fleet.begin
-    seen = {}
-
-    def run(command):
-        """Stand for SUMO: every car but the last stops a minute after its departure."""
-        options = {str(a): Path(b) for a, b in itertools.pairwise(command)}
-        for option in ("-n", "-e", "-x", "-a", "-r"):
-            if option in options and options[option].exists():
-                seen[options[option].name] = ElementTree.parse(options[option]).getroot()
-        if "--stop-output" in options:
-            root = ElementTree.Element("stops")
-            for trip in seen["trips.rou.xml"].findall("trip")[:-1]:
-                started = str(float(trip.get("depart")) + 60.0)
-                ElementTree.SubElement(root, "stopinfo", {"id": trip.get("id"), "started": started})
-            ElementTree.ElementTree(root).write(options["--stop-output"])
-        return ""
-
-    monkeypatch.setattr(sumo, "_run", run)
-    day = sumo.run_sumo(fleet, Path("/nowhere"), 1.0, 7200.0)
-    np.testing.assert_allclose(day.search_s[:-1], 60.0, atol=1e-3)
-    assert np.isnan(day.search_s[-1])
-    edges = {edge.get("id") for edge in seen["lot.edg.xml"]}
-    nodes = {node.get("id") for node in seen["lot.nod.xml"]}
-    assert {edge.get(end) for edge in seen["lot.edg.xml"] for end in ("from", "to")} <= nodes
-    turns = {(turn.get("from"), turn.get("to")) for turn in seen["lot.con.xml"]}
-    assert turns == {(a, b) for a in edges for b in edges if a.split("-")[1] == b.split("-")[0]}
-    areas = {area.get("id"): area for area in seen["parking.add.xml"].findall("parkingArea")}
-    assert len(areas) == STREET.lot.n_slots
-    assert {area.get("lane").removesuffix("_0") for area in areas.values()} <= edges
-    for street in sumo.streets_of(STREET.lot):
-        (places,) = seen["parking.add.xml"].findall(f"rerouter[@edges='{street.name}']/interval")
-        assert len(places) == min(sumo.ALTERNATIVES, len(areas))
-        # The nearest come first: those of the street itself, in their order.
-        names = [place.get("id") for place in places]
-        assert names[: len(street.slots)] == [f"slot{slot}" for slot, _ in street.slots]
-    trips = seen["trips.rou.xml"].findall("trip")
-    assert len(trips) == len(fleet.cars)
-    for trip, car, arrival in zip(trips, fleet.cars, arrival_s, strict=True):
-        assert float(trip.get("depart")) == pytest.approx(arrival, abs=1e-3)
-        assert float(trip.find("stop").get("duration")) == pytest.approx(car["stay_s"], abs=1e-3)
-        assert trip.get("from").startswith(f"{car['entry']}-")
-        assert areas[trip.find("stop").get("parkingArea")].get("lane") == f"{trip.get('to')}_0"
-
-
-def test_a_district_of_counted_kerbs_keeps_its_spaces_and_its_garage():
-    blocks = town.blocks_of(town.with_garage(city_lot(200, 1), 30))
-    assert blocks.capacity.sum() == 230
-    assert blocks.is_counted.all()
-    assert blocks.capacity[-1] == 30
-    streets = sumo.streets_of(blocks)
-    assert sorted(slot for street in streets for slot, _ in street.slots) == list(range(blocks.n_slots))
-    assert len({street.name for street in streets}) == len(streets)
-    slot = np.array([blocks.n_slots - 1, blocks.n_slots - 1, -1])
-    began, left = np.array([0.0, 50.0, np.nan]), np.array([100.0, np.inf, np.nan])
-    share = sumo.ParkedDay(began, slot, began, left, 0.0).parked_share(blocks.capacity, 100.0)
-    assert share[-1] == 1.5 / 30
-    assert not share[:-1].any()

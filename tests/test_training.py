@@ -5,7 +5,6 @@ import json
 import math
 import pathlib
 import pickle
-import resource
 import shutil
 import tempfile
 import zipfile
@@ -17,7 +16,6 @@ import pytest
 import torch
 from command_line import parkenv
 from gymnasium.vector import AutoresetMode
-from pictures import shows_color
 from sb3_contrib import MaskablePPO
 from small_trainings import make_small, search_training, stop_training
 from stable_baselines3 import DQN, PPO
@@ -31,13 +29,11 @@ from parkenv.envs.search_vector import ParkSearchVectorEnv
 from parkenv.errors import InputError
 from parkenv.files.spec_file import read_tables
 from parkenv.scenarios.spec import scenario_spec
-from parkenv.show.figures.learning_curves import COLORS, save_learning_curves
 from parkenv.studies.compare.cases import Case
 from parkenv.studies.study import schemas
-from parkenv.studies.training.checkpoint import save_checkpoint
 from parkenv.studies.training.cloning import Demonstrations, clone
 from parkenv.studies.training.configs import MAX_STEPS, SEARCH_CONFIGS
-from parkenv.studies.training.curve_file import across_seeds, read_curve
+from parkenv.studies.training.curve_file import read_curve
 from parkenv.studies.training.evaluation import episode_times
 from parkenv.studies.training.spec import TrainingSpec
 from parkenv.studies.training.training import TRAINING_SEEDS, Training
@@ -397,24 +393,6 @@ def test_a_checkpoint_that_does_not_fit_is_refused(checkpoint, keys, value, want
         training.train(0, path.parent)
 
 
-def test_checkpoints_and_models_on_a_full_disk_are_named(checkpoint, tmp_path):
-    training, _ = checkpoint
-    model = PPO("MultiInputPolicy", training.make_env(4), n_steps=8, batch_size=16)
-    model.env.reset()
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (3_000, limits[1]))
-    try:
-        for save in (
-            lambda: save_checkpoint(tmp_path / "a.pt", model, []),
-            lambda: save_model(model, tmp_path / "a.safetensors"),
-        ):
-            with pytest.raises(InputError, match="cannot be written: File too large"):
-                save()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert not list(tmp_path.glob("*.part")) + list(tmp_path.glob("a.*"))
-
-
 def test_a_damaged_checkpoint_is_refused(checkpoint):
     training, path = checkpoint
     data = bytearray(path.read_bytes())
@@ -446,42 +424,8 @@ def test_a_mask_that_allows_nothing_is_refused(trained):
         agent.predict(observation)
 
 
-@pytest.mark.parametrize("algorithm", ["ppo", "maskable-ppo", "recurrent-ppo", "dqn"])
-def test_short_trainings_have_smaller_batches(algorithm):
-    usual = SEARCH_CONFIGS[algorithm]
-    short = usual.for_steps(30_000)
-    assert usual.for_steps(2_000_000) is usual
-    if algorithm == "dqn":
-        assert short is usual
-    else:
-        size = short.settings["batch_size"] / short.n_envs
-        assert size == usual.settings["batch_size"] / usual.n_envs
-        assert 30_000 / (short.n_envs * short.settings["n_steps"]) >= 12
-
-
 def test_every_algorithm_has_a_recipe():
     assert SEARCH_CONFIGS.keys() == ALGORITHMS.keys()
-
-
-def test_curves_are_drawn_over_the_seeds_that_there_are(tmp_path):
-    curves = [
-        [
-            {"steps": 0, "total_s": 900.0},
-            {"steps": 10, "total_s": 90.0 + k},
-            {"steps": 20, "total_s": 80.0 + k},
-        ]
-        for k in range(3)
-    ]
-    rows = across_seeds([*curves[:2], curves[2][:2]])
-    assert [row["steps"] for row in rows] == [0, 10]
-    assert rows[1]["total_s"] == rows[1]["median_s"] == pytest.approx(91.0)
-    for name, some, planners in (
-        ("curve.png", curves, {"mdp": 85.0, "belief": 84.9}),
-        ("one.png", [[curves[0][0]]], {}),
-    ):
-        means = {"ppo": across_seeds(some)}
-        save_learning_curves({"ppo": some}, means, planners, "a title", tmp_path / name)
-        assert shows_color(tmp_path / name, COLORS[0])
 
 
 # One on-policy algorithm and one with a replay buffer; `test_resumed_trainings` stops each kind.
@@ -536,17 +480,6 @@ def curves_beside(folders, out):
         beside=tuple(folders),
     )  # fmt: skip
     return Training(spec).curves_beside(out)
-
-
-def test_trainings_are_set_beside_each_other_by_what_tells_them_apart(tmp_path):
-    folders = [
-        training_in(tmp_path / "dqn"),
-        training_in(tmp_path / "again", algorithm="ppo"),
-        training_in(tmp_path / "cloned", algorithm="ppo", clone="mdp"),
-    ]
-    beside = curves_beside(folders, tmp_path / "own")
-    assert list(beside) == ["dqn", f"ppo ({folders[1]})", "ppo after cloning mdp"]
-    assert beside["dqn"] == [[{"steps": 0, "total_s": 300.0}, {"steps": 10, "total_s": 90.0}]]
 
 
 def test_a_specification_in_a_file_is_the_same(tmp_path):
@@ -617,13 +550,6 @@ def test_trainings_that_cannot_be_compared_are_refused(tmp_path, changed, spoil,
         spoil(tmp_path / "other")
     with pytest.raises(InputError, match=wanted):
         curves_beside([folder], tmp_path / "own")
-
-
-def test_a_training_is_drawn_once(tmp_path):
-    folder = training_in(tmp_path / "other")
-    for folders, own in (([folder, f"{folder}/../other"], "own"), ([folder], "other")):
-        with pytest.raises(InputError, match="is already drawn"):
-            curves_beside(folders, tmp_path / own)
 
 
 def test_what_is_refused_leaves_the_folder_as_it_was(tmp_path):

@@ -7,16 +7,12 @@ from functools import lru_cache
 
 import numpy as np
 import pytest
-from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from parkenv import InputError, make_scenario
 from parkenv.compiled.keyed_random import world_key
-from parkenv.driving.collision_world import ObstacleKind
 from parkenv.driving.driven_lines import KEPT_RIGHT_M, DrivenLines
-from parkenv.driving.encounters import PREDICTION_TIMES_S
-from parkenv.driving.road_users import CLEAR_RADIUS_M, RoadUsers
 from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters, advance
 from parkenv.envs.search import SearchEnv
 from parkenv.lots import packaged_lot
@@ -29,12 +25,9 @@ from parkenv.studies.trips.calibration import calibrate
 from parkenv.studies.trips.calibration_study import CalibrationStudy
 from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
 from parkenv.studies.trips.executor import (
-    ACROSS,
-    ALONG,
     NO_ROOM,
     OBSERVED,
     TAKEN,
-    TURN,
     UNOBSERVED,
     ParkingAttempt,
 )
@@ -134,17 +127,6 @@ def test_every_edge_lies_on_a_line_that_keeps_right_and_is_as_long_as_the_graph_
             if vertex < lot.n_slots and not edge.across:
                 assert math.cos(pose[2] - lot.vertex_yaw[vertex]) > 0.99
     assert (across > 0) == (name != "street"), "two-way lanes with slots on both sides have them"
-
-
-def test_a_line_is_beside_its_lane_by_what_cars_keep_to_the_right():
-    lot, lines = lines_of("campus")
-    points = lot.lanes[0].points
-    there, back = lines.lines[0], lines.lines[1]
-    np.testing.assert_allclose(there.points[:, 1], points[:, 1] - KEPT_RIGHT_M)
-    np.testing.assert_allclose(back.points[:, 1], points[::-1, 1] + KEPT_RIGHT_M)
-    assert there.pose(there.length + 5.0)[0] == pytest.approx(points[-1, 0] + 5.0), (
-        "straight on beyond its end"
-    )
 
 
 @given(
@@ -350,51 +332,6 @@ def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, c
     assert lost > 0.0
 
 
-class StandingTraffic:
-    """One car across the lane of a car that drives east from the origin, which waits for that for ever."""
-
-    outlines = ((ObstacleKind.MOVING_CAR, np.array([[2.0, 0.9], [-2.0, 0.9], [-2.0, -0.9], [2.0, -0.9]])),)
-    corners = outlines[0][1][None]
-
-    def __init__(self, x):
-        self.at = np.array([[x, 0.0, 0.5 * math.pi]])
-
-    def poses(self, clocks):
-        return np.repeat(self.at, len(clocks), axis=0)
-
-    def advance_clocks(self, clocks, seconds, car):
-        del seconds, car
-        return clocks
-
-
-def test_who_gives_way_is_out_of_sight_until_the_car_has_gone():
-    others = RoadUsers(StandingTraffic(5.0), CAR)
-    own = np.column_stack(
-        [
-            np.linspace(0.0, 3.0, len(PREDICTION_TIMES_S)),
-            np.zeros(len(PREDICTION_TIMES_S)),
-            np.zeros(len(PREDICTION_TIMES_S)),
-        ]
-    )
-    when = others.encounter_times(own)
-    reached = own[:, 0] + 0.5 * CAR.length > 5.0 - 0.9 - 0.05
-    assert when[0] == PREDICTION_TIMES_S[reached.argmax()]
-    assert np.isinf(others.encounter_times(own - np.array([1.2, 0.0, 0.0]))), "it would stop short of it"
-    assert np.isinf(others.encounter_times(own + np.array([9.0, 0.0, 0.0]))), "it has passed it"
-    others.hide_standing(np.array([True]))
-    assert np.isinf(others.encounter_times(own))
-    assert np.isnan(others.clocks).all()
-    seen = []
-    for x in np.arange(0.0, 30.0, 0.5):
-        others.advance(0.1, CAR.corners(np.array([x, 0.0, 0.0])))
-        middle = x + CAR.middle
-        there = bool(np.isfinite(others.clocks).all())
-        assert there == (np.abs(others.poses[0, 0]) < 100.0)
-        seen.append((there, abs(middle - 5.0)))
-    assert all(there == (away >= CLEAR_RADIUS_M) for there, away in seen)
-    assert {there for there, _ in seen} == {True, False}
-
-
 def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
     search = DrivenSearch(busy("mini", 1, 1), rig="laser", weather="sunny", captures=1)
     driver, met = search.driver, []
@@ -417,58 +354,6 @@ def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
 
     search.run(1, [Calling(keep)])
     assert checked > 0
-
-
-def test_straight_on_the_car_drives_at_the_limit_and_slower_where_that_is_lower():
-    fast, _, _ = started("campus", style=DrivingStyle(speed=4.0))
-    slow, _, _ = started("campus", style=DrivingStyle(speed=2.0))
-    lot = fast.scenario.lot
-    v = int(lot.entry_vertices[0])
-    c = int(np.flatnonzero(lot.neighbors[v] >= 0)[0])
-    # The driver decides before the junction, so less than the whole edge is driven.
-    assert slow.drive(v, c) == pytest.approx(2.0 * fast.drive(v, c), rel=0.1)
-    assert fast.log.legs[0].kind == ALONG
-    assert fast.state[SPEED] == pytest.approx(4.0, abs=0.1)
-    junction = int(lot.neighbors[v, c])
-    away = next(
-        c for c in range(4) if lot.neighbors[junction, c] >= lot.n_slots and lot.neighbors[junction, c] != v
-    )
-    before = fast.time
-    fast.drive(junction, away)
-    assert fast.log.legs[-1].kind == TURN
-    assert fast.log.legs[-1].graph_m / (fast.time - before) < 4.0, "turning is slower"
-    assert not fast.log.contacts
-
-
-@pytest.mark.slow
-def test_crossing_a_lane_costs_nothing_before_one_drives_on_from_there():
-    driver, _, _ = started("mini")
-    lot = driver.scenario.lot
-    v = int(lot.entry_vertices[0])
-    c = int(np.flatnonzero(lot.neighbors[v] >= 0)[0])
-    driver.drive(v, c)
-    slot = int(lot.neighbors[v, c])
-    lines = DrivenLines(lot)
-    over = next(
-        c
-        for c in range(4)
-        if lot.neighbors[slot, c] >= 0
-        and lines.edge(slot, int(lot.neighbors[slot, c]), float(lot.edge_length[slot, c])).across
-    )
-    yaw = driver.state[2]
-    assert driver.drive(slot, over) == 0.0
-    opposite = int(lot.neighbors[slot, over])
-    onward = next(
-        c
-        for c in range(4)
-        if lot.neighbors[opposite, c] >= 0
-        and not lines.edge(
-            opposite, int(lot.neighbors[opposite, c]), float(lot.edge_length[opposite, c])
-        ).across
-    )
-    assert driver.drive(opposite, onward) > 5.0
-    assert [leg.kind for leg in driver.log.legs] == [ALONG, ACROSS, "round"]
-    assert abs(math.remainder(driver.state[2] - yaw, 2 * math.pi)) > 2.0
 
 
 def first_slot(driver):
@@ -604,23 +489,3 @@ def test_trips_are_gone_on_with_where_they_were_left(tmp_path):
         run(study, tmp_path)
     with pytest.raises(InputError, match="agent was 'mdp' in"):
         run(study.changed(agent="belief"), tmp_path, resume=True)
-
-
-@pytest.mark.slow
-def test_the_commands_calibrate_and_compare(tmp_path):
-    out, compared = tmp_path / "calibrate", tmp_path / "compare"
-    done = parkenv("calibrate", "--scenario", "mini", "--episodes", 3, "--seed", 0, "--out", out)
-    assert done.returncode == 0, done.stderr
-    summary = json.loads((out / "summary.json").read_text())
-    made = Calibration.from_file(out / "calibrated.json")
-    assert summary["calibrated"] == dataclasses.asdict(made)
-    assert (out / "calibration_mini.png").stat().st_size > 10_000
-    assert 5.0 < made.failure_s < 40.0
-    measured = f"--calibrated {out / 'calibrated.json'} --occupancy-levels none -n 4 --no-figures"
-    done = parkenv(f"compare --scenario mini --agents mdp,greedy-goal {measured} -j 1 --out", compared)
-    assert done.returncode == 0, done.stderr
-    rows = json.loads((compared / "summary.json").read_text())["rows"]
-    assert [r["failure_cost_s"] for r in rows] == [10.0, 10.0, made.failure_s, made.failure_s]
-    assert {r["agent"] for r in rows[2:]} == {"mdp", "greedy-goal"}
-    refused = parkenv(f"compare --scenario campus {measured} --out", tmp_path / "x")
-    assert "was measured on 'mini'" in refused.stderr

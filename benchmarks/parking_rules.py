@@ -1,6 +1,6 @@
 """Fit the rules by which a town has places where its map says none, and state their errors.
 
-`python tests/parking_rules.py NEUKOELLN_FOLDER [EXTRACT.osm.pbf ...]`
+`python benchmarks/parking_rules.py NEUKOELLN_FOLDER [EXTRACT.osm.pbf ...]`
 
 The folder holds the parking of Berlin-Neukölln (ODbL) as GeoJSON: `parking_way` (kerbs with capacities),
 `streets_processed_epsg25833` (street lines) and `parking_area`; extracts of OpenStreetMap add car parks with
