@@ -19,12 +19,8 @@ from planners.network.features import IS_SLOT, LOOKAHEAD, WAITING
 from planners.network.policy import NetworkCard, NetworkPolicy
 
 SCENARIOS, FILE = ("mini", "campus"), "network.safetensors"
-DECISIONS, EPOCHS, BATCH, RATES = (
-    2_000,
-    8,
-    256,
-    (2e-3, 1e-3),
-)  # decisions of each round; learning rate of each
+DECISIONS, EPOCHS, BATCH = 2_000, 8, 256  # decisions of each round
+RATES = (2e-3, 1e-3)  # learning rate of each round
 LONGEST = 200  # decisions of a search: longer ones drive in circles in a full lot
 EXPLORATION = 0.15  # probability of a random move where the teacher drives
 SHARPNESS = 20.0  # inverse temperature of the teacher's choice: a twentieth of the time is clearly worse

@@ -174,7 +174,7 @@ def test_a_lone_search_goes_on_to_the_next_best_place_as_often_as_one_is_full(be
         *[car] * 3, np.ones(1), np.full(1, 900.0), np.zeros((1, 1)), 1.0, 1.0, np.array([believed]),
         full=np.array([[0.5, 0.2]]), inside_s=np.array([[3.0, 0.0]]), entry_drive_s=np.array([[10.0, 12.0]]),
         drive_s=np.array([[0.0, 13.0], [8.0, 0.0]]), walk_s=np.array([[10.0, 40.0]]),
-        enter_s=np.zeros(2), size=places + 1, zone=places, area=places,
+        enter_s=np.zeros(2), size=places + 1, zone=places,
     )  # fmt: skip
     np.testing.assert_allclose(found[:, 0], expected)
 

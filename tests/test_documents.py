@@ -110,7 +110,7 @@ FEWER = {
     r"range\(1, 31\)": "range(1, 11)",
     r"(ROUNDS, DAYS, HOURS) = .*": r"\1 = 2, 1, '10:00-10:30'",
     r"DECISIONS, TASKS = 20_000, 50": "DECISIONS, TASKS = 1_100, 2",
-    r"(DECISIONS, EPOCHS, BATCH, RATES) = 2_000, 8": r"\1 = 50, 2",
+    r"(DECISIONS, EPOCHS, BATCH) = 2_000, 8": r"\1 = 50, 2",
     r"WORLDS = 40": "WORLDS = 2",
     r"model.learn\(4_096\)\n    observations": "model.learn(1_024)\n    observations",
 }

@@ -170,10 +170,6 @@ def test_what_is_too_large_or_uncertain_is_refused_with_the_limit():
         ExactSolution(problem, p, entry, most_states=500)
     with pytest.raises(InputError, match="want 12 probabilities"):
         ExactSolution(problem, p[:3], entry)
-    with pytest.raises(InputError, match="without errors"):
-        expected_time(
-            make_agent("belief", problem), problem.replace(sensor_model=SensorModel(hit_rate=0.9)), p, entry
-        )
 
 
 def test_it_goes_on_from_what_it_knows():

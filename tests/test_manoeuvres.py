@@ -259,7 +259,6 @@ def test_a_bad_scene_is_one_line_and_nothing_is_written(name, tmp_path):
         (("--levels", "parallel-extrem"), "parallel-extreme"),
         (("--levels", "all", "--cases", "."), "exclude each other"),
         (("--levels", "all", "--vehicle", "tank"), "tank"),
-        (("--levels", "all", "--agents", "magic"), "magic"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(options, said, tmp_path):
