@@ -1,6 +1,6 @@
 """Learn to drive into a slot: SAC with hindsight experience replay on `parkenv/Drive-v1`, the planner beside it.
 
-`python examples/train_drive.py` trains on an easy task, a start up to 4 m outside a perpendicular slot. A curriculum
+`python examples/train_drive.py` trains for some minutes on an easy task, a start up to 4 m outside a slot. A curriculum
 goes on from there: larger `DISTANCE`, then `starts="lane"`, then the other kinds of slots. That takes hundreds of
 thousands of decisions, and parallel slots stay hard; the planner parks in all of them.
 """
