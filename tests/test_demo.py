@@ -27,7 +27,7 @@ def test_a_quick_demo_leaves_a_report_and_a_film_and_says_where(tmp_path):
     assert all(row["regret_s"] >= -1e-6 for row in summary["rows"])
     for name in ("lot.png", "report.html", "search.gif"):
         assert str(out / name) in done.stdout
-    assert done.stdout.count("\n  parkenv ") == 3, "commands to try next"
+    assert done.stdout.count("\n  parkenv ") == 2, "commands to try next"
     page = (out / "report.html").read_text()
     assert page.count("<figure") == len(list(out.glob("*.png"))) == 6
     assert '"drives":[{' in page

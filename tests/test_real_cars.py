@@ -14,6 +14,7 @@ from parkenv.perception.detection_scores import recall_on_crops, score_on
 from parkenv.perception.hog import Descriptor
 from parkenv.perception.training import TrainingSettings, train
 
+BLOCKS = 20
 DATA = Path(__file__).parents[2] / "shared" / "data"
 UIUC, KITTI = DATA / "uiuc_cars_train", DATA / "kitti_crops" / "vehicles_and_background.zip"
 
@@ -34,8 +35,12 @@ def uiuc(tmp_path_factory):
 
 
 def halves(crops):
-    """Two sets of crops; consecutive ones, often of the same car, are in the same half but at the middle."""
-    parts = [(images[: len(images) // 2], images[len(images) // 2 :]) for images in vars(crops).values()]
+    """Two sets of blocks of consecutive crops, drawn at random: crops of the same car are in the same set."""
+    of_block = np.random.default_rng(0).permutation(np.arange(BLOCKS) % 2)
+    parts = []
+    for images in vars(crops).values():
+        half = of_block[np.arange(len(images)) * BLOCKS // len(images)]
+        parts.append([[image for image, h in zip(images, half, strict=True) if h == part] for part in (0, 1)])
     return [Crops(*half) for half in zip(*parts, strict=True)]
 
 
