@@ -141,8 +141,8 @@ class Run(RunCommand, ExecutionSpec):
     """Settings that the file omits have the defaults of its command.
 
     The result folder keeps a copy, experiment.json, for `parkenv report` and `--resume`. The key `kind` selects the
-    command: compare (the default), commute, fleet, curve, demand, benchmark, survey, detectors, demo, calibrate,
-    train or park (scenes).
+    command: compare (the default), commute, fleet, curve, demand, benchmark, survey, demo, calibrate, train
+    or park (scenes).
     """
 
     examples = """

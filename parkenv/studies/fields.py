@@ -204,7 +204,6 @@ Detector = Annotated[
 Figures = Annotated[bool, Field(description="Draw figures."), Option(panel="Results")]
 
 
-ArrivalRate = Annotated[float, Field(gt=0.0, le=1e6)]
 _Stay = Annotated[float, Field(ge=1.0, le=1e7)]  # s
 MeanStay = Annotated[
     _Stay,

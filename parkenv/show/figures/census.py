@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
 import numpy as np
-from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
-from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.picture_files import picture
 from parkenv.show.plurals import plural
 
 KIND_COLORS = {"perpendicular": "#0072b2", "oblique": "#e69f00", "kerbside": "#009e73", "mixed": "#8c8c8c"}
@@ -40,8 +38,10 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
 
     low, high = np.floor(np.log2(slots.min())), np.ceil(np.log2(slots.max() + 1))
     edges = 2.0 ** np.arange(low, high + 1e-9, 1 / _EDGES_AN_OCTAVE)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(10.5, 3.4), layout="constrained")
+    caption = (
+        f"{plural(len(rows), 'lot')}: sizes, kinds of slots, drive times at 10 km/h, error probabilities."
+    )
+    with picture(path, (10.5, 3.4), caption) as figure:
         size, kind, drive, error = figure.subplots(1, 4, width_ratios=(1.2, 0.9, 1.3, 0.9))
         size.hist(by_kind("slots"), edges, stacked=True, color=colors, edgecolor="white", linewidth=0.4)
         size.set_xscale("log", base=2)
@@ -76,8 +76,3 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
         figure.legend(handles=handles, title="lots that are", loc="outside lower center", ncols=len(handles))
         for ax in (size, drive, error):
             ax.grid(visible=True, axis="y")
-        save_picture(
-            figure,
-            path,
-            f"{plural(len(rows), 'lot')}: sizes, kinds of slots, drive times at 10 km/h, error probabilities.",
-        )

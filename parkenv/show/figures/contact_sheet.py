@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from parkenv.show.figures.lot import ENTRY, GOAL, GROUND, INK
-from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.picture_files import picture
 from parkenv.show.figures.schematic import ONE_WAY, TWO_WAY, schematic
 from parkenv.show.painters.axes import paint
 from parkenv.world.lot import ParkingLot
@@ -54,8 +52,7 @@ def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path)
     shown = lots[:LARGEST]
     columns = min(COLUMNS, max(len(shown), 1))
     rows = -(-len(shown) // columns)
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(WIDTH * columns, HEIGHT * rows + KEY))
+    with picture(path, (WIDTH * columns, HEIGHT * rows + KEY), layout=None) as figure:
         grid = figure.subplots(rows, columns, squeeze=False)
         for ax in grid.flat[len(shown) :]:
             ax.remove()
@@ -76,7 +73,6 @@ def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path)
             Line2D([], [], color=ONE_WAY, label="one-way lane"),
         ]
         figure.legend(handles=handles, loc="lower center", ncols=4 if columns > 2 else 2, fontsize=9)
-        save_picture(figure, path)
 
 
 def _draw_lot(ax: Axes, lot: ParkingLot) -> None:

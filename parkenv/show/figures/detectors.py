@@ -5,17 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib as mpl
-from matplotlib.figure import Figure
-
 from parkenv.perception.detection_scores import TestSetScore
-from parkenv.show.figures.picture_files import STYLE, save_picture
+from parkenv.show.figures.picture_files import picture
 
 
 def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
     """Plot recall against 1 - precision, as in the papers on UIUC's sets."""
-    with mpl.rc_context(STYLE):
-        figure = Figure(figsize=(5.4, 4.4))
+    with picture(path, (5.4, 4.4), layout=None) as figure:
         ax = figure.subplots()
         for score in scores:
             label = f"{score.row['test_set']}-scale: equal error at {score.row['eer']:.1%}"
@@ -24,4 +20,3 @@ def save_curves(scores: Sequence[TestSetScore], title: str, path: Path) -> None:
         ax.set(xlim=(0.0, 0.3), ylim=(0.7, 1.005), xlabel="1 - precision", ylabel="recall", title=title)
         ax.legend(loc="lower right")
         figure.tight_layout()
-        save_picture(figure, path)
