@@ -24,11 +24,7 @@ def needs_extra(what: str, extra: str) -> str:
 
 @contextmanager
 def with_extra(what: str, extra: str) -> Iterator[None]:
-    """Import packages of an extra in the block.
-
-    Raises:
-        InputError: one is not installed; the message says what needs the extra, and how to install it.
-    """
+    """Import packages of an extra in the block."""
     try:
         yield
     except ImportError as error:
@@ -58,9 +54,6 @@ def require_number(
 ) -> None:
     """Check that a value is a number within bounds, each of which may be absent.
 
-    Raises:
-        InputError: it is no number, not finite or out of bounds.
-
     Examples:
         >>> require_number("every", -1.0, above=0.0)
         Traceback (most recent call last):
@@ -84,11 +77,7 @@ def require_number(
 
 
 def require_whole(name: str, value: Any, *, least: int = 0, most: int | None = None) -> None:
-    """Check that a value is a whole number of at least `least` and, unless that is None, at most `most`.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Check that a value is a whole number of at least `least` and, unless that is None, at most `most`."""
     good = isinstance(value, Integral) and not _is_flag(value)
     if not good or value < least or (most is not None and value > most):
         wanted = f"of at least {least}" if most is None else f"from {least:,} to {most:,}"
@@ -96,21 +85,13 @@ def require_whole(name: str, value: Any, *, least: int = 0, most: int | None = N
 
 
 def require_one_of(name: str, value: object, known: Collection[object]) -> None:
-    """Check that a value is one of those known.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Check that a value is one of those known."""
     if value not in known:
         raise InputError(f"{name} is {value!r:.60}, want one of {', '.join(map(str, known)) or 'none'}")
 
 
 def reset_options(options: object, known: Collection[str]) -> dict[str, Any]:
-    """Return the options of a call of `reset` by name; None stands for no options.
-
-    Raises:
-        InputError: it is no dictionary, or an option is unknown.
-    """
+    """Return the options of a call of `reset` by name; None stands for no options."""
     if options is None:
         return {}
     if not isinstance(options, Mapping):

@@ -204,9 +204,6 @@ def agent_options(name: str) -> tuple[str, ...]:
     Args:
         name: a name that `make_agent` accepts.
 
-    Raises:
-        InputError: an unknown name.
-
     Examples:
         >>> agent_options("exact")
         ('most_states',)

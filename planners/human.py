@@ -42,9 +42,6 @@ class HumanAgent(SearchAgent[Iterator[int]]):
 
     It recognises a world by what every agent observes at the reset: time and entry.
 
-    Raises:
-        InputError: the file is damaged, or from a game in another scenario.
-
     Attributes:
         totals: total time, s, by seed, as the page says.
     """

@@ -23,9 +23,6 @@ class LearnedAgent:
         algorithm: algorithm that it was trained with.
         path: the model file.
 
-    Raises:
-        InputError: the file is not a model, or is one of another algorithm or observation.
-
     Attributes:
         card: metadata of the file.
         model: the policy.
@@ -49,11 +46,7 @@ class LearnedAgent:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[Any, Any]:
-        """Choose an action for an observation of `LocalObservation`, as stable-baselines3 does.
-
-        Raises:
-            InputError: the observation has another layout, or its mask allows no action.
-        """
+        """Choose an action for an observation of `LocalObservation`, as stable-baselines3 does."""
         if "local" not in observation:
             raise InputError(
                 f"{self.name} wants observations of parkenv.envs.local_observation.LocalObservation, "

@@ -51,11 +51,7 @@ class BoxSpace(Spec):
 
     @classmethod
     def of(cls, space: spaces.Space[Any]) -> Self:
-        """Describe a space.
-
-        Raises:
-            InputError: the space is of another kind.
-        """
+        """Describe a space."""
         if not isinstance(space, spaces.Box):
             raise InputError(f"the model has a space {space}, want boxes of numbers")
         low, high = (
@@ -154,11 +150,7 @@ class ModelCard(_WithNulls):
 
 
 def algorithm_class(name: str) -> Any:
-    """Return the stable-baselines3 class of an algorithm.
-
-    Raises:
-        InputError: the name is unknown, or the extra `rl` is not installed.
-    """
+    """Return the stable-baselines3 class of an algorithm."""
     if name not in ALGORITHMS:
         raise InputError(f"unknown algorithm {name!r}; known: {', '.join(ALGORITHMS)}")
     module, class_name = ALGORITHMS[name]
@@ -224,11 +216,7 @@ def save_model(
 
 
 def slots_observed(space: spaces.Space[Any]) -> int:
-    """Return k of a model's observation space.
-
-    Raises:
-        InputError: it is of another observation.
-    """
+    """Return k of a model's observation space."""
     shape = space["local"].shape if isinstance(space, spaces.Dict) and "local" in space.spaces else None
     if not shape:
         raise InputError("the model does not observe `local`")
@@ -241,9 +229,6 @@ def load_model(algorithm: str, path: str | os.PathLike[str]) -> tuple[ModelCard,
     Args:
         algorithm: algorithm that it was trained with.
         path: the model file.
-
-    Raises:
-        InputError: the file is not a model, or is one of another algorithm or observation.
     """
     data = read_bytes(Path(path), _MAX_BYTES)
     card = ModelCard._of_bytes(data, path)
@@ -295,9 +280,6 @@ def convert_archive(algorithm: str, path: str | os.PathLike[str]) -> Path:
 
     Returns:
         The model file, `NAME.safetensors`.
-
-    Raises:
-        InputError: the archive cannot be read, the model does not fit, or the model file exists.
     """
     made = Path(path).with_suffix(SUFFIX)
     if made.exists():

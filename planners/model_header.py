@@ -31,9 +31,6 @@ def read_header(data: bytes, path: str | os.PathLike[str]) -> ModelHeader:
     Args:
         data: content of the file.
         path: its name, for messages.
-
-    Raises:
-        InputError: the content is not that of a safetensors file, or has no card.
     """
     size = int.from_bytes(data[:8], "little")
     if data[8:9] != b"{" or size > min(_MAX_HEADER, len(data) - 8):

@@ -100,9 +100,6 @@ class Neighborhoods:
     Args:
         problem: lot, goal and speeds.
         most_vertices: maximum size of a subgraph; lots up to this size are one neighbourhood.
-
-    Raises:
-        InputError: `most_vertices` is too small, or too large for a table.
     """
 
     def __init__(self, problem: SearchProblem, most_vertices: int = MOST_VERTICES) -> None:

@@ -67,11 +67,7 @@ class RoadTable:
             self._ready = n, end
 
     def move(self, vertex: int, target: int) -> int:
-        """Return the first move of a shortest route.
-
-        Raises:
-            InputError: no route leads to the target, or the car is there already.
-        """
+        """Return the first move of a shortest route."""
         following = int(self.following[vertex, target])
         if following < 0:
             raise InputError(f"no route leads from vertex {vertex} to vertex {target}")

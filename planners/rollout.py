@@ -105,9 +105,6 @@ class RolloutAgent(ModelAgent):
         ahead: decisions of `belief` in a simulated search; 0: to its end.
         seed: of the worlds.
         any_day: whether the worlds may be of days unlike their forecast, see `parkenv.engine.model.Model`.
-
-    Raises:
-        InputError: an option out of its range.
     """
 
     name: ClassVar[str] = "rollout"

@@ -58,11 +58,7 @@ class DriveRoutes:
         return np.flatnonzero(slots & (seconds[: len(slots)] == least)), least
 
     def move_toward(self, vertex: int, target: int) -> int:
-        """Return the first move of a shortest route.
-
-        Raises:
-            InputError: no route leads to the target, or the car is there already.
-        """
+        """Return the first move of a shortest route."""
         moves = self._moves.setdefault(target, {})
         self._moves.move_to_end(target)
         if len(self._moves) > _KEPT_TARGETS:
@@ -80,11 +76,7 @@ class DriveRoutes:
         return tuple(v for _, v in self.hops(vertex, target))
 
     def hops(self, vertex: int, target: int) -> Iterator[tuple[int, int]]:
-        """Yield the moves of a shortest route and the vertices that they lead to; nothing if the car is already there.
-
-        Raises:
-            InputError: no route leads to the target.
-        """
+        """Yield the moves of a shortest route and the vertices that they lead to; nothing at the target."""
         while vertex != target:
             move = self.move_toward(vertex, target)
             vertex = int(self._neighbors[vertex, move])

@@ -19,11 +19,7 @@ LOOKS = 12  # number of different pedestrians
 
 @dataclass(frozen=True, eq=False)
 class Movers:
-    """Moving vehicles and pedestrians at one moment; world frame.
-
-    Raises:
-        SensorError: a shape is wrong, a value is not finite, or an index is out of range.
-    """
+    """Moving vehicles and pedestrians at one moment; world frame."""
 
     # (m, 3): x, y in m, yaw in rad
     vehicle_pose: FloatArray = field(default_factory=lambda: np.empty((0, 3)))

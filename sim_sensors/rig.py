@@ -270,9 +270,6 @@ def poses_along(path: ArrayLike, every: float) -> FloatArray:
 
     Returns:
         (n, 3) float64, x, y, yaw.
-
-    Raises:
-        SensorError: the path has the wrong shape, is not finite or has no length, or the distance is not positive.
     """
     points = np.asarray(path, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 2 or not np.isfinite(points).all():

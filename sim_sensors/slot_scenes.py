@@ -263,9 +263,6 @@ def scene_of_slots(
         manners: distribution of parking poses.
         surroundings: fields of `Surroundings`: walls, buildings, trees and so on.
 
-    Raises:
-        SensorError: as for `SlotLot` and `Surroundings`.
-
     Examples:
         >>> scene = scene_of_slots([[0, 0], [2.5, 0]], [1.57, 1.57], 5.0, 2.5, np.array([True, False]))
         >>> scene.present.tolist(), len(scene.ground.markings)

@@ -29,11 +29,7 @@ class Standing(NamedTuple):
 
 
 def floats(name: str, value: ArrayLike, columns: int) -> FloatArray:
-    """Return `value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape.
-
-    Raises:
-        SensorError: the shape differs, or a value is not finite.
-    """
+    """Return `value` as a finite, read-only (n, columns) float64 array; an empty one may have any shape."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:

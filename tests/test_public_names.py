@@ -1,10 +1,13 @@
 """What `import parkenv` gives, and what it leaves alone."""
 
+import inspect
+import pydoc
 import re
 import subprocess
 import sys
 import tomllib
 from pathlib import Path
+from types import FunctionType
 
 import pytest
 
@@ -12,6 +15,7 @@ import parkenv
 from parkenv.lots.local_frame import LocalFrame
 
 ROOT = Path(__file__).parents[1]
+REFERENCE = "\n".join(page.read_text(encoding="utf-8") for page in (ROOT / "docs").rglob("*.md"))
 PAGE = (ROOT / "docs" / "api" / "index.md").read_text(encoding="utf-8")
 
 
@@ -20,6 +24,17 @@ def test_public_names_are_those_of_the_page_and_exist():
     assert set(re.findall(r"`(\w+)`", listed)) == set(parkenv.__all__) == set(parkenv._EXPORTS)
     for name in parkenv.__all__:
         assert getattr(parkenv, name).__name__ == name
+
+
+@pytest.mark.parametrize("name", re.findall(r"^::: (\S+)", REFERENCE, re.M))
+def test_the_reference_documents_every_member(name):
+    thing = pydoc.locate(name)
+    own = vars(thing).items() if inspect.isclass(thing) else ()
+    methods = [
+        m for m, what in own if isinstance(what, FunctionType | classmethod | property) and m[0] != "_"
+    ]
+    assert inspect.getdoc(thing)
+    assert [member for member in methods if not inspect.getdoc(getattr(thing, member))] == []
 
 
 def test_import_changes_no_signal_handler_and_loads_no_study():

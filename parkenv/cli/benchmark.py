@@ -54,7 +54,6 @@ class Check(Command):
     results: Several[Path] = option(..., "Result files.", takes="FILE", argument=True)
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.studies.benchmark.result_file import check_result
 
         console = make_console()
@@ -85,7 +84,6 @@ class Page(Command):
     out: Path = option(Path("results/benchmark.html"), "The page.", short="-o", takes="FILE.html")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.show.report.page import write_page
         from parkenv.studies.benchmark.page import benchmark_data, result_files
@@ -109,7 +107,6 @@ class Show(Command):
     suite: Literal["v3"] = option("v3", "The suite.", argument=True)
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.studies.benchmark.suite import Suite
 
         suite = Suite.packaged()

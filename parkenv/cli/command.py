@@ -177,7 +177,6 @@ class _CommandPage(_Page, TyperCommand):
 
     @property
     def text(self) -> str:
-        """See `_Page`."""
         return f"{self.help}\n\n{inspect.cleandoc(self.command_class.__doc__ or '')}".strip()
 
     @property

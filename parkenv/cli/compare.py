@@ -147,7 +147,6 @@ class Plan(Command):
     out: Path = option(Path("results/plan"), "Folder for plan.png and summary.json.", short="-o")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.scenarios.build import build
         from parkenv.show.figures.picture_files import save_picture

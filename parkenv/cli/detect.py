@@ -70,7 +70,6 @@ class Detect(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.studies.sensing.detection_run import find_cars
 
         console = make_console()
@@ -176,7 +175,6 @@ class TrainDetector(Command):
         return self
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import check_writable
         from parkenv.perception.car_regions import END, SIDE
         from parkenv.perception.hog import Descriptor
@@ -264,7 +262,6 @@ class EvaluateDetector(Command):
         return self
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.perception.car_datasets import read_crop_folder
         from parkenv.perception.detection_scores import recall_on_crops, score_on_uiuc

@@ -127,7 +127,6 @@ class Park(StudyCommand):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         if self.study.cases is not None or self.study.levels is not None:
             self.run_study()
         else:

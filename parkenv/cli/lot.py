@@ -73,7 +73,6 @@ class Show(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.lots import load_lot
         from parkenv.show.figures.lot import save_lot_picture
 
@@ -106,7 +105,6 @@ class Check(Command):
     drive: bool = option(True, "Plan how the car drives into each kind of slot.")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.lots import check_lot, read_lot
         from parkenv.lots.lot_files import lot_format
         from parkenv.studies.lots.drivability import check_drivability
@@ -300,7 +298,6 @@ class Import(Command):
         )
 
     def run(self) -> None:
-        """See `Command`."""
         if self.split:
             with writing_into(self.out):
                 self._import_car_parks()
@@ -407,7 +404,6 @@ class Census(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.studies.lots.census import take_census
 
         with stages(make_console(soft_wrap=True), "lots") as progress:
@@ -435,7 +431,6 @@ class Convert(Command):
     out: Path = option(..., "Lot file to write.", short="-o", takes="FILE.geojson")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.lots import load_lot, write_lot
 
         write_lot(load_lot(self.lot), self.out)

@@ -84,7 +84,6 @@ class Fit(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.forecast.counts import Counts, is_counts
         from parkenv.studies.occupancy import fit_counts, fit_log
@@ -137,7 +136,6 @@ class Evaluate(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.forecast.counts import Counts, is_counts
         from parkenv.studies.occupancy import evaluate_counts, evaluate_log
@@ -228,7 +226,6 @@ class Record(Command):
     out: Path = option(..., "The log, .csv or .csv.gz.", short="-o", takes="FILE")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import check_writable
         from parkenv.studies.fleet.recorded_days import record_days
 

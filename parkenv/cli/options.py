@@ -41,11 +41,7 @@ class Command(Spec):
 
     @classmethod
     def of(cls, given: Given) -> Self:
-        """Make the command from what was given.
-
-        Raises:
-            InputError: a value cannot be used, or options exclude each other; the message names the options.
-        """
+        """Make the command from what was given."""
         return made(cls, given)
 
     @abstractmethod
@@ -142,11 +138,7 @@ class FieldOption:
         return ",".join(_shown(part) for part in (value if isinstance(value, tuple) else (value,)))
 
     def value(self, given: Any) -> object:
-        """Convert what was given.
-
-        Raises:
-            InputError: the text has another form; the message names the option.
-        """
+        """Convert what was given."""
         if self.is_switch:
             return given
         try:
@@ -201,9 +193,6 @@ def made(model: type[SpecT], given: Given, base: SpecT | None = None) -> SpecT:
         model: its class.
         given: what was given, by option.
         base: what to change; without it, what is not given has its default.
-
-    Raises:
-        InputError: a value cannot be used, or options exclude each other; the message names the options.
     """
     chosen: dict[tuple[str, ...], FieldOption] = {}
     for option in field_options(model if base is None else type(base)):

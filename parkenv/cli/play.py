@@ -43,7 +43,6 @@ class Play(Command):
     out: Path = option(Path("results/play.html"), "The page.", short="-o", takes="FILE.html")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.scenarios.build import build
         from parkenv.show.report.page import write_game

@@ -36,7 +36,6 @@ class Report(Command, ExecutionSpec, ReportOptions):
     trust: Trust = False
 
     def run(self) -> None:
-        """See `Command`."""
         make_report(self.folder, self, self, out=self.out, trust=self.trust)
 
 
@@ -58,10 +57,6 @@ def make_report(
         out: the page; None for `report.html` in the folder.
         stage: what the progress bar says.
         trust: run the classes that the run names, without asking.
-
-    Raises:
-        InputError: the folder holds no finished run of this version, not the chosen searches, or names classes that
-            are not trusted.
     """
     from parkenv.studies.report import RunFolder, write_report
 

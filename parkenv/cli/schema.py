@@ -27,7 +27,6 @@ class Schema(Command):
     out: Path | None = option(None, "Folder for all schemas, KIND.schema.json.", short="-o", default="none")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
 
         if self.kind is not None and self.kind not in KINDS:

@@ -52,7 +52,6 @@ class Preview(Command):
     out: Path = option(Path("results/sensors"), "Folder for the pictures and drive.gif.", short="-o")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.sensor_preview import preview_sensors
 
@@ -97,7 +96,6 @@ class FitSensorModel(Command, ExecutionSpec):
     out: Path = option(Path("sensor_model.json"), "The file to write.", short="-o", takes="FILE.json")
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.sensor_model_fit import AGENTS, measure_sensors

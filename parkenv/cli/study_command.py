@@ -44,11 +44,7 @@ class StudyCommand(RunCommand):
 
     @classmethod
     def of(cls, given: Given) -> Self:
-        """See `Command`: options change the study, which with --resume is the one in the folder.
-
-        Raises:
-            InputError: see `Command`; or the folder holds no run to resume, or is not trusted.
-        """
+        """See `Command`: options change the study, which with --resume is the one in the folder."""
         options = [option for option in field_options(cls) if option.name in given]
         command = made(cls, {option.name: given[option.name] for option in options if len(option.path) == 1})
         study, file = command.study, (command.out or Path()) / SPEC_FILE
@@ -66,7 +62,6 @@ class StudyCommand(RunCommand):
         return made(cls, {name: given[name] for name in inner}, command.changed(study=study))
 
     def run(self) -> None:
-        """See `Command`."""
         self.run_study()
 
     def run_study(self) -> Result:
@@ -115,7 +110,6 @@ class AgentStudyCommand(StudyCommand):
 
     @classmethod
     def of(cls, given: Given) -> Self:
-        """See `StudyCommand`."""
         if "--agents" in given and "--trust-model" in given:
             given = {**given, "--agents": ",".join(readable_models(split_agents(given["--agents"])))}
         return super().of(given)

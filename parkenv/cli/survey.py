@@ -111,7 +111,6 @@ class MapDrive(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.mapping.drive_calibration import DriveCalibration
         from parkenv.scenarios.build import build
         from parkenv.studies.sensing.recorded_session import add_recording
@@ -158,7 +157,6 @@ class Map(Command):
     )
 
     def run(self) -> None:
-        """See `Command`."""
         from parkenv.files.atomic_write import make_folder
         from parkenv.files.csv_tables import write_csv
         from parkenv.mapping.inference import predict

@@ -178,11 +178,7 @@ def _show_compiling(progress: Progress, ended: Event) -> None:
 
 @contextmanager
 def writing_into(out: Path) -> Iterator[None]:
-    """Be the only writer of a folder; say so after an interruption.
-
-    Raises:
-        InputError: the folder cannot be made or written, or another process writes into it.
-    """
+    """Be the only writer of a folder; say so after an interruption."""
     from parkenv.files.folder_lock import only_writer
 
     try:

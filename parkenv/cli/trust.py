@@ -44,9 +44,6 @@ def require_trust(spec: Spec, source: Path, trust: bool, given: Collection[str] 
         source: the file or folder, for the message.
         trust: the value of `--trust`.
         given: fields of the specification that the command line replaces.
-
-    Raises:
-        InputError: it names some and is not trusted; the message lists them, classes with their files.
     """
     from parkenv.files.user_class import find_module
     from parkenv.studies.agent_spec import classes_in
@@ -69,9 +66,6 @@ def readable_models(agents: Sequence[str]) -> list[str]:
 
     Args:
         agents: names or `ALGORITHM:FILE`.
-
-    Raises:
-        InputError: an archive cannot be converted.
     """
     from planners.names import ALGORITHMS
 

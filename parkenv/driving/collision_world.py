@@ -38,11 +38,7 @@ _OTHERS = 1  # group of all other shapes, which are not checked against each oth
 
 @dataclass(frozen=True, eq=False)
 class Obstacles:
-    """Static obstacles around a car; world frame.
-
-    Raises:
-        InputError: shapes that do not fit together, or a value that is not finite.
-    """
+    """Static obstacles around a car; world frame."""
 
     # (n, k_max, 2) float64, m: convex outlines; a line has two corners. Outlines with fewer corners are padded with
     # their last corner.

@@ -34,9 +34,6 @@ class Crossing:
         way: (2, 2) m, where it starts and ends; it stands there before and after.
         speed: m/s.
         begins_s: when it sets off, s.
-
-    Raises:
-        InputError: a value that is not finite or out of its range.
     """
 
     kind: str

@@ -107,9 +107,6 @@ class DrivenLines:
             source: vertex where it starts.
             target: vertex where it ends.
             length: its length in the graph, m.
-
-        Raises:
-            InputError: no line leads to the target.
         """
         ends = self._on_lines(target)
         along = [

@@ -51,11 +51,7 @@ _TRIES = 1_000
 
 
 def level_scene(level: str, seed: int, vehicle: VehicleParameters | None = None) -> Scene:
-    """Draw a scene of a level, one of `SCENE_LEVELS`; equal seeds give equal scenes.
-
-    Raises:
-        InputError: there is no such level.
-    """
+    """Draw a scene of a level, one of `SCENE_LEVELS`; equal seeds give equal scenes."""
     if level not in SCENE_LEVELS:
         raise InputError(f"level is {level!r:.60}; {nearest(level, SCENE_LEVELS)}")
     vehicle = vehicle or VehicleParameters()

@@ -40,11 +40,7 @@ _ARRIVALS = 16  # number of different cars and poses per slot
 
 @dataclass(frozen=True, eq=False)
 class ParkingTask:
-    """A slot to park in, the obstacles around it, and the start of the car; public to agents.
-
-    Raises:
-        InputError: a slot that the car does not fit into, or a start that is not finite.
-    """
+    """A slot to park in, the obstacles around it, and the start of the car; public to agents."""
 
     vehicle: VehicleParameters  # the car
     lot: str  # the lot's name
@@ -342,11 +338,7 @@ class ParkingTasks:
 
 
 def require_room(vehicle: VehicleParameters, size: tuple[float, float], what: str) -> None:
-    """Check that a car fits into a slot.
-
-    Raises:
-        InputError: a length or width of the slot that is not finite, or less than the car's.
-    """
+    """Check that a car fits into a slot."""
     for name, own, needed in (("long", size[0], vehicle.length), ("wide", size[1], vehicle.width)):
         if not (math.isfinite(own) and own >= needed):
             raise InputError(f"{what} is {own:g} m {name}, want at least {needed:g} m, the size of the car")

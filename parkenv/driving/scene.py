@@ -50,10 +50,6 @@ class Scene:
         bounds: least x and y and greatest x and y, m, that the footprint may reach; None for no limits.
         origin: (2,) m, of the scene's coordinates in those of its file.
         crossings: road users that cross it.
-
-    Raises:
-        InputError: values that are not finite, too many points, a polygon that crosses itself, or a contact at the
-            start or the target.
     """
 
     name: str

@@ -29,11 +29,7 @@ PARKBENCH_STEP_M = 0.1
 
 
 def vehicle_of(given: object, folder: str | Path = ".") -> VehicleParameters:
-    """Return a car by its name in `VEHICLES`, from a file, or from its table, where the default car's values stand in.
-
-    Raises:
-        InputError: there is no such car or file, or a value is out of its range; the message names the file.
-    """
+    """Return a car by its name in `VEHICLES`, from a file or a table; missing values are the default car's."""
     if isinstance(given, VehicleParameters):
         return given
     if isinstance(given, str | Path):
@@ -92,11 +88,7 @@ class SceneSpec(Spec):
 
 
 def scene_files(path: str | Path) -> list[Path]:
-    """Return a scene file, or those in a folder in the order of their names.
-
-    Raises:
-        InputError: there is none, or two have the same name but for their suffix.
-    """
+    """Return a scene file, or those in a folder in the order of their names."""
     path = Path(path)
     if not is_there(path):
         raise InputError(f"{path}: is not there, want a scene file or a folder with some")
@@ -123,9 +115,6 @@ def read_scene(path: str | Path, vehicle: VehicleParameters | None = None) -> Sc
     Args:
         path: the file.
         vehicle: the car; None for the one of the file, or else the one that goes with its format.
-
-    Raises:
-        InputError: the file cannot be read or holds no valid scene; the message names it.
     """
     path = Path(path)
     with naming(path):

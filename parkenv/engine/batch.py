@@ -154,24 +154,20 @@ class BeliefObserver(Observer):
             self.seen[name] = getattr(self.searches, name).reshape(len(self.searches.records), -1)
 
     def renew(self) -> None:
-        """See `Observer`."""
         if self._memory.renew():
             self._moved = True
             self._find_beliefs()
 
     def observations(self) -> dict[str, NDArray[Any]]:
-        """See `Observer`."""
         hand_out, beliefs = self._memory.hand_out, self._beliefs
         return {name: hand_out(name) if name in beliefs else seen.copy() for name, seen in self.seen.items()}
 
     def set_state(self, state: tuple[NDArray[Any], ...]) -> None:
-        """See `Observer`."""
         self.renew()
         super().set_state(state)
         self._memory.forget()
 
     def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
-        """See `Observer`."""
         self._memory.begin(fresh)
         vertex, time = self.seen["vertex"], self.seen["time"]
         step_with_belief(self.address, self._moved, actions, fresh, idle, limit, steps, vertex, time)
@@ -187,7 +183,6 @@ class LocalObserver(Observer):
         super().__init__(tables, n, local_space(k))
 
     def step(self, actions: IntArray, fresh: BoolArray, idle: BoolArray, limit: int, steps: Steps) -> None:
-        """See `Observer`."""
         step_with_surroundings(
             self.address, self._around, actions, fresh, idle, limit, steps, self.seen["local"]
         )

@@ -189,9 +189,6 @@ class NetworkPolicy(CompiledPolicy):
         masked: whether actions that the graph does not have are left out.
         sampled: whether to draw actions from the policy, instead of taking the most probable one.
         name: for tables.
-
-    Raises:
-        InputError: layers that do not fit.
     """
 
     def __init__(

@@ -817,11 +817,7 @@ class Searches:
         return tuple(array[rows] if len(array) else array.copy() for array in parts)
 
     def restore(self, saved: tuple[NDArray[Any], ...]) -> None:
-        """Restore a copy returned by `save` of searches in the same scenarios; records may be given as bytes, uint8.
-
-        Raises:
-            InputError: the number of slots differs.
-        """
+        """Restore a copy returned by `save` of searches in the same scenarios; records may be given as bytes, uint8."""
         records, *arrays = saved
         records = records.view(SEARCH)
         width = int(records["width"][0])

@@ -44,9 +44,6 @@ def make_rig(rig: str | SensorRig | None, scenario: Scenario, picture_width: int
         rig: the rig or its name.
         scenario: defines the default.
         picture_width: px, width of the pictures; None: `PICTURE_WIDTH` for a rig by name, a `SensorRig`'s own.
-
-    Raises:
-        InputError: an unknown name, something else than a rig, or a width below 64.
     """
     rig = scenario.rig if rig is None else rig
     if isinstance(rig, SensorRig):
@@ -76,9 +73,6 @@ class SensorSampler:
         weather: one of `sim_sensors.camera.weather.PRESETS`; None draws one for each world.
         captures: largest number of captures on an edge.
         every: m, least distance between captures on an edge, except for the last one.
-
-    Raises:
-        InputError: an unknown rig or weather, a number outside its range.
     """
 
     def __init__(

@@ -69,9 +69,6 @@ class FlatLayout:
 
     Attributes:
         space: of the vectors, float32.
-
-    Raises:
-        InputError: the observations have a belief, or none of these parts.
     """
 
     def __init__(self, space: spaces.Dict) -> None:
@@ -107,11 +104,7 @@ def _box_of_parts(bounds: Sequence[tuple[float, float]], length: int) -> spaces.
 
 
 def action_number(action: Any) -> int:
-    """Return the number of an action, which may be an array of one as models return it.
-
-    Raises:
-        InputError: none of the five actions.
-    """
+    """Return the number of an action, which may be an array of one as models return it."""
     try:
         number = index(action)
     except TypeError:

@@ -25,9 +25,6 @@ def choose_start(searches: Searches, index: int, episode: int, options: Mapping[
         options: some of `START_OPTIONS`: `place`, name or index of the scenario; `entry`, index among the scenario's;
             `arrival`, s since Monday 00:00 or a text such as "Tue 08:30", on a weekday of the scenario's; one of
             several such days is drawn.
-
-    Raises:
-        InputError: a value out of range, or an entry or arrival of several scenarios without place.
     """
     scenarios, record = searches.scenarios.scenarios, searches.records[index]
     place, names = options.get("place", 0 if len(scenarios) == 1 else None), [one.name for one in scenarios]

@@ -25,9 +25,6 @@ def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]
     """Return the files of a zip archive, by name, at most `most` bytes in all when unpacked.
 
     Sizes are those that the archive claims; the library unpacks no more than that.
-
-    Raises:
-        InputError: not a whole zip archive, encrypted, too large or of too many files; the message starts with `name`.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -47,21 +44,12 @@ def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]
 
 
 def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
-    """Return the arrays of an `.npz` file; see `parse_arrays`.
-
-    Raises:
-        InputError: the file cannot be read, or see `parse_arrays`.
-    """
+    """Return the arrays of an `.npz` file; see `parse_arrays`."""
     return parse_arrays(read_bytes(path), str(path))
 
 
 def parse_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
-    """Return the arrays of `.npz` data, without pickle; sizes are checked before memory is taken.
-
-    Raises:
-        InputError: not an `.npz` file, an array of Python objects, or one that is larger or smaller than its header
-            says; the message starts with `name`.
-    """
+    """Return the arrays of `.npz` data, without pickle; sizes are checked before memory is taken."""
     arrays = {}
     for member, content in parse_zip(data, name).items():
         stream = io.BytesIO(content)

@@ -18,9 +18,6 @@ def atomic_write(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`; it replaces `path` at the end of the block, or is deleted on failure.
 
     The previous file at `path` stays intact until then.
-
-    Raises:
-        InputError: the file cannot be written; the message names it.
     """
     path = Path(path)
     beside = _temporary(path)
@@ -42,11 +39,7 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 @contextmanager
 def write_together(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder in `folder`, whose files move there at the end of the block, or are deleted on failure.
-
-    Raises:
-        InputError: a file cannot be written; the message names it.
-    """
+    """Yield a temporary folder in `folder`; its files move there when the block ends, or are deleted on failure."""
     beside = Path(tempfile.mkdtemp(prefix=".parts-", dir=folder))
     try:
         yield beside
@@ -61,11 +54,7 @@ def write_together(folder: Path) -> Iterator[Path]:
 
 
 def check_writable(path: str | os.PathLike[str]) -> None:
-    """Check that `atomic_write` can write a file, before any work; nothing is left behind, a previous file stays.
-
-    Raises:
-        InputError: the file cannot be written; the message names it.
-    """
+    """Check that `atomic_write` can write a file, before any work; nothing is left behind, a previous file stays."""
     path = Path(path)
     beside = _temporary(path)
     try:
@@ -91,9 +80,6 @@ def append_text(path: Path, text: str, *, sync: bool = True) -> None:
         path: the file.
         text: the text.
         sync: flush it to disk, so that it survives a power failure; otherwise it survives the end of this process.
-
-    Raises:
-        InputError: the file cannot be written, e.g. because the disk is full; the message names it.
     """
     try:
         size = path.stat().st_size
@@ -111,11 +97,7 @@ def append_text(path: Path, text: str, *, sync: bool = True) -> None:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and check that it is writable before any work is done.
-
-    Raises:
-        InputError: the folder cannot be made or written.
-    """
+    """Make a folder for results, and check that it is writable before any work is done."""
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / f".probe.{os.getpid()}"

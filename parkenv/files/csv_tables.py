@@ -103,10 +103,6 @@ def typed_records(
         columns: the columns that it must have, in order; None for any.
         most: maximum size, bytes unpacked.
         whole_lines: leave out a last line without its end, which a crash cut off.
-
-    Raises:
-        InputError: the file cannot be read, has other columns, or a value is not of its column's kind; the message
-            names file, line, column, value, and what was wanted.
     """
     if not path.exists():
         return
@@ -178,9 +174,5 @@ def _is_formula(text: str) -> bool:
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Mapping[str, Any]]) -> None:
-    """Write a CSV file with a header, atomically.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a CSV file with a header, atomically."""
     write_text(path, csv_text(columns, rows, header=True))

@@ -23,9 +23,6 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
     The system releases the lock when this process ends, even by SIGKILL, so a lock cannot be stale. Worker processes do
     not inherit it.
-
-    Raises:
-        InputError: another process holds the lock; the message names the process.
     """
     path = folder / LOCK
     lock = FileLock(path)
@@ -54,11 +51,7 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def only_writer(folder: Path) -> Iterator[None]:
-    """Make a folder, and be its only writer during the block; remove it again if the block leaves it empty.
-
-    Raises:
-        InputError: the folder cannot be made or written, or another process writes into it.
-    """
+    """Make a folder, and be its only writer during the block; remove it again if the block leaves it empty."""
     made = [each for each in (folder, *folder.parents) if not each.exists()]
     make_folder(folder)
     try:

@@ -23,21 +23,12 @@ MAX_PIXELS = 100_000_000
 
 
 def read_image(path: Path) -> Image:
-    """Read an image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped.
-
-    Raises:
-        InputError: the file cannot be read, or see `decode_image`.
-    """
+    """Read an image file as (h, w) grey or (h, w, 3) RGB, uint8; transparency is dropped."""
     return decode_image(read_bytes(path), str(path))
 
 
 def decode_image(data: bytes, name: str) -> Image:
-    """Decode an image as `read_image`; its size is read from its header before memory is taken.
-
-    Raises:
-        InputError: not a whole image, more than 8 bits per channel, or over 100 million pixels; the message starts
-            with `name`.
-    """
+    """Decode an image as `read_image`; its size is read from its header before memory is taken."""
     with _opened(data, name) as image:
         width, height = image.size
         if width * height > MAX_PIXELS:
@@ -82,11 +73,7 @@ def image_text(path: Path, key: str) -> str | None:
 
 
 def images_in(folder: Path) -> list[Path]:
-    """Return the image files in a folder and its subfolders, in natural order of their names.
-
-    Raises:
-        InputError: the folder does not exist or contains no images.
-    """
+    """Return the image files in a folder and its subfolders, in natural order of their names."""
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder")
     files = files_in(folder, SUFFIXES)

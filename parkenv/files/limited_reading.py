@@ -72,12 +72,7 @@ def is_there(path: str | Path) -> bool:
 
 
 def require_file(path: str | Path) -> None:
-    """Check that a path can be opened at once: that it is a file or a folder.
-
-    Raises:
-        InputError: there is none, or it is a pipe or a device: opening a pipe would wait for its writer, reading a
-            terminal for its user.
-    """
+    """Check that a path can be opened at once: that it is a file or a folder."""
     try:
         kind = Path(path).stat().st_mode
     except OSError as error:
@@ -99,9 +94,6 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
 
     What states that it has no bytes is read as empty. Files of /proc state so whatever they hold, and some of them wait
     for news when read, such as /proc/kmsg.
-
-    Raises:
-        InputError: the file cannot be read or unpacked, or more bytes were asked for; the message names it.
     """
     require_file(path)
     try:
@@ -123,31 +115,19 @@ def open_limited(path: str | Path, most: int = MAX_BYTES) -> Iterator[IO[bytes]]
 
 
 def read_bytes(path: str | Path, most: int = MAX_BYTES) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        InputError: see `open_limited`.
-    """
+    """Return the content of a file."""
     with open_limited(path, most) as file:
         return file.read()
 
 
 def read_text(path: str | Path, most: int = MAX_BYTES) -> str:
-    """Return the content of a text file in UTF-8, without its byte order mark.
-
-    Raises:
-        InputError: see `open_limited`, or the file is not UTF-8.
-    """
+    """Return the content of a text file in UTF-8, without its byte order mark."""
     with open_limited(path, most) as file:
         return file.read().decode("utf-8-sig")
 
 
 def read_json(path: str | Path, most: int = MAX_BYTES, *, finite: bool = False) -> Any:
-    """Return the content of a JSON file; see `parse_json`.
-
-    Raises:
-        InputError: the file cannot be read, is too large or is not JSON within the limits; the message names it.
-    """
+    """Return the content of a JSON file; see `parse_json`."""
     return parse_json(read_text(path, most), str(path), finite=finite)
 
 
@@ -158,9 +138,6 @@ def parse_json(text: str | bytes, name: str, *, finite: bool = False) -> Any:
         text: the text, in UTF-8.
         name: of the text, for messages.
         finite: whether to refuse NaN, infinities, and numbers that become one.
-
-    Raises:
-        InputError: the text is anything else; the message starts with `name`.
     """
     data = text.encode() if isinstance(text, str) else text
     _require_short_numbers(data, name)
@@ -176,11 +153,7 @@ def parse_json(text: str | bytes, name: str, *, finite: bool = False) -> Any:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Return the content of a TOML file of at most `MAX_SPEC_BYTES`.
-
-    Raises:
-        InputError: the file cannot be read, is too large, is not TOML, or is nested deeper than `MAX_DEPTH`.
-    """
+    """Return the content of a TOML file of at most `MAX_SPEC_BYTES`."""
     text = read_text(path, MAX_SPEC_BYTES)
     _require_short_numbers(text.encode(), str(path))
     try:
@@ -196,12 +169,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
 
 
 def read_yaml(path: str | Path) -> Any:
-    """Return the content of a YAML file of at most `MAX_SPEC_BYTES` without aliases: what JSON could hold too.
-
-    Raises:
-        InputError: the file cannot be read, is too large, is not YAML, has an alias (which could stand for
-            gigabytes), a date or another special type, or is nested deeper than `MAX_DEPTH`.
-    """
+    """Return the content of a YAML file of at most `MAX_SPEC_BYTES` without aliases: what JSON could hold too."""
     with with_extra(f"{path}: YAML", "osm"):
         import yaml
 
@@ -243,9 +211,6 @@ def read_xml(path: str | Path, root: str, most: int = MAX_BYTES // 4) -> Element
         path: the file.
         root: name of the root, without namespace.
         most: maximum size, bytes; a tree takes some twenty times as much.
-
-    Raises:
-        InputError: the file cannot be read, is too large, declares a document type, or is no XML with this root.
     """
     with naming(path):
         try:
@@ -266,9 +231,6 @@ def csv_rows(
         path: the file, gzipped if its name ends in `.gz`.
         most: maximum size, bytes unpacked.
         whole_lines: leave out a last line without its end, which a crash cut off.
-
-    Raises:
-        InputError: the file cannot be read, is too large or is not CSV; the message names file and line.
     """
     width = 0
     with open_limited(path, most) as file:
@@ -289,11 +251,7 @@ def csv_rows(
 def csv_records(
     path: str | Path, most: int = MAX_BYTES, *, whole_lines: bool = False
 ) -> Iterator[tuple[int, dict[str, str]]]:
-    """Yield the rows of a CSV file below its header, by the header's names, with their line numbers.
-
-    Raises:
-        InputError: see `csv_rows`.
-    """
+    """Yield the rows of a CSV file below its header, by the header's names, with their line numbers."""
     rows = csv_rows(path, most, whole_lines=whole_lines)
     _, header = next(rows, (0, []))
     for line, row in rows:

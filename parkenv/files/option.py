@@ -79,11 +79,7 @@ class Inside:
 
 
 def words_in(text: str) -> list[str]:
-    """Split text at commas.
-
-    Raises:
-        InputError: there is no word.
-    """
+    """Split text at commas."""
     words = [word.strip() for word in text.split(",") if word.strip()]
     if not words:
         raise InputError(f"is {text!r}, want values separated by commas")
@@ -96,9 +92,6 @@ def numbers_in(text: str, count: int | None = None) -> list[float]:
     Args:
         text: the numbers.
         count: how many are wanted, all of them finite; None for any.
-
-    Raises:
-        InputError: the text is something else.
     """
     try:
         numbers = [float(word) for word in text.split(",")]
@@ -113,11 +106,7 @@ def numbers_in(text: str, count: int | None = None) -> list[float]:
 
 
 def seconds_of_minutes(text: str) -> float:
-    """Convert minutes to s.
-
-    Raises:
-        InputError: the text is no number.
-    """
+    """Convert minutes to s."""
     return 60.0 * numbers_in(text, 1)[0]
 
 
@@ -127,9 +116,6 @@ def parse_call(text: str, kind: str = "agent") -> dict[str, Any]:
     Args:
         text: the text.
         kind: what the name is of, for messages.
-
-    Raises:
-        InputError: brackets do not match, or an option has no value.
 
     Examples:
         >>> parse_call("mdp(failure_s=90,solver=policy_iteration)")

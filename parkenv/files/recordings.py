@@ -47,11 +47,7 @@ def is_recording(path: Path) -> bool:
 
 
 def require_rosbags() -> None:
-    """Check that the library rosbags is installed.
-
-    Raises:
-        InputError: it is not; the message says how to install it.
-    """
+    """Check that the library rosbags is installed."""
     with with_extra("a recorded drive", "bags"):
         import rosbags.rosbag2  # noqa: F401
 
@@ -63,9 +59,6 @@ def open_recording(path: Path) -> Iterator[tuple[dict[str, str], Messages]]:
     Yields:
         The type of each topic, and a function that reads the messages of some topics in order: topic, time of the
         recording in ns, message.
-
-    Raises:
-        InputError: the recording cannot be read whole.
     """
     require_rosbags()
     from rosbags.rosbag1 import Reader as Reader1
@@ -169,11 +162,7 @@ def _unpacked(make: Callable[[], Any], data: bytes, most: int = MAX_PART_BYTES) 
 
 
 def _require_few_overlaps(path: Path, chunks: Any) -> None:
-    """Check that chunks of an MCAP file that overlap in time, of which the library holds all, fit into memory.
-
-    Raises:
-        InputError: they do not, or a chunk is listed twice.
-    """
+    """Check that chunks of an MCAP file that overlap in time, of which the library holds all, fit into memory."""
     if len({chunk.chunk_start_offset for chunk in chunks}) < len(chunks):
         raise InputError(f"{path}: lists a chunk twice")
     changes = [(chunk.message_start_time, chunk.uncompressed_size) for chunk in chunks]
@@ -192,11 +181,7 @@ def stamp_of(message: Any, recorded: int) -> int:
 
 
 def picture_in(message: Any, where: str) -> Image:
-    """Return the picture of an image message, (h, w) grey or (h, w, 3) RGB, uint8.
-
-    Raises:
-        InputError: it cannot be read; the message starts with `where`.
-    """
+    """Return the picture of an image message, (h, w) grey or (h, w, 3) RGB, uint8."""
     return decode_image(bytes(message.data), where) if hasattr(message, "format") else _raw(message, where)
 
 
@@ -248,11 +233,7 @@ class Footage:
         return self.path.with_name(f"{self.path.stem}{camera}{self.path.suffix}")
 
     def read(self, step: int = 1) -> Iterator[VideoFrame]:
-        """Yield every `step`-th picture, the first one included, at its time since the first.
-
-        Raises:
-            InputError: see `footage_in`; or a picture is of another size than the first.
-        """
+        """Yield every `step`-th picture, the first one included, at its time since the first."""
         start, last = None, 0.0
         for number, (stamp, message) in enumerate(_pictures(self.path, self.topic)):
             start = stamp if start is None else start
@@ -267,11 +248,7 @@ class Footage:
 
 
 def footage_in(path: Path) -> list[Footage]:
-    """Return the footage of every camera in a recording that has pictures, by topic.
-
-    Raises:
-        InputError: the recording or a first picture cannot be read, or there are no pictures.
-    """
+    """Return the footage of every camera in a recording that has pictures, by topic."""
     with open_recording(path) as (types, _):
         topics = sorted(topic for topic, kind in types.items() if kind in (IMAGE, COMPRESSED_IMAGE))
     found = []

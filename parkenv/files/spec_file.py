@@ -129,12 +129,7 @@ class Spec(BaseModel):
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """Read a TOML file, or a JSON file (`.json`).
-
-        Raises:
-            InputError: the file cannot be read or is invalid; the message is one line with file, field, value and what
-                was wanted.
-        """
+        """Read a TOML file, or a JSON file (`.json`)."""
         path = Path(path)
         return cls.parse(read_tables(path), str(path), path.parent).of_file(path)
 
@@ -153,9 +148,6 @@ class Spec(BaseModel):
             tables: nested mappings and lists.
             source: name of the source for messages, such as the file; or the options that set fields, by field.
             folder: folder that relative paths start from.
-
-        Raises:
-            InputError: see `read`.
         """
         try:
             return cls.model_validate(tables, context={_FOLDER: Path(folder)})
@@ -168,9 +160,6 @@ class Spec(BaseModel):
         Args:
             source: name of the source for messages; or the options that set fields, by field.
             changes: plain values or specs, by field name.
-
-        Raises:
-            InputError: see `read`.
         """
         fields = {name: getattr(self, name) for name in type(self).model_fields} | changes
         return type(self).parse(fields, source).of_file(self._file)
@@ -197,11 +186,7 @@ class Spec(BaseModel):
 
 
 def read_tables(path: Path) -> dict[str, Any]:
-    """Read a TOML or JSON file without validation.
-
-    Raises:
-        InputError: the file cannot be read, is too large, or has a syntax error.
-    """
+    """Read a TOML or JSON file without validation."""
     tables = read_json(path, MAX_SPEC_BYTES) if path.suffix == ".json" else read_toml(path)
     if not isinstance(tables, dict):
         raise InputError(f"{path}: is a {type(tables).__name__}, want a JSON object")

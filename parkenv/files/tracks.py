@@ -41,11 +41,7 @@ class Track:
     yaw: FloatArray
 
     def headings(self, xy: FloatArray) -> FloatArray:
-        """Return the headings, (n,) rad: as given, else the direction of the way along positions, (n, 2) m; forwards.
-
-        Raises:
-            InputError: headings are missing, and the way is shorter than 2 m.
-        """
+        """Return the headings, (n,) rad: as given, else the direction from position to position, (n, 2) m."""
         if not np.isnan(self.yaw).any():
             return self.yaw
         kept = [0]
@@ -69,9 +65,6 @@ def read_track(path: Path, timezone_s: float = 0.0) -> Track:
     Args:
         path: the file.
         timezone_s: time of the place minus UTC; dates without zone are of the place.
-
-    Raises:
-        InputError: the file cannot be read, or lacks something; the message is one line.
     """
     time = Kind(
         "a date (2026-05-04T09:00:00Z), Unix time, or seconds of a week",

@@ -21,9 +21,6 @@ def load_class(name: str, kind: str, method: str, *, alternatives: str = "") -> 
         kind: role of the class, for messages: `agent`, `detector`.
         method: required method of the class, with its parameters: `detect(image)`.
         alternatives: other valid values for the part before the colon, for the message.
-
-    Raises:
-        InputError: the module or class does not exist, or the class lacks the method.
     """
     module, _, class_name = name.partition(":")
     if not all(part.isidentifier() for part in (*module.split("."), class_name)):

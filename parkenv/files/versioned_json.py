@@ -29,11 +29,7 @@ class JsonFormat:
     meaning: str
 
     def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
-        """Read the fields of a file, without format and version.
-
-        Raises:
-            InputError: the file cannot be read, is not JSON, or is of another format or version; the message names it.
-        """
+        """Read the fields of a file, without format and version."""
         try:
             content = read_json(Path(path))
         except InputError as error:
@@ -45,10 +41,6 @@ class JsonFormat:
         return content
 
     def write(self, path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
-        """Write a file atomically.
-
-        Raises:
-            InputError: the file cannot be written.
-        """
+        """Write a file atomically."""
         content = {"format": self.name, "version": self.version, **fields}
         write_text(path, json.dumps(content, indent=1) + "\n")

@@ -63,11 +63,7 @@ class Video:
 
     @classmethod
     def of(cls, path: Path) -> Video:
-        """Open a video file, and read its first frame.
-
-        Raises:
-            InputError: the file cannot be read, has no frames, or frames of over 100 million pixels.
-        """
+        """Open a video file, and read its first frame."""
         with _opened(path) as capture:
             there, first = capture.read()
             if not there or first is None:
@@ -85,11 +81,7 @@ class Video:
             )
 
     def read(self, step: int = 1) -> Iterator[VideoFrame]:
-        """Yield every `step`-th frame, the first one included, up to the last that can be read.
-
-        Raises:
-            InputError: see `of`.
-        """
+        """Yield every `step`-th frame, the first one included, up to the last that can be read."""
         with _opened(self.path) as capture:
             number, last = 0, 0.0
             while capture.grab():
@@ -125,9 +117,6 @@ def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Film]:
         path: the file, `.mp4`.
         size: width and height, px; an odd last row or column is left out, as encoders want.
         fps: frames per second.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     even = size[0] // 2 * 2, size[1] // 2 * 2
     with atomic_write(path) as beside:

@@ -82,9 +82,6 @@ class Counts:
         Args:
             path: .csv or .csv.gz.
             timezone: IANA name of the local time of `hour_utc` and `time_utc`, and of when summer time begins and ends.
-
-        Raises:
-            InputError: the file cannot be read, or is not such a file; the message names file, line and field.
         """
         zone = _time_zone(timezone)
         readings = _read(path, zone)
@@ -117,11 +114,7 @@ class Counts:
         return found
 
     def chosen(self, names: Iterable[str]) -> Counts:
-        """Return the counts of some car parks.
-
-        Raises:
-            InputError: an unknown name.
-        """
+        """Return the counts of some car parks."""
         rows = []
         for name in names:
             if name not in self.car_parks:
@@ -140,11 +133,7 @@ class Counts:
 
 
 def is_counts(path: str | Path) -> bool:
-    """Return whether a file has the columns of counts, and not those of a log of slots.
-
-    Raises:
-        InputError: the file cannot be read.
-    """
+    """Return whether a file has the columns of counts, and not those of a log of slots."""
     _, header = next(csv_rows(path, MAX_COUNT_BYTES), (0, []))
     return {"car_park", "free"} <= set(header)
 

@@ -50,9 +50,6 @@ class MapErrorPrior:
         memory_days: time constant of the drift, in days: after this time, 1/e of the error is left.
         weight: probability of this prior, relative to the others.
         trust: factor of the map's logits; 0 if the map says nothing.
-
-    Raises:
-        InputError: a number that is negative, or a memory or weight of 0.
     """
 
     level: float

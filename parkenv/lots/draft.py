@@ -30,11 +30,7 @@ _SHARED = (
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Goals, entries and bounds that complete or replace those of a file.
-
-    Raises:
-        InputError: a pair that is not two finite numbers.
-    """
+    """Goals, entries and bounds that complete or replace those of a file."""
 
     # walking destinations as pairs of numbers: metres east and north in the lot's frame or, for a file with latitudes
     # and longitudes, a latitude and a longitude (any pair within a degree of the lot)
@@ -53,11 +49,7 @@ class ImportOptions:
                     raise InputError(f"{what} is {point!r}, want two finite numbers")
 
     def box(self, frame: LocalFrame | None) -> tuple[float, float, float, float] | None:
-        """Return the bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds.
-
-        Raises:
-            InputError: bounds without an area.
-        """
+        """Return the bounds in the lot's frame: least x and y, greatest x and y, m; None without bounds."""
         if self.bounds is None:
             return None
         corners = points_in_frame(frame, self.bounds)
@@ -130,11 +122,7 @@ class LotDraft:
         )
 
     def lot(self) -> ParkingLot:
-        """Create the lot.
-
-        Raises:
-            InputError: something is missing or the parts do not fit together; the message gives details.
-        """
+        """Create the lot."""
         try:
             return self._lot()
         except GraphError as error:

@@ -168,9 +168,6 @@ def grid_lot(
         pitch: width of a slot, m.
         depth: length of a slot, m.
         aisle: width of an aisle and of the end roads, m.
-
-    Raises:
-        InputError: a count below one, or sizes without room to drive or without a lane within reach.
     """
     require_whole("grid lot: rows", rows, least=1)
     require_whole("grid lot: columns", columns, least=1)
@@ -217,9 +214,6 @@ def city_lot(n_slots: int, seed: int = 0) -> ParkingLot:
     slot can be reached from every other. Slots are numbered crossing by crossing from the south-west, so neighbours
     have close numbers. If more slots fit than requested, random ones are omitted, like driveways. The block in the
     middle is a square without a building; the goal is its centre.
-
-    Raises:
-        InputError: `n_slots` is below one.
     """
     require_whole("city: n_slots", n_slots, least=1)
     # A block has about 45 slots: add rows of blocks until all slots fit.

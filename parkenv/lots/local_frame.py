@@ -20,9 +20,6 @@ if TYPE_CHECKING:
 class LocalFrame:
     """An azimuthal equidistant projection: distances and bearings from its centre are exact.
 
-    Raises:
-        InputError: an invalid longitude or latitude.
-
     Examples:
         >>> frame = LocalFrame(lon=7.85, lat=48.0)
         >>> frame.to_xy([[7.85, 48.0]]).round(3).tolist()

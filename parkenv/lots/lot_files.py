@@ -81,11 +81,7 @@ PLACES = Path(__file__).parent / "places"
 
 
 def packaged_lot(name: str) -> ParkingLot:
-    """Load a packaged lot: campus, jam, street, mini.
-
-    Raises:
-        InputError: an unknown name.
-    """
+    """Load a packaged lot: campus, jam, street, mini."""
     if name not in PACKAGED_LOTS:
         raise InputError(f"no packaged lot {name!r}, want one of {', '.join(PACKAGED_LOTS)}")
     with resources.as_file(resources.files("parkenv.lots") / "packaged" / f"{name}.geojson") as path:
@@ -96,10 +92,6 @@ def read_lot(path: str | Path) -> ParkingLot:
     """Read a lot from native GeoJSON (`.geojson`, `.json`) or a Dragon Lake map (`.yml`).
 
     Slots without exact properties take their shape from their polygons (`slots_from_polygons`).
-
-    Raises:
-        InputError: the file cannot be read or contains no valid lot; the message states the first fault and the
-            number of further ones, and `parkenv.lots.check_lot` lists all.
     """
     return _read_whole(Path(path))[0]
 

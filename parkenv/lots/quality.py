@@ -52,11 +52,7 @@ def combined_error_probability(issues: tuple[QualityIssue, ...]) -> float:
 
 
 def read_provenance(path: Path) -> Provenance | None:
-    """Return what a lot file says of its import; None if it says nothing.
-
-    Raises:
-        InputError: the member `import` is malformed.
-    """
+    """Return what a lot file says of its import; None if it says nothing."""
     document = read_json(path)
     origin = document.get("import") if isinstance(document, dict) else None
     if origin is None:

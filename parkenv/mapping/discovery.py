@@ -48,9 +48,6 @@ def discover(cars: FloatArray, *, reach: float = 1.0, least: int = 3) -> FoundSl
         reach: m, largest distance of cars in the same slot.
         least: smallest number of cars that make a slot.
 
-    Raises:
-        InputError: a wrong shape, a number that is not finite, a reach not above 0, or `least` below 1.
-
     Examples:
         >>> found = discover(np.array([[0.0, 0.1, 1.6], [0.1, 0.0, 4.7], [-0.1, 0.0, 1.5], [2.5, 0.0, 1.6]]))
         >>> found.xy.round(1).tolist(), found.cars.tolist()

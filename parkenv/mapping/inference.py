@@ -88,9 +88,6 @@ def predict(log: SessionLog, time: float | None = None, *, confidence: float = 0
         log: the sessions.
         time: s since Monday 00:00; None: all sessions with equal weight.
         confidence: probability of the credible interval.
-
-    Raises:
-        InputError: no session, or a confidence outside (0, 1).
     """
     if not len(log.time):
         raise InputError("the map holds no session, want at least one")

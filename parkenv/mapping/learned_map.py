@@ -140,9 +140,6 @@ class LearnedMap(PriorModel):
         base: the map before any trip.
         walk: (n,) walk from each slot to the goal.
         priors: how far that map may be off.
-
-    Raises:
-        InputError: a lot with more than 3,000 slots.
     """
 
     def __init__(

@@ -22,9 +22,6 @@ def make_locate(name: str, lot: ParkingLot) -> Callable[[FloatArray], Located]:
     Args:
         name: `none` or `scan-matching`.
         lot: the lot that the car is in.
-
-    Raises:
-        InputError: an unknown name.
     """
     require_one_of("localise", name, LOCALISERS)
     if name == "none":

@@ -25,9 +25,6 @@ class PoseNoise:
     `drift` is of odometry alone, which nothing corrects: the root mean square of the error of position after 100 m
     straight ahead, as a share of the distance. A third of its variance each is a wrong scale, a heading that turns
     evenly, and one that wanders; scale and turn are drawn once for a drive. The first pose is right.
-
-    Raises:
-        InputError: a number below 0, a length of 0, or a drift above 0.5.
     """
 
     position: float = 0.0  # m, stationary standard deviation of each coordinate

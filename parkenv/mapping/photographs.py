@@ -61,9 +61,6 @@ class Photographs:
         calibration: the camera, with a topic for the pictures.
         errors: of the poses.
         without_pose: number of photographs that the table of poses does not name.
-
-    Raises:
-        InputError: a file cannot be read, or something is missing; the message says what is wanted.
     """
 
     def __init__(

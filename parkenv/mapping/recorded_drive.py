@@ -141,11 +141,7 @@ class DriveWriter:
 
 @contextmanager
 def recording(path: Path, rig: SensorRig) -> Iterator[DriveWriter]:
-    """Write a drive to an MCAP file, atomically; images are stored without loss.
-
-    Raises:
-        InputError: the file cannot be written, or the library rosbags is not installed.
-    """
+    """Write a drive to an MCAP file, atomically; images are stored without loss."""
     require_recordable(path)
     from rosbags.rosbag2 import StoragePlugin, Writer
     from rosbags.typesys import Stores, get_typestore
@@ -162,11 +158,7 @@ def recording(path: Path, rig: SensorRig) -> Iterator[DriveWriter]:
 
 
 def require_recordable(path: Path) -> None:
-    """Check that a drive can be written to a file, before any work.
-
-    Raises:
-        InputError: see `recording`.
-    """
+    """Check that a drive can be written to a file, before any work."""
     require_rosbags()
     if path.suffix != ".mcap":
         raise InputError(f"{path}: want a name that ends in .mcap")
@@ -181,10 +173,6 @@ class RecordedDrive:
         path: the file or folder.
         calibration: sensors and topics; None for a recording of `parkenv survey --record`.
         photographs: what takes the place of a recording; its calibration counts.
-
-    Raises:
-        InputError: the recording cannot be read whole; a topic is missing or of another type; stamps go back in time;
-            or streams do not overlap in time.
     """
 
     path: Path
@@ -245,9 +233,6 @@ class RecordedDrive:
 
         Args:
             every: m, least distance between the poses of captures.
-
-        Raises:
-            InputError: an image cannot be read, or is of another size than the calibration's.
         """
         plan = self._frames(every)
         needed: dict[tuple[str, int], list[int]] = {}
@@ -498,9 +483,6 @@ def map_drive(
         every: m, least distance between captures.
         on_frame: called after every capture.
         localise: what corrects the recorded poses: `none`, or `scan-matching`, for which they are drifting odometry.
-
-    Raises:
-        InputError: an unknown localiser; see also `RecordedDrive` and `make_detector`.
     """
     if localise != "none" and not (drive.rig.lasers or drive.rig.stereo_cameras):
         raise InputError(f"localise is {localise!r}, want none: {drive.path} has no laser nor stereo camera")
@@ -532,11 +514,7 @@ def _car_rows(time: float, view: CameraView, lot: ParkingLot) -> Iterator[dict[s
 
 
 def record_drive(survey: Survey, number: int, path: Path) -> None:
-    """Drive a survey session, and write what its sensors measure to an MCAP file.
-
-    Raises:
-        InputError: see `recording`.
-    """
+    """Drive a survey session, and write what its sensors measure to an MCAP file."""
     with recording(path, survey.pipeline.rig) as writer:
         driven = survey.drive(
             number, on_frame=lambda frame: writer.add(frame.result.captured, frame.odometry)

@@ -48,9 +48,6 @@ def survey_route(lot: ParkingLot, entry: int = 0, *, both_sides: bool = False) -
         lot: the lot.
         entry: index into `lot.entries`, start and end of the drive.
         both_sides: whether a camera also points to the left.
-
-    Raises:
-        InputError: a required lane cannot be reached from the entry, or the entry cannot be reached from it.
     """
     passes = _passes(lot)
     # A section begins at each vertex of its junction from which cars may take it.

@@ -71,9 +71,6 @@ class Session:
         rig, weather: names.
         p_occupied: (n_slots,) float64; NaN if the slot was never in view.
         cars: (n, 3) float64, x, y in m and yaw in rad of the located cars.
-
-    Raises:
-        InputError: an empty key, a time or a car that is not finite or too far, or a probability outside 0 to 1.
     """
 
     key: str

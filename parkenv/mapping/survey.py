@@ -38,12 +38,7 @@ _SEEDS = 1 << 31
 
 @dataclass(frozen=True)
 class SurveySettings:
-    """Settings of a survey.
-
-    Raises:
-        InputError: an unknown rig, weather or localiser, no window, a distance that is not positive, or pictures
-            narrower than 64 px.
-    """
+    """Settings of a survey."""
 
     # `laser`: the thesis's camera and 270° laser; `stereo`: only a stereo camera; `both_sides`: a laser, a camera to
     # the right and one to the left, so that aisles with slots on both sides are driven once

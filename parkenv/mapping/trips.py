@@ -27,9 +27,6 @@ class Trip:
         taken: (k,) bool, observed states.
         hit_rate: (k,) float64, P(observed taken | taken); 1 for a parking attempt.
         false_alarm_rate: (k,) float64, P(observed taken | free); 0 for a parking attempt.
-
-    Raises:
-        InputError: an empty key, times that are not finite or not ascending, a negative slot, or a rate outside 0 to 1.
     """
 
     key: str

@@ -54,9 +54,6 @@ def fit_box(
         end_on: whether the front or rear of the car is visible rather than its flank.
         cut: whether the car continues unseen before the first and after the last point.
 
-    Raises:
-        InputError: no point, or one that is not finite.
-
     Examples:
         >>> front = np.stack([np.linspace(-0.9, 0.9, 30), np.full(30, 4.0)], axis=1)
         >>> car = fit_box(front, np.zeros(2), end_on=True)

@@ -41,11 +41,7 @@ class LabelledImage:
 
 
 def read_uiuc_training(folder: Path) -> Crops:
-    """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`.
-
-    Raises:
-        InputError: there are none, or an image is truncated.
-    """
+    """Read UIUC's training images: `TrainImages/pos-N.pgm` and `neg-N.pgm`."""
     images = {file.name: as_grey(read_image(file)) for file in images_in(folder / "TrainImages")}
     crops = Crops(
         *([im for name, im in images.items() if name.startswith(kind)] for kind in ("pos-", "neg-"))
@@ -63,9 +59,6 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
     Args:
         folder: the published `CarData`.
         test_set: `single` or `multi`.
-
-    Raises:
-        InputError: an unknown set, missing files, or a line that is not `n: (i,j) ...` or `n: (i,j,w) ...`.
     """
     require_one_of("test set", test_set, UIUC_TESTS)
     images, truth = (folder / name for name in UIUC_TESTS[test_set])
@@ -98,11 +91,7 @@ def read_uiuc_test(folder: Path, test_set: str) -> list[LabelledImage]:
 
 
 def read_crop_folder(folder: Path) -> Crops:
-    """Read a folder with `positives` and `negatives` (or `vehicles` and `non-vehicles`), images at any depth.
-
-    Raises:
-        InputError: one of the two is missing or holds no image, or an image cannot be read.
-    """
+    """Read a folder with `positives` and `negatives` (or `vehicles` and `non-vehicles`), images at any depth."""
     parts = []
     for names in (_POSITIVE, _NEGATIVE):
         there = [folder / name for name in names if (folder / name).is_dir()]

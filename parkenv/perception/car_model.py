@@ -29,11 +29,7 @@ _EPOCH = (1980, 1, 1, 0, 0, 0)  # equal models are equal files
 
 @dataclass(frozen=True, eq=False)
 class CarModel:
-    """A linear classifier (support vector machine) of image windows on HOG features (T §3.2.1).
-
-    Raises:
-        InputError: weights of another shape, or a number outside its range.
-    """
+    """A linear classifier (support vector machine) of image windows on HOG features (T §3.2.1)."""
 
     descriptor: Descriptor  # the features of a window
     weights: Float32Array  # `descriptor.shape` float32
@@ -102,11 +98,7 @@ class CarModel:
 
     @classmethod
     def load(cls, name: str | Path) -> CarModel:
-        """Load a packaged model by name, or a model from a file.
-
-        Raises:
-            InputError: an unknown model, a missing file, or a file with another format or version.
-        """
+        """Load a packaged model by name, or a model from a file."""
         if str(name) in PACKAGED_MODELS:
             source = resources.files("parkenv.perception") / "models" / f"{name}.npz"
             parts = parse_arrays(source.read_bytes(), str(name))

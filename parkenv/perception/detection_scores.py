@@ -126,9 +126,6 @@ def score_on_uiuc(
         model: a side model, or any detector.
         folder: the published folder `CarData`.
         on_image: called after every image.
-
-    Raises:
-        InputError: no test set, or a damaged one.
     """
     sets = [name for name, (_, truth) in UIUC_TESTS.items() if (folder / truth).is_file()] or ["single"]
     return [score_on(model, read_uiuc_test(folder, name), name, on_image=on_image) for name in sets]
@@ -191,9 +188,6 @@ def recall_on_crops(
 
     A crop's score is a model's of its window, or a detector's greatest probability of a box in the crop's middle, at
     least 0.45 times as wide. Consecutive crops often show the same car: the intervals are over blocks of them.
-
-    Raises:
-        InputError: fewer crops of cars than blocks.
     """
     if len(crops.positives) < BLOCKS:
         raise InputError(f"{len(crops.positives)} crops of cars, want at least {BLOCKS}")

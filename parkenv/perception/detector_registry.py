@@ -70,9 +70,6 @@ def detector_version(name: str) -> str:
 
     Args:
         name: as for `make_detector`.
-
-    Raises:
-        InputError: there is no such class.
     """
     files = detector_files(name)
     shown = Path(name).name if files else name

@@ -40,9 +40,6 @@ class Descriptor:
             by the energies of the four blocks of 2×2 cells that contain it, averaged; the same number of values.
             `blocks`: Dalal and Triggs (2005), each block of 2×2 cells separately, 36 values each.
 
-    Raises:
-        InputError: a size that is not whole cells, or an unknown normalization.
-
     Examples:
         >>> Descriptor(128, 64).size, Descriptor(128, 128).size, Descriptor(128, 64, "blocks").size
         (1152, 2304, 3780)
@@ -90,9 +87,6 @@ class Descriptor:
 
         Args:
             crop: (height, width) uint8, grey; its border pixels are replicated.
-
-        Raises:
-            InputError: a crop of another size.
         """
         if crop.shape != (self.height, self.width):
             raise InputError(f"crop is {crop.shape}, want ({self.height}, {self.width})")
@@ -103,11 +97,7 @@ class Descriptor:
 
 
 def rooted(image: Image) -> Image:
-    """Take the square root of the grey values; 255 stays 255.
-
-    Raises:
-        InputError: another shape or dtype.
-    """
+    """Take the square root of the grey values; 255 stays 255."""
     return np.asarray(cv2.LUT(_checked(image), _ROOT)) if image.size else _checked(image)
 
 
@@ -129,9 +119,6 @@ def cell_histograms(image: Image) -> Float32Array:
     Returns:
         (h // 8, 9, w // 8) float32; orientation k is centred at (k + 0.5)/9 of half a turn, counted from a gradient
         along the columns.
-
-    Raises:
-        InputError: another shape or dtype.
     """
     _checked(image)
     rows, columns = image.shape[0] // CELL, image.shape[1] // CELL

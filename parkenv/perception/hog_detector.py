@@ -191,11 +191,7 @@ def _features_of_rows(window: Descriptor, level: Image, first: int, end: int) ->
 
 
 def as_grey(image: Image) -> Image:
-    """Return the image as (h, w) uint8.
-
-    Raises:
-        InputError: an image that is neither (h, w) nor (h, w, 3), not uint8, or empty.
-    """
+    """Return the image as (h, w) uint8."""
     if image.dtype != np.uint8 or image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[2] != 3):
         raise InputError(f"image is {image.shape} of {image.dtype}, want (h, w) or (h, w, 3) uint8")
     if image.size == 0:

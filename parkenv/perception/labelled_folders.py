@@ -83,10 +83,6 @@ def read_labels(path: Path, images: Path | None = None, classes: Sequence[str] =
         path: the file or folder.
         images: of COCO, the folder of the pictures; None: that of the file.
         classes: names of the classes that are cars; empty: `CAR_NAMES`.
-
-    Raises:
-        InputError: a file of another format, an unknown class or picture, a missing picture, a label without a picture,
-            a box outside its picture, or no label of a car.
     """
     if path.is_dir() and images is not None:
         raise InputError(
@@ -151,9 +147,6 @@ def crops_of(
 
     Returns:
         The crops, aligned as those of the packaged models; and all pictures, to mine false positives from.
-
-    Raises:
-        InputError: fewer than 20 cars are left.
     """
     car = END if end_on else SIDE
     rng = np.random.default_rng(seed)

@@ -106,9 +106,6 @@ class OnnxDetector:
         name: the file, for messages.
         settings: how it is fed and read.
         is_known: whether the file is known to be whole: it is not tried in a process of its own.
-
-    Raises:
-        InputError: OpenCV cannot run the network, settings do not fit it, or it keeps its weights in other files.
     """
 
     def __init__(
@@ -147,9 +144,6 @@ class OnnxDetector:
             path: the file, `.onnx`.
             threshold: replaces that of the settings.
             is_known: see the class.
-
-        Raises:
-            InputError: a file cannot be read, or see the class.
         """
         data, beside = read_bytes(path, MAX_ONNX_BYTES), sidecar_of(path)
         settings = OnnxSettings.read(beside) if beside.is_file() else OnnxSettings()
@@ -160,11 +154,7 @@ class OnnxDetector:
         return self.__dict__ | {"_net": None}  # read again where it is needed
 
     def detect(self, image: Image) -> Detections:
-        """Find the cars in an image, best first; see `Detector`.
-
-        Raises:
-            InputError: an image of another shape or dtype, or the network's numbers are no boxes and scores.
-        """
+        """Find the cars in an image, best first; see `Detector`."""
         fed, scale, offset = _fed(image, self.settings)
         output = self._run(fed)
         if self._is_centers:

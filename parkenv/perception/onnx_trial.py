@@ -37,9 +37,6 @@ def require_runs(data: bytes, name: str, shape: tuple[int, ...]) -> None:
         data: the content of its file.
         name: of the file, for messages.
         shape: of the input.
-
-    Raises:
-        InputError: OpenCV refuses it or crashes, or it takes too much time or memory.
     """
     key = hashlib.sha256(data).hexdigest(), shape
     if key in _passed:

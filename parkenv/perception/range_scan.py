@@ -63,9 +63,6 @@ def scan_from_laser(
         mount: its pose on the vehicle.
         vehicle: (3,) estimated x, y in m and yaw in rad of the vehicle, world frame.
         ranges: (n_beams,) float32, m; inf for beams without a return.
-
-    Raises:
-        InputError: a wrong number of beams, NaN, or a range below 0.
     """
     if ranges.shape != (laser.n_beams,):
         raise InputError(f"scan has shape {ranges.shape}, want ({laser.n_beams},)")

@@ -40,11 +40,7 @@ _SAME_AXIS = 0.1  # m, largest distance between a camera and its ranging sensor
 
 @dataclass(frozen=True, eq=False)
 class LocatedCars:
-    """Detected cars in the world frame.
-
-    Raises:
-        InputError: columns of different lengths, or numbers that are not finite.
-    """
+    """Detected cars in the world frame."""
 
     xy: FloatArray  # (n, 2) float64, m, centres, world frame
     yaw: FloatArray  # (n,) float64, rad, along the car, in [0, π): front and rear are not distinguished
@@ -175,9 +171,6 @@ def localize_cars(
         camera: the camera that took the image.
         mount: its pose on the vehicle, on the same vertical axis as the ranging sensor.
         vehicle: (3,) x, y in m and yaw in rad of the vehicle, world frame.
-
-    Raises:
-        InputError: a scan from another position.
     """
     _require_same_axis(scan, mount, vehicle)
     rows, cars, distances = [], [], []

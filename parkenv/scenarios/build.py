@@ -133,11 +133,7 @@ def require_changes(owners: Sequence[type], changes: Iterable[str], *others: str
 
 
 def largest_lots(specs: Sequence[ScenarioSpec], count: int) -> list[ScenarioSpec]:
-    """Return the `count` scenarios whose lots have the most slots, the largest first; equal ones in their order.
-
-    Raises:
-        InputError: a lot cannot be read.
-    """
+    """Return the `count` scenarios whose lots have the most slots, the largest first; equal ones in their order."""
     slots = [_lot(spec.lot).n_slots for spec in specs]
     order = sorted(range(len(specs)), key=lambda i: -slots[i])
     return [specs[i] for i in order[:count]]
@@ -151,11 +147,7 @@ def _of_lot(lot: ParkingLot, changes: dict[str, Any]) -> Scenario:
 
 
 def build(spec: ScenarioSpec) -> Scenario:
-    """Build the scenario of a specification.
-
-    Raises:
-        InputError: a file that it names cannot be used or does not fit the lot.
-    """
+    """Build the scenario of a specification."""
     try:
         lot = _lot(spec.lot)
         goal = 0
@@ -220,11 +212,7 @@ def _with_day_error(scenario: Scenario, day_error: DayError | float) -> Scenario
 
 
 def _with_rules(lot: ParkingLot, zones: Mapping[str, ZoneSpec]) -> ParkingLot:
-    """Return a lot with other rules of zones.
-
-    Raises:
-        InputError: the lot has no such zone or class; the message names the table.
-    """
+    """Return a lot with other rules of zones."""
     if not zones:
         return lot
     rules = {name: lot.zone_rules.get(name, Zone(name)) for name in lot.zones} | dict(lot.zone_rules)
@@ -394,11 +382,7 @@ def _process(path: Path, lot: ParkingLot, goal: int) -> OccupancyProcess:
 
 
 def sensor_model(spec: SensorModelSpec) -> SensorModel:
-    """Build the sensor model of a specification.
-
-    Raises:
-        InputError: its file cannot be used.
-    """
+    """Build the sensor model of a specification."""
     if spec.name == "blind":
         model = SensorModel.blind()
     elif spec.name in ("laser", "stereo"):

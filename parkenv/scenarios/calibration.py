@@ -18,11 +18,7 @@ _FORMAT = JsonFormat("parkenv-calibration", 1, "a calibration of `parkenv calibr
 
 @dataclass(frozen=True)
 class Calibration:
-    """Values measured in a scenario, which may replace the assumed ones.
-
-    Raises:
-        InputError: a value is out of range; the message names it.
-    """
+    """Values measured in a scenario, which may replace the assumed ones."""
 
     scenario: str
     v_drive: float  # m/s, distance on the drive graph divided by the time on the lanes
@@ -50,11 +46,7 @@ class Calibration:
 
     @classmethod
     def from_file(cls, path: Path) -> Self:
-        """Read a file written by `to_file`.
-
-        Raises:
-            InputError: the file cannot be read or is not a calibration.
-        """
+        """Read a file written by `to_file`."""
         content = _FORMAT.read(path)
         names = [f.name for f in dataclasses.fields(cls)]
         if missing := [name for name in names if name not in content]:

@@ -116,10 +116,6 @@ def demand_of(
 
     A purpose that the lot has no weights for has the sum of those for its purposes; where the lot has none at all, all
     weights are equal if another table has weights, or else goal and entry are those of the scenario.
-
-    Raises:
-        InputError: the hours end when they begin, a weight does not fit the lot, or nobody arrives; the message names
-            the table.
     """
     from parkenv.world.demand import ConstantTime, Demand, TownDemand, weights_of_all
 

@@ -58,9 +58,6 @@ def split_by_lot(scenarios: Sequence[Scenario], held_out: float) -> tuple[list[S
     Args:
         scenarios: the scenarios.
         held_out: share that is held out.
-
-    Raises:
-        InputError: all are on one side.
     """
     sides: tuple[list[Scenario], list[Scenario]] = ([], [])
     for scenario in scenarios:
@@ -91,11 +88,7 @@ def open_scenarios(n: int, progress: float) -> int:
 
 
 def require_different_names(scenarios: Sequence[Scenario]) -> None:
-    """Check that tables can tell scenarios apart.
-
-    Raises:
-        InputError: two have one name.
-    """
+    """Check that tables can tell scenarios apart."""
     names = [scenario.name for scenario in scenarios]
     for i, name in enumerate(names):
         if name in names[:i]:

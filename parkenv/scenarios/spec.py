@@ -605,11 +605,7 @@ class ZoneSpec(Spec):
     users: Several[str] | None = Field(None, description="Classes of drivers who may park there.")
 
     def changed_rules(self, zone: Zone) -> Zone:
-        """Return a zone with the rules that are given here.
-
-        Raises:
-            InputError: a rule is none; the message names the field.
-        """
+        """Return a zone with the rules that are given here."""
         from parkenv.lots.formats.geojson_supply import price_of
 
         own: dict[str, Any] = {"price": price_of(self.price)} if self.price is not None else {}
@@ -755,9 +751,6 @@ _PACKAGED = Path(__file__).with_name("packaged")
 def scenario_spec(source: str | Path) -> ScenarioSpec:
     """Return the specification of one scenario; see `scenario_specs`.
 
-    Raises:
-        InputError: see `scenario_specs`; or the source is a folder with more than one scenario.
-
     Examples:
         >>> scenario_spec("jam").occupancy.event
         Event(share=0.75, factor=200.0)
@@ -776,9 +769,6 @@ def scenario_specs(source: str | Path) -> list[ScenarioSpec]:
             week as counted in real car parks (`lot_scenario`); or a folder with scenario files (.toml) and lot
             files (.geojson), in order of their names. A lot that a scenario file of the folder names is that
             scenario's.
-
-    Raises:
-        InputError: the source is none of these, or a file is invalid; the message names the file.
 
     Examples:
         >>> [spec.title for spec in scenario_specs("mini")]
@@ -808,9 +798,6 @@ def lot_scenario(lot: str | Path, source: str | None = None) -> ScenarioSpec:
     Args:
         lot: name of a packaged lot, or a lot file.
         source: source of the name for messages.  [default: the lot]
-
-    Raises:
-        InputError: neither a packaged lot nor a file.
     """
     name = "".join(c if c.isprintable() and c not in "/\\," else " " for c in Path(lot).stem)[:80]
     tables = {"name": name, "lot": str(lot), "occupancy": {"real_week": {}, "day_error": DAY_ERROR}}

@@ -31,11 +31,7 @@ class AgentSpec(Spec):
 
     @classmethod
     def of(cls, text: str) -> AgentSpec:
-        """Parse an agent from text such as `mdp(failure_s=90)`.
-
-        Raises:
-            InputError: brackets do not match, or an option has no value.
-        """
+        """Parse an agent from text such as `mdp(failure_s=90)`."""
         return cls.parse(parse_call(text), "--agent")
 
     @property

@@ -57,11 +57,7 @@ def _with_folders(value: object, info: ValidationInfo) -> object:
 
 
 def one_word(text: str) -> str:
-    """Return the name of the one scenario of an option.
-
-    Raises:
-        InputError: there are several.
-    """
+    """Return the name of the one scenario of an option."""
     words = words_in(text)
     if len(words) > 1:
         raise InputError(f"names {len(words)} scenarios, want one")
@@ -244,11 +240,7 @@ CaptureDistance = Annotated[float, Field(ge=0.1, le=1_000.0)]
 
 
 def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[ScenarioSpec, ...] = ()) -> None:
-    """Check that no two agents, and no two scenarios, share a name.
-
-    Raises:
-        PydanticCustomError: two share one.
-    """
+    """Check that no two agents, and no two scenarios, share a name."""
     for what, names in (
         ("agents", [agent.label for agent in agents]),
         ("scenarios", [scenario.title for scenario in scenarios]),
@@ -259,20 +251,12 @@ def require_distinct_names(agents: tuple[AgentSpec, ...], scenarios: tuple[Scena
 
 
 def require_at_most(count: int, what: str, unit: str, most: int = MAX_EPISODES) -> None:
-    """Check the size of a study.
-
-    Raises:
-        PydanticCustomError: it is too large.
-    """
+    """Check the size of a study."""
     if count > most:
         raise PydanticCustomError("whole", f"{what} is {count} {unit}, want at most {most}")
 
 
 def require_rig(rig: str | None, detector: str | None) -> None:
-    """Check that a detector has images.
-
-    Raises:
-        PydanticCustomError: there is a detector and no rig.
-    """
+    """Check that a detector has images."""
     if detector is not None and rig is None:
         raise PydanticCustomError("whole", "detector requires a rig, such as laser")

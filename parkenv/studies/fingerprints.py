@@ -70,11 +70,7 @@ def agent_fingerprints(names: Iterable[str]) -> dict[str, str]:
 
 
 def require_unchanged(spec: Spec, folder: Path) -> None:
-    """Check that the files of the run in a folder have not changed since.
-
-    Raises:
-        InputError: a file has changed.
-    """
+    """Check that the files of the run in a folder have not changed since."""
     before = (read_settings(folder) or {}).get("files", {})
     for path, now in fingerprints(spec.files()).items():
         if before.get(path) not in (None, now):

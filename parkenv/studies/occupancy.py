@@ -44,9 +44,6 @@ def fit_log(log: Path, folder: Path, *, max_gap_s: float = 7200.0) -> Found:
         log: the log.
         folder: where the files go.
         max_gap_s: observations farther apart are not linked, s.
-
-    Raises:
-        InputError: the log cannot be read.
     """
     fitted = fit_process(OccupancyLog.read(log), max_gap_s=max_gap_s)
     process = fitted.process
@@ -123,9 +120,6 @@ def evaluate_counts(
         from_day: first day that is scored; None: halfway.
         seed: seed of the bootstrap.
         progress: called as steps, days and models are finished.
-
-    Raises:
-        InputError: there are no usable readings from that day on.
     """
     n = len(counts.days)
     first = n // 2 if from_day is None else counts.day_index(from_day)
@@ -167,9 +161,6 @@ def evaluate_log(
         from_day: see `evaluate_counts`.
         seed: see `evaluate_counts`.
         progress: called as days are finished.
-
-    Raises:
-        InputError: the log cannot be read, or has no day from then on with one of its class before it.
     """
     recorded = OccupancyLog.read(log)
     first = recorded.days[len(recorded.days) // 2] if from_day is None else str(from_day)

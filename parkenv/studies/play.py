@@ -42,9 +42,6 @@ def game_data(
     """Return the data of a game's page: the search problem, and a world for each seed with the agents' actions in it.
 
     What decides the cost of a search is written as float64, so that the page's search equals `parkenv/Search-v2`.
-
-    Raises:
-        InputError: the lot is too large to draw, two agents are called the same, or a world cannot be made.
     """
     lot, actions_s = scenario.lot, scenario.edges["seconds"]
     if lot.n_slots > MOST_SLOTS:
@@ -111,11 +108,7 @@ def _floats(values: ArrayLike) -> str:
 
 
 def require_same_worlds(case: Case, seeds: Sequence[int]) -> None:
-    """Check that the searches of an agent `human:FILE` take as long here as on the page that recorded them.
-
-    Raises:
-        InputError: the file has no search for a seed, or it takes another time here: costs or worlds differ.
-    """
+    """Check that the searches of an agent `human:FILE` take as long here as on the page that recorded them."""
     runner = case.runner()
     played: dict[int, float] = runner.agent.totals  # type: ignore[attr-defined]
     for seed in seeds:

@@ -46,11 +46,7 @@ class Replay(Protocol):
     """Something in a run that a page can show again, such as its searches."""
 
     def again(self, options: ReportOptions) -> Again:
-        """Return what runs again.
-
-        Raises:
-            InputError: the run lacks a chosen agent, seed or day, or a table is damaged.
-        """
+        """Return what runs again."""
 
 
 class Summary(Spec, extra="allow"):
@@ -80,12 +76,7 @@ class RunFolder:
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """Read a run folder.
-
-        Raises:
-            InputError: there is no folder or no finished run in it, the run is of another version, or a file is
-                damaged.
-        """
+        """Read a run folder."""
         if not path.is_dir():
             raise InputError(f"{path}: no such folder; want one that a command with --out wrote")
         file = path / SUMMARY
@@ -119,11 +110,7 @@ class RunFolder:
             raise InputError(f"{damaged}: {error!r}") from error
 
     def spec(self) -> Study | None:
-        """Read the specification that the run kept; None for a command that keeps none.
-
-        Raises:
-            InputError: the file is missing or damaged.
-        """
+        """Read the specification that the run kept; None for a command that keeps none."""
         return read_study(self.path / SPEC_FILE) if self.kind in STUDIES else None
 
     @property
@@ -175,9 +162,6 @@ def write_report(
 
     Returns:
         The page, and all notes on it.
-
-    Raises:
-        InputError: the run lacks a chosen search, or the page cannot be written.
     """
     options = options or ReportOptions()
     path = out or run.path / PAGE

@@ -40,22 +40,14 @@ class ReportOptions(Spec):
     )
 
     def chosen_agents(self, known: Sequence[str]) -> Sequence[str]:
-        """Return which of the agents of a run are replayed.
-
-        Raises:
-            InputError: the run has no such agent.
-        """
+        """Return which of the agents of a run are replayed."""
         for name in self.agents or ():
             if name not in known:
                 raise InputError(f"--agents has {name!r}; {nearest(name, list(dict.fromkeys(known)))}")
         return known if self.agents is None else self.agents
 
     def chosen_numbers(self, known: Sequence[int]) -> list[int] | None:
-        """Return which seeds or days of a run are replayed; None to choose them.
-
-        Raises:
-            InputError: the run has no such seed or day.
-        """
+        """Return which seeds or days of a run are replayed; None to choose them."""
         for number in self.numbers or ():
             if number not in known:
                 theirs = f"{known[0]} to {known[-1]}" if known else "none"

@@ -106,11 +106,7 @@ class Table(ABC):
 
     @abstractmethod
     def read(self, folder: Path) -> list[Row]:
-        """Read the complete lines of the file in a folder; none if there is no file.
-
-        Raises:
-            InputError: the file is damaged, or not of this version.
-        """
+        """Read the complete lines of the file in a folder; none if there is no file."""
 
     @abstractmethod
     def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
@@ -214,7 +210,6 @@ class LongTable(Table):
         ]
 
     def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        """See `Table`."""
         in_line = (*self.line_keys, *self.columns)
         texts = [csv_text((*self.keys, *in_line), [], header=header)]
         for row in rows:
@@ -240,7 +235,6 @@ class JsonTable(Table):
     what: str
 
     def read(self, folder: Path) -> list[Row]:
-        """See `Table`."""
         path = folder / self.file
         if not path.exists():
             return []
@@ -257,7 +251,6 @@ class JsonTable(Table):
         return rows
 
     def texts(self, rows: Sequence[Row], *, header: bool = False) -> Iterator[tuple[str, str]]:
-        """See `Table`."""
         del header
         yield self.file, "".join(json.dumps(row) + "\n" for row in rows)
 
@@ -272,11 +265,7 @@ def write_summary(folder: Path, summary: Mapping[str, Any], name: str = SUMMARY)
 
 
 def read_settings(folder: Path) -> Row | None:
-    """Read the settings of the run in a folder; return None if there is no run.
-
-    Raises:
-        InputError: the file is damaged.
-    """
+    """Read the settings of the run in a folder; return None if there is no run."""
     file = folder / SETTINGS
     if not file.exists():
         return None
@@ -298,9 +287,6 @@ def require_same_settings(folder: Path, settings: Mapping[str, Any], kind: str) 
 
     Returns:
         The merged settings; new values take precedence.
-
-    Raises:
-        InputError: there is no run, or its settings differ.
     """
     before = read_settings(folder)
     if before is None:
@@ -356,11 +342,7 @@ class Results:
         self._rows: dict[str, dict[Key, Row]] = {table.file: {} for table in tables}
 
     def read(self) -> None:
-        """Read the rows that the folder holds.
-
-        Raises:
-            InputError: a table is damaged, or not of this version.
-        """
+        """Read the rows that the folder holds."""
         for table in self._tables:
             self._rows[table.file] = {table.key(row): row for row in table.read(self.path)}
 
@@ -384,10 +366,6 @@ class Results:
 
         Returns:
             The settings for `begin`, and whether an earlier run is continued.
-
-        Raises:
-            InputError: the folder is not writable, it holds another run and neither `resume` nor `overwrite` is set, or
-                `resume` is set and the settings differ.
         """
         make_folder(self.path)
         found, finished = (self.path / SETTINGS).exists(), (self.path / SUMMARY).exists()

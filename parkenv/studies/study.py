@@ -87,11 +87,7 @@ class ExecutionSpec(Spec):
     )
 
     def workers(self) -> Workers:
-        """Return the workers, a context manager that connects to clusters.
-
-        Raises:
-            InputError: the fields are incompatible.
-        """
+        """Return the workers, a context manager that connects to clusters."""
         return Workers(self.jobs or None, self.backend, self.address)
 
 
@@ -250,11 +246,7 @@ class Stage(NamedTuple):
 
 
 def study_class(kind: object, source: str = "") -> type[Any]:
-    """Return the class of a kind of study.
-
-    Raises:
-        InputError: an unknown kind; the message starts with the source and names the nearest.
-    """
+    """Return the class of a kind of study."""
     if not isinstance(kind, str) or kind not in STUDIES:
         raise InputError(f"{source}: kind is {kind!r}; {nearest(str(kind), STUDIES)}")
     module, _, name = STUDIES[kind].partition(":")
@@ -272,11 +264,7 @@ def schemas() -> dict[str, dict[str, Any]]:
 
 
 def read_study(file: Path) -> Any:
-    """Read the specification of a study; its key `kind` says which, `compare` if absent.
-
-    Raises:
-        InputError: see `Spec.read`.
-    """
+    """Read the specification of a study; its key `kind` says which, `compare` if absent."""
     tables = read_tables(file)
     study = study_class(tables.get("kind", "compare"), str(file))
     return study.parse(tables, str(file), file.parent).of_file(file)

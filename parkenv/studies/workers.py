@@ -53,9 +53,6 @@ class Workers:
         address: address of a cluster (dask: `tcp://HOST:8786`; ray: `HOST:6379` or `ray://HOST:10001`). Without one,
             ray and dask start a cluster on this machine and stop it at the end.
 
-    Raises:
-        InputError: the backend is unknown or not installed, or there is no cluster at the address.
-
     Examples:
         >>> with Workers(jobs=1) as workers:
         ...     sorted(workers.results([int, float]))

@@ -38,9 +38,6 @@ class Facility:
         inside_s: s from the barrier to a space when a counted facility is empty and when it is full; linear between.
         known: what drivers know of it: `nothing`, `sign` or `live`.
         delay_s: s by which a live count lags behind.
-
-    Raises:
-        InputError: a value out of its range; the message names the field.
     """
 
     name: str

@@ -90,9 +90,6 @@ class Turn(_ByValue):
         points: (3, 2) float64, m, lot frame: a point on the lane by which cars come, the junction, and a point on the
             lane by which they leave; the first and the last one are the same where cars turn back.
         only: whether the turn is mandatory: all others from its lane are prohibited.
-
-    Raises:
-        InputError: a wrong shape, or a value that is not finite.
     """
 
     points: FloatArray

@@ -58,9 +58,6 @@ class Hours:
         Args:
             text: the hours.
             field: what messages call them.
-
-        Raises:
-            InputError: another text, or a span that does not end after it begins.
         """
         if not isinstance(text, str):
             raise InputError(f"{field} is {text!r:.40}, want a text such as 'Mo-Sa 08:00-20:00'")
@@ -163,9 +160,6 @@ class Price:
         hourly: pairs of hours, which do not overlap, and the price of an hour then, instead of `per_hour`, `steps`,
             `free_s` and `charged`; other hours are free.
 
-    Raises:
-        InputError: a value out of its range, or steps that fall; the message names the field.
-
     Examples:
         >>> price = Price(steps=((3600.0, 1.0), (7200.0, 3.0)), per_hour=2.0, daily_cap=8.0)
         >>> price.amount(0.0, np.array([1800.0, 7200.0, 10800.0, 86400.0])).tolist()
@@ -209,9 +203,6 @@ class Price:
     @classmethod
     def parse(cls, text: str, field: str = "price") -> Price:
         """Read prices by hours, as OpenStreetMap writes them: `1.5 @ 08:00-12:00; 3 @ Mo-Sa 12:00-15:00`.
-
-        Raises:
-            InputError: another text, a price below 0, or two prices at a time.
 
         Examples:
             >>> price = Price.parse("1 @ 08:00-12:00; 3 @ 12:00-15:00")
@@ -304,9 +295,6 @@ class Zone:
         max_stay_s: s, longest stay; where the price has charged hours, only these count.
         users: classes of users, one of which a driver must belong to: `public` (everyone), or names such as
             `permit-a`, `disabled`, `charging`, `customers`, `delivery`, `private`.
-
-    Raises:
-        InputError: a value out of its range; the message names the field.
     """
 
     name: str
@@ -345,9 +333,6 @@ class Tariff:
             hour of the zone costs, with its hours and steps as they are; one such as `1 @ 08:00-12:00; 3 @ 12:00-18:00`
             has prices by hours (`Price.parse`). A name may have `*` for any letters: that of
             all such zones that cost something. The first name of a zone counts; other zones keep their prices.
-
-    Raises:
-        InputError: a price is no number of at least 0.
     """
 
     per_hour: Mapping[str, float | str] = field(default_factory=dict)
@@ -378,11 +363,7 @@ class Tariff:
         return replace(zone, price=given if isinstance(given, Price) else Price(given))
 
     def require_zones(self, zones: Sequence[Zone], lot: str) -> None:
-        """Check that a lot has every zone with a price.
-
-        Raises:
-            InputError: it does not; the message names the nearest zone.
-        """
+        """Check that a lot has every zone with a price."""
         for name in self.per_hour:
             if not any(_means(name, zone) for zone in zones):
                 near = nearest(name, [zone.name for zone in zones])
@@ -391,11 +372,7 @@ class Tariff:
 
 
 def priced(price: float | str) -> float | Price:
-    """Return the amount of a price, or that which a text such as `+1` adds; of a text with `@`, prices by hours.
-
-    Raises:
-        InputError: it is another text.
-    """
+    """Return the amount of a price, or that which a text such as `+1` adds; of a text with `@`, prices by hours."""
     if not isinstance(price, str):
         return float(price)
     if "@" in price:

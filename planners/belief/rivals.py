@@ -68,9 +68,6 @@ class BeliefRivalsAgent(BeliefAgent):
         budget_ms: see `belief`.
         day: see `belief`.
         most_vertices: see `belief`.
-
-    Raises:
-        InputError: see `belief`; `arrivals_per_hour` is negative or not finite.
     """
 
     name: ClassVar[str] = "belief-rivals"

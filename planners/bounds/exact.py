@@ -415,9 +415,6 @@ class ExactAgent(SearchAgent[ExactState]):
     Args:
         problem: lot, goal, speeds and costs.
         most_states: maximum number of belief states.
-
-    Raises:
-        InputError: the lot is too large, or the sensor errs.
     """
 
     name: ClassVar[str] = "exact"

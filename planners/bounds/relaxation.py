@@ -102,9 +102,6 @@ class SearchBound:
     Args:
         problem: lot, goal, speeds, costs and view range.
         most_states: limits how fine the groups are, and so the time of a bound.
-
-    Raises:
-        InputError: `most_states` is not positive.
     """
 
     name: ClassVar[str] = "bound"

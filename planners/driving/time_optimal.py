@@ -51,9 +51,6 @@ def shorten(made: Manoeuvre, deadline_s: float) -> Manoeuvre:
     """Return the shortest drive found until a deadline, s: one that touches nothing and arrives, or the given one.
 
     A drive among road users stays as it is: it has waited for them.
-
-    Raises:
-        InputError: CasADi is not installed.
     """
     until = time.perf_counter() + deadline_s
     if made.path is None or made.others is not None or not made.judged.driven:
@@ -225,10 +222,6 @@ def _at(time_s: FloatArray, knots: FloatArray, at: float) -> FloatArray:
 
 
 def require_casadi() -> Any:
-    """Return the module of CasADi.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """Return the module of CasADi."""
     with with_extra("shortening drives", "optimal"):
         return import_module("casadi")

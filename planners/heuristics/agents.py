@@ -141,9 +141,6 @@ class FirstFreeAgent(TargetAgent):
         problem: the problem.
         within_m: maximum distance from the goal, m, at which a free slot is good enough; None: the lot's median. A
             slot's price counts as the distance that one walks in as many seconds.
-
-    Raises:
-        InputError: no slot is within `within_m`.
     """
 
     name: ClassVar[str] = "first-free"

@@ -125,11 +125,7 @@ def update_labels(graph: StoppingGraph, labels: Labels) -> None:
 
 
 def by_policy_iteration(mdp: ParkingMDP, start: Labels | None = None) -> tuple[Labels, int]:
-    """Plan by the thesis's solver, starting from the moves of another plan; return the plan and the iterations.
-
-    Raises:
-        InputError: gamma is 1.
-    """
+    """Plan by the thesis's solver, starting from the moves of another plan; return the plan and the iterations."""
     policy = None if start is None else start.move.astype(np.int64)
     solution = policy_iteration(mdp, policy)
     labels = Labels(-solution.values, solution.policy.astype(np.int8), mdp.p_free, settled=False)

@@ -62,9 +62,6 @@ class StaticAgent(SearchAgent[Plan]):
             (`problem.failure_s`).
         gamma: discount per decision. None: 0.9999, or more where edges are short (`discount`).
         solver: one of `SOLVERS`.
-
-    Raises:
-        InputError: the solver is unknown, a value is out of range, or gamma is 1 for policy iteration.
     """
 
     name: ClassVar[str] = "mdp-static"
@@ -95,9 +92,6 @@ class StaticAgent(SearchAgent[Plan]):
 
         Args:
             p_occupied: (n_slots,) P(taken).
-
-        Raises:
-            InputError: the belief has the wrong shape, or a value outside 0 to 1.
         """
         n_slots = self.problem.lot.n_slots
         if p_occupied.shape != (n_slots,):
@@ -168,9 +162,6 @@ class ReplanningAgent(StaticAgent):
         solver: one of `SOLVERS`.
         day: whether to plan with the belief of `belief`: the observations of some slots tell how the day differs from
             its forecast, and so change P(taken) of the others (`DayBelief`).
-
-    Raises:
-        InputError: as for `mdp-static`.
     """
 
     name: ClassVar[str] = "mdp"

@@ -224,9 +224,6 @@ class TunedAgent(SearchAgent[TunedPlan]):
         seed: seed of those worlds.
         gamma: discount per decision. None: 0.9999, or more where edges are short.
         most_vertices: a larger lot is simulated in part (`Neighborhoods`).
-
-    Raises:
-        InputError: `worlds` or `most_vertices` is out of range.
     """
 
     name: ClassVar[str] = "mdp-tuned"

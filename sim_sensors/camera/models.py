@@ -353,12 +353,7 @@ def camera_pose(
 
 
 def checked_pose(scene: Drawable, pose: FloatArray) -> FloatArray:
-    """Return the pose as a contiguous (4, 4) float64 array.
-
-    Raises:
-        SensorError: the pose has another shape, is not finite, not a rotation, not above the ground, or inside a
-        vehicle.
-    """
+    """Return the pose as a contiguous (4, 4) float64 array."""
     pose = np.ascontiguousarray(pose, dtype=np.float64)
     if pose.shape != (4, 4):
         raise SensorError(f"camera pose has shape {pose.shape}, want (4, 4)")

@@ -174,10 +174,6 @@ class ScanPlane:
         ids: (n,) int, 0 or more, the id that a scan reports for a hit; several footprints may share one. None: 0 to
             n-1.
 
-    Raises:
-        SensorError: a shape does not fit, a value is not finite, a footprint is concave, crosses itself or has no area,
-        or a wall has no length.
-
     Examples:
         >>> plane = ScanPlane([[[1, -1], [2, -1], [2, 1], [1, 1]]], walls=[[[5, -9], [5, 9]]])
         >>> plane.n_footprints, plane.n_walls
@@ -231,9 +227,6 @@ class ScanPlane:
         Args:
             index: index of the footprint, 0 to n_footprints - 1.
             corners: (k, 2) float, m, world frame, 3 to k_max corners in either orientation; None to clear it.
-
-        Raises:
-            SensorError: the footprint does not exist, or the corners are invalid.
         """
         if not 0 <= index < self.n_footprints:
             raise SensorError(f"index is {index}, want 0 to {self.n_footprints - 1}")
@@ -299,11 +292,7 @@ def _cell_of(circle: FloatArray, frame: FloatArray) -> IntArray:
 
 
 def _as_floats(name: str, value: ArrayLike, shape: tuple[int | None, ...]) -> FloatArray:
-    """Return `value` as a finite float64 array of the given shape; None stands for any length.
-
-    Raises:
-        SensorError: the shape differs, or a value is not a finite number.
-    """
+    """Return `value` as a finite float64 array of the given shape; None stands for any length."""
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -350,9 +339,6 @@ def _normalised(name: str, corners: FloatArray, n_corners: IntArray) -> tuple[Fl
 
     Returns:
         (n, k_max, 2) float64 and (n,) int64.
-
-    Raises:
-        SensorError: too few or too many corners, coinciding corners, no area, or a concave or self-crossing outline.
     """
     k_max = corners.shape[1]
     wrong = (n_corners < 3) & (n_corners != 0) | (n_corners > k_max)

@@ -67,9 +67,6 @@ def dragon_lake_lot(path: Path) -> ParkingLot:
     rows R1 to R4 from column C1 to their east ends, which are dead ends; C1 and C2 connect them, and EXT
     leads in from the north. All are two-way. Cars enter at the outer end of EXT. The map has no goal; the goal is
     set to (80, -4), a door at the southern end of the middle column C2.
-
-    Raises:
-        InputError: the file cannot be read or is not a Dragon Lake map.
     """
     document = _Map.parse(read_yaml(path), str(path))
     with naming(path):

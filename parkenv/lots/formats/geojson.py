@@ -63,9 +63,6 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
         lot: the lot.
         path: the file.
         provenance: what an import guessed, kept in the member `import`.
-
-    Raises:
-        InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
     """
     path = Path(path)
     _check_suffix(path)
@@ -87,11 +84,7 @@ def write_lot(lot: ParkingLot, path: str | Path, provenance: Provenance | None =
 
 
 def check_lot_output(path: Path) -> None:
-    """Check that `write_lot` can write a file, before any work.
-
-    Raises:
-        InputError: the name does not end in `.geojson` or `.json`, or the file cannot be written.
-    """
+    """Check that `write_lot` can write a file, before any work."""
     _check_suffix(path)
     check_writable(path)
 

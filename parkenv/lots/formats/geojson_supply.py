@@ -28,11 +28,7 @@ _COUNTED = ("gate_s", "inside_s", "known", "delay_s")  # properties of counted f
 
 
 def read_zones(document: Any) -> dict[str, Zone]:
-    """Return the rules of the member `zones`.
-
-    Raises:
-        InputError: a rule is none; the message names zone and field.
-    """
+    """Return the rules of the member `zones`."""
     if not isinstance(document, dict):
         raise InputError(f"zones is {document!r:.40}, want an object with the rules of each zone")
     rules = {}
@@ -52,11 +48,7 @@ def read_zones(document: Any) -> dict[str, Zone]:
 
 
 def price_of(given: Any) -> Price:
-    """Return the price of a number, that of an hour, of a text, by hours, or of the members of a price.
-
-    Raises:
-        InputError: it is none; the message names the field.
-    """
+    """Return the price of a number, that of an hour, of a text, by hours, or of the members of a price."""
     if type(given) in (int, float):
         return Price(given)
     if isinstance(given, str):

@@ -64,10 +64,6 @@ class Positions:
         """Recognise the positions of a parsed FeatureCollection: by `frame`, by `crs`, else by their size.
 
         Metres that nothing but their size tells are warned of.
-
-        Raises:
-            InputError: `crs` names no known system, the positions do not fit it, or they have no plausible size; the
-                message does not name the file.
         """
         rings, spaces = _outlines(document)
         low, high = (

@@ -49,10 +49,6 @@ def read_slot_list(path: str | Path) -> SlotList:
     The first line names the columns: `x,y` in metres east and north, or `lat,lon` in degrees; optional are `yaw`,
     the heading in rad, counter-clockwise from east, of a car parked nose-in, `id` (by default the row number),
     `parking_cost_s`, the parking cost in seconds (by default 0), and `zone`, the tariff zone (by default none).
-
-    Raises:
-        InputError: the file cannot be read, a column is missing or unknown, a value is not a finite number or
-            out of range, an id or a position appears twice.
     """
     path = Path(path)
     rows = [row for _, row in csv_rows(path) if any(cell.strip() for cell in row)]
@@ -122,9 +118,6 @@ def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> L
     The centres become rectangles (`parkenv.lots.infer.centers`), from which lanes are inferred
     (`parkenv.lots.infer.layout`). Where that fails, the draft has only slot centres and says why; it can still be
     drawn. A list has neither entries nor goals; they are given or guessed.
-
-    Raises:
-        InputError: see `read_slot_list`.
     """
     path = Path(path)
     options = options or ImportOptions()

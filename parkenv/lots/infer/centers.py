@@ -66,9 +66,6 @@ def spaces_from_centers(
         ids: n names.
         xy: (n, 2) m, centres.
         yaw: (n,) rad, heading of a car parked nose-in, or None.
-
-    Raises:
-        InputError: too few centres or rows, an implausible spacing, a sharp bend, or cars at different angles in a row.
     """
     rows, strays = _find_rows(xy)
     if len(strays) > MOST_STRAYS * len(xy):

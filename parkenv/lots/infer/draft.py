@@ -53,9 +53,6 @@ def draft_inferred_lot(
         goal_note: where they come from, if they were found.
         walls: (k, 2) m each.
         outlines: (k, 2) m each, parking areas for the figure.
-
-    Raises:
-        InputError: too many spaces have no aisle.
     """
     without_aisle = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
     lost = sum(map(len, without_aisle.values()))

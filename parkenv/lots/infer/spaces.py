@@ -66,9 +66,6 @@ def spaces_from_outlines(ids: Sequence[str], outlines: NDArray[np.object_]) -> S
 
     A parallelogram becomes the rectangle along its longer sides, any other outline the smallest rectangle around it,
     narrowed to the outline's area. Rectangles that overlap a little are narrowed until they do not.
-
-    Raises:
-        InputError: an area out of bounds, or two spaces on top of each other.
     """
     area = shapely.area(outlines)
     validate_areas(ids, area)

@@ -39,9 +39,6 @@ class Area:
             frame: the lot's frame.
             simple: whether outlines that cross themselves are refused; otherwise, and if the edge of the map cuts them,
                 they are mended.
-
-        Raises:
-            InputError: an outline that is open, or that crosses itself.
         """
         if not element.is_closed:
             raise InputError(f"{element.id}: its outline is open, want its first position again at the end")

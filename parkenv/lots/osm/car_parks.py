@@ -44,9 +44,6 @@ def import_car_parks(
         path: an OpenStreetMap file with outlines of parking spaces.
         options: whether entries and goals may be guessed, and which spaces count.
         least: number of spaces below which a group of spaces is no car park.
-
-    Raises:
-        InputError: the file cannot be read, has no parking spaces or an outline that is none.
     """
     path = Path(path)
     place = read_map(path)
@@ -66,11 +63,7 @@ def import_car_parks(
 def split_town(
     name: str, elements: Sequence[OsmElement], least: int
 ) -> Iterator[tuple[str, list[OsmElement]]]:
-    """Yield the name and the elements of each group of at least `least` spaces, the largest first.
-
-    Raises:
-        InputError: no parking spaces, or too many.
-    """
+    """Yield the name and the elements of each group of at least `least` spaces, the largest first."""
     spaces = [e for e in elements if is_space(e)]
     if not spaces:
         raise InputError("no amenity=parking_space in it, want their outlines to find car parks")

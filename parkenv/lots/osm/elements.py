@@ -104,9 +104,6 @@ class OsmMap:
 
         Args:
             bounds: two corners, each a latitude and a longitude, degrees.
-
-        Raises:
-            InputError: the box holds nothing of the map.
         """
         corners = np.array(bounds)[:, ::-1]
         low, high = corners.min(axis=0), corners.max(axis=0)
@@ -137,12 +134,7 @@ class OsmMap:
 
 
 def read_map(path: Path) -> OsmMap:
-    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON, cut at the edge of the map.
-
-    Raises:
-        InputError: the file cannot be read, is damaged, too large or has another format; a position is not on the
-            globe; an element appears twice with different content; or no way has a node in the file.
-    """
+    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON, cut at the edge of the map."""
     suffix = unpacked_path(path).suffix.lower()
     if suffix == ".pbf":
         return _read_pbf(path)
@@ -227,11 +219,7 @@ class RawElements:
     count: int = 0  # of elements
 
     def count_one(self) -> None:
-        """Count an element.
-
-        Raises:
-            InputError: there are too many.
-        """
+        """Count an element."""
         self.count += 1
         if self.count > MOST_ELEMENTS:
             raise InputError(
@@ -260,11 +248,7 @@ class RawElements:
         self.ways[number] = way
 
     def map(self, positions: Positions | None = None) -> OsmMap:
-        """Return the tagged elements with their references resolved, cut at the edge of the map.
-
-        Raises:
-            InputError: there are ways, but none has a node in the file.
-        """
+        """Return the tagged elements with their references resolved, cut at the edge of the map."""
         nodes = [
             OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
             for i, tags in self.node_tags.items()
@@ -512,11 +496,7 @@ def _read_xml(path: Path) -> OsmMap:
 
 
 def map_of_json(document: Any, positions: Positions) -> OsmMap:
-    """Return the map of parsed Overpass JSON, or of GeoJSON with positions that are yet to be converted.
-
-    Raises:
-        InputError: see `read_map`; the message does not name the file.
-    """
+    """Return the map of parsed Overpass JSON, or of GeoJSON with positions that are yet to be converted."""
     if not isinstance(document, dict):
         raise InputError(f"holds a {type(document).__name__}, want Overpass JSON or a FeatureCollection")
     if isinstance(document.get("elements"), list):

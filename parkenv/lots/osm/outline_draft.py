@@ -40,10 +40,6 @@ def outline_draft(
         roads: roads open to cars, in the lot's frame.
         frame: the lot's frame.
         options: goals, entries and bounds given by the user.
-
-    Raises:
-        InputError: an outline that is open, crosses itself or lies on another, an area that is no space's, too many
-            spaces, spaces of which no lot can be made, or nothing left of them.
     """
     drawn = [e for e in elements if is_space(e)]
     if len(drawn) > MOST_SPACES:

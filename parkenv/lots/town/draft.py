@@ -106,9 +106,6 @@ def import_town(
             out.
         bounds: two corners, each a latitude and a longitude, at which the map is cut; None: all of it.
         untagged_kerbs: places of kerbs that the map says nothing of, as a multiple of the rule's.
-
-    Raises:
-        InputError: the file is damaged or has another format, has no street or no parking, or is too large for a plane.
     """
     path = Path(path)
     listed = [] if car_parks is None else read_listed(Path(car_parks))

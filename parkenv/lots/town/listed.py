@@ -60,11 +60,7 @@ _COLUMNS = {
 
 
 def read_listed(path: Path) -> list[ListedCarPark]:
-    """Read a list of car parks, a CSV file with the columns name, capacity, lat and lon; others are not read.
-
-    Raises:
-        InputError: the file cannot be read, or a value is wrong; the message names file, line, column and value.
-    """
+    """Read a list of car parks, a CSV file with the columns name, capacity, lat and lon; others are not read."""
     require_file(path)
     found: dict[str, ListedCarPark] = {}
     for line, row in typed_records(path, lambda name: _COLUMNS.get(name, TEXT)):

@@ -55,9 +55,6 @@ class Streets:
     Args:
         roads: the roads that cars may drive, whole ways.
         cut: ids of the ways that the edge of the map cuts.
-
-    Raises:
-        InputError: no road, or none that leads back.
     """
 
     roads: tuple[Road, ...]
@@ -381,11 +378,7 @@ def _joined(lanes: Sequence[Lane], mouths: FloatArray) -> list[Lane]:
 
 
 def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, list[LeftOut]]:
-    """Return the streets of a map, motorways and tunnels among them, and the roads left out.
-
-    Raises:
-        InputError: see `Streets`.
-    """
+    """Return the streets of a map, motorways and tunnels among them, and the roads left out."""
     roads: list[Road] = []
     left_out: dict[str, list[str]] = {}
     for element in elements:

@@ -24,9 +24,6 @@ def save_census(rows: Sequence[dict[str, Any]], path: str | Path) -> None:
     Args:
         rows: of a census: slots, kind, result, drive_s, error_probability and the number of slots of each kind.
         path: the PNG file to write.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     slots = np.array([row["slots"] for row in rows], float)
     kinds = [row["kind"] for row in rows]

@@ -27,11 +27,7 @@ SLOT = "#9db8d2"
 
 
 def save_contact_sheets(lots: Sequence[tuple[str, ParkingLot]], folder: Path) -> list[Path]:
-    """Draw lots, 60 in a sheet, into `contact-sheet-1.png` and so on in a folder, and return the files.
-
-    Raises:
-        InputError: a file cannot be written.
-    """
+    """Draw lots, 60 in a sheet, into `contact-sheet-1.png` and so on in a folder, and return the files."""
     files = []
     for k in range(0, len(lots), LARGEST):
         files.append(folder / f"contact-sheet-{k // LARGEST + 1}.png")
@@ -45,9 +41,6 @@ def save_contact_sheet(lots: Sequence[tuple[str, ParkingLot]], path: str | Path)
     Args:
         lots: captions, whose first line is bold, and lots; each is drawn at a scale of its own, with a bar.
         path: the file.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     shown = lots[:LARGEST]
     columns = min(COLUMNS, max(len(shown), 1))

@@ -66,11 +66,7 @@ def picture(
 
 
 def save_picture(figure: Figure, path: str | Path, caption: str = "") -> None:
-    """Write a PNG atomically.
-
-    Raises:
-        InputError: the file cannot be written.
-    """
+    """Write a PNG atomically."""
     with mpl.rc_context(STYLE), atomic_write(path) as beside:
         figure.savefig(beside, format="png", dpi=DPI, metadata={CAPTION: caption} if caption else None)
 
@@ -86,9 +82,6 @@ def save_film(
         fps: frames per second.
         colors: size of one palette for all frames, which keeps rare colours (for drawings). If None, each frame has
             its own palette (for photographs).
-
-    Raises:
-        InputError: the file cannot be written.
     """
     pictures = [Image.fromarray(frame) for frame in frames]
     if colors is not None:

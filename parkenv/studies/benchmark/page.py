@@ -36,11 +36,7 @@ _WHO = (
 
 
 def result_files(path: Path) -> list[Path]:
-    """Return the result files in a folder: each `result.json` below it, or else each `.json`; a file is itself.
-
-    Raises:
-        InputError: there is none.
-    """
+    """Return the result files in a folder: each `result.json` below it, or else each `.json`; a file is itself."""
     if not path.is_dir():
         return [path]
     if not (found := sorted(path.rglob(RESULT)) or sorted(path.rglob("*.json"))):
@@ -66,11 +62,7 @@ class Entry(NamedTuple):
 
 
 def entries_of(results: Sequence[Row]) -> list[Entry]:
-    """Return the agents of results, the best score first.
-
-    Raises:
-        InputError: an agent that does not come with parkenv has no address.
-    """
+    """Return the agents of results, the best score first."""
     entries = []
     for result in results:
         for agent, tasks in result["episodes"].items():
@@ -133,9 +125,6 @@ def benchmark_data(results: Sequence[Row], command: Sequence[str]) -> dict[str, 
     Args:
         results: contents of result files that passed `check_result`.
         command: the command that makes the page.
-
-    Raises:
-        InputError: see `entries_of`.
     """
     suite, entries = Suite.packaged(), entries_of(results)
     pairs, searches = neighbours(suite, entries), sum(map(len, entries[0].times.values()))

@@ -143,9 +143,6 @@ def result_of(
         command: the command that ran them.
         by: who submits the result; dated today.
         code: address of the agents' code.
-
-    Raises:
-        InputError: the wall times of an agent's decisions are lost.
     """
     rows = score_rows(suite, cells, finished)
     for row in rows:
@@ -207,9 +204,6 @@ def check_result(path: Path) -> Row:
     The check recomputes the clairvoyant bounds of all searches, which differ in other worlds or with other costs and
     speeds, and from the times of the searches all means and scores. It cannot verify the times of an agent; for that,
     run the agent again.
-
-    Raises:
-        InputError: the check failed; the message names file, field, value and what was wanted.
     """
     result: Row = read_json(path)
     ResultFile.parse(result, str(path))

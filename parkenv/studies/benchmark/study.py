@@ -46,11 +46,9 @@ class Benchmark(CaseStudy):
         return Suite.packaged()
 
     def check(self) -> None:
-        """See `Study`."""
         self.cells()
 
     def settings(self) -> Row:
-        """See `Study`."""
         from parkenv.studies.fingerprints import agent_fingerprints
 
         return {
@@ -61,7 +59,6 @@ class Benchmark(CaseStudy):
         }
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return self._cases
 
     @cached_property
@@ -69,7 +66,6 @@ class Benchmark(CaseStudy):
         return self.made_suite.cases(self.agents)
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         from parkenv.studies.benchmark.result_file import score_rows
 
         return {"rows": score_rows(self.made_suite, self.cells(), results.rows(self.table))}

@@ -109,11 +109,7 @@ class Suite:
         )
 
     def cases(self, agents: Sequence[AgentSpec]) -> list[Cell]:
-        """Return the cases: every agent in every task.
-
-        Raises:
-            InputError: an agent does not exist or does not support a task.
-        """
+        """Return the cases: every agent in every task."""
         worlds = [task.made(self.arrival) for task in self.tasks]
         for world in worlds:
             for agent in agents:

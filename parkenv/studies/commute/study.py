@@ -124,7 +124,6 @@ class Commute(Study):
         return {scenario.name: calendar(scenario, self.days) for scenario in self.built}
 
     def check(self) -> None:
-        """See `Study`."""
         from planners.agent import make_agent
 
         for scenario in self.built:
@@ -137,21 +136,17 @@ class Commute(Study):
             run.start_map()
 
     def settings(self) -> Row:
-        """See `Study`."""
         from parkenv.studies.fingerprints import search_settings
 
         return search_settings(self, "seed", "fleet")
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [Cell(run, self.calendars[run.scenario.name]) for run in self.runs]
 
     def keys(self, work: CommuteRun, item: Day) -> list[Key]:
-        """See `Study`."""
         return [(*work.columns.values(), item.number, driver) for driver in range(work.fleet)]
 
     def label(self, work: CommuteRun) -> str:
-        """See `Study`."""
         return f"{work.agent.label} in {work.scenario.name}"
 
     def stages(self, results: Results) -> Iterator[Stage]:
@@ -176,7 +171,6 @@ class Commute(Study):
         return _Days(work, before)
 
     def run(self, work: Any, items: Sequence[Day]) -> list[Row]:
-        """See `Study`."""
         run, before = work
         rows: list[Row] = run.run(items, before)
         return rows
@@ -194,7 +188,6 @@ class Commute(Study):
                         store.add_trip(trip)
 
     def prepare(self, results: Results, *, continues: bool) -> None:
-        """See `Study`."""
         from parkenv.studies.commute.runs import MAPS_FOLDER
 
         maps = results.path / MAPS_FOLDER
@@ -203,7 +196,6 @@ class Commute(Study):
             old.unlink()
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         from parkenv.studies.commute.tables import day_rows, week_rows
 
         episodes = [row for cell in self.cells() for row in results.of(self, cell)]

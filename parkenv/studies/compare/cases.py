@@ -98,11 +98,7 @@ def _forecast_of(scenario: Scenario, seed: int) -> SlotBelief:
 
 
 def require_distinct(cases: Iterable[Case]) -> None:
-    """Check that no two cases would share their rows, as two of a user's agents with the same `name` would.
-
-    Raises:
-        InputError: two agents are called the same.
-    """
+    """Check that no two cases would share their rows, as two of a user's agents with the same `name` would."""
     counts = Counter(tuple(case.columns.values()) for case in cases)
     if counts and (most := counts.most_common(1)[0])[1] > 1:
         raise InputError(f"two agents are called {most[0][2]!r}, want different names")
@@ -127,11 +123,7 @@ def settings_of(
 
 
 def at_occupancy(scenario: Scenario, level: float) -> Scenario:
-    """Return the scenario with a mean occupancy of `level` at the middle of its arrival window, on its first day.
-
-    Raises:
-        InputError: its occupancy or forecast is not `adjustable`, such as a recorded log.
-    """
+    """Return the scenario with a mean occupancy of `level` at the middle of its arrival window, on its first day."""
     window = scenario.arrival
     middle = (window.start_s + window.end_s) / 2
     # Occupancy differs between days, so the level can hold on one day only.
@@ -187,11 +179,7 @@ def rows_of(
 
 
 def check_worlds(scenario: Scenario, seeds: Sequence[int]) -> None:
-    """Check, before anything is written, that the scenario has a world and a forecast for every search.
-
-    Raises:
-        InputError: it has not, e.g. because a log has no other day to forecast from.
-    """
+    """Check, before anything is written, that the scenario has a world and a forecast for every search."""
     days = set()
     for seed in seeds:
         key = world_key(seed, 0)

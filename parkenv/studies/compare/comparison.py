@@ -131,15 +131,12 @@ class CaseStudy(Study):
     """A study whose cells are cases: an agent in a scenario, with the seeds of its searches."""
 
     def run(self, work: Case, items: Sequence[int]) -> list[Row]:
-        """See `Study`."""
         return work.run(items)
 
     def label(self, work: Case) -> str:
-        """See `Study`."""
         return f"{work.label} in {work.scenario.name}"
 
     def replays(self, folder: Path) -> Sequence[Replay]:
-        """See `Study`."""
         from parkenv.studies.compare.search_replay import SearchReplay
 
         return [SearchReplay(_driven(self.cells()), folder)]
@@ -248,7 +245,6 @@ class Comparison(CaseStudy):
         return range(self.seed, self.seed + self.episodes)
 
     def check(self) -> None:
-        """See `Study`."""
         from parkenv.studies.compare.cases import BUDGET, check_worlds, require_distinct
         from planners.agent import make_agent
 
@@ -290,13 +286,11 @@ class Comparison(CaseStudy):
             check_worlds(scenario, self.seeds)
 
     def settings(self) -> Row:
-        """See `Study`."""
         from parkenv.studies.fingerprints import search_settings
 
         return search_settings(self, "rig")
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [*self.cases, *self.occupancy_cases]
 
     @cached_property
@@ -353,14 +347,12 @@ class Comparison(CaseStudy):
         return settings_of(scenario, self.grid.failure_s, walk, drive)
 
     def prepare(self, results: Results, *, continues: bool) -> None:
-        """See `Study`."""
         from parkenv.studies.compare.figures import remove_figures
 
         del continues
         remove_figures(results.path)
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         from parkenv.studies.compare.cases import table
 
         episodes, measured = results.rows(self.table), self.calibration
@@ -371,7 +363,6 @@ class Comparison(CaseStudy):
         }
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`."""
         from parkenv.studies.compare.figures import ComparisonResults, draw_figures
 
         flat = {

@@ -30,9 +30,6 @@ def plan_searches(
 
     Returns:
         A row for each setting, with expected and total time, s, and the path; and the searches, for pictures.
-
-    Raises:
-        InputError: the agent is unknown, or makes no plan.
     """
     if not isinstance(make_agent(agent.name, scenario, **agent.options), StaticAgent):
         raise InputError(f"--agents {agent.label!r} makes no plan; known: mdp, mdp-static")

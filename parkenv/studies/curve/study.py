@@ -79,7 +79,6 @@ class CurveStudy(FleetStudy):
 
     @property
     def knowledge(self) -> tuple[str, ...]:
-        """See `FleetStudy`."""
         return self.knows or (OWN,)
 
     @property
@@ -106,13 +105,11 @@ class CurveStudy(FleetStudy):
 
     @property
     def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
-        """See `Study`."""
         from parkenv.studies.curve.zones import ZONES
 
         return (self.table, ZONES)
 
     def day_tables(self, fleet: Fleet, tally: Tally, times: FloatArray, taken: IntArray) -> dict[str, Row]:
-        """See `FleetStudy`."""
         from parkenv.studies.curve.zones import ZONES, day_of_zones
 
         del tally
@@ -133,7 +130,6 @@ class CurveStudy(FleetStudy):
         super().check()
 
     def settings(self) -> Row:
-        """See `Study`."""
         return super().settings() | {"reach_m": self.reach_m}
 
     def _paths(self, results: Results) -> Paths | None:
@@ -224,7 +220,6 @@ class CurveStudy(FleetStudy):
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`."""
         from parkenv.show.report.tables import OF_FLEETS, tables_of
         from parkenv.studies.curve.fit import PREDICTORS
 

@@ -51,7 +51,6 @@ class _RecordedSurvey(SurveyStudy):
     doing: ClassVar = "1/3 survey drives"
 
     def drive(self, number: int) -> tuple[SessionResult, Any]:
-        """See `SurveyStudy`."""
         from parkenv.show.report.drive_recording import record_drive
 
         return record_drive(self.survey, number, PICTURES) if number == 0 else super().drive(number)
@@ -99,11 +98,9 @@ class Demo(CaseStudy):
         )
 
     def check(self) -> None:
-        """See `Study`."""
         self.survey.check()
 
     def settings(self) -> Row:
-        """See `Study`."""
         from parkenv.perception.detector_registry import detector_version
         from parkenv.studies.fingerprints import fingerprints, flat_tables
 
@@ -120,7 +117,6 @@ class Demo(CaseStudy):
         return [partial(_short_survey, self.survey.drive_settings), _short_searches]
 
     def prepare(self, results: Results, *, continues: bool) -> None:
-        """See `Study`."""
         from parkenv.show.figures.lot import save_lot_picture
 
         self.survey.prepare(results, continues=continues)
@@ -128,7 +124,6 @@ class Demo(CaseStudy):
         results.progress(f"The lot: {results.path / LOT}", 1, 1)
 
     def stages(self, results: Results) -> Iterator[Stage]:
-        """See `Study`."""
         yield from self.survey.stages(results)
         yield Stage("2/3 searches through the sensors", self, self.cases_in(results.path))
         yield Stage("3/3 searches without images", self, self.more_cases_in(results.path))
@@ -166,7 +161,6 @@ class Demo(CaseStudy):
             return store.log()
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         from parkenv.studies.compare.cases import table
 
         episodes = results.rows(EPISODES)
@@ -204,12 +198,10 @@ class Demo(CaseStudy):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`."""
         return [*SurveyStudy.findings({"rows": [summary["survey"]]}), *Comparison.findings(summary)]
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`."""
         from parkenv.show.report.tables import survey_tables
 
         page = super().page(summary, folder)
@@ -217,7 +209,6 @@ class Demo(CaseStudy):
         return page._replace(tables=[*page.tables, *surveyed])
 
     def replays(self, folder: Path) -> Sequence[Replay]:
-        """See `Study`."""
         from parkenv.studies.compare.search_replay import SearchReplay
 
         return [SearchReplay(self.cases_in(folder), folder), *self.survey.replays(folder)]

@@ -119,11 +119,7 @@ class DemandStudy(Study):
 
     @cached_property
     def town(self) -> CountedTown:
-        """The town and its counts.
-
-        Raises:
-            InputError: there are no counts, no counted facility of the lot has some, or the hours are not full ones.
-        """
+        """The town and its counts."""
         from parkenv.forecast.counts import Counts
         from parkenv.studies.fleet.counted_demand import CountedTown
 
@@ -147,7 +143,6 @@ class DemandStudy(Study):
         return self.town.counts.day_index(self._first + timedelta(weeks=self.weeks))
 
     def check(self) -> None:
-        """See `Study`."""
         counts = self.town.counts
         if not 0 < self._first_held_out < len(counts.days):
             from parkenv.show.plurals import plural
@@ -198,14 +193,12 @@ class DemandStudy(Study):
         return work._replace(fit=fit["car_parks"], expected=(before[0], expected[0]))
 
     def run(self, work: _RollOut, items: Sequence[Any]) -> list[Row]:
-        """See `Study`."""
         day = self.town.counts.day_index(date.fromisoformat(items[0]))
         before, expected = work.expected
         lines = self.town.predicted(day, work.fit, before, expected, self.episodes, self.seed)
         return [{"date": items[0], **lines}]
 
     def label(self, work: _RollOut) -> str:
-        """See `Study`."""
         del work
         return self.agent.label
 
@@ -326,16 +319,13 @@ class _Fits(DemandStudy):
     doing: ClassVar = "Fitting weeks followed"
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [Cell(_RollOut(number), tuple(KINDS)) for number in range(self.roll_outs)]
 
     def input_of(self, work: _RollOut, items: Sequence[Any], results: Results) -> _RollOut:
-        """See `Study`."""
         del items, results
         return work
 
     def run(self, work: _RollOut, items: Sequence[Any]) -> list[Row]:
-        """See `Study`."""
         (kind,), (followed, _) = items, self.days(work.number)
         days = followed[np.isin(self.town.counts.weekday[followed], KINDS[kind])]
         fit = self.town.fitted(days, self.rounds, self.episodes, self.seed)

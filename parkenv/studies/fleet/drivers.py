@@ -43,9 +43,6 @@ def policy_of(
     Heuristics and trained networks without memory are compiled. Networks of policies (ppo, maskable-ppo) draw their
     actions, as in training, so that equal cars do not all do the same; the draws follow from the world and the car.
     An agent that expects rivals gets how many cars arrive in an hour, if that is a number, as by a forecast of traffic.
-
-    Raises:
-        InputError: there is no such agent, or it is none for fleets.
     """
     if not spec.options and spec.name in POLICIES:
         return POLICIES[spec.name], None
@@ -72,20 +69,13 @@ def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "n
         k: number of slots in the observation.
         sampled: whether to draw actions from the policy, instead of taking the most probable one.
         name: for tables.
-
-    Raises:
-        InputError: a policy that is no multilayer perceptron.
     """
     layers, activation, masked = _layers_of(policy)
     return NetworkPolicy(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
 
 
 def _layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
-    """Return the layers of a policy network, their activation, and whether actions are masked.
-
-    Raises:
-        InputError: a policy that is no multilayer perceptron with one of the activations of `NetworkPolicy`.
-    """
+    """Return the layers of a policy network, their activation, and whether actions are masked."""
     from torch import nn
 
     if hasattr(policy, "q_net"):
@@ -150,9 +140,6 @@ def demand_in(
         patience_s: search time after which a car goes elsewhere, s, unless the scenario has a demand.
 
     In a lot with weights, cars choose entries and goals by these; else they go to the scenario's goal.
-
-    Raises:
-        InputError: the hours end when they begin, a number is out of range, or no demand is given.
     """
     window, own = scenario.arrival, scenario.demand
     if window.end_s <= window.start_s:
@@ -190,9 +177,6 @@ class LimitedAgent:
     Args:
         agent: has `predict(observation, state)`.
         limit_s: wall time of a decision, s.
-
-    Raises:
-        InputError: this platform, or this thread, gets no signals.
     """
 
     def __init__(self, agent: Any, limit_s: float) -> None:

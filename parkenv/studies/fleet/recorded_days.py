@@ -50,9 +50,6 @@ def record_days(
             last ones are recorded.
         seed: seed of the days.
         progress: called as days are driven.
-
-    Raises:
-        InputError: the scenario has no demand, or the agent is not compiled.
     """
     occupancy: object = "typical"
     for number in range(rounds):

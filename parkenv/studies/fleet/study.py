@@ -290,11 +290,7 @@ class FleetStudy(Study):
         return [by_scenario[name] for name in self.built]
 
     def fleet(self, setting: Setting) -> tuple[Fleet, list[Any]]:
-        """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled.
-
-        Raises:
-            InputError: the demand is out of range, or the agent cannot be made or drives no fleet.
-        """
+        """Return the fleet of a setting, and for each kind of driver its agent, or None if it is compiled."""
         from parkenv.engine.fleet import DriverKind, Fleet
         from parkenv.studies.fleet.drivers import LimitedAgent, demand_in, policy_of
 
@@ -328,11 +324,7 @@ class FleetStudy(Study):
         return self.built[next(name for name in its if its[name] == its[setting.scenario])]
 
     def run_day(self, setting: Setting, day: int) -> Row:
-        """Run a day of a setting; return its row of `days.csv`.
-
-        Raises:
-            InputError: an agent raised an error or took too long; the message names setting, day, car and time.
-        """
+        """Run a day of a setting; return its row of `days.csv`."""
         import numpy as np
 
         from parkenv.studies.fleet.blocks import Tally
@@ -398,17 +390,14 @@ class FleetStudy(Study):
             self.fleet(setting)
 
     def settings(self) -> Row:
-        """See `Study`."""
         from parkenv.studies.fingerprints import search_settings
 
         return search_settings(self, *OPTIONS, "seed") | {"manoeuvre_s": self.blocked_s}
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [Cell(setting, range(self.days)) for setting in self.fleet_settings]
 
     def run(self, work: Setting, items: Sequence[int]) -> list[Row]:
-        """See `Study`."""
         return [self.run_day(work, day) for day in items]
 
     @property
@@ -425,11 +414,9 @@ class FleetStudy(Study):
             results.add([row.pop(table.file) for row in rows], table, sync=False)
 
     def label(self, work: Setting) -> str:
-        """See `Study`."""
         return work.agent.label
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         from parkenv.studies.fleet.blocks import ALL, BLOCKS, has_zones, summarize_blocks, zone_prices
         from parkenv.studies.fleet.tables import summarize_changes, summarize_days, summarize_hours
 
@@ -544,7 +531,6 @@ class FleetStudy(Study):
         return super().page(summary, folder)._replace(tables=tables)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
-        """See `Study`."""
         from parkenv.studies.fleet.day_map import DayMaps
         from parkenv.studies.fleet.day_replay import FleetReplay
 

@@ -37,11 +37,7 @@ COLUMNS = (
 
 
 def lot_files(places: Sequence[Path]) -> list[Path]:
-    """Return the lot files that paths stand for: files, and the .geojson files in folders, in order of their names.
-
-    Raises:
-        InputError: a path does not exist, or a folder has no lot.
-    """
+    """Return the lot files that paths stand for: files, and the .geojson files in folders, in order of their names."""
     files: list[Path] = []
     for place in places:
         if not place.is_dir():
@@ -71,9 +67,6 @@ def take_census(
 
     Returns:
         A row for each lot, the largest first; those of files that hold no lot say why.
-
-    Raises:
-        InputError: see `lot_files`.
     """
     from parkenv.show.figures.census import save_census
     from parkenv.show.figures.contact_sheet import save_contact_sheets

@@ -43,9 +43,6 @@ def import_town_lots(
         options: see `import_car_parks`.
         least: number of spaces of the smallest car park.
         progress: called as car parks are finished.
-
-    Raises:
-        InputError: see `import_car_parks`.
     """
     rows: list[Row] = []
     lots = []

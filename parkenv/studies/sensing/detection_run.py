@@ -72,9 +72,6 @@ def find_cars(
         step: of a video, every `step`-th frame is looked at.
         folder: where pictures, films and boxes.csv go; None to draw nothing.
         progress: called as frames are finished.
-
-    Raises:
-        InputError: a file cannot be read, or a drawing would replace a file that is searched.
     """
     chosen = require_readable(paths)  # a damaged one is refused before any work
     files = [one if isinstance(one, Path) else one.file for one in chosen]
@@ -113,9 +110,6 @@ def require_readable(paths: Sequence[Path]) -> list[Path | Film]:
     """Return the images, as their paths, and the videos that are named or in the named folders, in order.
 
     Each camera of a recording is a video.
-
-    Raises:
-        InputError: a folder holds none of them, or a file cannot be read.
     """
     files: list[Path] = []
     for path in paths:
@@ -155,11 +149,7 @@ def detect_in_video(
     drawn: Path | None = None,
     on_frame: Callable[[], None] = lambda: None,
 ) -> VideoCars:
-    """Return the cars in every `step`-th frame of a video, and draw them into a film (MP4) of equal speed.
-
-    Raises:
-        InputError: the video has no frame that can be read, or the film cannot be written.
-    """
+    """Return the cars in every `step`-th frame of a video, and draw them into a film (MP4) of equal speed."""
     boxes: list[Row] = []
     frames = most = 0
     seconds = 0.0

@@ -20,7 +20,6 @@ class DriveReplay(NamedTuple):
     sessions: int
 
     def again(self, options: ReportOptions) -> Again:
-        """See `Replay`."""
         numbers = range(min(options.sessions, self.sessions) if options.drives is None else 0)
         frames = options.frames // max(len(numbers), 1)
         return Again([partial(_drive, self.scenario, self.settings, number, frames) for number in numbers])

@@ -61,9 +61,6 @@ def add_recording(
 
     Returns:
         What was found: captures, slots seen and taken, cars, and the errors and largest correction of poses, m.
-
-    Raises:
-        InputError: the recording cannot be read, or the map holds it already.
     """
     finder = make_detector(detector)
     progress("Reading", 0, 0)

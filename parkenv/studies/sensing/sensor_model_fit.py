@@ -44,11 +44,7 @@ class ObservationCounts:
         return ObservationCounts(self.counts + other.counts)
 
     def fitted(self) -> SensorModel:
-        """Return the sensor model with these rates, with a Jeffreys prior of half an error in each band.
-
-        Raises:
-            InputError: too few observations.
-        """
+        """Return the sensor model with these rates, with a Jeffreys prior of half an error in each band."""
         reported = self.counts.sum(axis=(0, 1))[:, 1:]
         if reported.sum(axis=1).min() < LEAST_OBSERVATIONS:
             raise InputError(
@@ -123,9 +119,6 @@ def count_observations(
         seeds: one seed per search.
         weather: the weather; None to draw it for each search.
         detector: the detector; None: the scenario's.
-
-    Raises:
-        InputError: an unknown rig.
     """
     scenario = scenario.replace(sensor_model=_ASSUMED)
     env = gym.make(

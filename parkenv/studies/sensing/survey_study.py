@@ -133,7 +133,6 @@ class SurveyStudy(Study):
         return Survey(self.built, self.drive_settings)
 
     def check(self) -> None:
-        """See `Study`."""
         self.survey.key_of(0)
 
     def settings(self) -> Row:
@@ -141,16 +140,13 @@ class SurveyStudy(Study):
         return {"version": __version__}
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [Cell("survey", range(self.sessions))]
 
     def keys(self, work: Any, item: int) -> list[Key]:
-        """See `Study`."""
         del work
         return [(self.survey.key_of(item),)]
 
     def run(self, work: Any, items: Sequence[int]) -> list[Row]:
-        """See `Study`."""
         from parkenv.studies.sensing.surveys import session_row
 
         del work
@@ -185,7 +181,6 @@ class SurveyStudy(Study):
                     results.kept[SHOWN] = result, recording
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         from parkenv.studies.sensing.surveys import summarize
 
         rows = results.of(self, self.cells()[0])
@@ -201,7 +196,6 @@ class SurveyStudy(Study):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`."""
         (row,) = summary["rows"]
         right, unknown = row["slot_accuracy"], row["unknown_fraction"]
         return [
@@ -211,14 +205,12 @@ class SurveyStudy(Study):
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`."""
         from parkenv.show.report.tables import survey_tables
 
         tables = survey_tables(summary["rows"][0], without_nan(cls.table.read(folder)))
         return super().page(summary, folder)._replace(tables=tables)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
-        """See `Study`."""
         from parkenv.studies.sensing.drive_replay import DriveReplay
 
         return [DriveReplay(self.built, self.drive_settings, len(self.table.read(folder)))]

@@ -36,9 +36,6 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
         path: file to write, atomically.
         model: of stable-baselines3 or sb3-contrib; its environment has `get_state` and `set_state`.
         curve: evaluations so far.
-
-    Raises:
-        InputError: the file cannot be written.
     """
     buffer = getattr(model, "replay_buffer", None)
     state = {
@@ -67,11 +64,7 @@ def save_checkpoint(path: Path, model: Any, curve: list[Row]) -> None:
 
 
 def read_checkpoint(path: Path) -> tuple[dict[str, Any], list[Row]]:
-    """Read a checkpoint for `restore`, and its curve.
-
-    Raises:
-        InputError: the file is no checkpoint of this version, or a damaged one.
-    """
+    """Read a checkpoint for `restore`, and its curve."""
     try:
         with zipfile.ZipFile(path) as archive:
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist()):
@@ -94,9 +87,6 @@ def restore(state: Mapping[str, Any], model: Any) -> None:
     """Bring a new model with the same settings, its environment and the random generators to a checkpoint.
 
     Types and shapes are checked. Values are not: where the searches stood is taken at its word.
-
-    Raises:
-        InputError: the checkpoint is of a training with other settings.
     """
     try:
         first = {

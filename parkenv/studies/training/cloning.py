@@ -29,11 +29,7 @@ LEARNING_RATE = 1e-3
 
 
 def require_cloneable(algorithm: str, agent: str, scenario: Scenario) -> None:
-    """Check that an algorithm supports behaviour cloning of an agent, before demonstrations are collected.
-
-    Raises:
-        InputError: the algorithm does not support cloning, or the agent is unknown or the oracle.
-    """
+    """Check that an algorithm supports behaviour cloning of an agent, before demonstrations are collected."""
     if algorithm not in CLONEABLE:
         raise InputError(f"{algorithm} has no behaviour cloning; take {' or '.join(CLONEABLE)}")
     if isinstance(make_agent(agent, scenario), ClairvoyantAgent):
@@ -67,9 +63,6 @@ class Demonstrations:
         """Simulate an agent, one search per seed, in a scenario or in the one of several that the seed draws.
 
         Truncated searches are left out.
-
-        Raises:
-            InputError: all searches were truncated.
         """
         places = [places] if isinstance(places, Scenario) else places
         finished = []

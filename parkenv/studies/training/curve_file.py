@@ -22,19 +22,12 @@ def read_curve(path: Path, columns: Sequence[str] = ()) -> list[Row]:
     Args:
         path: a `curve.csv`.
         columns: those that it must have; all but `steps` are floats.
-
-    Raises:
-        InputError: a column is missing, or a value is not a number.
     """
     return require_columns([row for _, row in typed_records(path, _kind_of)], columns, path)
 
 
 def require_columns(curve: list[Row], columns: Sequence[str], path: Path) -> list[Row]:
-    """Return evaluations that a file held.
-
-    Raises:
-        InputError: one lacks a column.
-    """
+    """Return evaluations that a file held."""
     for name in columns:
         if any(name not in row for row in curve):
             raise InputError(f"{path}: has no column {name!r}, want {', '.join(columns)}")

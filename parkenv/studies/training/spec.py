@@ -171,15 +171,12 @@ class TrainingSpec(Study):
         return Training(self)
 
     def check(self) -> None:
-        """See `Study`."""
         self.training.check()
 
     def settings(self) -> Row:
-        """See `Study`."""
         return {"version": __version__, **self.training.settings()}
 
     def prepare(self, results: Results, *, continues: bool) -> None:
-        """See `Study`."""
         from parkenv.studies.training.training import FIGURE
 
         results.kept["beside"] = self.training.curves_beside(results.path)
@@ -192,7 +189,6 @@ class TrainingSpec(Study):
         results.drop(short, self.table)
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [Cell(_Seeds(), range(self.seed, self.seed + self.trainings))]
 
     def stages(self, results: Results) -> Iterator[Stage]:
@@ -202,7 +198,6 @@ class TrainingSpec(Study):
             yield Stage(self.doing, self, self.cells())
 
     def input_of(self, work: _Seeds, items: Sequence[int], results: Results) -> _Seeds:
-        """See `Study`."""
         del items
         return work._replace(folder=results.path, shared=self.training.shared, command=tuple(results.command))
 
@@ -257,7 +252,6 @@ class TrainingSpec(Study):
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
-        """See `Study`."""
         from parkenv.show.report.learning import learning_panels
         from parkenv.show.report.page import listed, on_scenarios
 
@@ -268,5 +262,4 @@ class TrainingSpec(Study):
         return super().page(summary, folder)._replace(title=title, learning=panels)
 
     def replays(self, folder: Path) -> Sequence[Replay]:
-        """See `Study`."""
         return self.training.replays(read_json(folder / SUMMARY), folder)

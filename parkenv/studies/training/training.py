@@ -152,11 +152,7 @@ class Training:
         return f"Trained on {_places(learned)}, and evaluated on {_places(held_out)} held out: {names}"
 
     def check(self) -> None:
-        """Check, before training, that everything can be trained, tested and drawn.
-
-        Raises:
-            InputError: an invalid option, or a missing package.
-        """
+        """Check, before training, that everything can be trained, tested and drawn."""
         algorithm_class(self.spec.algorithm)
         learned = self.sides[0]
         if self.spec.clone is not None:
@@ -249,9 +245,6 @@ class Training:
 
         Returns:
             The rows of `curve.csv`.
-
-        Raises:
-            InputError: a training to go on with has lost its checkpoint.
         """
         folder.mkdir(parents=True, exist_ok=True)
         checkpoint, curve = folder / CHECKPOINT, read_curve(folder / CURVE, self.columns)
@@ -436,10 +429,6 @@ class Training:
 
         Args:
             out: folder of this training.
-
-        Raises:
-            InputError: a folder has no training, or one with other evaluations; a folder is given twice; or there are
-                too many to tell apart.
         """
         if len(self.spec.beside) >= len(COLORS):
             raise InputError(
@@ -528,11 +517,7 @@ class _Naming(Spec, extra="ignore"):
 
 
 def name_of(settings: Row, source: str = "settings") -> str:
-    """Return the name of a training in a figure with others.
-
-    Raises:
-        InputError: a setting is of another kind; the message starts with `source`.
-    """
+    """Return the name of a training in a figure with others."""
     its = _Naming.parse(settings, source)
     scenarios = its.scenario or ()
     name = its.algorithm + (f" on {', '.join(scenarios)}" if len(scenarios) > 1 else "")
@@ -540,11 +525,7 @@ def name_of(settings: Row, source: str = "settings") -> str:
 
 
 def require_apart(learned: Sequence[Scenario], held_out: Sequence[Scenario]) -> None:
-    """Check that no place is on both sides.
-
-    Raises:
-        InputError: two places have one name, or a held-out lot is also one to train on.
-    """
+    """Check that no place is on both sides."""
     if not held_out:
         return
     require_different_names([*learned, *held_out])

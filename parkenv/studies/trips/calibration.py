@@ -103,9 +103,6 @@ def calibrate(rows: Sequence[Row], scenario: Scenario, speed_limit: float) -> tu
 
     The speed is the total distance of trips with observations over their total time, so that drive times on the graph
     are right on average.
-
-    Raises:
-        InputError: no trip ended parked, or no attempt failed.
     """
     observed = [row for row in rows if row["slots"] == OBSERVED]
     metres = np.array([row["graph_m"] for row in observed])

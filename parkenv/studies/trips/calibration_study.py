@@ -113,11 +113,7 @@ class CalibrationStudy(Study):
         return self.built.v_drive if self.v_drive_kmh is None else self.v_drive_kmh * KMH
 
     def search(self, slots: str) -> DrivenSearch:
-        """Return the trips with or without observations of slots.
-
-        Raises:
-            InputError: agent, rig and scenario do not fit together.
-        """
+        """Return the trips with or without observations of slots."""
         from parkenv.scenarios.blind import blind_scenario
         from parkenv.studies.trips.driven_search import DrivenSearch
 
@@ -127,11 +123,9 @@ class CalibrationStudy(Study):
         )
 
     def check(self) -> None:
-        """See `Study`."""
         self.search(OBSERVED)
 
     def settings(self) -> Row:
-        """See `Study`."""
         from parkenv.studies.fingerprints import search_settings
 
         driving = {"agent": self.agent.label, "style": dataclasses.asdict(self.style)}
@@ -139,34 +133,26 @@ class CalibrationStudy(Study):
         return search_settings(self, "rig") | driving | car
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         seeds = range(self.seed, self.seed + self.episodes)
         return [Cell(_Trips(slots), seeds) for slots in (OBSERVED, UNOBSERVED)]
 
     def run(self, work: _Trips, items: Sequence[int]) -> list[Row]:
-        """See `Study`."""
         from parkenv.studies.trips.calibration import trip_row
 
         search = self.search(work.slots)
         return [trip_row(search.run(seed), work.slots) for seed in items]
 
     def label(self, work: _Trips) -> str:
-        """See `Study`."""
         del work
         return f"{self.agent.label} in {self.built.name}"
 
     def measured(self, rows: Sequence[Row]) -> tuple[Calibration, list[Row]]:
-        """Return the calibration and a row for each distribution.
-
-        Raises:
-            InputError: no trip ended parked, or no attempt failed.
-        """
+        """Return the calibration and a row for each distribution."""
         from parkenv.studies.trips.calibration import calibrate
 
         return calibrate(rows, self.built, self.speed_limit)
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         cells = self.cells()
         rows = [row for cell in cells for row in results.of(self, cell)]
         calibrated: Row | None = None

@@ -153,10 +153,6 @@ class DrivenSearch:
         captures: maximum number of captures per edge.
         detector: the rig's detector, as in `parkenv/SearchPerception-v2`.
 
-    Raises:
-        InputError: an unknown agent, rig or weather, a speed above the car's maximum, or a lot without a slot that
-            fits the car.
-
     Example:
         >>> import math
         >>> from parkenv import make_scenario
@@ -194,9 +190,6 @@ class DrivenSearch:
         Args:
             seed: seed of the world, at least 0.
             observers: observers of the decisions.
-
-        Raises:
-            InputError: the seed is not an integer of at least 0.
         """
         require_whole("seed", seed)
         env, driver = self.env, self.driver

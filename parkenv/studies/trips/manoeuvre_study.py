@@ -122,11 +122,7 @@ class ManoeuvreStudy(Study):
         return {f"{level}-{seed}": (level, seed) for level in self.levels or () for seed in seeds}
 
     def scene(self, name: str) -> Scene:
-        """Return a scene by its name.
-
-        Raises:
-            InputError: its file is no valid scene.
-        """
+        """Return a scene by its name."""
         from parkenv.driving.levels import level_scene
         from parkenv.driving.scene_files import read_scene
 
@@ -147,7 +143,6 @@ class ManoeuvreStudy(Study):
             self.scene(name)
 
     def settings(self) -> Row:
-        """See `Study`."""
         return {"version": __version__, **self.tables(), "files": fingerprints(self.files())}
 
     def files(self) -> list[Path]:
@@ -156,11 +151,9 @@ class ManoeuvreStudy(Study):
         return [file for file in super().files() if file != self.cases] + scenes
 
     def cells(self) -> list[Cell]:
-        """See `Study`."""
         return [Cell(_Planned(), list(self.sources))]
 
     def run(self, work: _Planned, items: Sequence[str]) -> list[Row]:
-        """See `Study`."""
         from planners.driving.manoeuvre import park
         from planners.driving.time_optimal import shorten
 
@@ -178,7 +171,6 @@ class ManoeuvreStudy(Study):
             )
 
     def summarise(self, results: Results) -> Row:
-        """See `Study`."""
         rows = [row for cell in self.cells() for row in results.of(self, cell)]
         names = (*MANOEUVRES.keys, *MANOEUVRES.columns)
         rows = [{name: row[name] for name in names} for row in rows]
@@ -199,7 +191,6 @@ class ManoeuvreStudy(Study):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`."""
         return [
             f"{row['agent']}: {row['driven']} of {row['scenes']} scenes were driven to their target without a contact, "
             f"within 5 cm and 0.01 rad. Planning took {row['planning_ms']:.0f} ms (median), "

@@ -50,9 +50,6 @@ def park_on_lots(
         folder: where the files go.
         workers: where the episodes run.
         progress: called as episodes finish.
-
-    Raises:
-        InputError: a lot has no slot of these kinds.
     """
     for case in cases:
         case.environment().close()

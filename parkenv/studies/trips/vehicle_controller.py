@@ -65,9 +65,6 @@ _NOBODY: NDArray[np.float64] = np.empty(0)
 class DrivingStyle:
     """Parameters of driving.
 
-    Raises:
-        InputError: a value is not a finite number above 0, or the notice distance is too short to stop.
-
     Example:
         >>> DrivingStyle(notice_m=0.1)
         Traceback (most recent call last):
@@ -122,9 +119,6 @@ class VehicleController:
         scenario: the scenario, with lot, parked cars and traffic.
         vehicle: the car.
         style: driving style.
-
-    Raises:
-        InputError: the car cannot drive that fast, or there are more than `MOST_ROAD_USERS` road users.
 
     Attributes:
         log: record of the drive since `begin`.

@@ -18,9 +18,6 @@ from parkenv.world.occupancy.process import Arrival, CompiledModel, Forecast, Oc
 class FlatMap(PriorModel):
     """A `prior` of a `Scenario` with the same occupancy probability for every slot.
 
-    Raises:
-        InputError: `p_occupied` is not a probability.
-
     Examples:
         >>> from parkenv import make_scenario
         >>> mini = make_scenario("mini")
@@ -40,7 +37,6 @@ class FlatMap(PriorModel):
         return PROCESS_KIND if self.true.kind == PROCESS_KIND else EXTERNAL_KIND
 
     def compiled(self, window: ArrivalWindow) -> CompiledModel | None:
-        """See `PriorModel`."""
         model = self.true.compiled(window) if self.kind == PROCESS_KIND else None
         if model is None:
             return None

@@ -52,9 +52,6 @@ class CountedOccupancy(OccupancyModel):
         attraction: (n,) float64, logit, popularity of the lot's slots.
         mean_stay_s: s, mean parking duration; shorter in hours in which the lot empties faster.
         source: name of the counts in messages.
-
-    Raises:
-        InputError: a wrong shape, or no days.
     """
 
     kind: ClassVar[int] = PROCESS_KIND
@@ -86,11 +83,7 @@ class CountedOccupancy(OccupancyModel):
         return int(self.attraction.size)
 
     def days_in(self, window: ArrivalWindow) -> list[str]:
-        """Return the days on the window's weekdays that were counted in all of its hours.
-
-        Raises:
-            InputError: there are none.
-        """
+        """Return the days on the window's weekdays that were counted in all of its hours."""
         first = int(window.start_s // HOUR_S)
         end = max(math.ceil(window.end_s / HOUR_S), first + 1)
         counted = np.flatnonzero(np.isfinite(self.occupied[:, first:end]).all(axis=1))

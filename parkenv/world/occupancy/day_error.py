@@ -27,9 +27,6 @@ class DayError:
         level: of the shift of all slots at once.
         slope: of the additional rise from the middle of the lot to the goal, with a fall of the same size to the far
             end; see `nearness`.
-
-    Raises:
-        InputError: a value that is not a number from 0 to 5.
     """
 
     level: float = 0.0

@@ -252,9 +252,6 @@ def fit_process(log: "OccupancyLog", max_gap_s: float = 7200.0, prior_sd: float 
         log: the observations.
         max_gap_s: s, longest interval used.
         prior_sd: no unit, standard deviation of the logarithms under the prior.
-
-    Raises:
-        InputError: no two observations of a slot on one day within `max_gap_s`.
     """
     require_number("prior_sd", prior_sd, above=0.0)
     pairs = log.intervals(max_gap_s)

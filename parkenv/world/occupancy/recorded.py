@@ -51,9 +51,6 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
 
     Returns:
         (n,) int64, indices into `log.slot_ids`, in the order of `lot_slot_ids`.
-
-    Raises:
-        InputError: an invalid file; the message names file, line and value.
     """
     path = Path(path)
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
@@ -81,11 +78,7 @@ def read_mapping(path: str | os.PathLike[str], lot_slot_ids: Sequence[str], log:
 
 
 def same_slots(lot_slot_ids: Sequence[str], log: OccupancyLog) -> IntArray:
-    """Return the log slot of each slot of a lot, (n,) int64: that of the same name.
-
-    Raises:
-        InputError: the log lacks a slot of the lot.
-    """
+    """Return the log slot of each slot of a lot, (n,) int64: that of the same name."""
     log_index = {slot_id: i for i, slot_id in enumerate(log.slot_ids)}
     if missing := [slot_id for slot_id in lot_slot_ids if slot_id not in log_index]:
         raise InputError(
