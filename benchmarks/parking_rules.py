@@ -24,13 +24,12 @@ from pyproj import Transformer
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.files.limited_reading import read_json
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.buildings import areas_of
+from parkenv.lots.osm.areas import areas_of, is_parking_area
 from parkenv.lots.osm.elements import read_map
-from parkenv.lots.osm.kerbs import Junctions, free_intervals
 from parkenv.lots.osm.roads import Road, road_of, whole_number
-from parkenv.lots.osm.spaces import is_parking_area
-from parkenv.lots.town.capacity import KINDS, RULES, levels_of, rule_of
+from parkenv.lots.osm.rows import Junctions, free_intervals
 from parkenv.lots.town.kerbs import PLACES_PER_METRE
+from parkenv.lots.town.supply import KINDS, RULES, levels_of, rule_of
 from parkenv.world.drive_graph import linestrings
 
 COUNTED = ("OSM", "document", "aerial imagery", "survey")

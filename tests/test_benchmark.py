@@ -11,8 +11,8 @@ from command_line import parkenv
 
 from parkenv import InputError
 from parkenv.lots import read_lot
+from parkenv.lots.draft import combined_error_probability, read_provenance
 from parkenv.lots.lot_files import PLACES
-from parkenv.lots.quality import combined_error_probability, read_provenance
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.benchmark.page import Entry, precision
 from parkenv.studies.benchmark.result_file import check_result, fingerprint, result_of, write_result

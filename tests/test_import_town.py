@@ -15,13 +15,12 @@ from scipy.sparse.csgraph import dijkstra
 from benchmarks.parking_rules import fit_kerbs, kerb_table
 from parkenv import make_scenario
 from parkenv.lots import import_town, read_lot, write_lot
+from parkenv.lots.draft import read_provenance
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.osm.elements import read_map
 from parkenv.lots.osm.roads import whole_number
-from parkenv.lots.quality import read_provenance
-from parkenv.lots.town.capacity import RULES, expected_capacity
 from parkenv.lots.town.kerbs import PLACES_PER_METRE
-from parkenv.lots.town.zones import PRICE, Rules, kerb_rules, rules_of
+from parkenv.lots.town.supply import PRICE, RULES, Rules, expected_capacity, kerb_rules, rules_of
 from parkenv.world.drive_graph import build_drive_graph
 from parkenv.world.lot import Lane
 from parkenv.world.tariff import Hours

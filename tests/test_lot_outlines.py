@@ -19,10 +19,9 @@ from small_lots import features
 from parkenv.driving.vehicle import VehicleParameters
 from parkenv.errors import InputError
 from parkenv.lots import check_lot, import_lot, packaged_lot, read_lot, write_lot
-from parkenv.lots.draft import ImportOptions
+from parkenv.lots.draft import ImportOptions, Provenance, read_provenance
 from parkenv.lots.infer.layout import infer_lot
 from parkenv.lots.infer.spaces import spaces_from_outlines
-from parkenv.lots.quality import Provenance, read_provenance
 from parkenv.show.colors import PALETTE
 from parkenv.studies.lots.drivability import ManoeuvreKind, can_park, check_drivability
 from parkenv.world.lot import Lane, ParkingLot
@@ -267,7 +266,7 @@ class TestFaults:
         assert not out.exists()
 
     def test_too_many_spaces(self, monkeypatch, tmp_path):
-        monkeypatch.setattr("parkenv.lots.osm.outline_draft.MOST_SPACES", 10)
+        monkeypatch.setattr("parkenv.lots.osm.draft.MOST_SPACES", 10)
         with pytest.raises(InputError, match="32 parking spaces, want at most 10 in one lot"):
             imported(tmp_path, double_row())
 

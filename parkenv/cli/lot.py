@@ -24,8 +24,7 @@ from parkenv.show.report.tables import Column
 from parkenv.world.tariff import NO_ZONE
 
 if TYPE_CHECKING:
-    from parkenv.lots.draft import ImportOptions
-    from parkenv.lots.quality import Provenance
+    from parkenv.lots.draft import ImportOptions, Provenance
     from parkenv.world.lot import ParkingLot
 
 CENSUS = (
@@ -305,9 +304,9 @@ class Import(Command):
         from parkenv.files.atomic_write import check_writable
         from parkenv.files.csv_tables import write_csv
         from parkenv.lots import import_lot, import_town, write_lot
+        from parkenv.lots.draft import Provenance
         from parkenv.lots.formats.geojson import check_lot_output
-        from parkenv.lots.quality import Provenance
-        from parkenv.lots.town.facilities import TABLE
+        from parkenv.lots.town.supply import TABLE
 
         check_lot_output(self.out)
         table = self.out.with_suffix(".csv")
@@ -439,7 +438,7 @@ class Convert(Command):
 
 def _provenance(path: Path) -> Provenance | None:
     """Return what a lot file says of its import; None for a packaged lot or another format."""
-    from parkenv.lots.quality import read_provenance
+    from parkenv.lots.draft import read_provenance
 
     is_json = path.suffix.lower() in (".json", ".geojson") and path.exists()
     return read_provenance(path) if is_json else None

@@ -1,22 +1,86 @@
-"""Options and result of an import: a lot, or an incomplete lot with a list of what is missing."""
+"""Options and result of an import: a lot, or an incomplete lot with a list of what is missing, guessed or doubtful."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
 from parkenv.errors import InputError
+from parkenv.files.limited_reading import read_json
 from parkenv.lots.generators import Slots
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.quality import QualityIssue
 from parkenv.world.drive_graph import GraphError
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, Mouth, ParkingLot, Turn
 from parkenv.world.tariff import Zone
+
+
+@dataclass(frozen=True)
+class QualityIssue:
+    """A reason why a lot may differ from the place."""
+
+    reason: str
+    error_probability: float  # that it makes the lot wrong, 0 to 1
+
+    def __str__(self) -> str:
+        return f"{self.error_probability:.2f} {self.reason}"
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a lot comes from: the file, what was guessed, and what may be wrong with it."""
+
+    source: str
+    guesses: tuple[str, ...] = ()  # one sentence each
+    issues: tuple[QualityIssue, ...] = ()
+    caution: str = ""  # what decides results and is a guess
+
+    def document(self) -> dict[str, Any]:
+        """Return the JSON object that a lot file keeps."""
+        return {
+            "source": self.source,
+            "guesses": list(self.guesses),
+            "issues": [
+                {"reason": issue.reason, "error_probability": round(issue.error_probability, 3)}
+                for issue in self.issues
+            ],
+            **({"caution": self.caution} if self.caution else {}),
+        }
+
+
+def combined_error_probability(issues: tuple[QualityIssue, ...]) -> float:
+    """Return the probability, 0 to 1, that a lot is wrong, if its issues are independent."""
+    right = 1.0
+    for issue in issues:
+        right *= 1.0 - min(max(issue.error_probability, 0.0), 1.0)
+    return 1.0 - right
+
+
+def read_provenance(path: Path) -> Provenance | None:
+    """Return what a lot file says of its import; None if it says nothing."""
+    document = read_json(path)
+    origin = document.get("import") if isinstance(document, dict) else None
+    if origin is None:
+        return None
+    try:
+        guesses, issues = origin["guesses"], origin["issues"]
+        return Provenance(
+            str(origin["source"]),
+            tuple(str(guess) for guess in guesses),
+            tuple(QualityIssue(str(issue["reason"]), float(issue["error_probability"])) for issue in issues),
+            str(origin.get("caution", "")),
+        )
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{path}: import is {origin!r:.60}, want an object with source, guesses and issues"
+        ) from error
+
 
 NEAR_ON_GLOBE = 1.0
 """Degrees: a pair of numbers this close to the lot's position is a latitude and a longitude, otherwise metres."""

@@ -606,7 +606,7 @@ class ZoneSpec(Spec):
 
     def changed_rules(self, zone: Zone) -> Zone:
         """Return a zone with the rules that are given here."""
-        from parkenv.lots.formats.geojson_supply import price_of
+        from parkenv.lots.formats.contents import price_of
 
         own: dict[str, Any] = {"price": price_of(self.price)} if self.price is not None else {}
         if self.hours is not None:

@@ -1,20 +1,36 @@
-"""The contents of a lot file: its valid features, and the errors of the others."""
+"""The contents of a lot file: its valid slots, facilities and zones, and the errors of the others.
+
+The member `zones` of the file has an object for each zone with rules; all of its members may be absent:
+
+| member | value |
+|---|---|
+| `price` | a number (of an hour), or an object with `per_hour`, `steps` (pairs of a stay, s, and the price up to it), \
+`free_s`, `daily_cap`, `charged` (hours) and `per_kwh` |
+| `hours` | when cars may be parked there, such as `"Mo-Sa 08:00-20:00"` |
+| `max_stay_s` | s, longest stay |
+| `users` | list of classes of users, `["public"]` if absent |
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
+from parkenv.errors import InputError, naming, nearest, require_number
+from parkenv.files.file_names import is_plain
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.slot_polygons import slots_from_polygons
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.facility import Facility
-from parkenv.world.lot import FARTHEST, Lane, ParkingLot, Turn
-from parkenv.world.tariff import Zone
+from parkenv.world.lot import FARTHEST, SLOT_SIDE, Lane, Mouth, ParkingLot, Turn
+from parkenv.world.tariff import NO_ZONE, Hours, Price, Zone
 
 KINDS = {
     "slot": ("Polygon",),
@@ -162,3 +178,276 @@ def _facility_errors(contents: LotContents) -> list[LotProblem]:
             for problem in error.problems
         ]
     return []
+
+
+_COUNTED = ("gate_s", "inside_s", "known", "delay_s")  # properties of counted facilities alone
+
+
+def read_zones(document: Any) -> dict[str, Zone]:
+    """Return the rules of the member `zones`."""
+    if not isinstance(document, dict):
+        raise InputError(f"zones is {document!r:.40}, want an object with the rules of each zone")
+    rules = {}
+    for name, given in document.items():
+        with naming(f"zone {name!a:.40}"):
+            if not name or not is_plain(name):
+                raise InputError("its name is empty or has control characters")
+            members = _members(given, ("price", "hours", "max_stay_s", "users"), "rules")
+            if "price" in members:
+                members["price"] = price_of(members["price"])
+            if "hours" in members:
+                members["hours"] = Hours.parse(members["hours"])
+            if not isinstance(members.get("users", []), list):
+                raise InputError(f"users is {members['users']!r:.40}, want a list of names")
+            rules[name] = Zone(name, **members)
+    return rules
+
+
+def price_of(given: Any) -> Price:
+    """Return the price of a number, that of an hour, of a text, by hours, or of the members of a price."""
+    if type(given) in (int, float):
+        return Price(given)
+    if isinstance(given, str):
+        return Price.parse(given)
+    members = _members(given, [f.name for f in fields(Price)], "price")
+    steps = members.get("steps", [])
+    if not isinstance(steps, list) or not all(isinstance(step, list) for step in steps):
+        raise InputError(f"steps is {steps!r:.40}, want a list of pairs: stay in seconds and price")
+    if "charged" in members:
+        members["charged"] = Hours.parse(members["charged"], "charged")
+    if "hourly" in members:
+        members["hourly"] = Price.parse(str(members["hourly"]), "hourly").hourly
+    return Price(**members)
+
+
+def _members(given: Any, known: Collection[str], what: str) -> dict[str, Any]:
+    if not isinstance(given, dict):
+        raise InputError(f"{what} is {given!r:.40}, want an object with some of {', '.join(known)}")
+    for name in given:
+        if name not in known:
+            raise InputError(f"no member {name!r:.40} of {what}; {nearest(name, known)}")
+    return dict(given)
+
+
+def zone_document(zone: Zone) -> dict[str, Any]:
+    """Return the rules of a zone, as the member `zones` has them."""
+    price = {f.name: value for f in fields(Price) if (value := getattr(zone.price, f.name)) != f.default}
+    if zone.price.charged is not None:
+        price["charged"] = str(zone.price.charged)
+    if zone.price.hourly:
+        price["hourly"] = "; ".join(f"{amount:.12g} @ {hours}" for amount, hours in zone.price.rules)
+    document: dict[str, Any] = {"price": price} if price else {}
+    if zone.hours is not None:
+        document["hours"] = str(zone.hours)
+    if zone.max_stay_s is not None:
+        document["max_stay_s"] = zone.max_stay_s
+    return document | {"users": list(zone.users)}
+
+
+def read_zone(properties: dict[str, Any], what: str, rules: Collection[str]) -> str:
+    """Return the zone of a feature, empty text if not given; where the file has rules, one of those zones."""
+    zone = properties.get("zone", "")
+    if not isinstance(zone, str) or not is_plain(zone) or ("zone" in properties and not zone):
+        raise InputError(f"{what}: zone is {zone!r:.40}, want a name")
+    if zone and rules and zone != NO_ZONE and zone not in rules:
+        raise InputError(
+            f"{what}: zone is {zone!r:.40}, want one of the file's zones; {nearest(zone, rules)}"
+        )
+    return zone
+
+
+def read_facilities(contents: LotContents, raw: list[RawFeature], xy: FloatArray) -> None:
+    """Validate the facilities of a file and add the valid ones."""
+    seen: set[str] = set()
+    for feature in raw:
+        given = dict(feature.properties)
+        name = given.get("name", feature.given_id)
+        known = ("kind", "name", "type", "zone", "capacity", *_COUNTED)
+        try:
+            with naming(f"facility {name!r:.40}"):
+                for member in given:
+                    if member not in known:
+                        raise InputError(
+                            f"no property {member!r:.40} of facilities; {nearest(member, known)}"
+                        )
+                absent = [member for member in _COUNTED if member in given and not given.get("capacity")]
+                if absent:
+                    raise InputError(f"{absent[0]} is of counted facilities, want a capacity, too")
+                if str(name) in seen:
+                    raise InputError("its name appears already")
+                contents.facilities.append(
+                    Facility(
+                        name=name,
+                        kind=given.get("type", "lot"),
+                        zone=given.get("zone", ""),
+                        capacity=given.get("capacity", 0),
+                        xy=tuple(xy[feature.parts[0]][0].tolist()) if given.get("capacity") else None,
+                        **{member: given[member] for member in _COUNTED if member in given},
+                    )
+                )
+                contents.numbers["facility"].append(feature.number)
+                seen.add(str(name))
+            read_zone(given, f"facility {name!r:.40}", contents.zone_rules)
+        except InputError as error:
+            contents.error(feature.number, str(error))
+
+
+def facility_properties(facility: Facility) -> dict[str, Any]:
+    """Return the properties of a facility's feature."""
+    given: dict[str, Any] = {"name": facility.name, "type": facility.kind}
+    if facility.zone:
+        given["zone"] = facility.zone
+    if facility.is_counted:
+        given["capacity"] = facility.capacity
+        given |= {name: getattr(facility, name) for name in _COUNTED}
+    return given
+
+
+def read_weights(feature: RawFeature) -> dict[str, float]:
+    """Return the weights of a goal or an entry by purpose; empty if not given."""
+    weights = feature.properties.get("weights", {})
+    if not isinstance(weights, dict):
+        raise InputError(f"{feature.kind}: weights is {weights!r:.40}, want numbers by purpose")
+    for purpose, weight in weights.items():
+        require_number(f"{feature.kind}: weights[{purpose!r:.40}]", weight, least=0.0)
+    return {purpose: float(weight) for purpose, weight in weights.items()}
+
+
+SLOT_SHAPE = ("center", "yaw", "length", "width", "mouth")  # the properties that define a slot exactly
+MOUTHS = {mouth.name.lower(): mouth for mouth in Mouth}
+SLOT_AGREEMENT = 0.01  # largest distance, m, between a slot's polygon and the rectangle of its properties
+
+
+def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exact: bool) -> None:
+    """Validate the slots of a file and add the valid ones.
+
+    Exact properties are used only in a local frame: after a projection, stale ones would go unnoticed.
+    """
+    if not raw:
+        return
+    polygons = _polygons([xy[feature.parts[0]] for feature in raw])
+    area = shapely.area(shapely.convex_hull(polygons))
+    valid = shapely.is_valid(polygons)
+    first_with: dict[str, int] = {}
+    valid_rows: list[int] = []
+    ids: list[str] = []
+    shapes: list[tuple[float, ...] | None] = []
+    costs: list[float] = []
+    zones: list[str] = []
+    facilities: list[str] = []
+    drawn = dict.fromkeys(place.name for place in contents.facilities if not place.is_counted)
+    first_with |= {
+        facility.name: contents.numbers["facility"][i]
+        for i, facility in enumerate(contents.facilities)
+        if facility.is_counted
+    }
+    for i, feature in enumerate(raw):
+        try:
+            slot_id = _slot_id(feature)
+            if slot_id in first_with:
+                raise InputError(f"slot: id {slot_id!r:.40} appears already in feature {first_with[slot_id]}")
+            first_with[slot_id] = feature.number
+            if area[i] < SLOT_SIDE**2:
+                raise InputError(f"slot {slot_id!r:.40}: the polygon is flat, want an area to park on")
+            if not valid[i]:
+                reason = shapely.is_valid_reason(polygons[i])
+                raise InputError(f"slot {slot_id!r:.40}: the polygon is not a simple one: {reason}")
+            cost = _parking_cost(feature.properties, slot_id)
+            zone = read_zone(feature.properties, f"slot {slot_id!r:.40}", contents.zone_rules)
+            facility = _facility(feature.properties, slot_id, drawn)
+            shapes.append(_slot_shape(feature.properties, slot_id) if exact else None)
+        except InputError as error:
+            contents.error(feature.number, str(error))
+            continue
+        valid_rows.append(i)
+        ids.append(slot_id)
+        costs.append(cost)
+        zones.append(zone)
+        facilities.append(facility)
+
+    polygons = polygons[valid_rows]
+    bare = np.array([shape is None for shape in shapes], dtype=bool)
+    slots = slots_from_polygons(polygons[bare], contents.lanes)
+    if not bare.all():
+        # x, y, yaw, length, width, mouth
+        table = np.empty((len(valid_rows), 6))
+        table[bare] = np.column_stack([slots.xy, slots.yaw, slots.length, slots.width, slots.mouth])
+        table[~bare] = [shape for shape in shapes if shape is not None]
+        slots = Slots(table[:, :2], table[:, 2], table[:, 3], table[:, 4], table[:, 5].astype(np.int8))
+
+    apart = shapely.hausdorff_distance(polygons, slots.boxes())
+    disagrees = ~bare & (apart > SLOT_AGREEMENT)
+    thin = slots.width < SLOT_SIDE
+    for k in np.flatnonzero(disagrees):
+        contents.error(
+            raw[valid_rows[k]].number,
+            f"slot {ids[k]!r:.40}: the polygon lies {apart[k]:.2f} m from what center, yaw, length and width "
+            f"say, want at most {SLOT_AGREEMENT:g} m",
+        )
+    for k in np.flatnonzero(thin):
+        contents.error(
+            raw[valid_rows[k]].number,
+            f"slot {ids[k]!r:.40}: the polygon is {slots.width[k]:.3f} m wide, want at least {SLOT_SIDE:g} m",
+        )
+    kept = np.flatnonzero(~disagrees & ~thin)
+    contents.slots = replace(
+        slots,
+        parking_cost_s=np.array(costs, np.float64),
+        zone=np.array(zones, np.str_),
+        facility=np.array(facilities, np.str_),
+    )[kept]
+    contents.slot_ids = [ids[k] for k in kept]
+    contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
+
+
+def _polygons(rings: Sequence[FloatArray]) -> NDArray[np.object_]:
+    which = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    return np.asarray(shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=which)))
+
+
+def _slot_id(feature: RawFeature) -> str:
+    given = feature.number if feature.given_id is None else feature.given_id
+    if type(given) is int:
+        return str(given)
+    if not isinstance(given, str) or not given or not is_plain(given):
+        raise InputError(f"slot: id is {given!r:.40}, want a text")
+    return given
+
+
+def _parking_cost(properties: dict[str, Any], slot_id: str) -> float:
+    """Return the parking cost of a slot, s; 0 if not given."""
+    cost = properties.get("parking_cost_s", 0.0)
+    if not is_coordinate(cost) or cost < 0.0:
+        raise InputError(f"slot {slot_id!r:.40}: parking_cost_s is {cost!r:.40}, want seconds, at least 0")
+    return float(cost)
+
+
+def _facility(properties: dict[str, Any], slot_id: str, drawn: Collection[str]) -> str:
+    """Return the facility that a slot belongs to, one of those whose slots are drawn; empty text if not given."""
+    facility = properties.get("facility", "")
+    if not (isinstance(facility, str) and facility in drawn) and "facility" in properties:
+        hint = nearest(str(facility), drawn)
+        raise InputError(
+            f"slot {slot_id!r:.40}: facility is {facility!r:.40}, want that of a feature without a capacity; {hint}"
+        )
+    return str(facility)
+
+
+def _slot_shape(properties: dict[str, Any], slot_id: str) -> tuple[float, ...] | None:
+    """Return exact x, y, yaw, length, width and mouth; None for a slot with only a polygon."""
+    absent = [name for name in SLOT_SHAPE if name not in properties]
+    if len(absent) == len(SLOT_SHAPE):
+        return None
+    if absent:
+        raise InputError(f"slot {slot_id!r:.40}: no {absent[0]}, want all of {', '.join(SLOT_SHAPE)} or none")
+    center, yaw, length, width, mouth = (properties[name] for name in SLOT_SHAPE)
+    if not (isinstance(center, list) and len(center) == 2 and all(map(is_coordinate, center))):
+        raise InputError(f"slot {slot_id!r:.40}: center is {center!r:.40}, want two finite numbers")
+    if not is_coordinate(yaw):
+        raise InputError(f"slot {slot_id!r:.40}: yaw is {yaw!r:.40}, want a finite number")
+    for name, value in (("length", length), ("width", width)):
+        if not is_coordinate(value) or value < SLOT_SIDE:
+            raise InputError(f"slot {slot_id!r:.40}: {name} is {value!r:.40}, want at least {SLOT_SIDE:g} m")
+    if not isinstance(mouth, str) or mouth not in MOUTHS:
+        raise InputError(f"slot {slot_id!r:.40}: mouth is {mouth!r:.40}, want one of {', '.join(MOUTHS)}")
+    return (*center, yaw, length, width, MOUTHS[mouth])

@@ -19,7 +19,7 @@ make it; true: they may make no other |
 `known` (nothing, sign, live), `delay_s` |
 
 The member `traffic` is `left` where cars keep to the left; `zones` has the rules of zones by name
-(`parkenv.lots.formats.geojson_supply`).
+(`parkenv.lots.formats.contents`).
 
 A file made by an import may have the member `import`: its source, what was guessed, and what may be wrong with it.
 """
@@ -39,18 +39,22 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import check_writable, write_text
 from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import read_json
-from parkenv.lots.formats.contents import KINDS, LotContents, RawFeature, is_coordinate
-from parkenv.lots.formats.geojson_slots import SLOT_SHAPE, read_slots
-from parkenv.lots.formats.geojson_supply import (
+from parkenv.lots.draft import Provenance
+from parkenv.lots.formats.contents import (
+    KINDS,
+    SLOT_SHAPE,
+    LotContents,
+    RawFeature,
     facility_properties,
+    is_coordinate,
     read_facilities,
+    read_slots,
     read_weights,
     read_zones,
     zone_document,
 )
 from parkenv.lots.formats.positions import Positions
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.quality import Provenance
 from parkenv.world.lot import FARTHEST, Lane, Mouth, ParkingLot, Turn, is_building
 
 LOT_VERSION = 1

@@ -14,10 +14,8 @@ from parkenv.files.file_names import is_plain
 from parkenv.files.limited_reading import csv_rows
 from parkenv.lots.draft import ImportOptions, LotDraft, points_in_frame
 from parkenv.lots.generators import KERB_SIZE, NO_SLOTS, Slots
-from parkenv.lots.infer.centers import CenterRow, describe_rows, spaces_from_centers
-from parkenv.lots.infer.draft import draft_inferred_lot
-from parkenv.lots.infer.layout import InferredLot, infer_lot
-from parkenv.lots.infer.spaces import Spaces
+from parkenv.lots.infer.layout import InferredLot, draft_inferred_lot, infer_lot
+from parkenv.lots.infer.spaces import CenterRow, Spaces, describe_rows, spaces_from_centers
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.world.lot import Mouth
 
@@ -115,7 +113,7 @@ def _require_apart(path: Path, xy: FloatArray, ids: tuple[str, ...], rows: tuple
 def slot_list_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a list of slots.
 
-    The centres become rectangles (`parkenv.lots.infer.centers`), from which lanes are inferred
+    The centres become rectangles (`parkenv.lots.infer.spaces`), from which lanes are inferred
     (`parkenv.lots.infer.layout`). Where that fails, the draft has only slot centres and says why; it can still be
     drawn. A list has neither entries nor goals; they are given or guessed.
     """

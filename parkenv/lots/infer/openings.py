@@ -11,8 +11,7 @@ import shapely
 from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.lots.infer.rows import Row
-from parkenv.lots.infer.spaces import Spaces
+from parkenv.lots.infer.spaces import Row, Spaces
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
 
 LOOK = 18.0  # how far ahead of a mouth obstacles are looked for, m

@@ -4,7 +4,7 @@ Slots come from:
 
 - `amenity=parking_space` areas, by their outlines; one with a `capacity` is split into that many along its road;
 - `amenity=parking` areas without such spaces, filled by the rule of `fill_outline`;
-- kerbside parking tagged on streets, see `osm_kerbs`.
+- kerbside parking tagged on streets, see `rows`.
 
 The import leaves out, and lists, spaces for disabled drivers (unless requested; they are subtracted from a tagged
 capacity), private and closed parking, parking underground or on a deck, and spaces for other vehicles.
@@ -34,11 +34,11 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.lots.draft import ImportOptions, LeftOut, LotDraft, points_in_frame
 from parkenv.lots.generators import NO_SLOTS, Slots
-from parkenv.lots.infer.network import limit_junctions
-from parkenv.lots.infer.spaces import to_rectangle
+from parkenv.lots.infer.layout import draft_inferred_lot, infer_lot
+from parkenv.lots.infer.network import STREET, Line, limit_junctions
+from parkenv.lots.infer.spaces import rectangle_corners, spaces_from_outlines, to_rectangle, validate_areas
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm import network
-from parkenv.lots.osm.buildings import (
+from parkenv.lots.osm.areas import (
     BUILDING_REACH,
     ENTRANCE_REACH,
     Area,
@@ -46,18 +46,41 @@ from parkenv.lots.osm.buildings import (
     exterior_rings,
     find_goals,
     is_building,
+    is_parking_area,
+    is_space,
+    slots_by_rank,
+    split_space,
     split_walls,
+    usable_spaces,
     within,
 )
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
-from parkenv.lots.osm.kerbs import Junctions, kerb_of, kerb_slots
-from parkenv.lots.osm.outline_draft import outline_draft
-from parkenv.lots.osm.outlines import CORRIDOR, fill_outline
-from parkenv.lots.osm.roads import Rank, Road, closed_to_cars, off_the_ground, road_of, whole_number
-from parkenv.lots.osm.rows import ARRANGEMENTS, without_overlaps
-from parkenv.lots.osm.spaces import is_parking_area, is_space, slots_by_rank, split_space, usable_spaces
-from parkenv.lots.osm.turns import turns_of
-from parkenv.world.drive_graph import SLOT_REACH
+from parkenv.lots.osm.roads import (
+    Rank,
+    Road,
+    clipped_road,
+    closed_to_cars,
+    components_with_slots,
+    dead_ends,
+    lanes_of,
+    off_the_ground,
+    open_ends,
+    road_of,
+    street_junctions,
+    turns_of,
+    used_roads,
+    whole_number,
+)
+from parkenv.lots.osm.rows import (
+    ARRANGEMENTS,
+    CORRIDOR,
+    Junctions,
+    fill_outline,
+    kerb_of,
+    kerb_slots,
+    without_overlaps,
+)
+from parkenv.world.drive_graph import SLOT_REACH, component_labels
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
 """Values of `parking` for slots that are not in the open at ground level."""
@@ -117,7 +140,7 @@ def draft_of_map(
     incomplete = bool(draft.missing) or any(left.reason == NO_AISLE for left in draft.left_out)
     if has_spaces and incomplete and (options.guess_entry or options.guess_goal):
         edge = importer._edge(draft.slots)
-        roads = [part for road in importer.roads for part in network.clipped_road(road, edge)]
+        roads = [part for road in importer.roads for part in clipped_road(road, edge)]
         return outline_draft(name, elements, roads, importer.frame, options)
     return draft
 
@@ -216,7 +239,7 @@ class _OsmImporter:
                 if isinstance(road, str):
                     self._leave_out(road, element.id)
                 elif road is not None:
-                    roads += [road] if box is None else network.clipped_road(road, box)
+                    roads += [road] if box is None else clipped_road(road, box)
         return roads
 
     # ---- slots ----
@@ -229,7 +252,7 @@ class _OsmImporter:
             self.blocked.append(area.polygon)
         if not kept:
             return
-        lanes = network.lanes_of(self.roads)
+        lanes = lanes_of(self.roads)
         parts = [
             (area.element.id, *part)
             for area in kept
@@ -331,22 +354,20 @@ class _OsmImporter:
         roads = self.roads
         if len(slots) and not lanes_of_streets:
             service = [road for road in roads if road.rank < Rank.STREET]
-            lanes_of_streets = len(network.components_with_slots(service, slots)) > 1
+            lanes_of_streets = len(components_with_slots(service, slots)) > 1
         streets = [road for road in roads if road.rank is Rank.STREET]
         edge = None
         if lanes_of_streets:
             edge = self._edge(slots)
-            roads = [part for road in roads for part in network.clipped_road(road, edge)]
+            roads = [part for road in roads for part in clipped_road(road, edge)]
             lanes_around: list[Road] = []
         else:
             roads = [road for road in roads if road.rank < Rank.STREET]
             lanes_around = streets
-        roads = network.used_roads(roads, lanes_around, slots)
+        roads = used_roads(roads, lanes_around, slots)
         entries = points_in_frame(self.frame, self.options.entries)
         if not len(entries) and roads:
-            entries = (
-                network.street_junctions(roads, streets) if edge is None else self._open_ends(roads, edge)
-            )
+            entries = street_junctions(roads, streets) if edge is None else self._open_ends(roads, edge)
         goals, goal_note = points_in_frame(self.frame, self.options.goals), None
         if not len(goals):
             goals, goal_note = find_goals(slots, self.nodes, self.buildings, self.frame)
@@ -354,7 +375,7 @@ class _OsmImporter:
         for name in passages:
             self._leave_out("buildings over slots or lanes, which are no walls", name)
 
-        whole = network.lanes_of(roads)
+        whole = lanes_of(roads)
         lanes = limit_junctions(whole)
         turns = turns_of(self.place, self.frame, whole, lanes, away=False)
         draft = LotDraft(
@@ -403,7 +424,7 @@ class _OsmImporter:
 
     def _open_ends(self, roads: Sequence[Road], edge: shapely.Geometry) -> FloatArray:
         blind = [e.lines[0] for e in self.nodes if _is_blind_end(e)]
-        return network.open_ends(roads, edge, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *blind])))
+        return open_ends(roads, edge, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *blind])))
 
     def _missing(
         self, slots: Slots, roads: Sequence[Road], entries: FloatArray, goals: FloatArray
@@ -413,7 +434,7 @@ class _OsmImporter:
         elif not len(slots):
             yield "no slot: nothing that the file calls parking could be used"
         if len(slots) and roads and not len(entries):
-            ends = self.frame.to_lonlat(network.dead_ends(roads))[:3, ::-1].tolist()
+            ends = self.frame.to_lonlat(dead_ends(roads))[:3, ::-1].tolist()
             where = (
                 "; lanes end at " + " and ".join(f"{lat:.6f},{lon:.6f}" for lat, lon in ends) if ends else ""
             )
@@ -475,3 +496,193 @@ def refuse_far_away(elements: Sequence[OsmElement]) -> None:
 def _is_blind_end(element: OsmElement) -> bool:
     tags = element.tags
     return tags.get("noexit") == "yes" or tags.get("highway") in ("turning_circle", "turning_loop")
+
+
+MOST_SPACES = 20_000
+"""Maximum number of spaces of one lot."""
+LARGEST_USUAL = 18.0  # area, m², that few parking spaces for cars exceed
+
+
+def outline_draft(
+    name: str,
+    elements: Sequence[OsmElement],
+    roads: Sequence[Road],
+    frame: LocalFrame,
+    options: ImportOptions,
+) -> LotDraft:
+    """Draft a lot from the outlines of its spaces; `parkenv.lots.infer.layout` has the rules.
+
+    Args:
+        name: the lot's name.
+        elements: all elements of the map.
+        roads: roads open to cars, in the lot's frame.
+        frame: the lot's frame.
+        options: goals, entries and bounds given by the user.
+    """
+    drawn = [e for e in elements if is_space(e)]
+    if len(drawn) > MOST_SPACES:
+        raise InputError(
+            f"{len(drawn):,} parking spaces, want at most {MOST_SPACES:,} in one lot; divide it by --split or --bounds"
+        )
+    areas = within([Area.of(e, frame, simple=True) for e in drawn], options.box(frame))
+    _refuse_swapped(areas)
+    validate_areas(
+        [a.element.id for a in areas], shapely.area(np.array([a.polygon for a in areas], dtype=object))
+    )
+    buildings, parking = (
+        [a for a in areas_of(elements, frame, wanted, mended=True) if shapely.area(a.polygon)]
+        for wanted in (is_building, is_parking_area)
+    )
+    kept, unused = usable_spaces(areas, parking, with_disabled=options.with_disabled)
+    left_out: dict[str, list[str]] = {}
+    for area, reason in unused:
+        left_out.setdefault(reason, []).append(area.element.id)
+    if not kept:
+        listed = "; ".join(str(LeftOut(reason, tuple(members))) for reason, members in left_out.items())
+        raise InputError(f"no parking space for cars: {listed}")
+    ids, polygons = zip(*(part for a in kept for part in split_space(a.element, a.polygon, [])), strict=True)
+    spaces = spaces_from_outlines(ids, np.array(polygons, dtype=object))
+    obstacles = [*(a.polygon for a in buildings), *(a.polygon for a, _ in unused)]
+    entries, goals = (points_in_frame(frame, given) for given in (options.entries, options.goals))
+    lines = [Line(road.points, road.oneway, STREET if road.rank is Rank.STREET else -1) for road in roads]
+    lot = infer_lot(spaces, obstacles, lines, entries)
+    goal_note: str | None = None
+    if not len(goals):
+        goals, goal_note = find_goals(lot.slots, [e for e in elements if e.is_node], buildings, frame)
+    return draft_inferred_lot(
+        name,
+        lot,
+        spaces,
+        options,
+        source="amenity=parking_space",
+        unit="outlines",
+        left_out=left_out,
+        frame=frame,
+        goals=goals,
+        goal_note=goal_note or "",
+        walls=exterior_rings(a.polygon for a in buildings),
+        outlines=exterior_rings(a.polygon for a in parking),
+    )
+
+
+def _refuse_swapped(areas: Sequence[Area]) -> None:
+    """Raise an error if the spaces have the size of parked cars only with latitude and longitude exchanged."""
+    if not areas:
+        return
+    lonlat = [area.element.lines[0] for area in areas]
+    if np.abs(np.concatenate(lonlat)).max() > 89.0:
+        return
+    (size, skew), (other_size, other_skew) = (
+        _plausibility(positions) for positions in (lonlat, [line[:, ::-1] for line in lonlat])
+    )
+    if (size < 0.3 and other_size > 0.6) or (skew > 0.12 and other_skew < 0.06 and other_size > 0.6):
+        lon, lat = lonlat[0][0].tolist()
+        raise InputError(
+            f"{areas[0].element.id} is at {lat:.4f}, {lon:.4f}, where few spaces have the size of a car, want "
+            "positions at which they have (are latitude and longitude swapped?)"
+        )
+
+
+def _plausibility(outlines: Sequence[FloatArray]) -> tuple[float, float]:
+    """Return the fraction of outlines, (k, 2) degrees, of a parked car's size, and their typical skew.
+
+    The skew is the cosine of the angle between two sides: 0 for a rectangle.
+    """
+    frame = LocalFrame.around(np.concatenate(outlines))
+    fits, skew = [], []
+    for outline in outlines:
+        polygon = shapely.Polygon(frame.to_xy(outline))
+        if shapely.area(polygon) < 0.1:
+            continue
+        one, other = np.diff(rectangle_corners(polygon)[:3], axis=0)
+        width, length = sorted((float(np.hypot(*one)), float(np.hypot(*other))))
+        fits.append(1.8 < width < 3.3 and 4.0 < length < 6.4 and width * length < LARGEST_USUAL)
+        corners = shapely.get_coordinates(shapely.simplify(polygon, 0.2))
+        if len(corners) == 5:
+            one, other = np.diff(corners[:3], axis=0)
+            skew.append(abs(float(one @ other)) / float(np.hypot(*one) * np.hypot(*other)))
+    return float(np.mean(fits)) if fits else 0.0, float(np.median(skew)) if skew else 0.0
+
+
+SAME_CAR_PARK = 22.0
+"""Distance, m, between spaces up to which they belong to one car park: a street with verges, or two aisles."""
+AROUND = 60.0  # distance, m, from the spaces of a car park within which roads and buildings belong to it
+LEAST_SPACES = 10  # number of spaces of the smallest car park, by default
+MOST_IN_TOWN = 300_000
+"""Maximum number of spaces in one file."""
+
+
+@dataclass(frozen=True, eq=False)
+class CarPark:
+    """What became of one car park of a town."""
+
+    name: str
+    spaces: int  # number of outlines
+    draft: LotDraft | None  # its lot
+    reason: str = ""  # why there is none
+
+
+def import_car_parks(
+    path: str | Path, options: ImportOptions, least: int = LEAST_SPACES
+) -> Iterator[CarPark]:
+    """Yield the car parks of a town, the largest first.
+
+    Args:
+        path: an OpenStreetMap file with outlines of parking spaces.
+        options: whether entries and goals may be guessed, and which spaces count.
+        least: number of spaces below which a group of spaces is no car park.
+    """
+    path = Path(path)
+    place = read_map(path)
+    with naming(path):
+        parts = list(split_town(place_name(path), place.elements, least))
+    for name, part in parts:
+        count = sum(map(is_space, part))
+        try:
+            draft = draft_of_map(name, replace(place, elements=part), options, place.positions.frame)
+            draft.lot()
+        except InputError as error:
+            yield CarPark(name, count, None, str(error))
+        else:
+            yield CarPark(name, count, draft)
+
+
+def split_town(
+    name: str, elements: Sequence[OsmElement], least: int
+) -> Iterator[tuple[str, list[OsmElement]]]:
+    """Yield the name and the elements of each group of at least `least` spaces, the largest first."""
+    spaces = [e for e in elements if is_space(e)]
+    if not spaces:
+        raise InputError("no amenity=parking_space in it, want their outlines to find car parks")
+    if len(spaces) > MOST_IN_TOWN:
+        raise InputError(f"{len(spaces):,} parking spaces, want at most {MOST_IN_TOWN:,} in one file")
+    frame = map_frame(spaces)
+    shapes = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in spaces], dtype=object)
+    near = shapely.STRtree(shapes).query(shapes, predicate="dwithin", distance=SAME_CAR_PARK)
+    label = component_labels(near.T, len(spaces))
+    size = np.bincount(label)
+    first = np.array([int(np.flatnonzero(label == k)[0]) for k in range(len(size))])
+    chosen = [k for k in np.lexsort((first, -size)).tolist() if size[k] >= least]
+    if not chosen:
+        raise InputError(
+            f"{len(spaces)} parking spaces in groups of at most {size.max()}, want a group of {least}"
+        )
+    others = [e for e in elements if not is_space(e)]
+    around = np.array([_hull(e, frame.to_xy(np.concatenate(e.lines))) for e in others], dtype=object)
+    tree = shapely.STRtree(around)
+    digits = len(str(len(chosen)))
+    for number, k in enumerate(chosen, start=1):
+        members = np.flatnonzero(label == k)
+        ground = shapely.union_all(shapes[members])
+        around_it: list[int] = np.sort(tree.query(ground, predicate="dwithin", distance=AROUND)).tolist()
+        yield (
+            f"{name}-{number:0{digits}d}",
+            [spaces[i] for i in members.tolist()] + [others[i] for i in around_it],
+        )
+
+
+def _hull(element: OsmElement, xy: FloatArray) -> shapely.Geometry:
+    """Return a shape that is valid for every element."""
+    if element.tags.get("highway") and not element.is_node:
+        return shapely.LineString(xy)
+    return shapely.convex_hull(shapely.MultiPoint(xy))

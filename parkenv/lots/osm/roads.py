@@ -1,16 +1,27 @@
-"""Roads open to cars, from OpenStreetMap tags."""
+"""Roads open to cars, from OpenStreetMap tags: their network, entries and turn restrictions."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
+import shapely
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.generators import ONE_WAY_HALF_WIDTH
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.lots.draft import LeftOut
+from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, Slots
+from parkenv.lots.local_frame import LocalFrame
+from parkenv.lots.osm.elements import OsmMap
+from parkenv.world.drive_graph import NODE_TOLERANCE, centrelines, component_labels, node_labels
+from parkenv.world.lot import Lane, Turn
+from parkenv.world.turns import Chains, Rule, connected, rules_of
 
 STREET_WIDTH = {
     "motorway": 7.5,
@@ -182,3 +193,251 @@ def whole_number(text: str | None) -> int | None:
     plain = re.sub(r"(?<=\d)[,. ](?=\d{3}(?!\d))", "", (text or "").strip())
     match = re.fullmatch(r"[^\d-]{0,5}(\d{1,5})(?:\s*[-–]\s*(\d{1,5}))?\D{0,10}", plain)
     return (int(match[1]) + int(match[2] or match[1])) // 2 if match else None
+
+
+def lanes_of(roads: Sequence[Road]) -> list[Lane]:
+    """Return one lane per road."""
+    return [Lane(road.points, road.oneway) for road in roads]
+
+
+def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
+    """Return the parts of a road within a box, each in the direction of the road."""
+    line = shapely.LineString(road.points)
+    if shapely.covers(box, line):
+        return [road]
+    parts = []
+    for part in shapely.get_parts(shapely.intersection(line, box)):
+        if part.geom_type != "LineString" or part.length < 1.0:
+            continue
+        points = shapely.get_coordinates(part)
+        ends = [line.project(shapely.Point(point)) for point in points[:2]]
+        parts.append(replace(road, points=points[::-1] if ends[0] > ends[1] else points))
+    return parts
+
+
+def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> list[Road]:
+    """Return the roads connected to slots, without service roads that do not lead to a slot.
+
+    Args:
+        roads: candidates for lanes.
+        around: other roads; a road that meets one of them is not a dead end.
+        slots: the slots to reach.
+    """
+    parts = components_with_slots(roads, slots)
+    kept = [road for part in parts for road in part]
+    serving = _serving_roads(kept, slots)
+    while True:
+        shared = _shared_node_counts(kept, around)
+        loose = [
+            road.rank < Rank.STREET and k not in serving and shared[k] < 2 for k, road in enumerate(kept)
+        ]
+        if not any(loose):
+            return kept
+        new_number = np.cumsum(~np.array(loose)) - 1
+        serving = {int(new_number[k]) for k in serving}
+        kept = [road for road, dead in zip(kept, loose, strict=True) if not dead]
+
+
+def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) -> FloatArray:
+    """Return the points where streets leave the map and cars may enter, (n, 2) m.
+
+    These are the road ends at the edge of the map or, if no road ends there, all ends that are not dead ends.
+
+    Args:
+        roads: all lanes.
+        edge: the polygon within which roads are lanes.
+        blind: (k, 2) m, road ends that are tagged as dead ends.
+    """
+    ends = [
+        xy
+        for road, xy, is_first in road_ends(roads)
+        if road.rank is Rank.STREET and (is_first or not road.oneway)
+    ]
+    if not ends:
+        return np.empty((0, 2))
+    xy = np.array(ends)
+    at_edge = shapely.dwithin(shapely.get_exterior_ring(edge), np.asarray(shapely.points(xy)), 0.1)
+    if at_edge.any():
+        return xy[np.flatnonzero(at_edge)]
+    if len(blind):
+        away = blind[None] - xy[:, None]
+        xy = xy[np.flatnonzero(np.hypot(away[..., 0], away[..., 1]).min(axis=1) > 0.1)]
+    return xy
+
+
+def _road_nodes(roads: Sequence[Road]) -> list[NDArray[np.int64]]:
+    """Return the node labels of the points of each road; roads meet where they share a label."""
+    if not roads:
+        return []
+    label = node_labels(np.concatenate([road.points for road in roads]))
+    return np.split(label, np.cumsum([len(road.points) for road in roads])[:-1])
+
+
+def _serving_roads(roads: Sequence[Road], slots: Slots) -> set[int]:
+    """Return the indices of the roads that are nearest to the mouth of some slot."""
+    if not roads or not len(slots):
+        return set()
+    lines = np.array([shapely.LineString(road.points) for road in roads])
+    nearest = shapely.STRtree(lines).nearest(shapely.points(slots.mouths()))
+    return set(np.asarray(nearest).tolist())
+
+
+def components_with_slots(roads: Sequence[Road], slots: Slots) -> list[list[Road]]:
+    """Return the connected components of the roads, without those that serve no slot."""
+    if not roads:
+        return []
+    along = _road_nodes(roads)
+    road = np.repeat(np.arange(len(roads)), [len(p) for p in along])
+    label = np.concatenate(along)
+    n = len(roads) + int(label.max()) + 1
+    part = component_labels(np.column_stack([road, len(roads) + label]), n)[: len(roads)]
+    serving = {int(part[k]) for k in _serving_roads(roads, slots)}
+    return [[r for r, p in zip(roads, part, strict=True) if p == k] for k in sorted(serving)]
+
+
+def _shared_node_counts(roads: Sequence[Road], around: Sequence[Road]) -> list[int]:
+    """Count the nodes that each road shares with other roads of either list."""
+    along = [set(p.tolist()) for p in _road_nodes([*roads, *around])]
+    users: dict[int, int] = {}
+    for labels in along:
+        for label in labels:
+            users[label] = users.get(label, 0) + 1
+    return [sum(users[label] > 1 for label in labels) for labels in along[: len(roads)]]
+
+
+def street_junctions(roads: Sequence[Road], streets: Sequence[Road]) -> FloatArray:
+    """Return the nodes that a road shares with a street, where cars turn in, (n, 2) m."""
+    if not streets:
+        return np.empty((0, 2))
+    along = _road_nodes([*roads, *streets])
+    public = set(np.concatenate(along[len(roads) :]).tolist())
+    shared: dict[int, FloatArray] = {}
+    for road, on_road in zip(roads, along, strict=False):
+        # Cars cannot enter at the end of a one-way road.
+        last = len(on_road) - 1 if road.oneway else len(on_road)
+        for i in range(last):
+            if int(on_road[i]) in public:
+                shared.setdefault(int(on_road[i]), road.points[i])
+    return np.array(list(shared.values())).reshape(-1, 2)
+
+
+def dead_ends(roads: Sequence[Road]) -> FloatArray:
+    """Return the road ends, (n, 2) m, at which no other road begins."""
+    return np.array([xy for _, xy, _ in road_ends(roads)]).reshape(-1, 2)
+
+
+def road_ends(roads: Sequence[Road]) -> list[tuple[Road, FloatArray, bool]]:
+    """Return unshared road ends: the road, the point, (2,) m, and whether it is the road's first point."""
+    along = _road_nodes(roads)
+    users = np.bincount(np.concatenate([np.empty(0, np.int64), *along]))
+    return [
+        (road, road.points[i], i == 0)
+        for road, on_road in zip(roads, along, strict=True)
+        for i in (0, -1)
+        if users[on_road[i]] == 1
+    ]
+
+
+NO_LANE, SPLIT, CUTS = (
+    "on streets that are no lanes",
+    "at a junction that is split",
+    "that would cut streets off",
+)
+"""Why turns are left out."""
+
+
+class Turns(NamedTuple):
+    """The turns of a lot.
+
+    Attributes:
+        kept: those that it has.
+        found: a line that counts the restrictions of the map; none if there are none.
+        left_out: those left out.
+    """
+
+    kept: tuple[Turn, ...]
+    found: tuple[str, ...]
+    left_out: tuple[LeftOut, ...]
+
+
+def turns_of(
+    place: OsmMap, frame: LocalFrame, whole: Sequence[Lane], lanes: Sequence[Lane], *, away: bool = True
+) -> Turns:
+    """Return the turns of a lot.
+
+    Left out are those whose streets are no lanes of the lot, those at junctions that were split, and those with which
+    some street could not be reached, or left, that can be without: the map is incomplete there.
+
+    Args:
+        place: the map.
+        frame: frame of the lot.
+        whole: the lanes before junctions were split (`limit_junctions`).
+        lanes: the lanes.
+        away: whether restrictions away from the lanes are listed, too.
+    """
+    named = [(turn.id, Turn(frame.to_xy(turn.line), turn.only)) for turn in place.turns]
+    why = [NO_LANE] * len(named)
+    if named and lanes:
+        at = np.array([turn.points[1] for _, turn in named])
+        before, after = _arms_at(whole, at), _arms_at(lanes, at)
+        if not away:
+            named = [one for one, arms in zip(named, before, strict=True) if arms]
+            before, after = before[before > 0], after[before > 0]
+        split = (before != after).tolist()
+        why = _reasons(lanes, [turn for _, turn in named], split)
+    kept = {relation for (relation, _), reason in zip(named, why, strict=True) if not reason}
+    listed: dict[str, dict[str, None]] = defaultdict(dict)
+    for (relation, _), reason in zip(named, why, strict=True):
+        if relation not in kept:
+            listed[reason][relation] = None
+    left_out = [LeftOut(reason, tuple(those)) for reason, those in listed.items()]
+    if away:
+        left_out += place.turns_left_out
+    n_out = sum(len(left.ids) for left in left_out)
+    reasons = ", ".join(f"{left.reason}: {len(left.ids)}" for left in left_out)
+    line = f"turn restrictions: {len(kept)} kept" + (f", {n_out} left out ({reasons})" if n_out else "")
+    return Turns(
+        tuple(turn for (_, turn), reason in zip(named, why, strict=True) if not reason),
+        (line,) if kept or n_out else (),
+        tuple(LeftOut(f"turn restrictions {left.reason}", left.ids) for left in left_out),
+    )
+
+
+def _arms_at(lanes: Sequence[Lane], at: FloatArray) -> IntArray:
+    """Return how many stretches of lanes meet at points, (n,)."""
+    arms = np.concatenate([np.r_[1, np.full(len(lane.points) - 2, 2), 1] for lane in lanes])
+    near = cKDTree(np.concatenate([lane.points for lane in lanes])).query_ball_point(at, NODE_TOLERANCE)
+    return np.array([arms[those].sum() for those in near], np.int64)
+
+
+def _reasons(lanes: Sequence[Lane], turns: Sequence[Turn], split: Sequence[bool]) -> list[str]:
+    """Return why each turn cannot be kept, empty where it can."""
+    chains = centrelines([(lane.points, lane.oneway, lane.speed) for lane in lanes]).chains
+    rules = rules_of(chains, [(turn.points, turn.only) for turn in turns])
+    why = [
+        SPLIT if its else "" if isinstance(rule, Rule) else NO_LANE
+        for its, rule in zip(split, rules, strict=True)
+    ]
+    left = [(i, rule) for i, rule in enumerate(rules) if isinstance(rule, Rule) and not why[i]]
+    kept = _without_cuts(chains, [rule for _, rule in left])
+    for (i, _), fits in zip(left, kept.tolist(), strict=True):
+        why[i] = "" if fits else CUTS
+    return why
+
+
+def _without_cuts(chains: Chains, rules: Sequence[Rule]) -> BoolArray:
+    """Return which rules leave each chain connected with the others, (n,) bool: those that do not are tried last."""
+    whole, of = connected(chains, []), np.array([rule.chain for rule in rules], np.int64)
+    node, inside = chains.last[of], whole[of]
+    kept = inside.copy()
+
+    def lost() -> BoolArray:
+        return whole & ~connected(chains, [rule for rule, its in zip(rules, kept, strict=True) if its])
+
+    while (cut := np.flatnonzero(lost())).size:
+        touching = kept & np.isin(node, [chains.first[cut], chains.last[cut]])
+        kept &= ~(touching if touching.any() else kept)
+    for i in np.flatnonzero(inside & ~kept).tolist():
+        kept[i] = True
+        kept[i] = not lost().any()
+    return kept

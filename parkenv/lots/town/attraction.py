@@ -16,9 +16,9 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import with_extra
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.buildings import Area
+from parkenv.lots.osm.areas import Area
 from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.town.capacity import levels_of
+from parkenv.lots.town.supply import levels_of
 
 PURPOSES = ("residents", "commuters", "shoppers", "visitors", "deliveries")
 MOST_GOALS = 100

@@ -30,22 +30,40 @@ from parkenv.lots.draft import LeftOut, LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.infer.spaces import to_rectangle
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.buildings import Area, areas_of, is_building
+from parkenv.lots.osm.areas import (
+    CAR_SPACES,
+    Area,
+    areas_of,
+    is_building,
+    is_parking_area,
+    is_space,
+    slots_by_rank,
+    split_space,
+)
 from parkenv.lots.osm.draft import MAPPED_OVERLAP, NO_AISLE, RULE_OVERLAP, cut_elements, refuse_far_away
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
-from parkenv.lots.osm.outlines import CORRIDOR
-from parkenv.lots.osm.roads import Rank, off_the_ground, whole_number
-from parkenv.lots.osm.rows import without_overlaps
-from parkenv.lots.osm.spaces import CAR_SPACES, is_parking_area, is_space, slots_by_rank, split_space
-from parkenv.lots.osm.turns import Turns, turns_of
+from parkenv.lots.osm.roads import Rank, Turns, off_the_ground, turns_of, whole_number
+from parkenv.lots.osm.rows import CORRIDOR, without_overlaps
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.lots.town.attraction import PURPOSES, find_goals
-from parkenv.lots.town.capacity import GARAGES, expected_capacity, levels_of, rule_of
-from parkenv.lots.town.facilities import FacilityRow, facilities_of, table_of
 from parkenv.lots.town.kerbs import CLASS_RULE, STRIPS, kerb_sides, strip_side
-from parkenv.lots.town.listed import ListedCarPark, matched, read_listed
 from parkenv.lots.town.streets import read_streets
-from parkenv.lots.town.zones import PRICE, Rules, rules_of, zones_of
+from parkenv.lots.town.supply import (
+    GARAGES,
+    PRICE,
+    FacilityRow,
+    ListedCarPark,
+    Rules,
+    expected_capacity,
+    facilities_of,
+    levels_of,
+    matched,
+    read_listed,
+    rule_of,
+    rules_of,
+    table_of,
+    zones_of,
+)
 from parkenv.world.drive_graph import SLOT_REACH, component_labels, linestrings
 from parkenv.world.facility import FACILITY_REACH
 from parkenv.world.lot import Lane

@@ -1,6 +1,6 @@
 """The kerbs of a town: parking along streets as tagged, else as many places as streets of their class have.
 
-Both tagging schemes are read, see `parkenv.lots.osm.kerbs`. A tagged kerb without a capacity has a place for every
+Both tagging schemes are read, see `parkenv.lots.osm.rows`. A tagged kerb without a capacity has a place for every
 `METRES_PER_PLACE`; one whose tags say nothing of parking has `PLACES_PER_METRE` of its class, where houses stand beside
 it, and none on bridges, in tunnels and at roundabouts. Of main roads, one-way ones are one half of a dual carriageway:
 all places are on the right. Kerbs that are drawn as areas (`parking=street_side` and the like) are places along the
@@ -17,12 +17,19 @@ import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.lots.osm.buildings import Area
-from parkenv.lots.osm.kerbs import SHORTEST_KERB_SLOT, Junctions, Kerb, free_intervals, kerb_of, kerb_slots
+from parkenv.lots.osm.areas import Area
 from parkenv.lots.osm.roads import Rank, Road, whole_number
-from parkenv.lots.osm.rows import ARRANGEMENTS, Side
-from parkenv.lots.town.facilities import FacilityRow
-from parkenv.lots.town.zones import RESERVED, kerb_rules, rules_of
+from parkenv.lots.osm.rows import (
+    ARRANGEMENTS,
+    SHORTEST_KERB_SLOT,
+    Junctions,
+    Kerb,
+    Side,
+    free_intervals,
+    kerb_of,
+    kerb_slots,
+)
+from parkenv.lots.town.supply import RESERVED, FacilityRow, kerb_rules, rules_of
 from parkenv.world.drive_graph import linestrings
 
 PLACES_PER_METRE = {

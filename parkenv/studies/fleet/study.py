@@ -450,7 +450,7 @@ class FleetStudy(Study):
 
     def _cautions(self) -> dict[str, str]:
         """Return what to know of the import of each lot, by scenario, if there is something."""
-        from parkenv.lots.quality import read_provenance
+        from parkenv.lots.draft import read_provenance
 
         files = {spec.title: spec.lot.file for spec in self.scenarios}
         found = {

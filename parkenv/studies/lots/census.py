@@ -12,7 +12,7 @@ from parkenv.errors import InputError
 from parkenv.files.atomic_write import make_folder
 from parkenv.files.csv_tables import write_csv
 from parkenv.lots import read_lot
-from parkenv.lots.quality import QualityIssue, read_provenance
+from parkenv.lots.draft import QualityIssue, read_provenance
 from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability, manoeuvre_kinds
 from parkenv.studies.results import Row

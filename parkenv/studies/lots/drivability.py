@@ -18,8 +18,8 @@ from scipy.sparse.csgraph import connected_components
 
 from parkenv.compiled.arrays import IntArray
 from parkenv.driving.vehicle import VehicleParameters
+from parkenv.lots.draft import QualityIssue, combined_error_probability
 from parkenv.lots.formats.contents import LotProblem
-from parkenv.lots.quality import QualityIssue, combined_error_probability
 from parkenv.lots.slot_polygons import nearest_on_lanes
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.lot import Mouth, ParkingLot, corner_points, is_building, mouth_heading

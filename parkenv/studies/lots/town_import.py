@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from parkenv.lots import write_lot
-from parkenv.lots.draft import ImportOptions
-from parkenv.lots.osm.car_parks import LEAST_SPACES, import_car_parks
-from parkenv.lots.quality import Provenance
+from parkenv.lots.draft import ImportOptions, Provenance
+from parkenv.lots.osm.draft import LEAST_SPACES, import_car_parks
 from parkenv.show.figures.contact_sheet import save_contact_sheets
 from parkenv.show.plurals import plural
 from parkenv.studies.lots.drivability import check_drivability
