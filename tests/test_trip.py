@@ -23,15 +23,16 @@ from parkenv.studies.runner import run
 from parkenv.studies.simulate import Observer
 from parkenv.studies.trips.calibration import calibrate
 from parkenv.studies.trips.calibration_study import CalibrationStudy
-from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
-from parkenv.studies.trips.executor import (
+from parkenv.studies.trips.driven_car import (
     NO_ROOM,
     OBSERVED,
     TAKEN,
     UNOBSERVED,
+    DrivingStyle,
     ParkingAttempt,
 )
-from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
+from parkenv.studies.trips.driven_search import DrivenSearch, DrivenSearchEnv
+from parkenv.studies.trips.vehicle_controller import VehicleController
 from parkenv.world.lot_scene import LotScenes
 from parkenv.world.traffic import Traffic
 from planners.agent import make_agent
@@ -216,14 +217,14 @@ def test_a_trip_is_the_sum_of_its_parts_and_parks_without_a_contact(name, seed, 
     assert trip.manoeuvre_s == trip.attempts[-1].seconds
     # The car's clock, the search's clock, and the parts agree.
     began = search.env.state.arrival.time
-    assert driver.time - began == pytest.approx(trip.total_s - trip.costs["walk_s"])
-    assert search.env.state.time == pytest.approx(driver.time)
+    assert driver.car.time - began == pytest.approx(trip.total_s - trip.costs["walk_s"])
+    assert search.env.state.time == pytest.approx(driver.car.time)
     # It stands in the slot, which was free when it began to park.
     slot = scenario.lot.slot_ids.index(trip.slot)
-    middle = driver.vehicle.at_middle(driver.state[:3])
+    middle = driver.vehicle.at_middle(driver.car.state[:3])
     assert np.hypot(*(middle[:2] - scenario.lot.slot_xy[slot])) < 0.25
-    assert driver.state[SPEED] == pytest.approx(0.0, abs=0.01)
-    assert not search.env.state.world.occupied([slot], driver.time - trip.manoeuvre_s)[0]
+    assert driver.car.state[SPEED] == pytest.approx(0.0, abs=0.01)
+    assert not search.env.state.world.occupied([slot], driver.car.time - trip.manoeuvre_s)[0]
     assert any(t.reason for t in trip.attempts) == blind
 
 
@@ -246,7 +247,7 @@ def test_with_sensors_equal_seeds_give_equal_trips_and_captures_are_where_the_ca
     poses, told = [], []
 
     def keep(observation):
-        track = {spot.time: spot for spot in driver.track}
+        track = {spot.time: spot for spot in driver.car.track}
         results = env.perception.results
         # (ends of edges are no captures of their own where nothing was driven)
         assert len(results) <= 2
@@ -321,7 +322,7 @@ def test_among_others_trips_take_longer_and_end_parked_without_a_contact(name, c
     for seed in seeds:
         trip, quiet = among.run(seed), alone.run(seed)
         assert trip.parked
-        assert among.driver.log.contacts == []
+        assert among.driver.car.log.contacts == []
         assert quiet.waited_s == 0.0
         if trip.waited_s == 0.0:
             assert trip == quiet
@@ -348,7 +349,7 @@ def test_others_are_in_the_pictures_where_the_car_meets_them(monkeypatch):
         nonlocal checked
         if met:
             poses = np.concatenate(met.pop())
-            now = driver.others.poses[np.isfinite(driver.others.clocks)]
+            now = driver.car.others.poses[np.isfinite(driver.car.others.clocks)]
             np.testing.assert_allclose(poses, now)
             checked += len(now)
 
@@ -370,13 +371,15 @@ def test_a_failed_try_takes_longer_the_later_it_is_noticed_and_ends_on_the_lane(
         for seed in range(30):
             driver, world, arrival = started("mini", seed, style=DrivingStyle(notice_m=notice_m))
             slot = first_slot(driver)
-            if world.occupied([slot], driver.time)[0]:
+            if world.occupied([slot], driver.car.time)[0]:
                 break
         result = driver.park(slot, taken=True)
         assert (result.reason, result.slot) == (TAKEN, driver.scenario.lot.slot_ids[slot])
-        assert not driver.log.contacts
-        assert result.seconds == pytest.approx(driver.time - arrival.time - driver.log.legs[0].seconds)
-        pose = driver.vehicle.at_middle(driver.state[:3])
+        assert not driver.car.log.contacts
+        assert result.seconds == pytest.approx(
+            driver.car.time - arrival.time - driver.car.log.legs[0].seconds
+        )
+        pose = driver.vehicle.at_middle(driver.car.state[:3])
         assert abs(abs(pose[1]) - KEPT_RIGHT_M) < 0.4, "back on the lane, which lies along y = 0"
         assert min(abs(math.remainder(pose[2], math.pi)), 1.0) < 0.2
         seconds.append(result.seconds)

@@ -17,14 +17,14 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fields import Detector, OneAgent, OneScenario, Rig, Seed, Vehicle, require_rig
 from parkenv.studies.results import JsonTable, Results, Row
 from parkenv.studies.study import Cell, Study
-from parkenv.studies.trips.executor import OBSERVED, UNOBSERVED
+from parkenv.studies.trips.driven_car import OBSERVED, UNOBSERVED
 from parkenv.studies.workers import Task
 
 if TYPE_CHECKING:
     from parkenv.scenarios.calibration import Calibration
     from parkenv.studies.runner import Result
+    from parkenv.studies.trips.driven_car import DrivingStyle
     from parkenv.studies.trips.driven_search import DrivenSearch
-    from parkenv.studies.trips.vehicle_controller import DrivingStyle
     from parkenv.world.scenario import Scenario
 
 CALIBRATED = "calibrated.json"
@@ -101,7 +101,7 @@ class CalibrationStudy(Study):
     @cached_property
     def style(self) -> DrivingStyle:
         """How the car drives."""
-        from parkenv.studies.trips.vehicle_controller import DrivingStyle
+        from parkenv.studies.trips.driven_car import DrivingStyle
 
         return DrivingStyle(speed=self.speed_limit, notice_m=self.notice_m)
 

@@ -17,8 +17,8 @@ from parkenv.envs.search import SearchEnv
 from parkenv.errors import require_whole
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.simulate import STEP_LIMIT, Observer, adapt_to_agent, simulate
-from parkenv.studies.trips.executor import Leg, ParkingAttempt
-from parkenv.studies.trips.vehicle_controller import DrivingStyle, VehicleController
+from parkenv.studies.trips.driven_car import DrivingStyle, Leg, ParkingAttempt
+from parkenv.studies.trips.vehicle_controller import VehicleController
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.lot import PARK
 from parkenv.world.scenario import Scenario
@@ -93,12 +93,12 @@ class DrivenSearchEnv(SearchEnv):
             kernel.observe_at(self._address)
             return
         # After an attempt or a wait, the car observes once; captures within a manoeuvre are useless.
-        track = self.executor.track if moved else self.executor.track[-1:]
+        track = self.executor.car.track if moved else self.executor.car.track[-1:]
         stations: list[Station] = []
         if track:
             chosen = perception.sampler.select_stations(np.array([point.driven_m for point in track]))
             points = [track[i] for i in chosen.tolist()]
-            stations = [Station(s.time, s.pose, self.executor.movers_at(s)) for s in points]
+            stations = [Station(s.time, s.pose, self.executor.car.movers_at(s)) for s in points]
         captures = perception.sampler.sample(self._state, stations)
         perception.update_belief(self._address, self._state.vertex, captures)
 
@@ -199,7 +199,7 @@ class DrivenSearch:
         manoeuvre_s = parked.seconds if parked else 0.0
         lanes_s = float(info["drive_s"]) - manoeuvre_s
         costs = {name: float(info[name]) for name in COST_FIELDS if name != "drive_s"}
-        log = driver.log
+        log = driver.car.log
         return Trip(
             seed=int(seed),
             agent=self.agent,

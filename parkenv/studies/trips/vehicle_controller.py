@@ -4,40 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
-from parkenv.driving.collision_world import CollisionWorld, ObstacleKind, Obstacles
+from parkenv.driving.collision_world import ObstacleKind, Obstacles
 from parkenv.driving.driven_lines import DrivenEdge, DrivenLine, DrivenLines
-from parkenv.driving.lot_obstacles import REACH_M, LotObstacles
 from parkenv.driving.parking_task import KINDS, ParkingTasks
-from parkenv.driving.road_users import RoadUsers
-from parkenv.driving.vehicle import PHYSICS_S, SPEED, STATE_SIZE, STEERING, VehicleParameters, advance
-from parkenv.driving.yielding_traffic import YieldingTraffic
-from parkenv.envs.drive import CONTROL_S, SUBSTEPS
+from parkenv.driving.vehicle import SPEED, STEERING, VehicleParameters
 from parkenv.envs.drive_goals import ANGLE_TOLERANCE, POSITION_TOLERANCE
 from parkenv.errors import InputError
-from parkenv.studies.trips import executor
-from parkenv.studies.trips.executor import Leg, ParkingAttempt, TrackPoint
+from parkenv.studies.trips.driven_car import (
+    ACROSS,
+    ALONG,
+    NO_ROOM,
+    NO_WAY,
+    ROUND,
+    TAKEN,
+    TURN,
+    DrivenCar,
+    DrivingStyle,
+    Leg,
+    ParkingAttempt,
+)
 from parkenv.world.occupancy.process import World
 from parkenv.world.scenario import Scenario
 from planners.driving.car_path import CarPath
 from planners.driving.hybrid_astar import SearchSettings, plan_path
 from planners.driving.lane_keeping import LaneKeeper, joined, rounded
-from planners.driving.parking import STRAYED_M, STRAYED_RAD
 from planners.driving.path_tracking import PathTracker, TrackingSettings
 
-if TYPE_CHECKING:
-    from sim_sensors.movers import Movers
-
-
-RESCUE_S = 60.0  # time until a stuck car is back on the lane, s
-PATIENCE_S = 3.0  # time for which the car and a waiting road user both stand until the other gives way, s
 MOST_ROAD_USERS = 200  # maximum number of other cars and pedestrians
 TURN_IN_M = 9.0  # distance from the rear axle to the middle of a junction at which the turn begins, m
 
@@ -53,56 +50,8 @@ U_TURN_ANGLE = math.radians(150.0)
 _STRAYED_M = 1.0
 _MOST_PLANS = 6
 _NOTICE_STEP = 0.2
-_LEAST_NOTICE = 0.8
-_WAITS_M = 7.0
 _BEND_M = 8.0
 _LONGEST_S = 240.0
-_SOON_S = 0.8  # brake hard for encounters within this time
-_NOBODY: NDArray[np.float64] = np.empty(0)
-
-
-@dataclass(frozen=True)
-class DrivingStyle:
-    """Parameters of driving.
-
-    Example:
-        >>> DrivingStyle(notice_m=0.1)
-        Traceback (most recent call last):
-        ...
-        parkenv.errors.InputError: driving notice_m is 0.1 m, want at least 0.8, or the car could not stop in time
-    """
-
-    speed: float | None = None  # maximum on the lanes, m/s; None for the scenario's `v_drive`
-    acceleration: float = 1.2  # acceleration, and deceleration before turns, m/s²
-    braking: float = 2.0  # deceleration before parking, m/s²
-    # distance along the path, m, at which the car notices at the latest that a slot is taken
-    notice_m: float = 2.0
-
-    def __post_init__(self) -> None:
-        for name in ("speed", "acceleration", "braking", "notice_m"):
-            value = getattr(self, name)
-            if name == "speed" and value is None:
-                continue
-            if not (isinstance(value, int | float) and math.isfinite(value) and value > 0.0):
-                raise InputError(f"driving {name} is {value!r}, want a finite number above 0")
-        if self.notice_m < _LEAST_NOTICE:
-            raise InputError(
-                f"driving notice_m is {self.notice_m:g} m, want at least {_LEAST_NOTICE:g}, or the car could not stop "
-                "in time"
-            )
-
-
-@dataclass
-class DriveLog:
-    """Record of a drive."""
-
-    legs: list[Leg] = field(default_factory=list)  # driven edges
-    attempts: list[ParkingAttempt] = field(default_factory=list)  # parking attempts
-    driven_m: float = 0.0  # distance driven, forward and backward, m
-    contacts: list[str] = field(default_factory=list)  # kinds of obstacles touched, one per collision
-    strays: int = 0  # how often the car left its path and planned another
-    rescues: int = 0  # how often no path was found and the car was put back on the lane
-    waited_s: float = 0.0  # time spent braking and standing for other road users, s
 
 
 class VehicleController:
@@ -112,20 +61,13 @@ class VehicleController:
     driven at any time. Parking, turning round and leaving a slot are planned among the cars that are parked there. Cars
     that arrive during a manoeuvre wait until it is over.
 
-    The scenario's traffic moves meanwhile. The car brakes for road users that are in its way now or soon, and they
-    brake for the car; if both have stood for `PATIENCE_S`, the others give way, see `RoadUsers`.
-
     Args:
         scenario: the scenario, with lot, parked cars and traffic.
         vehicle: the car.
         style: driving style.
 
     Attributes:
-        log: record of the drive since `begin`.
-        state: (6,) state of the vehicle, see `parkenv.driving.vehicle`.
-        time: current time, s.
-        track: positions of the car since the last decision, every 0.1 s.
-        others: moving road users; None without traffic.
+        car: the car that is driven, with its state, log and track.
     """
 
     def __init__(
@@ -134,6 +76,7 @@ class VehicleController:
         self.scenario = scenario
         self.vehicle = vehicle or VehicleParameters()
         self.style = style or DrivingStyle()
+        self.car = DrivenCar(scenario, self.vehicle, self.style)
         speed = scenario.v_drive if self.style.speed is None else self.style.speed
         if speed > self.vehicle.max_speed:
             raise InputError(
@@ -146,55 +89,35 @@ class VehicleController:
             )
         lot = scenario.lot
         self._lines = DrivenLines(lot)
-        self._around = LotObstacles(scenario)
         self._kinds = ParkingTasks(lot).slot_kinds
         self._on_lane = TrackingSettings(
             speed=speed, acceleration=self.style.acceleration, blend_m=2.0, firmness=0.5
         )
         self._turns: dict[tuple[int, int, int, int], CarPath | None] = {}
-        self.log = DriveLog()
-        self.track: list[TrackPoint] = []
-        self.others: RoadUsers | None = None
-        self.state = np.zeros(STATE_SIZE)
-        self.time = 0.0
 
     def begin(self, key: np.uint64, world: World, vertex: int, time: float) -> None:
         """Start at a vertex at full speed, at a time in s, in the world with this key."""
-        self._around.begin(key, world)
-        self.log = DriveLog()
-        self.track = []
-        self.state = np.zeros(STATE_SIZE)
-        self.time = time
-        self._keeper: PathTracker | None = None
+        self.car.begin(key, world, vertex, time)
         self._line: int | None = None
         self._placed = False
-        self._touches = False
-        self._knew: set[int] | None = None
-        self._stood_s = 0.0
-        self.others = None
-        traffic = self.scenario.traffic
-        if traffic.cars or traffic.pedestrians:
-            rounds = YieldingTraffic(self.scenario.lot, traffic, key, self._around.slots)
-            self.others = RoadUsers(rounds, self.vehicle)
-        self._enter(self._standing(self.scenario.lot.vertex_xy[vertex]))
 
     def drive(self, source: int, column: int) -> float:
         """Drive along an edge of the graph to its end; return the time taken, s."""
         lot = self.scenario.lot
         target, length = int(lot.neighbors[source, column]), float(lot.edge_length[source, column])
         edge = self._lines.edge(source, target, length)
-        began, self.track = self.time, []
+        began, self.car.track = self.car.time, []
         if not self._placed:
             self._place(edge)
-        kind = executor.ACROSS
+        kind = ACROSS
         if not edge.across:
             kind = self._plan_edge(edge)
-            self._refresh()
-            while not self._arrived(edge, target) and self.time - began < _LONGEST_S:
+            self.car.refresh()
+            while not self._arrived(edge, target) and self.car.time - began < _LONGEST_S:
                 if not self._keep_lane():
                     break
-        leg = Leg(kind, length, self.time - began)
-        self.log.legs.append(leg)
+        leg = Leg(kind, length, self.car.time - began)
+        self.car.log.legs.append(leg)
         return leg.seconds
 
     def park(self, slot: int, taken: bool) -> ParkingAttempt:
@@ -204,91 +127,86 @@ class VehicleController:
             slot: index of the slot.
             taken: whether a car is parked in the slot; this car notices it when it is about to drive in.
         """
-        lot, vehicle, began = self.scenario.lot, self.vehicle, self.time
-        self.track = []
-        self._halt(self.style.braking)
-        center = 0.5 * (lot.slot_xy[slot] + self.state[:2])
-        there = self._standing(center, slot)
-        inside = self._around.footprint(slot, self.time) if taken else None
-        self._enter(there if inside is None else _with(there, inside))
+        lot, vehicle, began = self.scenario.lot, self.vehicle, self.car.time
+        self.car.track = []
+        self.car.halt(self.style.braking)
+        center = 0.5 * (lot.slot_xy[slot] + self.car.state[:2])
+        there = self.car.standing(center, slot)
+        inside = self.car.parked_outline(slot) if taken else None
+        self.car.enter(there if inside is None else _with(there, inside))
         kind = self._kinds[slot]
         pose = np.array([*lot.slot_xy[slot], lot.slot_yaw[slot]])
         targets = {"nose-in": pose, "back-in": pose + np.array([0.0, 0.0, math.pi])}
         if kind == KINDS[2]:
             targets = {"": pose}
-        way, reason, onward = "", executor.NO_ROOM, 0.0
+        way, reason, onward = "", NO_ROOM, 0.0
         if lot.slot_length[slot] >= vehicle.length and lot.slot_width[slot] >= vehicle.width:
             way, reason = self._drive_in(targets, there, inside)
         if reason:
             onward = self._back(slot)
-        result = ParkingAttempt(lot.slot_ids[slot], kind, way, self.time - began, reason, onward)
-        self.log.attempts.append(result)
+        result = ParkingAttempt(lot.slot_ids[slot], kind, way, self.car.time - began, reason, onward)
+        self.car.log.attempts.append(result)
         return result
 
     def wait(self, seconds: float) -> float:
         """Brake, and stand for some time; return the time taken, s."""
-        until, self.track = self.time + seconds, []
-        self._refresh()
-        while self.time < until - 1e-9:
-            self._brake(self.style.braking)
+        until, self.car.track = self.car.time + seconds, []
+        self.car.refresh()
+        while self.car.time < until - 1e-9:
+            self.car.brake(self.style.braking)
         return seconds
-
-    def movers_at(self, point: TrackPoint) -> Movers | None:
-        """Return the road users at the time of a point of `track`."""
-        return None if self.others is None else self.others.movers(point.clocks)
 
     # --- Lanes
 
     def _place(self, edge: DrivenEdge) -> None:
         """Place the car at the start of the first edge."""
-        line = self._lines.lines[edge.line]
-        self.state[:3] = line.pose(edge.start - self.vehicle.middle)
-        self.state[SPEED] = self._on_lane.speed
+        self.car.place(
+            self._lines.lines[edge.line].pose(edge.start - self.vehicle.middle), self._on_lane.speed
+        )
         self._placed = True
-        self._clear_area()
 
     def _plan_edge(self, edge: DrivenEdge) -> str:
         """Plan the path along an edge from the car's pose; return the edge's kind."""
-        if self._line == edge.line and self._keeper is not None and not self._keeper.done:
-            return executor.ALONG
+        if self._line == edge.line and self.car.path is not None and not self.car.path.done:
+            return ALONG
         line = self._lines.lines[edge.line]
         here = self._lines.lines[self._line] if self._line is not None else None
         before, self._line = self._line, edge.line
         if self._is_on(line):
             self._follow_line(line)
-            return executor.ALONG
+            return ALONG
         if here is not None and self._is_on(here):
             joint = line.pose(edge.start)
             at = here.station_of(joint[:2])
             if _away(here.pose(at), joint) < _NEAR_M / 2 and _askew(here.pose(at), joint) < _ALIGNED:
-                now = here.station_of(self.state[:2])
-                first = here.between(now, at) if at > now + 0.1 else self.state[None, :2]
+                now = here.station_of(self.car.state[:2])
+                first = here.between(now, at) if at > now + 0.1 else self.car.state[None, :2]
                 points = np.concatenate([first, line.between(max(edge.start, 0.1), line.length)])
-                self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
-                return executor.ALONG
+                self.car.path = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
+                return ALONG
             if _askew(here.pose(at), joint) < U_TURN_ANGLE:
                 turn = self._turn(before or 0, edge, at)
                 if turn is not None:
-                    self._keeper = LaneKeeper(self.vehicle, turn, self._on_lane)
-                    return executor.TURN
+                    self.car.path = LaneKeeper(self.vehicle, turn, self._on_lane)
+                    return TURN
         return self._turn_onto(line)
 
     def _follow_line(self, line: DrivenLine) -> None:
-        now = line.station_of(self.state[:2])
+        now = line.station_of(self.car.state[:2])
         points = line.between(now, max(line.length, now + 1.0))
-        self._keeper = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
+        self.car.path = LaneKeeper(self.vehicle, rounded(points, _BEND_M), self._on_lane)
 
     def _turn(self, before: int, edge: DrivenEdge, at: float) -> CarPath | None:
         """Plan the turn from the car's line to one that crosses it at station `at`; return None if there is none."""
         here, line = self._lines.lines[before], self._lines.lines[edge.line]
         # Measured to the middle of the junction, not to the near side of the other lane.
-        now = here.station_of(self.state[:2])
+        now = here.station_of(self.car.state[:2])
         leave = at - TURN_IN_M + _LEAD_M
         if now > leave:
             leave = math.ceil(2.0 * (now + 0.2)) / 2.0
         key = before, edge.line, round(10 * leave), round(10 * edge.start)
         if key not in self._turns:
-            there = self._around.worst_case(here.pose(at)[:2])
+            there = self.car.all_slots_taken(here.pose(at)[:2])
             path = self._planned_onto(
                 here.pose(leave), line, edge.start, MERGE_DISTANCES_M, there, TURN_MARGINS
             )
@@ -304,26 +222,26 @@ class VehicleController:
 
     def _turn_onto(self, line: DrivenLine) -> str:
         """Drive from the car's pose onto a line, and continue along it; return the edge's kind."""
-        self._halt(self.style.braking)
+        self.car.halt(self.style.braking)
         askew = 0.0
         for _ in range(_MOST_PLANS):
-            now = line.station_of(self.vehicle.at_middle(self.state[:3])[:2])
-            askew = max(askew, _askew(line.pose(now), self.state[:3]))
-            there = self._standing(self.state[:2])
-            self._enter(there)
+            now = line.station_of(self.car.middle[:2])
+            askew = max(askew, _askew(line.pose(now), self.car.pose))
+            there = self.car.standing(self.car.state[:2])
+            self.car.enter(there)
             onward = MERGE_DISTANCES_M if askew < U_TURN_ANGLE else RETURN_DISTANCES_M
-            path = self._planned_onto(self.state[:3], line, now, onward, there, TURN_MARGINS[-1:])
+            path = self._planned_onto(self.car.pose, line, now, onward, there, TURN_MARGINS[-1:])
             if path is None:
                 break
             tracker = PathTracker(self.vehicle, path)
-            self._follow(tracker)
+            self.car.follow(tracker)
             if tracker.done:
                 break
-            self.log.strays += 1
+            self.car.log.strays += 1
         if not self._is_on(line):
             self._rescue(line)
         self._follow_line(line)
-        return executor.TURN if askew < U_TURN_ANGLE else executor.ROUND
+        return TURN if askew < U_TURN_ANGLE else ROUND
 
     def _planned_onto(
         self,
@@ -361,24 +279,24 @@ class VehicleController:
 
     def _keep_lane(self) -> bool:
         """Drive one control step along the lane; return False at its end."""
-        assert self._keeper is not None
-        pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
-        command = self._keeper.command(pose, speed, steering)
-        if self._keeper.done:
+        assert self.car.path is not None
+        pose, speed, steering = self.car.pose, float(self.car.state[SPEED]), float(self.car.state[STEERING])
+        command = self.car.path.command(pose, speed, steering)
+        if self.car.path.done:
             return False
-        if abs(self._keeper.offset) > _STRAYED_M:
-            self.log.strays += 1
+        if abs(self.car.path.offset) > _STRAYED_M:
+            self.car.log.strays += 1
             assert self._line is not None
             self._turn_onto(self._lines.lines[self._line])
             return True
-        if not self._yields(self._keeper):
-            self._step(*command)
+        if not self.car.yields(self.car.path):
+            self.car.step(*command)
         return True
 
     def _arrived(self, edge: DrivenEdge, target: int) -> bool:
         goal = self._lines.lines[edge.line].pose(edge.end)
         slot = target < self.scenario.lot.n_slots
-        own = self.vehicle.at_middle(self.state[:3]) if slot else self.state[:3]
+        own = self.car.middle if slot else self.car.pose
         c, s = math.cos(goal[2]), math.sin(goal[2])
         dx, dy = own[0] - goal[0], own[1] - goal[1]
         ahead, aside = c * dx + s * dy, c * dy - s * dx
@@ -388,8 +306,8 @@ class VehicleController:
 
     def _is_on(self, line: DrivenLine) -> bool:
         """Return whether the car is aligned with a line."""
-        pose = line.pose(line.station_of(self.state[:2]))
-        return _away(pose, self.state[:3]) < _NEAR_M and _askew(pose, self.state[:3]) < _ALIGNED
+        pose = line.pose(line.station_of(self.car.state[:2]))
+        return _away(pose, self.car.pose) < _NEAR_M and _askew(pose, self.car.pose) < _ALIGNED
 
     # --- Manoeuvres
 
@@ -401,22 +319,22 @@ class VehicleController:
         for _ in range(_MOST_PLANS):
             paths = {way: path for way in ways if (path := self._planned_to(targets[way], there)) is not None}
             if not paths:
-                return ways[0] if len(ways) == 1 else "", executor.NO_WAY
+                return ways[0] if len(ways) == 1 else "", NO_WAY
             way = min(paths, key=lambda w: _seconds_of(paths[w]))
             ways = [way]
             tracker = PathTracker(self.vehicle, paths[way])
             notices = None if inside is None else self._noticing(tracker, inside)
-            if not self._follow(tracker, notices):
-                return way, executor.TAKEN
-            own = self.vehicle.at_middle(self.state[:3])
+            if not self.car.follow(tracker, notices):
+                return way, TAKEN
+            own = self.car.middle
             if (
                 tracker.done
                 and _away(targets[way], own) <= POSITION_TOLERANCE
                 and _askew(targets[way], own) <= ANGLE_TOLERANCE
             ):
                 return way, ""
-            self.log.strays += 1
-        return way, executor.NO_WAY
+            self.car.log.strays += 1
+        return way, NO_WAY
 
     def _noticing(self, tracker: PathTracker, inside: FloatArray) -> Callable[[], bool]:
         """Return a function that checks whether the path meets an outline within `notice_m`."""
@@ -432,25 +350,7 @@ class VehicleController:
     def _planned_to(self, target: FloatArray, there: Obstacles) -> CarPath | None:
         """Plan a path to a pose of the footprint's centre."""
         goal = self.vehicle.at_rear_axle(target)
-        return plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], goal)
-
-    def _follow(self, tracker: PathTracker, notices: Callable[[], bool] | None = None) -> bool:
-        """Follow a path to its end, or stop if the car leaves it; return False if `notices` stopped the car."""
-        while True:
-            pose, speed, steering = self.state[:3], float(self.state[SPEED]), float(self.state[STEERING])
-            command = tracker.command(pose, speed, steering)
-            if tracker.done:
-                return True
-            if notices is not None and notices():
-                self._halt(
-                    max(self.style.braking, 0.5 * speed * speed / (self.style.notice_m - 0.4)), tracker
-                )
-                return False
-            if abs(tracker.offset) > STRAYED_M or abs(tracker.askew) > STRAYED_RAD:
-                self._halt(self.style.braking, tracker)
-                return True
-            if not self._yields(tracker):
-                self._step(*command)
+        return plan_path(self.vehicle, there.corners, there.n_corners, self.car.pose, goal)
 
     def _back(self, slot: int) -> float:
         """Drive back onto the slot's lane or the previous one, whichever is faster; return `onward_m`."""
@@ -458,9 +358,9 @@ class VehicleController:
         if self._line is not None and self._line != ways[0][0]:
             line = self._lines.lines[self._line]
             ways.append((self._line, line.station_of(self.scenario.lot.vertex_xy[slot])))
-        there = self._standing(self.state[:2])
-        self._enter(there)
-        self._keeper = None
+        there = self.car.standing(self.car.state[:2])
+        self.car.enter(there)
+        self.car.path = None
         for _ in range(_MOST_PLANS):
             if any(self._is_on(self._lines.lines[index]) for index, _ in ways):
                 break
@@ -469,7 +369,7 @@ class VehicleController:
                 line = self._lines.lines[index]
                 for onward in RETURN_DISTANCES_M:
                     pose = line.pose(min(station + onward, line.length) - self.vehicle.middle)
-                    path = plan_path(self.vehicle, there.corners, there.n_corners, self.state[:3], pose)
+                    path = plan_path(self.vehicle, there.corners, there.n_corners, self.car.pose, pose)
                     if path is not None and (best is None or _seconds_of(path) < best[0]):
                         best = _seconds_of(path), path, index
             if best is None:
@@ -477,107 +377,16 @@ class VehicleController:
                 break
             _, path, self._line = best
             tracker = PathTracker(self.vehicle, path)
-            self._follow(tracker)
+            self.car.follow(tracker)
             if tracker.done:
                 break
-            self.log.strays += 1
+            self.car.log.strays += 1
         index, station = next((way for way in ways if way[0] == self._line), ways[0])
-        own = self._lines.lines[index].station_of(self.vehicle.at_middle(self.state[:3])[:2])
+        own = self._lines.lines[index].station_of(self.car.middle[:2])
         return own - station
 
-    # --- The car and its surroundings
-
     def _rescue(self, line: DrivenLine) -> None:
-        """Put a stuck car back onto a line."""
-        self.log.rescues += 1
-        self.time += RESCUE_S
-        pose = line.pose(line.station_of(self.state[:2]))
-        self.state = np.r_[pose, np.zeros(STATE_SIZE - 3)]
-        self._clear_area()
-
-    def _clear_area(self) -> None:
-        """Hide road users that stand where the car was placed."""
-        if self.others is not None:
-            self.others.clear_area(self.vehicle.corners(self.state[:3]))
-
-    def _yields(self, tracker: PathTracker) -> bool:
-        """Brake or stand for one step if a road user blocks the path; return whether the car did."""
-        if self.others is None:
-            return False
-        speed = abs(float(self.state[SPEED]))
-        when = self.others.encounter_times(tracker.middle_ahead(speed))
-        if np.isinf(when).all():
-            self._stood_s = 0.0
-            return False
-        if speed == 0.0:
-            self._stood_s += CONTROL_S
-            if self._stood_s >= PATIENCE_S:
-                self.others.hide_standing(np.isfinite(when))
-                self._stood_s = 0.0
-        self.log.waited_s += CONTROL_S
-        self._brake(self.vehicle.max_braking if when.min() < _SOON_S else self.style.braking, tracker)
-        return True
-
-    def _halt(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake to a standstill."""
-        self._refresh()
-        while self.state[SPEED] != 0.0:
-            self._brake(braking, tracker)
-
-    def _brake(self, braking: float, tracker: PathTracker | None = None) -> None:
-        """Brake for one control step along the current path."""
-        speed, steering = float(self.state[SPEED]), float(self.state[STEERING])
-        tracker = tracker or self._keeper
-        wheels = steering / self.vehicle.max_steering
-        if tracker is not None and speed != 0.0:
-            _, wheels = tracker.command(self.state[:3], speed, steering)
-        share = min(braking, abs(speed) / CONTROL_S) / self.vehicle.max_braking
-        self._step(-math.copysign(min(share, 1.0), speed) if speed else 0.0, wheels)
-
-    def _step(self, acceleration: float, steering: float) -> None:
-        """Advance the car by one control step."""
-        others = self.others
-        if others is not None:
-            others.advance(CONTROL_S, self.vehicle.corners(self.state[:3]))
-        for step in range(SUBSTEPS):
-            if others is not None:
-                self._space.move(others.interpolate((step + 1) / SUBSTEPS))
-            way = advance(self.state, acceleration, steering, self.vehicle.limits)
-            self.log.driven_m += abs(way)
-            touched = self._space.touched(*self.state[:3].tolist())
-            if touched and not self._touches:
-                self.log.contacts.append(ObstacleKind(touched).label)
-            self._touches = bool(touched)
-            self.time += PHYSICS_S
-        clocks = _NOBODY if others is None else others.clocks
-        self.track.append(
-            TrackPoint(self.time, self.log.driven_m, self.vehicle.at_middle(self.state[:3]), clocks)
-        )
-        if np.abs(self.state[:2] - self._space_at).max() > REACH_M - 10.0:
-            self._refresh()
-
-    def _refresh(self) -> None:
-        """Update the obstacles around the car."""
-        self._enter(self._standing(self.state[:2]))
-
-    def _standing(self, center: FloatArray, looks_free: int | None = None) -> Obstacles:
-        """Return the obstacles around a point, (2,) m, without waiting cars and any car in slot `looks_free`."""
-        taken = set(self._around.taken(center, self.time))
-        if self._knew is not None:
-            new = np.array(sorted(taken - self._knew), dtype=np.int64)
-            close = np.hypot(*(self.scenario.lot.slot_xy[new] - self.state[:2]).T) < _WAITS_M
-            taken -= set(new[close].tolist())
-        self._knew = taken
-        return self._around.at_time(center, self.time, sorted(taken - {looks_free}))
-
-    def _enter(self, there: Obstacles) -> None:
-        """Build the collision world of these obstacles."""
-        if self.others is None:
-            self._space = CollisionWorld(self.vehicle, there)
-        else:
-            self._space = CollisionWorld(self.vehicle, there, self.others.outlines)
-            self._space.move(self.others.poses)
-        self._space_at = self.state[:2].copy()
+        self.car.rescue(line.pose(line.station_of(self.car.state[:2])))
 
 
 def _with(there: Obstacles, outline: FloatArray) -> Obstacles:
