@@ -81,43 +81,6 @@ class Map:
             lines.append(f'<relation id="{i + 1001}">{members}{tags(values)}</relation>')
         return "\n".join([*lines, "</osm>"])
 
-    def overpass(self, *, geometry):
-        number, at = self.places()
-
-        def position(i):
-            return {"lat": at[i][1], "lon": at[i][0]}
-
-        elements = [
-            {"type": "node", "id": number[point], **position(number[point]), "tags": tags}
-            for point, tags in self.nodes.items()
-        ]
-        way_nodes = {}
-        for i, (points, tags) in enumerate(self.ways):
-            refs = way_nodes[i + 1] = [number[point] for point in points]
-            way = {"type": "way", "id": i + 1, "nodes": refs, "tags": tags}
-            if geometry:
-                way["geometry"] = [position(ref) for ref in refs]
-            elements.append(way)
-        for i, (outer, inner, tags) in enumerate(self.areas):
-            members = [
-                {"type": "way", "ref": ref, "role": role}
-                | ({"geometry": list(map(position, way_nodes[ref]))} if geometry else {})
-                for role, refs in (("outer", outer), ("inner", inner))
-                for ref in refs
-            ]
-            elements.append({"type": "relation", "id": i + 1, "members": members, "tags": tags})
-        for i, (refs, roles, tags) in enumerate(self.turns):
-            members = [
-                {"type": "node", "ref": refs[role], "role": role} | (position(refs[role]) if geometry else {})
-                if role == "via"
-                else {"type": "way", "ref": refs[role], "role": role}
-                for role in roles
-            ]
-            elements.append({"type": "relation", "id": i + 1001, "members": members, "tags": tags})
-        if geometry:
-            elements = [e for e in elements if e["type"] != "node" or e["tags"]]
-        return json.dumps({"version": 0.6, "generator": "Overpass API", "elements": elements})
-
     def geojson(self, *, flat=True):
         """As osmtogeojson writes it: closed ways are polygons unless they are roads."""
         number, at = self.places()

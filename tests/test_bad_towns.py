@@ -125,7 +125,6 @@ def test_a_damaged_map_is_one_line(tmp_path, monkeypatch, name, content):
     if name.endswith("pbf"):
         pytest.importorskip("osmium", reason="the extra osm is not installed")
     monkeypatch.setattr(elements, "MOST_ELEMENTS", 10_000)
-    monkeypatch.setattr(elements, "MOST_XML_BYTES", 2_000_000)
     path = tmp_path / name
     path.write_bytes(content)
     with pytest.raises(InputError) as error:

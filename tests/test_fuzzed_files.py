@@ -267,7 +267,6 @@ FORMATS = {
     "lot.geojson": Format(json.loads((ROOT / "lots/packaged/mini.geojson").read_text()), mutated_json, lot),
     "map.yml": Format(MAP, mutated_text, lot),
     "osm.osm": Format(car_park().xml(), mutated_text, imported),
-    "overpass.json": Format(json.loads(car_park().overpass(geometry=False)), mutated_json, imported),
     "turbo.geojson": Format(json.loads(car_park().geojson()), mutated_json, imported),
     "slots.csv": Format("id,x,y,yaw\n" + SLOTS, mutated_text, imported),
     "log.csv": Format(LOG, mutated_text, OccupancyLog.read),

@@ -15,7 +15,7 @@ from scipy.sparse.csgraph import dijkstra
 from parkenv import make_agent, make_scenario
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
-from parkenv.lots import check_lot, import_lot, import_town, read_lot, write_lot
+from parkenv.lots import check_lot, import_town, read_lot, write_lot
 from parkenv.mapping.route import survey_route
 from parkenv.studies.simulate import adapt_to_agent
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, PoissonArrivals
@@ -258,21 +258,20 @@ def test_a_survey_passes_every_slot_once_without_them(turns):
     assert route.length == pytest.approx(plain.length)
 
 
-def imported(place, tmp_path, form):
-    path = tmp_path / ("map.osm" if form == "xml" else "map.json")
-    path.write_text(place.xml() if form == "xml" else place.overpass(geometry=form == "geom"))
-    draft = import_lot(path)
+def imported(place, tmp_path):
+    draft = place.draft(tmp_path)
     return draft, [line for line in draft.found if line.startswith("turn restrictions")]
 
 
-@pytest.mark.parametrize("form", ["xml", "json", "geom"])
-def test_a_restriction_of_the_map_is_a_turn_of_the_lot(tmp_path, form):
-    draft, (line,) = imported(crossing(restriction="no_left_turn"), tmp_path, form)
+def test_a_restriction_of_the_map_is_a_turn_of_the_lot(tmp_path):
+    draft, (line,) = imported(crossing(restriction="no_left_turn"), tmp_path)
     assert line == "turn restrictions: 1 kept"
-    (one,) = draft.turns
-    assert not one.only
-    np.testing.assert_allclose(one.points - one.points[1], [(-100, 0), (0, 0), (0, 100)], atol=0.05)
-    plain, nothing = imported(crossing(), tmp_path, form)
+    (restriction,) = draft.turns
+    assert not restriction.only
+    np.testing.assert_allclose(
+        restriction.points - restriction.points[1], [(-100, 0), (0, 0), (0, 100)], atol=0.05
+    )
+    plain, nothing = imported(crossing(), tmp_path)
     assert nothing == []
     assert draft.lot().n_vertices == plain.lot().n_vertices + 1
 

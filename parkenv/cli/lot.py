@@ -50,7 +50,7 @@ LotName = Annotated[
 Place = Annotated[
     Path,
     Field(
-        description="OpenStreetMap (.osm, .osm.pbf, Overpass .json, overpass-turbo .geojson), slot centres (.csv), a "
+        description="OpenStreetMap (.osm, .osm.pbf, overpass-turbo .geojson), slot centres (.csv), a "
         "Dragon Lake map (.yml) or a lot."
     ),
     Option(takes="FILE", argument=True),

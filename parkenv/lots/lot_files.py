@@ -118,8 +118,8 @@ def _read_whole(path: Path) -> tuple[ParkingLot, str]:
 def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
     """Draft a lot from a file of a real place.
 
-    Supported formats are OpenStreetMap (`.osm`, `.xml`, `.osm.pbf`, Overpass JSON, overpass-turbo GeoJSON, also packed
-    as `.gz` and `.bz2`; see `parkenv.lots.osm.draft`), lists of slot centres (`.csv`; see
+    Supported formats are OpenStreetMap (`.osm`, `.xml`, also packed as `.gz` and `.bz2`, `.osm.pbf`,
+    overpass-turbo GeoJSON; see `parkenv.lots.osm.draft`), lists of slot centres (`.csv`; see
     `parkenv.lots.formats.slot_list`), the Dragon Lake map and native lots.
     Latitudes and longitudes are projected to metres east and north of the file's centre.
 
@@ -148,7 +148,7 @@ def import_lot(path: str | Path, options: ImportOptions | None = None) -> LotDra
     if file_format is None:
         raise InputError(
             f"{path}: unknown kind of file {path.suffix!r}, want .osm, .xml or .pbf (OpenStreetMap), "
-            ".json or .geojson (Overpass, overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
+            ".json or .geojson (overpass-turbo, a native lot), .csv (slot centres) or a Dragon Lake .yml"
         )
     if options.bounds is not None:
         raise InputError(

@@ -250,6 +250,8 @@ def _load(path: Path) -> Any:
 
 def _check_head(document: Any, stem: str) -> str:
     """Validate the top-level members; return the lot's name."""
+    if isinstance(document, dict) and "elements" in document:
+        raise InputError("holds Overpass JSON, want XML (`[out:xml]`) or overpass-turbo's GeoJSON")
     if not isinstance(document, dict) or document.get("type") != "FeatureCollection":
         kind = document.get("type") if isinstance(document, dict) else type(document).__name__
         raise InputError(f"type is {kind!r:.40}, want a GeoJSON 'FeatureCollection'")

@@ -21,10 +21,11 @@ right, unless `in_left_hand_traffic` converts the draft.
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -65,6 +66,7 @@ from parkenv.lots.osm.roads import (
     lanes_of,
     off_the_ground,
     open_ends,
+    read_roads,
     road_of,
     street_junctions,
     turns_of,
@@ -81,12 +83,15 @@ from parkenv.lots.osm.rows import (
     without_overlaps,
 )
 from parkenv.world.drive_graph import SLOT_REACH, component_labels
+from parkenv.world.lot import Lane
 
 OTHER_FLOORS = ("underground", "multi-storey", "rooftop", "garage", "garages", "garage_boxes", "sheds")
 """Values of `parking` for slots that are not in the open at ground level."""
 FARTHEST = 100_000.0  # largest distance of parking and roads from the centre of a map, m
 STREETS_AROUND = 60.0  # distance beyond the slots, m, within which streets are lanes if no bounds are given
 NO_AISLE = f"slots that no aisle reaches within {SLOT_REACH:g} m"  # reason for leaving out
+MAPPED, FILLED, KERBSIDE = "amenity=parking_space", "amenity=parking, rows by rule", "kerbside parking"
+"""Sources of slots."""
 MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 """Largest allowed overlap, m, of slots drawn by hand, and of slots created by rule."""
 
@@ -132,7 +137,7 @@ def draft_of_map(
     has_spaces = any(e.tags.get("amenity") == "parking_space" for e in elements)
     if has_spaces and not any(_may_be_lane(e) for e in elements):
         return outline_draft(name, elements, [], frame or map_frame(elements), options)
-    importer = _OsmImporter(name, place, options, frame)
+    importer = _LotImport(name, place, options, frame)
     importer.read_spaces()
     importer.fill_outlines()
     importer.line_kerbs()
@@ -163,119 +168,122 @@ def _may_be_lane(element: OsmElement) -> bool:
     return isinstance(road_of(element.id, element.tags, element.lines[0] * 1e5), Road)
 
 
-@dataclass(eq=False)
-class _Group:
-    """Slots from one kind of source, and the rank of the road that each opens to."""
+class _Part(NamedTuple):
+    """A part of a drawn space for one car."""
+
+    area: Area
+    name: str
+    polygon: shapely.Geometry
+
+
+class MapImport:
+    """The state of an import: the map, its frame and buildings, and what is left out, by reason."""
+
+    def __init__(self, name: str, place: OsmMap, frame: LocalFrame) -> None:
+        self.name, self.place, self.frame = name, place, frame
+        self.left_out: dict[str, list[str]] = defaultdict(list)
+        self.nodes = [e for e in place.elements if e.is_node]
+
+    def areas(self, wanted: Callable[[OsmElement], bool], *, mended: bool = False) -> list[Area]:
+        """Return the wanted elements that have an area."""
+        areas = areas_of(self.place.elements, self.frame, wanted, mended=mended)
+        if not mended:
+            self.left_out["outlines without an area"] += [
+                a.element.id for a in areas if not shapely.area(a.polygon)
+            ]
+        return [a for a in areas if shapely.area(a.polygon) > 0.0]
+
+    def points(self, wanted: Callable[[OsmElement], bool]) -> FloatArray:
+        """Return the positions of the wanted nodes, (n, 2) m."""
+        positions = (e.lines[0] for e in self.nodes if wanted(e))
+        return self.frame.to_xy(np.concatenate([np.empty((0, 2)), *positions]))
+
+    def drawn_slots(
+        self, spaces: Sequence[Area], lanes: Sequence[Lane], roads: Sequence[Road]
+    ) -> tuple[list[_Part], list[tuple[Rank, NDArray[np.intp], Slots]]]:
+        """Return the parts of drawn spaces, and by the rank of the road that they open to, their indices and slots."""
+        parts = [
+            _Part(area, name, polygon)
+            for area in spaces
+            for name, polygon in split_space(area.element, to_rectangle(area.polygon), lanes)
+        ]
+        if not parts:
+            return [], []
+        by_rank = list(slots_by_rank(np.array([part.polygon for part in parts], dtype=np.object_), roads))
+        left = np.ones(len(parts), bool)
+        for _, index, _ in by_rank:
+            left[index] = False
+        self.left_out[NO_AISLE] += [parts[i].name for i in np.flatnonzero(left).tolist()]
+        return parts, by_rank
+
+    def all_left_out(self) -> list[LeftOut]:
+        """Return what is left out."""
+        return [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items() if ids]
+
+
+class _Slot(NamedTuple):
+    """A slot of a lot: where it comes from, and the rank of the road that it opens to."""
 
     source: str
-    ids: list[str] = field(default_factory=list)
-    owners: list[str] = field(default_factory=list)
-    slots: list[Slots] = field(default_factory=list)
-    ranks: list[int] = field(default_factory=list)
-    rows: Counter[str] = field(default_factory=Counter)  # number of slots so far of each row
-
-    def add(self, owners: Sequence[str], ids: Sequence[str], slots: Slots, ranks: Sequence[int]) -> None:
-        self.owners += owners
-        self.ids += ids
-        self.slots.append(slots)
-        self.ranks += ranks
-
-    def add_row(self, owner: str, start: str, slots: Slots, rank: Rank) -> None:
-        """Add the slots of one element, or of a part of it, numbered from 1."""
-        n, first = len(slots), self.rows[start] + 1
-        self.rows[start] += n
-        self.add([owner] * n, [f"{start}-{k + first}" for k in range(n)], slots, [int(rank)] * n)
+    owner: str  # id of its element
+    id: str
+    rank: Rank
 
 
-class _OsmImporter:
-    """The state of an import: roads, areas, slots, and elements left out."""
+class _LotImport(MapImport):
+    """The state of an import of a lot: roads, areas and slots."""
 
     def __init__(self, name: str, place: OsmMap, options: ImportOptions, frame: LocalFrame | None) -> None:
-        self.name, self.place, elements = name, place, place.elements
-        self.options = options
-        self.left_out: dict[str, list[str]] = {}
-        self.notes: list[str] = []
-        parking = [e for e in elements if _is_parking(e)]
+        parking = [e for e in place.elements if _is_parking(e)]
         if not parking:
             raise InputError(
                 "no parking in it: no amenity=parking_space, no amenity=parking, no street with "
                 "parking:left, parking:right or parking:both"
             )
-        refuse_far_away([e for e in elements if _is_parking(e) or "highway" in e.tags])
-        self.frame = frame or LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
-        self.box = options.box(self.frame)
-        box = None if self.box is None else shapely.box(*self.box)
-        self.nodes = [e for e in elements if e.is_node]
-        self.roads = self._roads(elements, box)
-
-        def areas(wanted: Callable[[OsmElement], bool]) -> list[Area]:
-            found = areas_of(elements, self.frame, wanted)
-            for flat in (a.element for a in found if not shapely.area(a.polygon)):
-                self._leave_out("outlines without an area", flat.id)
-            return within([a for a in found if shapely.area(a.polygon)], self.box)
-
-        self.outlines = areas(is_parking_area)
-        self.spaces = areas(is_space)
-        self.buildings = areas(is_building)
+        refuse_far_away([e for e in place.elements if _is_parking(e) or "highway" in e.tags])
+        super().__init__(name, place, frame or map_frame(place.elements))
+        self.options, self.box = options, options.box(self.frame)
+        self.notes: list[str] = []
+        self.roads = read_roads(place.elements, self.frame, self.left_out)
+        if self.box is not None:
+            box = shapely.box(*self.box)
+            self.roads = [part for road in self.roads for part in clipped_road(road, box)]
+        self.outlines, self.spaces, self.buildings = (
+            within(self.areas(wanted), self.box) for wanted in (is_parking_area, is_space, is_building)
+        )
         for e in parking:
             kind = e.tags.get("amenity", "")
             if kind.startswith("parking") and not (e.lines and e.is_closed):
-                self._leave_out(f"amenity={kind} without an outline", e.id)
-        self.mapped = _Group("amenity=parking_space")
-        self.filled = _Group("amenity=parking, rows by rule")
-        self.kerbside = _Group("kerbside parking")
+                self.left_out[f"amenity={kind} without an outline"].append(e.id)
+        self.slots: list[_Slot] = []
+        self.parts: list[Slots] = []  # of the same slots
+        self.rows: Counter[str] = Counter()  # number of slots so far of each row
         self.blocked: list[shapely.Geometry] = [a.polygon for a in self.buildings]
 
-    def _leave_out(self, reason: str, name: str) -> None:
-        self.left_out.setdefault(reason, []).append(name)
-
-    def _roads(self, elements: Sequence[OsmElement], box: shapely.Geometry | None) -> list[Road]:
-        roads: list[Road] = []
-        for element in elements:
-            if element.is_node or "highway" not in element.tags:
-                continue
-            for line in element.lines:
-                road = road_of(element.id, element.tags, self.frame.to_xy(line))
-                if isinstance(road, str):
-                    self._leave_out(road, element.id)
-                elif road is not None:
-                    roads += [road] if box is None else clipped_road(road, box)
-        return roads
+    def _add_row(self, source: str, owner: str, start: str, slots: Slots, rank: Rank) -> None:
+        """Add the slots of one element, or of a part of it, numbered from 1."""
+        first = self.rows[start] + 1
+        self.rows[start] += len(slots)
+        self.slots += [_Slot(source, owner, f"{start}-{first + k}", rank) for k in range(len(slots))]
+        self.parts.append(slots)
 
     # ---- slots ----
 
     def read_spaces(self) -> None:
         """Create slots from mapped spaces."""
-        kept, unused = usable_spaces(self.spaces, self.outlines, with_disabled=self.options.with_disabled)
+        usable, unused = usable_spaces(self.spaces, self.outlines, with_disabled=self.options.with_disabled)
         for area, reason in unused:
-            self._leave_out(reason, area.element.id)
-            self.blocked.append(area.polygon)
-        if not kept:
-            return
-        lanes = lanes_of(self.roads)
-        parts = [
-            (area.element.id, *part)
-            for area in kept
-            for part in split_space(area.element, to_rectangle(area.polygon), lanes)
-        ]
-        owners, names, polygons = zip(*parts, strict=True)
-        self.blocked += [area.polygon for area in kept]
-
-        left = set(range(len(names)))
-        for rank, index, slots in slots_by_rank(np.array(polygons, dtype=np.object_), self.roads):
-            found = index.tolist()
-            self.mapped.add(
-                [owners[i] for i in found], [names[i] for i in found], slots, [int(rank)] * len(found)
-            )
-            left.difference_update(found)
-        for i in sorted(left):
-            self._leave_out(NO_AISLE, names[i])
+            self.left_out[reason].append(area.element.id)
+        self.blocked += [area.polygon for area in (*(area for area, _ in unused), *usable)]
+        spaces, by_rank = self.drawn_slots(usable, lanes_of(self.roads), self.roads)
+        for rank, index, slots in by_rank:
+            drawn = [spaces[i] for i in index.tolist()]
+            self.slots += [_Slot(MAPPED, space.area.element.id, space.name, rank) for space in drawn]
+            self.parts.append(slots)
 
     def fill_outlines(self) -> None:
         """Fill the parking areas without mapped spaces with rows of slots by rule."""
-        centers = shapely.points(
-            np.concatenate([s.xy for s in self.mapped.slots]) if self.mapped.slots else np.empty((0, 2))
-        )
+        centers = shapely.points(np.concatenate([np.empty((0, 2)), *(slots.xy for slots in self.parts)]))
         tree = shapely.STRtree([shapely.LineString(road.points) for road in self.roads])
         for area in self.outlines:
             tags, name = area.element.tags, area.element.id
@@ -284,7 +292,7 @@ class _OsmImporter:
             if kind in OTHER_FLOORS:
                 reason = f"parking={kind}"
             if reason is not None:
-                self._leave_out(f"parking areas with {reason}", name)
+                self.left_out[f"parking areas with {reason}"].append(name)
                 continue
             if shapely.contains(area.polygon, centers).any():
                 continue
@@ -306,19 +314,18 @@ class _OsmImporter:
                 if len(slots):
                     break
             if not len(slots):
-                self._leave_out("parking areas without a road along which a slot fits", name)
+                self.left_out["parking areas without a road along which a slot fits"].append(name)
                 continue
-            self.filled.add_row(name, name, slots, rank)
+            self._add_row(FILLED, name, name, slots, rank)
             self.blocked += list(slots.boxes(shrink=0.02))
             if capacity is not None and len(slots) < capacity:
                 self.notes.append(f"{name}: {len(slots)} of the tagged {capacity} slots fit by the rule")
 
     def line_kerbs(self) -> None:
         """Create slots along streets."""
-        crossings = [e.lines[0] for e in self.nodes if e.tags.get("highway") == "crossing"]
         if not any(road.has_kerb_parking for road in self.roads):
             return
-        junctions = Junctions(self.roads, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *crossings])))
+        junctions = Junctions(self.roads, self.points(is_crossing))
         corridors = shapely.union_all(
             [
                 shapely.LineString(road.points).buffer(CORRIDOR * road.half_width, cap_style="flat")
@@ -333,13 +340,13 @@ class _OsmImporter:
                     tagged = "left" if side == "right" else "right"
                 kerb = kerb_of(road.tags, tagged)  # type: ignore[arg-type]
                 if isinstance(kerb, str):
-                    self._leave_out(kerb, f"{road.id}-{tagged}")
+                    self.left_out[kerb].append(f"{road.id}-{tagged}")
                 if kerb is None or isinstance(kerb, str):
                     continue
                 slots = kerb_slots(road, side, kerb, junctions.closed_intervals(k, side))
                 clear = np.flatnonzero(~shapely.intersects(corridors, slots.boxes(shrink=0.05)))
                 slots = slots[clear]
-                self.kerbside.add_row(road.id, f"{road.id}-{tagged}", slots, road.rank)
+                self._add_row(KERBSIDE, road.id, f"{road.id}-{tagged}", slots, road.rank)
                 if kerb.capacity is not None and len(slots) < kerb.capacity:
                     self.notes.append(
                         f"{road.id}: {len(slots)} of the tagged {kerb.capacity} slots fit on the {tagged}"
@@ -349,8 +356,8 @@ class _OsmImporter:
 
     def draft(self) -> LotDraft:
         """Assemble slots, lanes, entries, goals and walls, and list what is missing."""
-        names, sources, slots, ranks = self._all_slots()
-        lanes_of_streets = bool((ranks == Rank.STREET).any())
+        sources, slots = self._without_overlaps()
+        lanes_of_streets = any(slot.rank == Rank.STREET for slot in sources)
         roads = self.roads
         if len(slots) and not lanes_of_streets:
             service = [road for road in roads if road.rank < Rank.STREET]
@@ -372,17 +379,16 @@ class _OsmImporter:
         if not len(goals):
             goals, goal_note = find_goals(slots, self.nodes, self.buildings, self.frame)
         walls, passages = split_walls(slots, roads, self.buildings)
-        for name in passages:
-            self._leave_out("buildings over slots or lanes, which are no walls", name)
+        self.left_out["buildings over slots or lanes, which are no walls"] += passages
 
         whole = lanes_of(roads)
         lanes = limit_junctions(whole)
         turns = turns_of(self.place, self.frame, whole, lanes, away=False)
         draft = LotDraft(
             name=self.name,
-            slot_ids=tuple(names),
+            slot_ids=tuple(slot.id for slot in sources),
             slots=slots,
-            slot_source=tuple(sources),
+            slot_source=tuple(slot.source for slot in sources),
             lanes=tuple(lanes),
             entries=entries,
             goals=goals,
@@ -392,28 +398,23 @@ class _OsmImporter:
             frame=self.frame,
             turns=turns.kept,
         ).searchable()
-        left_out = [LeftOut(reason, tuple(ids)) for reason, ids in self.left_out.items()]
         return replace(
             draft,
             found=(*self._found(draft, roads, goal_note), *turns.found),
-            left_out=(*left_out, *turns.left_out, *draft.left_out),
+            left_out=(*self.all_left_out(), *turns.left_out, *draft.left_out),
         )
 
-    def _all_slots(self) -> tuple[list[str], list[str], Slots, NDArray[np.int64]]:
-        groups = [g for g in (self.mapped, self.filled, self.kerbside) if g.ids]
-        if not groups:
-            return [], [], NO_SLOTS, np.empty(0, dtype=np.int64)
-        names = [name for g in groups for name in g.ids]
-        sources = [g.source for g in groups for _ in g.ids]
-        slots = Slots.joined([part for g in groups for part in g.slots])
-        ranks = np.array([rank for g in groups for rank in g.ranks], dtype=np.int64)
-        is_mapped = np.array([source == self.mapped.source for source in sources])
-        shrink = np.where(is_mapped, MAPPED_OVERLAP, RULE_OVERLAP)
-        kept = without_overlaps(slots.boxes(shrink))
-        for i in np.flatnonzero(~kept):
-            self._leave_out("slots that overlap others", names[i])
-        index = np.flatnonzero(kept)
-        return [names[i] for i in index], [sources[i] for i in index], slots[index], ranks[index]
+    def _without_overlaps(self) -> tuple[list[_Slot], Slots]:
+        if not self.slots:
+            return [], NO_SLOTS
+        slots = Slots.joined(self.parts)
+        shrink = np.where([slot.source == MAPPED for slot in self.slots], MAPPED_OVERLAP, RULE_OVERLAP)
+        is_free = without_overlaps(slots.boxes(shrink))
+        self.left_out["slots that overlap others"] += [
+            self.slots[i].id for i in np.flatnonzero(~is_free).tolist()
+        ]
+        index = np.flatnonzero(is_free)
+        return [self.slots[i] for i in index.tolist()], slots[index]
 
     def _edge(self, slots: Slots) -> shapely.Geometry:
         """Return the box within which streets are lanes."""
@@ -423,8 +424,7 @@ class _OsmImporter:
         return shapely.Polygon(shapely.box(*low, *high))
 
     def _open_ends(self, roads: Sequence[Road], edge: shapely.Geometry) -> FloatArray:
-        blind = [e.lines[0] for e in self.nodes if _is_blind_end(e)]
-        return open_ends(roads, edge, self.frame.to_xy(np.concatenate([np.empty((0, 2)), *blind])))
+        return open_ends(roads, edge, self.points(_is_blind_end))
 
     def _missing(
         self, slots: Slots, roads: Sequence[Road], entries: FloatArray, goals: FloatArray
@@ -449,11 +449,11 @@ class _OsmImporter:
             )
 
     def _found(self, draft: LotDraft, roads: Sequence[Road], goal_note: str | None) -> Iterable[str]:
-        for group in (self.mapped, self.filled, self.kerbside):
-            owner_of = dict(zip(group.ids, group.owners, strict=True))
+        for source in (MAPPED, FILLED, KERBSIDE):
+            owner_of = {slot.id: slot.owner for slot in self.slots if slot.source == source}
             owners = [owner_of[name] for name in draft.slot_ids if name in owner_of]
             if owners:
-                yield f"slots from {group.source}: {len(owners)} (elements: {len(set(owners))})"
+                yield f"slots from {source}: {len(owners)} (elements: {len(set(owners))})"
         aisles, service = (sum(road.rank is rank for road in roads) for rank in (Rank.AISLE, Rank.SERVICE))
         yield (
             f"lanes: {len(roads)} (parking aisles: {aisles}, other service roads: {service}, "
@@ -466,6 +466,11 @@ class _OsmImporter:
             yield f"goals: {len(draft.goals)}, {goal_note or 'as given'}"
         yield from self.notes
         yield f"frame: {self.frame}"
+
+
+def is_crossing(element: OsmElement) -> bool:
+    """Whether an element is a pedestrian crossing."""
+    return element.tags.get("highway") == "crossing"
 
 
 def _is_parking(element: OsmElement) -> bool:
@@ -554,7 +559,7 @@ def outline_draft(
         lot,
         spaces,
         options,
-        source="amenity=parking_space",
+        source=MAPPED,
         unit="outlines",
         left_out=left_out,
         frame=frame,

@@ -1,9 +1,9 @@
 """Read OpenStreetMap files: nodes, ways and multipolygons with their tags and positions.
 
-Four formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `out;`), Overpass
-JSON (`elements`, with node references or `out geom;`), GeoJSON as overpass-turbo and osmtogeojson write
-it (an element's id in `id` or `@id`, its tags in `properties` or `properties.tags`), and PBF with the package osmium.
-GeoJSON of polygons without any such tag holds outlines of parking spaces. XML and JSON may be packed (`.gz`, `.bz2`).
+Three formats are read: OSM XML (`.osm`, `.xml`: the map's own export, JOSM, Overpass `[out:xml]`), packed as `.gz` and
+`.bz2`, too, and PBF, both by the package osmium; and GeoJSON as overpass-turbo and osmtogeojson write it (an element's
+id in `id` or `@id`, its tags in `properties` or `properties.tags`). GeoJSON of polygons without any such tag holds
+outlines of parking spaces.
 
 Extracts are clipped: ways lack the nodes beyond the edge, multipolygons some of their ways. Streets are cut there,
 areas are closed by a straight line between what is left, and what has nothing left is listed.
@@ -11,28 +11,24 @@ areas are closed by a straight line between what is left, and what has nothing l
 Turn restrictions are relations. Those for cars at all hours are read, `no_*` and `only_*` from ways over a node to
 ways; others are listed: over a way, at some hours only (`restriction:conditional`), without cars (`except=motorcar`,
 `restriction:hgv`), and those that lack a member or whose ways do not end where they should.
-
-OSM XML has no document type. A file that declares one is rejected before its entities are read, so entities cannot
-expand into gigabytes or fetch other files.
 """
 
 from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
 
 import numpy as np
 import shapely
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, with_extra
-from parkenv.files.limited_reading import is_there, open_limited, read_json, unpacked_path
+from parkenv.files.limited_reading import read_json, require_file, unpacked_path
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.formats.positions import Positions
 
@@ -43,8 +39,6 @@ KEYS = (*MAPPED_KEYS, "noexit", "shop", "office", "craft", "healthcare", "touris
 """Keys of the elements that an import reads."""
 MOST_ELEMENTS = 5_000_000
 """Maximum number of nodes, ways and relations of one file: a city of a million people."""
-MOST_XML_BYTES = 512_000_000
-"""Maximum size of OSM XML, unpacked."""
 CAR_KEYS = frozenset(("motorcar", "motor_vehicle", "vehicle"))
 TURN_KEYS = (*(f"restriction:{key}" for key in ("motorcar", "motor_vehicle", "vehicle")), "restriction")
 """Keys of a restriction of turns that holds for cars, the most specific first."""
@@ -134,17 +128,14 @@ class OsmMap:
 
 
 def read_map(path: Path) -> OsmMap:
-    """Read all tagged nodes, ways and multipolygons of a file in PBF, XML or JSON, cut at the edge of the map."""
-    suffix = unpacked_path(path).suffix.lower()
-    if suffix == ".pbf":
-        return _read_pbf(path)
-    if suffix in (".osm", ".xml"):
-        return _read_xml(path)
+    """Read all tagged nodes, ways and multipolygons of a file, cut at the edge of the map."""
+    if unpacked_path(path).suffix.lower() in (".pbf", ".osm", ".xml"):
+        return _read_osm(path)
     content = read_json(path)
     with naming(path):
-        has_features = isinstance(content, dict) and isinstance(content.get("features"), list)
-        positions = Positions.of(content, path) if has_features else Positions()
-        return map_of_json(content, positions)
+        if not isinstance(content, dict) or not isinstance(content.get("features"), list):
+            raise InputError("no features, want a GeoJSON FeatureCollection, or a map as .osm or .osm.pbf")
+        return _map_of_geojson(content["features"], Positions.of(content, path))
 
 
 def place_name(path: Path) -> str:
@@ -153,13 +144,9 @@ def place_name(path: Path) -> str:
 
 
 def holds_osm(document: object) -> bool:
-    """Whether parsed JSON is Overpass JSON or GeoJSON made from OpenStreetMap, not a native lot."""
-    if not isinstance(document, dict):
-        return False
-    if isinstance(document.get("elements"), list):
-        return True
-    features = document.get("features")
-    if not isinstance(features, list) or "parkenv" in document:
+    """Whether parsed JSON is GeoJSON made from OpenStreetMap, not a native lot."""
+    features = document.get("features") if isinstance(document, dict) else None
+    if not isinstance(document, dict) or not isinstance(features, list) or "parkenv" in document:
         return False
     if _holds_outlines(features):
         return True
@@ -182,72 +169,72 @@ def _holds_outlines(features: list[Any]) -> bool:
     )
 
 
-# ---- common to all formats: references are resolved when everything has been read ----
+# ---- XML and PBF: references are resolved when everything has been read ----
 
 
 class _NoTurnError(Exception):
     """Why a restriction of turns is not read."""
 
 
-@dataclass
-class RawWay:
-    """A way with references to its nodes, or with its line."""
+class _Way(NamedTuple):
+    """A way with references to its nodes."""
 
     tags: dict[str, str]
-    refs: list[int] = field(default_factory=list)
-    line: FloatArray | None = None
+    refs: list[int]
 
 
-@dataclass
-class RawRelation:
-    """A relation with its member ways: reference, role, and line if it is known; and its nodes with the role via."""
+class _Relation(NamedTuple):
+    """A relation with its member ways: reference and role; and its nodes with the role via."""
 
     tags: dict[str, str]
-    members: list[tuple[int, str, FloatArray | None]] = field(default_factory=list)
-    via: list[int] = field(default_factory=list)
+    members: list[tuple[int, str]]
+    via: list[int]
 
 
 @dataclass
-class RawElements:
+class _RawElements:
     """Elements as read, with unresolved references."""
 
     positions: dict[int, tuple[float, float]] = field(default_factory=dict)
     node_tags: dict[int, dict[str, str]] = field(default_factory=dict)
-    ways: dict[int, RawWay] = field(default_factory=dict)
-    relations: dict[int, RawRelation] = field(default_factory=dict)
+    ways: dict[int, _Way] = field(default_factory=dict)
+    relations: dict[int, _Relation] = field(default_factory=dict)
+    needed_ways: set[int] = field(default_factory=set)
+    needed_nodes: set[int] = field(default_factory=set)
     left_out: dict[str, list[str]] = field(default_factory=lambda: defaultdict(list))
-    count: int = 0  # of elements
 
-    def count_one(self) -> None:
-        """Count an element."""
-        self.count += 1
-        if self.count > MOST_ELEMENTS:
-            raise InputError(
-                f"has more than {MOST_ELEMENTS:,} nodes, ways and relations, the most that is read; cut the town out "
-                "of it, e.g. by `osmium extract`"
-            )
+    # What refers to others is added first.
 
-    def add_node(self, number: int, position: tuple[float, float], tags: dict[str, str]) -> None:
-        """Add a node; Overpass may write it again, with or without its tags."""
-        before = self.positions.setdefault(number, position)
-        if before != position:
-            raise InputError(
-                f"node/{number} appears twice, at {before[1]}, {before[0]} and at {position[1]}, {position[0]}"
-            )
-        if tags:
-            self.node_tags[number] = tags
+    def add_relation(self, relation: Any) -> None:
+        tags = dict(relation.tags)
+        is_area = tags.get("type") == "multipolygon" and ("amenity" in tags or "building" in tags)
+        if is_area or tags.get("type") == "restriction":
+            ways = [(m.ref, m.role) for m in relation.members if m.type == "w"]
+            via = [m.ref for m in relation.members if m.type == "n" and m.role == "via"]
+            self.relations[relation.id] = _Relation(tags, ways, via)
+            self.needed_ways.update(ref for ref, _ in ways)
+            self.needed_nodes.update(via)
 
-    def add_way(self, number: int, way: RawWay) -> None:
-        """Add a way, which may also appear again."""
-        before = self.ways.get(number)
-        if before is not None:
-            if before.refs and way.refs and before.refs != way.refs:
-                raise InputError(f"way/{number} appears twice, with other nodes")
-            line = before.line if way.line is None else way.line
-            way = RawWay(way.tags or before.tags, way.refs or before.refs, line)
-        self.ways[number] = way
+    def add_way(self, way: Any) -> None:
+        if way.id in self.needed_ways or any(key in way.tags for key in KEYS):
+            refs = [node.ref for node in way.nodes]
+            before = self.ways.get(way.id, _Way({}, refs))
+            if before.refs != refs:
+                raise InputError(f"way/{way.id} appears twice, with other nodes")
+            self.ways[way.id] = _Way(before.tags or dict(way.tags), refs)
+            self.needed_nodes.update(refs)
 
-    def map(self, positions: Positions | None = None) -> OsmMap:
+    def add_node(self, node: Any) -> None:
+        is_wanted = any(key in node.tags for key in KEYS)
+        if is_wanted or node.id in self.needed_nodes:
+            name, at = f"node/{node.id}", node.location
+            position = _position(name, at.lat_without_check(), at.lon_without_check())
+            if self.positions.setdefault(node.id, position) != position:
+                raise InputError(f"{name} appears twice, at different positions")
+            if is_wanted:
+                self.node_tags[node.id] = dict(node.tags)
+
+    def map(self) -> OsmMap:
         """Return the tagged elements with their references resolved, cut at the edge of the map."""
         nodes = [
             OsmElement(f"node/{i}", tags, (np.array([self.positions[i]]),))
@@ -259,7 +246,7 @@ class RawElements:
         if self.left_out and not ways:
             raise InputError(
                 "none of its ways has its nodes in the file; export with complete ways (Overpass: "
-                "`out body; >; out skel qt;` or `out geom;`)"
+                "`out body; >; out skel qt;`)"
             )
         areas, turns = list[OsmElement](), list[OsmTurn]()
         no_turns: dict[str, list[str]] = defaultdict(list)
@@ -276,9 +263,9 @@ class RawElements:
             tuple(LeftOut(reason, tuple(ids)) for reason, ids in listed.items())
             for listed in (self.left_out, no_turns)
         )
-        return OsmMap(nodes + ways + areas, positions or Positions(), left_out, tuple(turns), turns_left_out)
+        return OsmMap(nodes + ways + areas, Positions(), left_out, tuple(turns), turns_left_out)
 
-    def _turns(self, name: str, relation: RawRelation) -> list[OsmTurn]:
+    def _turns(self, name: str, relation: _Relation) -> list[OsmTurn]:
         """Return the turns of a restriction: from each of its ways, to each of them."""
         tags = relation.tags
         key = next((key for key in TURN_KEYS if key in tags), None)
@@ -300,15 +287,14 @@ class RawElements:
         ):
             raise _NoTurnError("damaged")
         via = np.array(self.positions.get(relation.via[0], BEYOND))
-        comes, leaves = ([self._beside(via, *m) for m in ways[role]] for role in ("from", "to"))
+        comes, leaves = ([self._beside(via, ref) for ref, _ in ways[role]] for role in ("from", "to"))
         return [OsmTurn(name, np.array([a, via, b]), only) for a in comes for b in leaves]
 
-    def _beside(self, via: FloatArray, ref: int, _: str, line: FloatArray | None) -> FloatArray:
+    def _beside(self, via: FloatArray, ref: int) -> FloatArray:
         """Return the position of a way next to the junction at one of its ends, (2,) degrees."""
-        if line is None and ref in self.ways:
-            line = self._line_of(self.ways[ref])
-        if line is None or np.isnan(via).any():
+        if ref not in self.ways or np.isnan(via).any():
             raise _NoTurnError("beyond the edge of the map")
+        line = self._line_of(self.ways[ref])
         steps = line[(line != via).any(axis=1)]
         ends = [np.array_equal(line[k], via) for k in (0, -1)]
         if sum(ends) != 1 or not len(steps):
@@ -318,13 +304,11 @@ class RawElements:
             raise _NoTurnError("beyond the edge of the map")
         return beside
 
-    def _line_of(self, way: RawWay) -> FloatArray:
+    def _line_of(self, way: _Way) -> FloatArray:
         """Return the positions of a way, (k, 2) degrees, NaN beyond the edge of the map."""
-        if way.line is not None:
-            return way.line
         return np.array([self.positions.get(ref, BEYOND) for ref in way.refs]).reshape(-1, 2)
 
-    def _way(self, number: int, way: RawWay) -> OsmElement | None:
+    def _way(self, number: int, way: _Way) -> OsmElement | None:
         name, line = f"way/{number}", self._line_of(way)
         cut = bool(np.isnan(line).any())
         if not cut:
@@ -336,15 +320,13 @@ class RawElements:
             return None
         return OsmElement(name, way.tags, tuple(lines), cut=True)
 
-    def _area(self, number: int, relation: RawRelation) -> OsmElement | None:
+    def _area(self, number: int, relation: _Relation) -> OsmElement | None:
         name, cut = f"relation/{number}", False
         parts: dict[str, list[FloatArray]] = {"outer": [], "inner": []}
-        for ref, role, line in relation.members:
-            if line is None and ref in self.ways:
-                line = self._line_of(self.ways[ref])
-            cut |= line is None or bool(np.isnan(line).any())
-            if line is not None:
-                parts["inner" if role == "inner" else "outer"] += _runs(line)
+        for ref, role in relation.members:
+            line = self._line_of(self.ways[ref]) if ref in self.ways else np.full((1, 2), np.nan)
+            cut |= bool(np.isnan(line).any())
+            parts["inner" if role == "inner" else "outer"] += _runs(line)
         outer, inner = (_joined(parts[role]) for role in ("outer", "inner"))
         if cut:
             outer, inner = _closed(outer), _closed(inner)
@@ -399,170 +381,57 @@ def _position(name: str, lat: object, lon: object) -> tuple[float, float]:
     return values[1], values[0]
 
 
-def is_read(tags: Mapping[str, str]) -> bool:
-    """Whether an import reads a relation: an area, or a restriction of turns."""
-    if tags.get("type") == "multipolygon":
-        return any(key in tags for key in ("amenity", "building"))
-    return tags.get("type") == "restriction"
-
-
-# ---- OSM XML ----
-
-
-class _XmlReader:
-    """Target of an `ElementTree.XMLParser` that collects elements without building a tree."""
-
-    def __init__(self) -> None:
-        self.raw = RawElements()
-        self._root = ""
-        self._tags: dict[str, str] = {}
-        self._node: tuple[int, tuple[float, float]] | None = None
-        self._way: tuple[int, RawWay] | None = None
-        self._relation: RawRelation | None = None
-
-    def doctype(self, name: str, public_id: str | None, system: str | None) -> None:
-        del public_id, system
-        raise InputError(
-            f"declares the document type {name!r:.40}; OSM XML has none, and entities are not read"
-        )
-
-    def start(self, name: str, values: dict[str, str]) -> None:
-        if name in ("node", "way", "relation"):
-            self.raw.count_one()
-        if not self._root:
-            self._root = name
-            if name != "osm":
-                raise InputError(f"root is <{name:.40}>, want <osm>")
-        if values.get("visible") == "false" or values.get("action") == "delete":
-            self._tags = {}
-        elif name == "node":
-            number = self._number(name, values, "id")
-            self._tags = {}
-            self._node = number, _position(f"node/{number}", values.get("lat"), values.get("lon"))
-        elif name == "way":
-            self._tags = {}
-            self._way = self._number(name, values, "id"), RawWay(self._tags)
-        elif name == "relation":
-            self._tags = {}
-            self._relation = self.raw.relations[self._number(name, values, "id")] = RawRelation(self._tags)
-        elif name == "tag" and "k" in values and "v" in values:
-            self._tags[values["k"]] = values["v"]
-        elif name == "nd" and self._way is not None:
-            self._way[1].refs.append(self._number(name, values, "ref"))
-        elif name == "member" and self._relation is not None:
-            kind, role = values.get("type"), values.get("role", "")
-            if kind == "way":
-                self._relation.members.append((self._number(name, values, "ref"), role, None))
-            elif kind == "node" and role == "via":
-                self._relation.via.append(self._number(name, values, "ref"))
-
-    def end(self, name: str) -> None:
-        if name == "node" and self._node is not None:
-            self.raw.add_node(*self._node, self._tags)
-            self._node = None
-        elif name == "way" and self._way is not None:
-            self.raw.add_way(*self._way)
-            self._way = None
-        elif name == "relation":
-            self._relation = None
-
-    def close(self) -> None:
-        self.raw.relations = {i: r for i, r in self.raw.relations.items() if is_read(r.tags)}
-
-    @staticmethod
-    def _number(element: str, values: dict[str, str], key: str) -> int:
+def _read_osm(path: Path) -> OsmMap:
+    """Read the parking, roads, buildings and entrances of a map in XML or PBF."""
+    with naming(path), with_extra("OpenStreetMap", "osm"):
+        import osmium
+    require_file(path)
+    if not path.stat().st_size:  # so is what waits to be read, such as a link to /proc/kmsg
+        raise InputError(f"{path}: is empty")
+    packed = path.suffix.lower() if path != unpacked_path(path) else ""
+    source = osmium.io.File(str(path), "pbf" if path.suffix.lower() == ".pbf" else f"osm{packed}")
+    raw, count = _RawElements(), 0
+    with naming(path):
         try:
-            return int(values[key])
-        except (KeyError, ValueError) as error:
-            raise InputError(f"<{element}>: {key} is {values.get(key)!r:.40}, want a whole number") from error
+            for kind, add in (
+                (osmium.osm.RELATION, raw.add_relation),
+                (osmium.osm.WAY, raw.add_way),
+                (osmium.osm.NODE, raw.add_node),
+            ):
+                for element in osmium.FileProcessor(source, kind):
+                    count += 1
+                    if count > MOST_ELEMENTS:
+                        raise InputError(
+                            f"has more than {MOST_ELEMENTS:,} nodes, ways and relations, the most that is read; cut "
+                            "the town out of it, e.g. by `osmium extract`"
+                        )
+                    if element.visible:
+                        add(element)
+        except InputError:
+            raise
+        except (RuntimeError, ValueError, osmium.InvalidLocationError) as error:
+            raise InputError(f"not an OpenStreetMap file: {error}") from error
+        return raw.map()
 
 
-def _read_xml(path: Path) -> OsmMap:
-    reader = _XmlReader()
-    parser = ElementTree.XMLParser(target=reader)
-    with open_limited(path, MOST_XML_BYTES) as file, naming(path):
-        try:
-            while data := file.read(1 << 20):
-                parser.feed(data)
-            parser.close()
-        except ElementTree.ParseError as error:
-            line, column = error.position
-            reason = str(error).split(":")[0]
-            raise InputError(f"not XML: line {line}, column {column}: {reason}") from error
-        return reader.raw.map()
+# ---- GeoJSON ----
 
 
-# ---- JSON ----
-
-
-def map_of_json(document: Any, positions: Positions) -> OsmMap:
-    """Return the map of parsed Overpass JSON, or of GeoJSON with positions that are yet to be converted."""
-    if not isinstance(document, dict):
-        raise InputError(f"holds a {type(document).__name__}, want Overpass JSON or a FeatureCollection")
-    if isinstance(document.get("elements"), list):
-        return _overpass_map(document["elements"])
-    if isinstance(document.get("features"), list):
-        to_lonlat = positions.to_lonlat if positions.converts else None
-        elements: dict[str, tuple[int, OsmElement]] = {}
-        for index, feature in enumerate(document["features"]):
-            element = _feature_element(index, feature, to_lonlat)
-            if element is None:
-                continue
-            first = elements.setdefault(element.id, (index, element))[0]
-            if first != index:
-                raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
-        found = [element for _, element in elements.values()]
-        if _holds_outlines(document["features"]):
-            found = [replace(e, tags={"amenity": "parking_space"}) for e in found]
-        return OsmMap(found, positions)
-    raise InputError("no elements and no features, want Overpass JSON or a GeoJSON FeatureCollection")
-
-
-def _overpass_map(elements: Iterable[Any]) -> OsmMap:
-    raw = RawElements()
-    for index, element in enumerate(elements):
-        kind = element.get("type") if isinstance(element, dict) else None
-        if kind not in ("node", "way", "relation"):
-            continue  # Overpass also lists counts, areas and timelines
-        number = element.get("id")
-        if type(number) is not int:
-            raise InputError(f"elements[{index}]: id is {number!r:.40}, want a whole number")
-        name, tags = f"{kind}/{number}", _tags(element.get("tags"))
-        if kind == "node":
-            raw.add_node(number, _position(name, element.get("lat"), element.get("lon")), tags)
-        elif kind == "way":
-            line = _geometry(name, element)
-            refs = element.get("nodes")
-            if line is None and tags and not refs:
-                raise InputError(f"{name}: neither nodes nor geometry, want `out geom;`")
-            if not isinstance(refs, list) or not all(type(ref) is int for ref in refs):
-                refs = []
-            raw.add_way(number, RawWay(tags, refs, line))
-        elif is_read(tags):
-            relation = raw.relations[number] = RawRelation(tags)
-            listed = element.get("members")
-            for m in listed if isinstance(listed, list) else ():
-                if not isinstance(m, dict):
-                    continue
-                ref, role = m["ref"] if type(m.get("ref")) is int else 0, str(m.get("role", ""))
-                if m.get("type") == "way":
-                    relation.members.append((ref, role, _geometry(f"{name}: way {ref}", m)))
-                elif m.get("type") == "node" and role == "via":
-                    relation.via.append(ref)
-                    if "lat" in m:
-                        raw.positions.setdefault(ref, _position(f"{name}: node", m["lat"], m.get("lon")))
-    return raw.map()
-
-
-def _geometry(name: str, holder: Mapping[str, Any]) -> FloatArray | None:
-    points = holder.get("geometry")
-    if points is None:
-        return None
-    if not isinstance(points, list) or not all(isinstance(p, dict | None) for p in points):
-        raise InputError(f"{name}: geometry is {points!r:.40}, want positions")
-    # Overpass writes null for nodes beyond a bounding box.
-    inside = (BEYOND if p is None else _position(name, p.get("lat"), p.get("lon")) for p in points)
-    return np.array(list(inside)).reshape(-1, 2)
+def _map_of_geojson(features: list[Any], positions: Positions) -> OsmMap:
+    """Return the map of GeoJSON with positions that are yet to be converted."""
+    to_lonlat = positions.to_lonlat if positions.converts else None
+    elements: dict[str, tuple[int, OsmElement]] = {}
+    for index, feature in enumerate(features):
+        element = _feature_element(index, feature, to_lonlat)
+        if element is None:
+            continue
+        first = elements.setdefault(element.id, (index, element))[0]
+        if first != index:
+            raise InputError(f"{element.id} appears twice, as features[{first}] and features[{index}]")
+    listed = [element for _, element in elements.values()]
+    if _holds_outlines(features):
+        listed = [replace(element, tags={"amenity": "parking_space"}) for element in listed]
+    return OsmMap(listed, positions)
 
 
 def _feature_element(
@@ -625,44 +494,3 @@ def _tags(values: object) -> dict[str, str]:
 
 def _is_object(holder: Mapping[str, Any], key: str) -> bool:
     return isinstance(holder.get(key), dict)
-
-
-# ---- PBF ----
-
-
-def _read_pbf(path: Path) -> OsmMap:
-    """Read the parking, roads, buildings and entrances of an extract."""
-    with naming(path), with_extra(".osm.pbf", "osm"):
-        import osmium
-    if not is_there(path):
-        raise InputError(f"{path}: No such file or directory")
-    raw = RawElements()
-    needed, junctions = set[int](), set[int]()
-    with naming(path):
-        try:
-            for relation in osmium.FileProcessor(str(path), osmium.osm.RELATION):
-                raw.count_one()
-                tags = dict(relation.tags)
-                if is_read(tags):
-                    ways = [(m.ref, m.role) for m in relation.members if m.type == "w"]
-                    via = [m.ref for m in relation.members if m.type == "n" and m.role == "via"]
-                    raw.relations[relation.id] = RawRelation(tags, [(*way, None) for way in ways], via)
-                    needed.update(ref for ref, _ in ways)
-                    junctions.update(via)
-            for element in osmium.FileProcessor(str(path), osmium.osm.NODE | osmium.osm.WAY).with_locations():
-                raw.count_one()
-                _add(raw, element, needed, junctions)
-        except RuntimeError as error:
-            raise InputError(f"not an OpenStreetMap extract: {error}") from error
-        return raw.map()
-
-
-def _add(raw: RawElements, element: Any, needed: set[int], junctions: set[int]) -> None:
-    wanted = any(key in element.tags for key in KEYS)
-    if element.is_node():
-        if wanted or element.id in junctions:
-            location = element.location
-            raw.add_node(element.id, (location.lon, location.lat), dict(element.tags) if wanted else {})
-    elif wanted or element.id in needed:
-        line = [(n.location.lon, n.location.lat) if n.location.valid() else BEYOND for n in element.nodes]
-        raw.add_way(element.id, RawWay(dict(element.tags), [], np.array(line).reshape(-1, 2)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from enum import IntEnum
 from typing import NamedTuple
@@ -18,7 +18,7 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.lots.draft import LeftOut
 from parkenv.lots.generators import ONE_WAY_HALF_WIDTH, Slots
 from parkenv.lots.local_frame import LocalFrame
-from parkenv.lots.osm.elements import OsmMap
+from parkenv.lots.osm.elements import OsmElement, OsmMap
 from parkenv.world.drive_graph import NODE_TOLERANCE, centrelines, component_labels, node_labels
 from parkenv.world.lot import Lane, Turn
 from parkenv.world.turns import Chains, Rule, connected, rules_of
@@ -153,6 +153,23 @@ def road_of(
         oneway=turned or oneway in ("yes", "true", "1"),
         turned=turned,
     )
+
+
+def read_roads(
+    elements: Iterable[OsmElement], frame: LocalFrame, left_out: dict[str, list[str]], *, town: bool = False
+) -> list[Road]:
+    """Return the roads of a map, and list by reason those that cars may not drive; see `road_of`."""
+    roads: list[Road] = []
+    for element in elements:
+        if element.is_node or "highway" not in element.tags:
+            continue
+        for line in element.lines:
+            road = road_of(element.id, element.tags, frame.to_xy(line), town=town)
+            if isinstance(road, Road):
+                roads.append(road)
+            elif road is not None and element.id not in left_out.setdefault(road, [])[-1:]:
+                left_out[road].append(element.id)
+    return roads
 
 
 def closed_to_cars(tags: Mapping[str, str]) -> str | None:

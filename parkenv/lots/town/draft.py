@@ -26,21 +26,24 @@ import shapely
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming
 from parkenv.files.file_names import is_plain
-from parkenv.lots.draft import LeftOut, LotDraft
+from parkenv.lots.draft import LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots
-from parkenv.lots.infer.spaces import to_rectangle
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.areas import (
     CAR_SPACES,
-    Area,
-    areas_of,
     is_building,
     is_parking_area,
     is_space,
-    slots_by_rank,
-    split_space,
 )
-from parkenv.lots.osm.draft import MAPPED_OVERLAP, NO_AISLE, RULE_OVERLAP, cut_elements, refuse_far_away
+from parkenv.lots.osm.draft import (
+    MAPPED_OVERLAP,
+    NO_AISLE,
+    RULE_OVERLAP,
+    MapImport,
+    cut_elements,
+    is_crossing,
+    refuse_far_away,
+)
 from parkenv.lots.osm.elements import OsmElement, OsmMap, place_name, read_map
 from parkenv.lots.osm.roads import Rank, Turns, off_the_ground, turns_of, whole_number
 from parkenv.lots.osm.rows import CORRIDOR, without_overlaps
@@ -129,7 +132,7 @@ def import_town(
     listed = [] if car_parks is None else read_listed(Path(car_parks))
     place = read_map(path)
     with naming(path):
-        town = _Town(place_name(path), place if bounds is None else place.within(bounds))
+        town = _TownImport(place_name(path), place if bounds is None else place.within(bounds))
         town.read_drawn()
         town.read_kerbs(untagged_kerbs)
         town.read_counted()
@@ -141,25 +144,24 @@ def import_town(
         return town.draft()
 
 
-class _Town:
-    """The state of an import."""
+class _TownImport(MapImport):
+    """The state of an import of a town: its streets, car parks, and a row for each facility."""
 
     def __init__(self, name: str, place: OsmMap) -> None:
         # What an extract's edge cuts may have lost its nodes, too.
         elements = [e.closed() if is_parking_area(e) and not e.is_node else e for e in place.elements]
-        self.name, self.place = name, replace(place, elements=elements)
         streets = [e for e in elements if "highway" in e.tags and not e.is_node]
         if not streets:
             raise InputError("no street in it, want ways with the tag highway")
         refuse_far_away(streets)
-        self.frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
-        self.left_out: dict[str, list[str]] = defaultdict(list)
+        frame = LocalFrame.around(np.concatenate([line for e in streets for line in e.lines]))
+        super().__init__(name, replace(place, elements=elements), frame)
         self.streets, self.closed_roads = read_streets(elements, self.frame)
         self.roads = self.streets.roads_kept()
         self.lines = linestrings([road.points for road in self.roads])
         self.tree = shapely.STRtree(self.lines)
-        self.buildings = self._areas(elements, is_building)
-        self.parking = [a for a in self._areas(elements, is_parking_area) if self._is_open(a.element)]
+        self.buildings = self.areas(is_building, mended=True)
+        self.parking = [a for a in self.areas(is_parking_area, mended=True) if self._is_open(a.element)]
         for e in elements:
             if is_parking_area(e) and not e.is_node and not e.is_closed:
                 self.left_out["parking without an outline"].append(e.id)
@@ -168,10 +170,6 @@ class _Town:
         self.used: set[int] = set()  # parking areas whose places are slots
         self.beside: FloatArray | None = None  # what is near these attracts, if not everything does
         self.listed: list[str] = []  # which facilities car parks of a list are
-
-    def _areas(self, elements: Sequence[OsmElement], wanted: Any) -> list[Area]:
-        found = areas_of(elements, self.frame, wanted, mended=True)
-        return [a for a in found if shapely.area(a.polygon) > 0.0]
 
     def _is_open(self, element: OsmElement) -> bool:
         """Whether any car in town may use a car park; else it is listed."""
@@ -197,7 +195,7 @@ class _Town:
     def read_drawn(self) -> None:
         """Read the spaces that are drawn one by one, grouped by the car park around them, else by their distance."""
         spaces = []
-        for area in self._areas(self.place.elements, is_space):
+        for area in self.areas(is_space, mended=True):
             tags, kind = area.element.tags, area.element.tags.get("parking_space", "normal")
             reason = off_the_ground(tags) or (
                 f"access={tags['access']}" if tags.get("access") in CLOSED else None
@@ -211,28 +209,19 @@ class _Town:
             else:
                 self.left_out[f"spaces with {reason}"].append(area.element.id)
         lanes = [Lane(road.points, road.oneway) for road in self.roads if road.rank < Rank.STREET]
-        parts = [
-            (area, *part)
-            for area in spaces
-            for part in split_space(area.element, to_rectangle(area.polygon), lanes)
-        ]
+        parts, by_rank = self.drawn_slots(spaces, lanes, self.roads)
         if not parts:
             return
-        polygons = np.array([polygon for _, _, polygon in parts], dtype=np.object_)
-        owner = self._owners(polygons)
-        left = set(range(len(parts)))
+        owner = self._owners(np.array([part.polygon for part in parts], dtype=np.object_))
         groups: dict[int, tuple[list[Slots], list[Rules]]] = defaultdict(lambda: ([], []))
-        for _, index, slots in slots_by_rank(polygons, self.roads):
-            left.difference_update(index.tolist())
+        for _, index, slots in by_rank:
             for k in np.unique(owner[index]).tolist():
-                mine = owner[index] == k
-                groups[k][0].append(slots[mine])
-                groups[k][1].extend(rules_of(parts[i][0].element.tags) for i in index[mine].tolist())
-        for i in sorted(left):
-            self.left_out[NO_AISLE].append(parts[i][1])
+                is_own = owner[index] == k
+                groups[k][0].append(slots[is_own])
+                groups[k][1].extend(rules_of(parts[i].area.element.tags) for i in index[is_own].tolist())
         self.used = {k for k in groups if k < len(self.parking)}
         for k, (drawn, rules) in sorted(groups.items()):
-            around = self.parking[k] if k in self.used else parts[int(np.flatnonzero(owner == k)[0])][0]
+            around = self.parking[k] if k in self.used else parts[int(np.flatnonzero(owner == k)[0])].area
             inside = around.element
             whole = rules_of(inside.tags) if k in self.used else Rules()
             row = FacilityRow(self._named(inside.tags, inside.id), "lot", whole, "drawn", "", inside.id)
@@ -266,9 +255,7 @@ class _Town:
                 if side is not None:
                     self.used.add(k)
                     sides.append(side)
-        crossings = [e for e in self.place.elements if e.is_node and e.tags.get("highway") == "crossing"]
-        at = self.frame.to_xy(np.concatenate([np.empty((0, 2)), *(e.lines[0] for e in crossings)]))
-        sides += kerb_sides(self.roads, at, self.buildings, self.left_out, untagged)
+        sides += kerb_sides(self.roads, self.points(is_crossing), self.buildings, self.left_out, untagged)
         half_widths = [CORRIDOR * road.half_width for road in self.roads]
         corridors = shapely.buffer(self.lines, half_widths, cap_style="flat")
         # Several runs of one way are one kerb.
@@ -302,12 +289,11 @@ class _Town:
 
     def read_counted(self) -> None:
         """Read the car parks and garages whose places are counted."""
-        nodes = [e for e in self.place.elements if e.is_node]
-        ways_in = [e for e in nodes if e.tags.get("amenity") == "parking_entrance"]
+        ways_in = [e for e in self.nodes if e.tags.get("amenity") == "parking_entrance"]
         entrances = [self.frame.to_xy(e.lines[0])[0] for e in ways_in]
         points = [
             (e, shapely.Point(self.frame.to_xy(e.lines[0])[0]), None)
-            for e in (*nodes, *self._unseen_garages(ways_in, entrances))
+            for e in (*self.nodes, *self._unseen_garages(ways_in, entrances))
             if is_parking_area(e) and self._is_open(e)
         ]
         outlines = [
@@ -468,12 +454,11 @@ class _Town:
             turns=turns.kept,
         ).searchable()
         rows = table_of(self.rows, draft)
-        listed = [LeftOut(reason, tuple(names)) for reason, names in self.left_out.items() if names]
         left_out = (
             *self.place.left_out,
             *self.closed_roads,
             *self.streets.unconnected(),
-            *listed,
+            *self.all_left_out(),
             *turns.left_out,
             *draft.left_out,
         )

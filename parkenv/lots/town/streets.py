@@ -25,7 +25,7 @@ from parkenv.lots.draft import LeftOut
 from parkenv.lots.infer.network import limit_junctions
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import OsmElement
-from parkenv.lots.osm.roads import Rank, Road, road_of
+from parkenv.lots.osm.roads import Rank, Road, read_roads
 from parkenv.world.drive_graph import linestrings, node_labels
 from parkenv.world.lot import MOVES, Lane
 
@@ -379,18 +379,9 @@ def _joined(lanes: Sequence[Lane], mouths: FloatArray) -> list[Lane]:
 
 def read_streets(elements: Sequence[OsmElement], frame: LocalFrame) -> tuple[Streets, list[LeftOut]]:
     """Return the streets of a map, motorways and tunnels among them, and the roads left out."""
-    roads: list[Road] = []
     left_out: dict[str, list[str]] = {}
-    for element in elements:
-        if element.is_node or "highway" not in element.tags:
-            continue
-        for line in element.lines:
-            road = road_of(element.id, element.tags, frame.to_xy(line), town=True)
-            if isinstance(road, str):
-                left_out.setdefault(road, []).append(element.id)
-            elif road is not None:
-                roads.append(road)
+    roads = read_roads(elements, frame, left_out, town=True)
     cut = frozenset(element.id for element in elements if element.cut)
-    listed = [LeftOut(reason, tuple(dict.fromkeys(ids))) for reason, ids in left_out.items()]
+    listed = [LeftOut(reason, tuple(ids)) for reason, ids in left_out.items()]
     streets = Streets(tuple(roads), cut)
     return Streets((*roads, *streets.ways_beyond()), cut), listed
