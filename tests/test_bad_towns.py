@@ -46,7 +46,7 @@ def test_bad_demand_is_one_line(table, named):
     one_line(error, "bad.toml", named)
 
 
-@pytest.mark.parametrize("price", ["+x", "+nan", "+inf", "1", "+-1", True, -1.0])
+@pytest.mark.parametrize("price", ["+x", "+nan", "+inf", "1 @ late", "+-1", "-1/h", True, -1.0])
 def test_a_bad_price_is_one_line(price):
     with pytest.raises(InputError) as error:
         ScenarioSpec.parse({"lot": "mini", "costs": {"prices": {"a*": price}}}, "bad.toml")

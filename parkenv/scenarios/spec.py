@@ -54,7 +54,7 @@ from parkenv.scenarios.purposes import PurposeName, PurposeSpec
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.day_error import MAX_LOGITS
 from parkenv.world.occupancy.real_week_figures import DAY_ERROR, FULLER_THAN, PULL, UNEVENNESS
-from parkenv.world.tariff import NO_ZONE, VALUE_OF_TIME, Price, Zone, priced
+from parkenv.world.tariff import NO_ZONE, VALUE_OF_TIME, Price, Zone, parse_change
 from parkenv.world.tariff import Hours as ZoneHours
 from parkenv.world.week import HOUR_S
 
@@ -435,10 +435,7 @@ MAX_PRICE = 1e6
 
 def _per_hour(text: str) -> float:
     """Parse AMOUNT/h; the unit may be left out."""
-    try:
-        return float(text.removesuffix("/h"))
-    except ValueError:
-        raise InputError(f"is {text!r:.60}, want an amount an hour, such as 2/h") from None
+    return Price.parse(text).per_hour
 
 
 def _price(text: str) -> tuple[str, object]:
@@ -446,26 +443,24 @@ def _price(text: str) -> tuple[str, object]:
     zone, equals, amount = text.rpartition("=")
     if not (zone and equals):
         raise InputError(f"is {text!r:.60}, want ZONE=AMOUNT/h, such as centre=2/h")
-    if "@" in amount:
+    price, is_added = parse_change(amount)
+    if price.hourly:
         return zone, amount
-    number = _per_hour(amount)
-    return zone, f"+{number:g}" if amount.startswith("+") else number
+    return zone, f"+{price.per_hour:g}" if is_added else price.per_hour
 
 
 def _amount(value: object) -> object:
     """Check a price, a text such as +1 for one that is added, or prices by hours."""
-    number: float | Price = math.nan
-    if isinstance(value, int | float | str) and not isinstance(value, bool):
+    per_hour = math.inf
+    if isinstance(value, int | float | str):
         with contextlib.suppress(InputError):
-            number = priced(value)
-    if isinstance(number, float) and not 0.0 <= number <= MAX_PRICE:
+            per_hour = parse_change(value)[0].per_hour
+    if per_hour > MAX_PRICE:
         raise ValueError(f"a number from 0 to {MAX_PRICE:g}, a text such as +1, or 1 @ 08:00-12:00")
-    return value if isinstance(value, str) else number
+    return value if isinstance(value, str) else per_hour
 
 
-_PRICE = {
-    "anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_PRICE}, {"type": "string", "pattern": r"^\+|@"}]
-}
+_PRICE = {"anyOf": [{"type": "number", "minimum": 0, "maximum": MAX_PRICE}, {"type": "string"}]}
 _Amount = Annotated[float | str, BeforeValidator(_amount), WithJsonSchema(_PRICE)]
 
 
@@ -606,9 +601,7 @@ class ZoneSpec(Spec):
 
     def changed_rules(self, zone: Zone) -> Zone:
         """Return a zone with the rules that are given here."""
-        from parkenv.lots.formats.contents import price_of
-
-        own: dict[str, Any] = {"price": price_of(self.price)} if self.price is not None else {}
+        own: dict[str, Any] = {"price": Price.parse(self.price)} if self.price is not None else {}
         if self.hours is not None:
             own["hours"] = ZoneHours.parse(self.hours)
         if self.max_stay_s is not None:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from itertools import pairwise
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
-from parkenv.errors import InputError, nearest, require_number
+from parkenv.errors import InputError, naming, nearest, require_number
 from parkenv.files.file_names import is_plain
 from parkenv.world.week import DAY_S, HOUR_S, WEEK_S
 
@@ -30,6 +31,13 @@ The US Department of Transportation values local personal travel at half of the 
 """
 DAYS = ("Mo", "Tu", "We", "Th", "Fr", "Sa", "Su")
 _RULE = re.compile(r"(?:(?P<days>[A-Z][a-z](?:[-,][A-Z][a-z])*) +)?(?P<times>off|\d?\d:\d\d-\d.*)")
+_CHARGE = re.compile(
+    r"(\d+(?:[.,]\d+)?)[^\d/]{0,8}?(?:/|per)\s*(\d+(?:\.\d+)?)?\s*(h|hr|hours?|min|minutes?|days?|Stunde|Tag)\b",
+    re.I,
+)
+_HOURS_OF = {"h": 1.0, "s": 1.0, "m": 1.0 / 60.0, "d": 24.0, "t": 24.0}
+"""Hours of a unit, by its first letter."""
+MOST_PER_HOUR = 1000.0  # a higher charge is a mistake
 _SPAN = re.compile(r"(\d?\d):(\d\d)-(\d?\d):(\d\d)")
 
 
@@ -201,23 +209,46 @@ class Price:
             least_s, least = step
 
     @classmethod
-    def parse(cls, text: str, field: str = "price") -> Price:
-        """Read prices by hours, as OpenStreetMap writes them: `1.5 @ 08:00-12:00; 3 @ Mo-Sa 12:00-15:00`.
+    def parse(cls, given: Any, field: str = "price") -> Price:
+        """Read a price: a number or a text such as `2/h`, prices by hours as OpenStreetMap writes them, or members.
 
         Examples:
-            >>> price = Price.parse("1 @ 08:00-12:00; 3 @ 12:00-15:00")
+            >>> price = Price.parse("1 @ 08:00-12:00; 3 @ Mo-Sa 12:00-15:00")
             >>> price.amount([9 * 3600.0, 11 * 3600.0], 2 * 3600.0).tolist()
             [2.0, 4.0]
+            >>> Price.parse({"per_hour": 2, "charged": "Mo-Fr 08:00-18:00"}) == Price.parse("2/h")
+            False
         """
-        hourly = []
-        for part in text.split(";"):
-            amount, _, hours = part.partition("@")
-            try:
-                price = float(amount)
-            except ValueError:
-                raise InputError(f"{field} is {text!r:.60}, want prices such as 1.5 @ 08:00-12:00") from None
-            hourly.append((Hours.parse(hours.strip(), field), price))
-        return cls(hourly=tuple(hourly))
+        if type(given) in (int, float):
+            return cls(float(given))
+        if isinstance(given, str):
+            if "@" not in given and not given.startswith("+"):  # of a tariff alone
+                return cls(_per_hour(given, field, given))
+            parts = (part.partition("@") for part in given.split(";"))
+            return cls(
+                hourly=tuple(
+                    (Hours.parse(hours.strip(), field), _per_hour(amount, field, given))
+                    for amount, _, hours in parts
+                )
+            )
+        members = members_of(given, [f.name for f in fields(cls)], field)
+        steps = members.get("steps", [])
+        if not isinstance(steps, list) or not all(isinstance(step, list) for step in steps):
+            raise InputError(f"steps is {steps!r:.40}, want a list of pairs: stay in seconds and price")
+        if "charged" in members:
+            members["charged"] = Hours.parse(members["charged"], "charged")
+        if "hourly" in members:
+            members["hourly"] = cls.parse(str(members["hourly"]), "hourly").hourly
+        return cls(**members)
+
+    def members(self) -> dict[str, Any]:
+        """Return the members that `parse` reads, without those of a price that costs nothing."""
+        members = {f.name: value for f in fields(self) if (value := getattr(self, f.name)) != f.default}
+        if self.charged is not None:
+            members["charged"] = str(self.charged)
+        if self.hourly:
+            members["hourly"] = "; ".join(f"{amount:.12g} @ {hours}" for amount, hours in self.rules)
+        return members
 
     @property
     def rules(self) -> list[tuple[float, str]]:
@@ -329,20 +360,18 @@ class Tariff:
     """Prices per hour that replace those of a lot's zones, or are added to them.
 
     Args:
-        per_hour: price of an hour by zone, at least 0, in any currency; a text such as `+1` is added to what an
-            hour of the zone costs, with its hours and steps as they are; one such as `1 @ 08:00-12:00; 3 @ 12:00-18:00`
-            has prices by hours (`Price.parse`). A name may have `*` for any letters: that of
-            all such zones that cost something. The first name of a zone counts; other zones keep their prices.
+        per_hour: price of an hour by zone, at least 0, in any currency; a text such as `+1` is added to what an hour of
+            the zone costs, with its hours and steps as they are; other texts are read by `Price.parse`. A name may have
+            `*` for any letters: that of all such zones that cost something. The first name of a zone counts; other
+            zones keep their prices.
     """
 
     per_hour: Mapping[str, float | str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for zone, price in self.per_hour.items():
-            amount = priced(price)
-            require_number(
-                f"price of zone {zone!r:.40}", amount if isinstance(amount, float) else 0.0, least=0.0
-            )
+            with naming(f"price of zone {zone!r:.40}"):
+                parse_change(price)
         object.__setattr__(self, "per_hour", MappingProxyType(dict(self.per_hour)))
 
     def __bool__(self) -> bool:
@@ -357,10 +386,8 @@ class Tariff:
         price = next((price for name, price in self.per_hour.items() if _means(name, zone)), None)
         if price is None:
             return zone
-        given = priced(price)
-        if isinstance(price, str) and isinstance(given, float):
-            return replace(zone, price=zone.price.raised(given))
-        return replace(zone, price=given if isinstance(given, Price) else Price(given))
+        given, is_added = parse_change(price)
+        return replace(zone, price=zone.price.raised(given.per_hour) if is_added else given)
 
     def require_zones(self, zones: Sequence[Zone], lot: str) -> None:
         """Check that a lot has every zone with a price."""
@@ -371,20 +398,44 @@ class Tariff:
                 raise InputError(f"price: lot {lot!r:.40} has no {what} {name!r:.40}; {near}")
 
 
-def priced(price: float | str) -> float | Price:
-    """Return the amount of a price, or that which a text such as `+1` adds; of a text with `@`, prices by hours."""
-    if not isinstance(price, str):
-        return float(price)
-    if "@" in price:
-        return Price.parse(price)
+def parse_change(given: float | str) -> tuple[Price, bool]:
+    """Return the price of a tariff, and whether it is added to that of a zone, as a text such as `+1/h` says."""
+    is_added = isinstance(given, str) and given.startswith("+") and "@" not in given
+    return Price.parse(str(given)[1:] if is_added else given), is_added
+
+
+def charge_in(text: str) -> tuple[float, bool] | None:
+    """Return the price of an hour that OpenStreetMap's `charge` has, and whether it is paid by the day; else None."""
+    match = _CHARGE.search(text)
+    if match is None:
+        return None
+    unit = match[3][0].lower()
+    hours = float(match[2] or 1.0) * _HOURS_OF[unit]
+    per_hour = float(match[1].replace(",", ".")) / hours if hours else 0.0
+    return (per_hour if per_hour <= MOST_PER_HOUR else 0.0), unit in "dt"
+
+
+def _per_hour(text: str, field: str, whole: str) -> float:
+    """Return the price of an hour of a text such as `2`, `2/h` or `+1/h`."""
     try:
-        if price.startswith("+"):
-            return float(price)
+        amount = float(text.strip().removesuffix("/h"))
+        require_number(field, amount, least=0.0)
+        return amount
     except ValueError:
-        pass
-    raise InputError(
-        f"price is {price!r:.40}, want an amount, one that is added, such as +1, or 1 @ 08:00-12:00"
-    )
+        raise InputError(
+            f"{field} is {whole!r:.60}, want an amount such as 2/h, one that is added, such as +1/h, or amounts by "
+            "hours, such as 1.5 @ 08:00-12:00"
+        ) from None
+
+
+def members_of(given: Any, known: Collection[str], what: str) -> dict[str, Any]:
+    """Return the members of a JSON object, all of which are known."""
+    if not isinstance(given, dict):
+        raise InputError(f"{what} is {given!r:.40}, want an object with some of {', '.join(known)}")
+    for name in given:
+        if name not in known:
+            raise InputError(f"no member {name!r:.40} of {what}; {nearest(name, known)}")
+    return dict(given)
 
 
 def _means(name: str, zone: Zone) -> bool:

@@ -14,7 +14,7 @@ The member `zones` of the file has an object for each zone with rules; all of it
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -30,7 +30,7 @@ from parkenv.lots.slot_polygons import slots_from_polygons
 from parkenv.world.drive_graph import GraphError, build_drive_graph, linestrings
 from parkenv.world.facility import Facility
 from parkenv.world.lot import FARTHEST, SLOT_SIDE, Lane, Mouth, ParkingLot, Turn
-from parkenv.world.tariff import NO_ZONE, Hours, Price, Zone
+from parkenv.world.tariff import NO_ZONE, Hours, Price, Zone, members_of
 
 KINDS = {
     "slot": ("Polygon",),
@@ -192,9 +192,9 @@ def read_zones(document: Any) -> dict[str, Zone]:
         with naming(f"zone {name!a:.40}"):
             if not name or not is_plain(name):
                 raise InputError("its name is empty or has control characters")
-            members = _members(given, ("price", "hours", "max_stay_s", "users"), "rules")
+            members = members_of(given, ("price", "hours", "max_stay_s", "users"), "rules")
             if "price" in members:
-                members["price"] = price_of(members["price"])
+                members["price"] = Price.parse(members["price"])
             if "hours" in members:
                 members["hours"] = Hours.parse(members["hours"])
             if not isinstance(members.get("users", []), list):
@@ -203,39 +203,9 @@ def read_zones(document: Any) -> dict[str, Zone]:
     return rules
 
 
-def price_of(given: Any) -> Price:
-    """Return the price of a number, that of an hour, of a text, by hours, or of the members of a price."""
-    if type(given) in (int, float):
-        return Price(given)
-    if isinstance(given, str):
-        return Price.parse(given)
-    members = _members(given, [f.name for f in fields(Price)], "price")
-    steps = members.get("steps", [])
-    if not isinstance(steps, list) or not all(isinstance(step, list) for step in steps):
-        raise InputError(f"steps is {steps!r:.40}, want a list of pairs: stay in seconds and price")
-    if "charged" in members:
-        members["charged"] = Hours.parse(members["charged"], "charged")
-    if "hourly" in members:
-        members["hourly"] = Price.parse(str(members["hourly"]), "hourly").hourly
-    return Price(**members)
-
-
-def _members(given: Any, known: Collection[str], what: str) -> dict[str, Any]:
-    if not isinstance(given, dict):
-        raise InputError(f"{what} is {given!r:.40}, want an object with some of {', '.join(known)}")
-    for name in given:
-        if name not in known:
-            raise InputError(f"no member {name!r:.40} of {what}; {nearest(name, known)}")
-    return dict(given)
-
-
 def zone_document(zone: Zone) -> dict[str, Any]:
     """Return the rules of a zone, as the member `zones` has them."""
-    price = {f.name: value for f in fields(Price) if (value := getattr(zone.price, f.name)) != f.default}
-    if zone.price.charged is not None:
-        price["charged"] = str(zone.price.charged)
-    if zone.price.hourly:
-        price["hourly"] = "; ".join(f"{amount:.12g} @ {hours}" for amount, hours in zone.price.rules)
+    price = zone.price.members()
     document: dict[str, Any] = {"price": price} if price else {}
     if zone.hours is not None:
         document["hours"] = str(zone.hours)

@@ -25,7 +25,7 @@ from parkenv.lots.draft import LotDraft
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.osm.rows import Side
 from parkenv.world.facility import Facility
-from parkenv.world.tariff import PUBLIC, Hours, Price, Zone
+from parkenv.world.tariff import PUBLIC, Hours, Price, Zone, charge_in
 from parkenv.world.week import DAY_S, HOUR_S
 
 PRICE = 2.0  # assumed price of an hour where a fee is charged, in the currency of the town
@@ -44,13 +44,6 @@ RESERVED = {
 }
 """Class of users for each value of `access`, `parking:condition` and `restriction` that not everyone may park by."""
 LONGEST_LIMIT = 24 * HOUR_S  # s; a longer `maxstay` is no limit for a day's parking
-_CHARGE = re.compile(
-    r"(\d+(?:[.,]\d+)?)[^\d/]{0,8}?(?:/|per)\s*(\d+(?:\.\d+)?)?\s*(h|hr|hours?|min|minutes?|days?|Stunde|Tag)\b",
-    re.I,
-)
-_HOURS_OF = {"h": 1.0, "s": 1.0, "m": 1.0 / 60.0, "d": 24.0, "t": 24.0}
-"""Hours of a unit, by its first letter."""
-MOST_PER_HOUR = 1000.0  # a higher price is a mistake
 _STAY = re.compile(r"(\d+(?:[.,]\d+)?)\s*(h|hr|hour|hours|m|min|minute|minutes)\b", re.I)
 _HOURS = re.compile(r"[A-Z][a-z](?:[-,][A-Z][a-z])*\s+\d?\d:\d\d-\d?\d:\d\d")
 
@@ -137,11 +130,8 @@ def _rules(
     users: str, fee: str | None, charge: str | None, conditional: str | None, maxstay: str | None
 ) -> Rules:
     per_hour, assumed, charged, by_day = 0.0, False, "", False
-    if charge is not None and (match := _CHARGE.search(charge)):
-        unit = match[3][0].lower()
-        spans, by_day = float(match[2] or 1.0) * _HOURS_OF[unit], unit in "dt"
-        per_hour = float(match[1].replace(",", ".")) / spans if spans else 0.0
-        per_hour = per_hour if per_hour <= MOST_PER_HOUR else 0.0
+    if charge is not None and (known := charge_in(charge)) is not None:
+        per_hour, by_day = known
     elif (fee or "no").lower() not in ("no", "free", "unknown") or (conditional or "").startswith("yes"):
         per_hour, assumed = PRICE, True
     if per_hour:
