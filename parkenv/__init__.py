@@ -9,7 +9,7 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from parkenv.files.early_signals import end_on_signals, is_command
+from parkenv.files.command_process import end_on_signals, is_command
 
 if is_command():
     end_on_signals()  # before everything that takes time
@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from planners.agent import make_agent
 
 if sys.flags.safe_path:
-    from parkenv.files.working_folder import skip_settings
+    from parkenv.files.command_process import skip_settings
 
     skip_settings()
 

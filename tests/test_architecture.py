@@ -69,9 +69,9 @@ READS = dict.fromkeys(
 ) | dict.fromkeys(("yaml.load", "tomllib.loads", "csv.reader"), ("parkenv/files/limited_reading.py",)) | {
     "torch.load": ("parkenv/studies/training/checkpoint.py",),  # weights_only
     "PillowImage.open": ("parkenv/files/images.py",),
-    "tarfile.open": ("parkenv/files/archives.py",),
+    "tarfile.open": ("parkenv/files/limited_reading.py",),
     "zipfile.ZipFile": (
-        "parkenv/files/archives.py", "parkenv/perception/car_model.py", "parkenv/studies/training/checkpoint.py",
+        "parkenv/files/limited_reading.py", "parkenv/perception/car_model.py", "parkenv/studies/training/checkpoint.py",
     ),
     "pickle.loads": ("parkenv/compiled/code_files.py",),
 }  # fmt: skip

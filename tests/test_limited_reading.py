@@ -12,12 +12,15 @@ import numpy as np
 import pytest
 
 from parkenv.errors import InputError
-from parkenv.files.archives import MAX_MEMBERS, parse_arrays, parse_zip, read_arrays
 from parkenv.files.images import decode_image, read_image
 from parkenv.files.limited_reading import (
+    MAX_MEMBERS,
     csv_records,
     csv_rows,
     open_limited,
+    parse_arrays,
+    parse_zip,
+    read_arrays,
     read_bytes,
     read_json,
     read_text,

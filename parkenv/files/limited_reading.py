@@ -1,6 +1,6 @@
-"""Read text files from anywhere within limits: bytes, nesting, aliases, and types of values.
+"""Read files from anywhere within limits: bytes, nesting, aliases, types of values, unpacked size of archives.
 
-Every file that a user names is read through this module, `parkenv.files.archives` or `parkenv.files.images`.
+Every file that a user names is read through this module or `parkenv.files.images`.
 """
 
 from __future__ import annotations
@@ -10,20 +10,27 @@ import csv
 import gzip
 import io
 import json
+import math
 import os
 import re
 import stat
+import tokenize
 import tomllib
+import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 from xml.etree import ElementTree
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic_core import from_json
 
 from parkenv.errors import InputError, naming, with_extra
+from parkenv.files.atomic_write import write_text
 
 MAX_BYTES = 64_000_000
 """Maximum size of a file, if its reader sets no other; 64 MB of JSON become at most about 1.5 GB in memory."""
@@ -286,3 +293,89 @@ def _require_shallow(content: Any, name: str, *, plain: bool = False) -> None:
             and value != value.encode(errors="replace").decode()
         ):
             raise InputError(f"{name}: has text that is not Unicode: {value!a:.40}")
+
+
+MAX_MEMBERS = 10_000
+"""Maximum number of files in an archive."""
+_HEADER_ERRORS = (tokenize.TokenError, OverflowError, RecursionError, MemoryError)
+
+
+def parse_zip(data: bytes, name: str, most: int = MAX_BYTES) -> dict[str, bytes]:
+    """Return the files of a zip archive, by name, at most `most` bytes in all when unpacked.
+
+    Sizes are those that the archive claims; the library unpacks no more than that.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = archive.infolist()
+            if len(members) > MAX_MEMBERS:
+                raise InputError(f"{name}: holds {len(members):,} files, want at most {MAX_MEMBERS:,}")
+            if (size := sum(member.file_size for member in members)) > most:
+                raise InputError(f"{name}: unpacks to {size:,} bytes, want at most {most:,}")
+            if {member.compress_type for member in members} - {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+                raise InputError(f"{name}: is compressed otherwise than by deflate")
+            return {member.filename: archive.read(member) for member in members}
+    except InputError:
+        raise
+    # What zipfile raises for damage, and for encryption, offsets and names that it does not read.
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, RuntimeError, ValueError) as error:
+        raise InputError(f"{name}: not a zip archive that can be read: {error}") from error
+
+
+def read_arrays(path: str | Path) -> dict[str, NDArray[Any]]:
+    """Return the arrays of an `.npz` file; see `parse_arrays`."""
+    return parse_arrays(read_bytes(path), str(path))
+
+
+def parse_arrays(data: bytes, name: str) -> dict[str, NDArray[Any]]:
+    """Return the arrays of `.npz` data, without pickle; sizes are checked before memory is taken."""
+    arrays = {}
+    for member, content in parse_zip(data, name).items():
+        stream = io.BytesIO(content)
+        try:
+            version = np.lib.format.read_magic(stream)
+            read_header = {
+                (1, 0): np.lib.format.read_array_header_1_0,
+                (2, 0): np.lib.format.read_array_header_2_0,
+            }[version]
+            shape, is_fortran, dtype = read_header(stream)
+            size = math.prod(shape) * dtype.itemsize
+            if dtype.hasobject or min(shape, default=0) < 0 or size != len(content) - stream.tell():
+                raise ValueError(f"{dtype}{shape} in {len(content):,} bytes")
+            array = np.frombuffer(content, dtype, offset=stream.tell()).copy()
+            arrays[member.removesuffix(".npy")] = array.reshape(shape, order="F" if is_fortran else "C")
+        except (ValueError, LookupError, TypeError, SyntaxError, *_HEADER_ERRORS) as error:
+            raise InputError(f"{name}: {member}: not an array of numbers: {error}") from error
+    return arrays
+
+
+@dataclass(frozen=True)
+class JsonFormat:
+    """A file format.
+
+    Args:
+        name: value of `"format"` in the file.
+        version: value of `"version"`; this version of the package reads and writes no other.
+        meaning: description of the format for messages.
+    """
+
+    name: str
+    version: int
+    meaning: str
+
+    def read(self, path: str | os.PathLike[str]) -> dict[str, Any]:
+        """Read the fields of a file, without format and version."""
+        try:
+            content = read_json(Path(path))
+        except InputError as error:
+            raise InputError(f"{error}; want {self.meaning}") from error
+        if not isinstance(content, dict) or content.pop("format", None) != self.name:
+            raise InputError(f'{path}: want {self.meaning}, a JSON object with "format": "{self.name}"')
+        if (version := content.pop("version", None)) != self.version:
+            raise InputError(f"{path}: version is {version!r}, want {self.version}")
+        return content
+
+    def write(self, path: str | os.PathLike[str], fields: Mapping[str, Any]) -> None:
+        """Write a file atomically."""
+        content = {"format": self.name, "version": self.version, **fields}
+        write_text(path, json.dumps(content, indent=1) + "\n")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,41 +97,26 @@ class Video:
                 number += 1
 
 
-class Film:
-    """An MP4 film that is being written."""
-
-    def __init__(self, writer: Any, size: tuple[int, int]) -> None:
-        self._writer, self._size = writer, size
-
-    def add(self, image: Image) -> None:
-        """Append a frame, (h, w, 3) uint8, RGB."""
-        width, height = self._size
-        self._writer.write(np.ascontiguousarray(image[:height, :width, ::-1]))
-
-
 @contextmanager
-def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Film]:
-    """Write a film atomically, frame by frame.
+def film(path: Path, size: tuple[int, int], fps: float) -> Iterator[Callable[[Image], None]]:
+    """Yield a function that appends a frame, (h, w, 3) uint8, RGB, to a film (`.mp4`), which is written atomically.
 
-    Args:
-        path: the file, `.mp4`.
-        size: width and height, px; an odd last row or column is left out, as encoders want.
-        fps: frames per second.
+    An odd last row or column of `size`, width and height in px, is left out, as encoders want.
     """
     even = size[0] // 2 * 2, size[1] // 2 * 2
     with atomic_write(path) as beside:
-        made = beside.with_name(f"{beside.name}.mp4")  # the encoder goes by the name
-        writer = cv2.VideoWriter(str(made), cv2.VideoWriter.fourcc(*"mp4v"), min(fps, 240.0), even)
+        unfinished = beside.with_name(f"{beside.name}.mp4")  # the encoder goes by the name
+        writer = cv2.VideoWriter(str(unfinished), cv2.VideoWriter.fourcc(*"mp4v"), min(fps, 240.0), even)
         try:
             if not writer.isOpened():
                 raise InputError(f"{path}: cannot be written as a film of {even[0]}×{even[1]} px")
-            yield Film(writer, even)
+            yield lambda image: writer.write(np.ascontiguousarray(image[: even[1], : even[0], ::-1]))
             writer.release()
-            made.replace(beside)
+            unfinished.replace(beside)
         finally:
             writer.release()
             with suppress(OSError):
-                made.unlink()
+                unfinished.unlink()
 
 
 @contextmanager

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import Float32Array
 from parkenv.errors import InputError, require_number
-from parkenv.files.archives import parse_arrays, read_arrays
 from parkenv.files.atomic_write import atomic_write
-from parkenv.files.limited_reading import parse_json
+from parkenv.files.limited_reading import parse_arrays, parse_json, read_arrays
 from parkenv.perception.hog import Descriptor
 
 PACKAGED_MODELS = ("side", "front")  # packaged models, trained only on simulated images

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from parkenv.errors import InputError, require_number
-from parkenv.files.versioned_json import JsonFormat
+from parkenv.files.limited_reading import JsonFormat
 from parkenv.world.scenario import Scenario
 
 MAX_VALUE = 1_000_000

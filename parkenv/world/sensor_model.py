@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, require_number, require_one_of
-from parkenv.files.versioned_json import JsonFormat
+from parkenv.files.limited_reading import JsonFormat
 
 SENSOR_MODEL_NAMES = ("laser", "stereo")  # rigs with a packaged fitted sensor model
 _FOLDER = Path(__file__).parent / "sensor_models"

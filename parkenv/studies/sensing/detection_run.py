@@ -154,15 +154,15 @@ def detect_in_video(
     frames = most = 0
     seconds = 0.0
     with ExitStack() as stack:
-        made = None
+        append = None
         if drawn is not None:
-            made = stack.enter_context(film(drawn, (video.width, video.height), video.fps / step))
+            append = stack.enter_context(film(drawn, (video.width, video.height), video.fps / step))
         for frame in video.read(step):
             found = _likely(detector.detect(frame.image), threshold)
             boxes += _rows(video.name, found, frame.number, frame.time)
             frames, most, seconds = frames + 1, max(most, len(found)), frame.time
-            if made is not None:
-                made.add(draw_detections(frame.image, found))
+            if append is not None:
+                append(draw_detections(frame.image, found))
             on_frame()
         if not frames:
             raise InputError(f"{video.name}: has no frame that can be read")

@@ -20,7 +20,7 @@ from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
 from parkenv.compiled.keyed_random import world_key
 from parkenv.compiled.memory import address_of
 from parkenv.errors import InputError, naming, require_number
-from parkenv.files.versioned_json import JsonFormat
+from parkenv.files.limited_reading import JsonFormat
 from parkenv.world.occupancy import kernel as kernels
 from parkenv.world.occupancy.arrival_window import ArrivalWindow
 from parkenv.world.occupancy.centred_logits import centring_table
