@@ -107,3 +107,37 @@ class Map:
         path = tmp_path / "place.osm"
         path.write_text(self.xml(), encoding="utf-8")
         return import_lot(path, ImportOptions(**options))
+
+
+def car_park():
+    """Two rows on a one-way aisle that leaves a service road; a gate to the street; a shop."""
+    place = Map()
+    place.way([(-60, -20), (0, -20), (60, -20)], STREET)
+    place.way([(0, -20), (0, 0), (0, 20)], SERVICE)
+    place.way([(0, 0), (50, 0), (50, 20), (0, 20)], AISLE, oneway="yes")
+    for k in range(12):
+        x = 8 + 2.5 * k
+        place.box(x, 3, x + 2.5, 8, SPACE)
+        place.box(x, -8, x + 2.5, -3, SPACE, **({"parking_space": "disabled"} if k < 2 else {}))
+    place.box(-4, -9, 54, 24, {"amenity": "parking", "parking": "surface", "capacity": "24"})
+    place.box(10, 30, 40, 50, {"building": "retail"})
+    return place.node(10, 40, entrance="yes").node(25, 30, entrance="main")
+
+
+def outline_alone(half=8, **tags):
+    """A 16 m × 50 m area round a 50 m aisle: 20 slots of 2.5 m on either side of it."""
+    place = Map().way([(-60, -20), (0, -20), (60, -20)], STREET)
+    place.way([(0, -20), (0, 0)], SERVICE).way([(0, 0), (50, 0)], AISLE)
+    place.box(0, -half, 50, half, {"amenity": "parking", **tags})
+    return place.box(20, 20, 40, 40, {"building": "office"})
+
+
+def one_street(length=100.0, **tags):
+    """A street without crossings, and a house."""
+    place = Map().way([(0, 0), (length, 0)], {"highway": "residential", **tags})
+    return place.box(30, 20, 50, 30, {"building": "house"})
+
+
+def crossing_streets(**second):
+    place = Map().way([(0, 0), (50, 0), (100, 0)], STREET, **{"parking:both": "lane"})
+    return place.way([(50, 0), (50, 60)], second).box(20, 20, 30, 30, {"building": "yes"})

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import pytest
 from file_mutations import mutated_bytes, mutated_json, mutated_text
+from made_maps import car_park
 from test_csv_tables import EPISODE, SESSION
-from test_import_osm import car_park
 
 from parkenv import InputError, OccupancyLog, OccupancyProcess, SensorModel
 from parkenv.files.images import read_image

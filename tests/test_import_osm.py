@@ -10,7 +10,7 @@ import shapely
 from command_line import parkenv
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_maps import AISLE, FREIBURG, SERVICE, SPACE, STREET, Map
+from made_maps import AISLE, FREIBURG, SERVICE, SPACE, STREET, Map, car_park, one_street, outline_alone
 from pictures import shows_color
 from typer.testing import CliRunner
 
@@ -27,35 +27,6 @@ from parkenv.show.figures.lot_import import SOURCE_COLORS
 from parkenv.show.figures.schematic import TWO_WAY
 from parkenv.world.drive_graph import SLOT_REACH
 from parkenv.world.lot import Mouth
-
-
-def car_park():
-    """Two rows on a one-way aisle that leaves a service road; a gate to the street; a shop."""
-    place = Map()
-    place.way([(-60, -20), (0, -20), (60, -20)], STREET)
-    place.way([(0, -20), (0, 0), (0, 20)], SERVICE)
-    place.way([(0, 0), (50, 0), (50, 20), (0, 20)], AISLE, oneway="yes")
-    for k in range(12):
-        x = 8 + 2.5 * k
-        place.box(x, 3, x + 2.5, 8, SPACE)
-        place.box(x, -8, x + 2.5, -3, SPACE, **({"parking_space": "disabled"} if k < 2 else {}))
-    place.box(-4, -9, 54, 24, {"amenity": "parking", "parking": "surface", "capacity": "24"})
-    place.box(10, 30, 40, 50, {"building": "retail"})
-    return place.node(10, 40, entrance="yes").node(25, 30, entrance="main")
-
-
-def outline_alone(half=8, **tags):
-    """A 16 m × 50 m area round a 50 m aisle: 20 slots of 2.5 m on either side of it."""
-    place = Map().way([(-60, -20), (0, -20), (60, -20)], STREET)
-    place.way([(0, -20), (0, 0)], SERVICE).way([(0, 0), (50, 0)], AISLE)
-    place.box(0, -half, 50, half, {"amenity": "parking", **tags})
-    return place.box(20, 20, 40, 40, {"building": "office"})
-
-
-def one_street(length=100.0, **tags):
-    """A street without crossings, and a house."""
-    place = Map().way([(0, 0), (length, 0)], {"highway": "residential"}, **tags)
-    return place.box(30, 20, 50, 30, {"building": "house"})
 
 
 def street_slots(tmp_path, **tags):
@@ -147,158 +118,6 @@ def test_disabled_spaces_are_left_out_and_listed_unless_asked_for(tmp_path):
     assert reasons(asked) == {}
 
 
-@pytest.mark.parametrize(
-    ("tags", "reason"),
-    [
-        ({"access": "private"}, "spaces with access=private"),
-        ({"access": "private", "motorcar": "yes"}, None),
-        ({"access": "customers"}, None),
-        ({"parking_space": "motorcycle"}, "spaces with parking_space=motorcycle"),
-        ({"capacity:disabled": "1"}, "spaces for disabled drivers"),
-        ({"level": "-1"}, "spaces with level=-1"),
-    ],
-)
-def test_spaces_that_not_everyone_may_use_are_left_out(tmp_path, tags, reason):
-    draft = car_park().box(42, 3, 44.5, 8, SPACE, **tags).draft(tmp_path)
-    number = "way/30"
-    assert (number in draft.slot_ids) == (reason is None)
-    if reason:
-        assert number in reasons(draft)[reason]
-
-
-def test_spaces_in_private_parking_are_private(tmp_path):
-    place = car_park()
-    place.ways[27] = (place.ways[27][0], {"amenity": "parking", "access": "private"})
-    draft = place.draft(tmp_path)
-    assert len(reasons(draft)["spaces in private parking"]) == 22
-    with pytest.raises(InputError, match="no slot: nothing that the file calls parking could be used"):
-        draft.lot()
-
-
-def test_a_space_for_several_cars_is_cut_along_its_aisle(tmp_path):
-    place = car_park().box(38, 3, 48, 8, SPACE, capacity="4").box(38, -8, 48, -3, SPACE)
-    draft = place.draft(tmp_path)
-    assert [i for i in draft.slot_ids if i.startswith("way/30")] == [f"way/30-{k}" for k in (1, 2, 3, 4)]
-    cut = [k for k, i in enumerate(draft.slot_ids) if i.startswith("way/30")]
-    np.testing.assert_allclose(
-        np.sort(in_map_metres(draft, draft.slots.xy[cut])[:, 0]), [39.25, 41.75, 44.25, 46.75], atol=0.05
-    )
-    assert reasons(draft)["spaces larger than 30 m² without a capacity"] == ("way/31",)
-
-
-def test_slanted_spaces_stand_slanted_and_clear_of_each_other(tmp_path):
-    place = Map().way([(-20, -9), (0, -9), (60, -9)], STREET).way([(0, -9), (0, 0)], SERVICE)
-    place.way([(0, 0), (50, 0)], AISLE).box(20, 20, 30, 30, {"building": "yes"})
-    for k in range(8):
-        x = 6 + 2.9 * k
-        place.way([(x, 3), (x + 2.9, 3), (x + 5.4, 7.33), (x + 2.5, 7.33), (x, 3)], SPACE)
-    draft = place.draft(tmp_path)
-    assert len(draft.slots) == 8
-    np.testing.assert_allclose(draft.slots.yaw, np.radians(60.0), atol=0.02)
-    np.testing.assert_allclose(draft.slots.width, 2.9 * np.sin(np.radians(60.0)), atol=0.05)
-    boxes = shapely.polygons(draft.lot().slot_corners())
-    assert shapely.area(shapely.union_all(boxes)) == pytest.approx(shapely.area(boxes).sum(), rel=0.02)
-
-
-def test_a_slot_opens_to_its_aisle_though_a_street_is_nearer(tmp_path):
-    place = car_park().way(
-        [(-60, 10), (-4, 10), (-4, 60)], {"highway": "residential"}, **{"parking:left": "lane"}
-    )
-    place.way([(-4, 10), (55, 10.0)], {"highway": "unclassified"})
-    draft = place.draft(tmp_path)
-    row = [
-        k
-        for k, i in enumerate(draft.slot_ids)
-        if in_map_metres(draft, draft.slots.xy[[k]])[0, 1] == pytest.approx(5.5, abs=0.1)
-    ]
-    assert len(row) == 12
-    np.testing.assert_allclose(np.sin(draft.slots.yaw[row]), 1.0, atol=1e-3)
-
-
-def test_slots_that_no_aisle_reaches_are_listed(tmp_path):
-    draft = car_park().box(8, 60, 10.5, 65, SPACE).draft(tmp_path)
-    assert reasons(draft)["slots that no aisle reaches within 8 m"] == ("way/30",)
-
-
-def test_slots_that_no_way_leads_to_are_listed(tmp_path):
-    place = car_park()
-    # A one-way aisle from the lot's far side to the service road: no car can reach it.
-    place.way([(-40, 20), (0, 20)], AISLE, oneway="yes").box(-20, 23, -17.5, 28, SPACE)
-    draft = place.draft(tmp_path)
-    assert reasons(draft)["slots that cannot be reached from an entry"] == ("way/31",)
-    assert draft.lot().n_slots == 22
-
-
-def test_points_without_an_outline_are_listed(tmp_path):
-    draft = car_park().node(99, 9, amenity="parking").node(98, 9, amenity="parking_space").draft(tmp_path)
-    left = reasons(draft)
-    assert left["amenity=parking without an outline"] == (f"node/{len(car_park().nodes) + 1}",)
-    assert "amenity=parking_space without an outline" in left
-
-
-def test_an_outline_is_filled_with_rows_on_both_sides_of_its_aisle(tmp_path):
-    draft = outline_alone().draft(tmp_path)
-    xy = in_map_metres(draft, draft.slots.xy)
-    # The row at the service road's side begins beyond its carriageway: 80 % of 2.5 m.
-    assert 38 <= len(draft.slots) <= 40
-    np.testing.assert_allclose(np.abs(xy[:, 1]), 5.5, atol=0.02)
-    np.testing.assert_allclose(np.diff(np.sort(xy[xy[:, 1] > 0, 0])), 2.5, atol=0.01)
-    assert set(draft.slot_source) == {"amenity=parking, rows by rule"}
-
-
-@pytest.mark.parametrize(
-    ("tags", "count"),
-    [
-        ({"capacity": "12"}, 12),
-        ({"capacity": "12", "capacity:disabled": "2"}, 10),
-        ({"capacity": "dozens"}, None),
-    ],
-)
-def test_capacity_bounds_what_is_filled(tmp_path, tags, count):
-    assert len(outline_alone(**tags).draft(tmp_path).slots) == (
-        count or len(outline_alone().draft(tmp_path).slots)
-    )
-
-
-def test_too_great_a_capacity_is_not_believed_and_said(tmp_path):
-    draft = outline_alone(capacity="400").draft(tmp_path)
-    assert f"way/4: {len(draft.slots)} of the tagged 400 slots fit by the rule" in draft.found
-    assert len(draft.slots) == len(outline_alone().draft(tmp_path).slots)
-
-
-def test_slots_by_rule_keep_clear_of_buildings_and_holes(tmp_path):
-    place = outline_alone().box(10, 4, 20, 7, {"building": "kiosk"})
-    place.box(30, -7, 40, -4, {}).area([4], [7], amenity="parking")
-    place.ways[3] = (place.ways[3][0], {})
-    draft = place.draft(tmp_path)
-    boxes = shapely.polygons(
-        in_map_metres(draft, draft.lot().slot_corners().reshape(-1, 2)).reshape(-1, 4, 2)
-    )
-    assert 25 <= len(boxes) <= 34
-    for obstacle in (shapely.box(10, 4, 20, 7), shapely.box(30.5, -6.5, 39.5, -4.5)):
-        assert shapely.area(shapely.intersection(boxes, obstacle)).sum() < 0.3
-    assert {i.split("-")[0] for i in draft.slot_ids} == {"relation/1"}
-
-
-@pytest.mark.parametrize(
-    ("tags", "reason"),
-    [
-        ({"parking": "underground"}, "parking areas with parking=underground"),
-        ({"parking": "multi-storey"}, "parking areas with parking=multi-storey"),
-        ({"access": "private"}, "parking areas with access=private"),
-    ],
-)
-def test_areas_that_are_no_open_parking_are_listed(tmp_path, tags, reason):
-    draft = outline_alone(**tags).draft(tmp_path)
-    assert reasons(draft) == {reason: ("way/4",)}
-    assert len(draft.slots) == 0
-
-
-def test_an_area_without_an_aisle_is_listed(tmp_path):
-    draft = outline_alone().box(100, 100, 120, 120, {"amenity": "parking"}).draft(tmp_path)
-    assert reasons(draft)["parking areas without a road along which a slot fits"] == ("way/6",)
-
-
 def test_kerbs_hold_a_slot_every_six_metres_on_the_tagged_side(tmp_path):
     for side, y in (("right", -4.05), ("left", 4.05)):
         draft, xy = street_slots(tmp_path, **{f"parking:{side}": "lane"})
@@ -342,98 +161,6 @@ def test_the_old_tagging_says_the_same_as_the_new(tmp_path, new, old):
         np.testing.assert_array_equal(getattr(one.slots, name), getattr(other.slots, name))
 
 
-@pytest.mark.parametrize(
-    "tags",
-    [
-        {"parking:right": "lane", "parking:right:restriction": "no_parking"},
-        {"parking:both": "lane", "parking:both:restriction": "no_stopping"},
-        {"parking:right": "lane", "parking:right:access": "private"},
-        {"parking:lane:right": "parallel", "parking:condition:right": "no_parking"},
-        {"parking:right": "lane", "parking:right:orientation": "upright"},
-    ],
-)
-def test_forbidden_and_unknown_kerbs_are_listed(tmp_path, tags):
-    draft, _ = street_slots(tmp_path, **tags)
-    assert len(draft.slots) == 0
-    assert "way/1-right" in {i for left in draft.left_out for i in left.ids}
-
-
-@pytest.mark.parametrize(("capacity", "count", "length"), [("5", 5, 6.0), ("18", 18, 5.55), ("50", 20, 5.0)])
-def test_tagged_capacity_spreads_or_tightens_the_row(tmp_path, capacity, count, length):
-    draft, xy = street_slots(tmp_path, **{"parking:right": "lane", "parking:right:capacity": capacity})
-    assert len(draft.slots) == count
-    np.testing.assert_allclose(draft.slots.length, length, atol=0.01)
-    np.testing.assert_allclose(np.diff(xy[:, 0]), 100.0 / count, atol=0.01)
-    assert any("of the tagged 50 slots" in line for line in draft.found) == (capacity == "50")
-
-
-@pytest.mark.parametrize(
-    ("tags", "edge"),
-    [
-        ({}, 3.0),
-        ({"lanes": "1"}, 1.5),
-        ({"highway": "primary"}, 3.5),
-        ({"highway": "living_street"}, 2.5),
-        ({"oneway": "yes"}, 2.0),
-        ({"width": "10", "parking:right": "lane"}, 2.9),
-        ({"width": "10 m", "parking:right": "on_kerb"}, 5.0),
-    ],
-)
-def test_cars_stand_at_the_edge_of_what_the_street_measures(tmp_path, tags, edge):
-    draft, xy = street_slots(tmp_path, **{"parking:right": "lane", **tags})
-    np.testing.assert_allclose(-xy[:, 1], edge + 2.1 / 2, atol=0.02)
-    assert len(draft.slots) == 16
-
-
-def crossing_streets(**second):
-    place = Map().way([(0, 0), (50, 0), (100, 0)], STREET, **{"parking:both": "lane"})
-    return place.way([(50, 0), (50, 60)], second).box(20, 20, 30, 30, {"building": "yes"})
-
-
-@pytest.mark.parametrize(
-    ("second", "clear_north", "clear_south"),
-    [
-        ({"highway": "residential"}, 3.0 + 2.1 + 5.0, 3.0 + 2.1 + 5.0),
-        ({"highway": "service"}, 2.5 + 1.0, 0.0),
-        ({"highway": "footway"}, 0.0, 0.0),
-    ],
-)
-def test_crossings_stay_clear(tmp_path, second, clear_north, clear_south):
-    draft = crossing_streets(**second).draft(tmp_path)
-    xy = in_map_metres(draft, draft.slots.xy)
-    for side, clear in ((1, clear_north), (-1, clear_south)):
-        gap = np.abs(xy[xy[:, 1] * side > 0, 0] - 50.0).min() - 3.0
-        assert gap >= clear - 0.05 if clear else gap < 3.0
-
-
-def test_entries_are_where_service_roads_meet_the_street(tmp_path):
-    draft = car_park().draft(tmp_path)
-    np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, -20]], atol=0.02)
-    assert "lanes: 2 (parking aisles: 1, other service roads: 1, streets: 0; one-way: 1)" in draft.found
-
-
-def test_nobody_comes_in_by_a_one_way_exit(tmp_path):
-    place = car_park().way([(50, 0), (60, -20)], SERVICE, oneway="yes")
-    draft = place.draft(tmp_path)
-    np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, -20]], atol=0.02)
-    place = car_park().way([(60, -20), (50, 0)], SERVICE, oneway="yes")
-    assert len(place.draft(tmp_path).entries) == 2
-
-
-def test_nobody_comes_in_by_a_blind_end(tmp_path):
-    kerbs = {"highway": "residential", "parking:both": "lane"}
-    place = Map().way([(0, 0), (60, 0)], kerbs).way([(60, 0), (60, 40)], kerbs).way([(60, 0), (90, 0)], kerbs)
-    place.node(60, 40, noexit="yes").node(90, 0, highway="turning_circle").box(
-        9, 9, 20, 20, {"building": "yes"}
-    )
-    draft = place.draft(tmp_path)
-    np.testing.assert_allclose(in_map_metres(draft, draft.entries), [[0, 0]], atol=0.02)
-    # An end at the edge of the map leaves no doubt about the others.
-    place = Map().way([(-500, 0), (60, 0)], kerbs | {"parking:both": "no"}).way([(60, 0), (60, 40)], kerbs)
-    place.box(9, 9, 20, 20, {"building": "yes"})
-    assert len(place.draft(tmp_path).entries) == 1
-
-
 def test_given_entries_and_goals_count_by_metres_or_degrees(tmp_path):
     frame = car_park().draft(tmp_path).frame
     lon, lat = FREIBURG.to_lonlat([[25.0, 25.0]])[0].tolist()
@@ -443,16 +170,6 @@ def test_given_entries_and_goals_count_by_metres_or_degrees(tmp_path):
     by_metres = car_park().draft(tmp_path, goals=((x, y),), entries=((x, y),))
     np.testing.assert_allclose(by_metres.goals, by_degrees.goals, atol=1e-9)
     np.testing.assert_allclose(by_metres.entries, by_degrees.entries, atol=1e-9)
-
-
-def test_goals_are_entrances_main_ones_first_else_the_nearest_building(tmp_path):
-    draft = car_park().draft(tmp_path)
-    np.testing.assert_allclose(in_map_metres(draft, draft.goals), [[25, 30], [10, 40]], atol=0.02)
-    place = car_park().box(100, 30, 120, 50, {"building": "yes"}).box(0, 26, 4, 28, {"building": "garage"})
-    for point in ((25, 30), (10, 40)):
-        place.nodes[point].clear()
-    draft = place.draft(tmp_path)
-    np.testing.assert_allclose(in_map_metres(draft, draft.goals), [[25, 40]], atol=0.02)
 
 
 def test_without_goal_or_entry_it_refuses_and_says_how_to_give_one(tmp_path):
@@ -468,12 +185,6 @@ def test_without_goal_or_entry_it_refuses_and_says_how_to_give_one(tmp_path):
     entry = tuple(float(word) for word in ends[0].split(","))
     lot = place.draft(tmp_path, entries=(entry,), goals=((30.0, 30.0),)).lot()
     assert lot.n_slots == 2
-
-
-def test_buildings_are_walls_unless_they_stand_over_slots(tmp_path):
-    draft = car_park().box(7, 2, 24, 9, {"building": "roof"}).draft(tmp_path)
-    assert len(draft.walls) == 1
-    assert reasons(draft)["buildings over slots or lanes, which are no walls"] == ("way/30",)
 
 
 def test_bounds_cut_the_map(tmp_path):
