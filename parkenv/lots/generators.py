@@ -128,11 +128,8 @@ def kerb_rows(
 ) -> tuple[Slots, NDArray[np.intp]]:
     """Create as many kerbside slots as fit along each of m kerbs, evenly spaced; return slots and kerb indices.
 
-    Args:
-        start: (m, 2) m, start of the edge between carriageway and parked cars.
-        end: (m, 2) m, end of that edge; traffic runs from start to end.
-        left: (m,) bool, whether the cars park on the left of that edge; on the right otherwise.
-        size: length and width of a slot, m.
+    Start and end, (m, 2) m, are those of the edge between carriageway and parked cars, along which traffic runs; cars
+    park on the `left` of it, (m,) bool, or else on the right.
     """
     length, width = size
     reach = np.hypot(*(end - start).T)

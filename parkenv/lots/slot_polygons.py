@@ -14,17 +14,13 @@ from parkenv.world.lot import Lane, Mouth
 
 
 def slots_from_polygons(polygons: NDArray[np.object_], lanes: Sequence[Lane]) -> Slots:
-    """Infer length, width, yaw and mouth of slots from their outlines.
+    """Infer length, width, yaw and mouth of slots from their outlines, (n,) polygons with an area, m.
 
     A slot is the smallest rectangle around its polygon. A side faces a lane if the lane's nearest point is within 60°
     of the side's outward normal. A slot with a short side that faces a lane is perpendicular or angled, and entered by
     that side (the nearer one of two). If only a long side faces a lane, it is a kerbside slot, and the car faces the
     direction of traffic: that of a one-way lane, otherwise with the lane on its left. If no side faces a lane, the
     short side nearest to one counts.
-
-    Args:
-        polygons: (n,) polygons with an area, m.
-        lanes: the lot's lanes.
     """
     boxes = shapely.normalize(shapely.minimum_rotated_rectangle(polygons))
     corners = shapely.get_coordinates(boxes).reshape(len(polygons), 5, 2)[:, :4]

@@ -13,13 +13,12 @@ The member `zones` of the file has an object for each zone with rules; all of it
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection
 from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
 from parkenv.compiled.arrays import FloatArray
 from parkenv.errors import InputError, naming, nearest, require_number
@@ -295,7 +294,9 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
     """
     if not raw:
         return
-    polygons = _polygons([xy[feature.parts[0]] for feature in raw])
+    rings = [xy[feature.parts[0]] for feature in raw]
+    which = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
+    polygons = np.asarray(shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=which)))
     area = shapely.area(shapely.convex_hull(polygons))
     valid = shapely.is_valid(polygons)
     first_with: dict[str, int] = {}
@@ -368,11 +369,6 @@ def read_slots(contents: LotContents, raw: list[RawFeature], xy: FloatArray, exa
     )[kept]
     contents.slot_ids = [ids[k] for k in kept]
     contents.numbers["slot"] = [raw[valid_rows[k]].number for k in kept]
-
-
-def _polygons(rings: Sequence[FloatArray]) -> NDArray[np.object_]:
-    which = np.repeat(np.arange(len(rings)), [len(ring) for ring in rings])
-    return np.asarray(shapely.polygons(shapely.linearrings(np.concatenate(rings), indices=which)))
 
 
 def _slot_id(feature: RawFeature) -> str:

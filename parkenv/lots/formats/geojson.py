@@ -166,7 +166,10 @@ def read_contents(path: Path) -> LotContents:
         contents.name = _check_head(document, path.stem)
         system = Positions(True) if "frame" in document else Positions.of(document, path)
         contents.found = system.found
-        contents.left_hand = _keeps_left(document)
+        traffic = document.get("traffic", "right")
+        if traffic not in ("left", "right"):
+            raise InputError(f"traffic is {traffic!r:.40}, want 'left' or 'right'")
+        contents.left_hand = traffic == "left"
         contents.zone_rules = read_zones(document.get("zones", {}))
     except InputError as error:
         contents.error(None, str(error))
@@ -271,13 +274,6 @@ def _check_head(document: Any, stem: str) -> str:
     if document.get("frame", "local") != "local":
         raise InputError(f"frame is {document['frame']!r:.40}, want 'local', or no frame for lon/lat")
     return name
-
-
-def _keeps_left(document: dict[str, Any]) -> bool:
-    traffic = document.get("traffic", "right")
-    if traffic not in ("left", "right"):
-        raise InputError(f"traffic is {traffic!r:.40}, want 'left' or 'right'")
-    return bool(traffic == "left")
 
 
 def _check_feature(

@@ -55,13 +55,9 @@ def find_aisles(
     blocked: Sequence[shapely.Geometry],
     roads: Sequence[FloatArray] = (),
 ) -> list[Aisle]:
-    """Return the aisles that serve the rows; rows along a road need none.
+    """Return the aisles that serve the rows; rows along `roads`, centre lines, (k, 2) m each, need none.
 
-    Args:
-        spaces: all spaces.
-        rows: rows with their open sides.
-        blocked: polygons that no car drives over: spaces, buildings.
-        roads: centre lines, (k, 2) m each.
+    Cars drive over none of the `blocked` polygons: spaces, buildings.
     """
     on_road = [bool(is_on_road(spaces, p.row, p.side, p.view, roads).mean() > 0.5) for p in rows]
     if all(on_road):

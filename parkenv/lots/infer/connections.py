@@ -32,18 +32,17 @@ class Connection:
 
 
 def connect(lines: Sequence[FloatArray], space: FreeSpace, longest: float) -> list[Connection]:
-    """Connect centre lines, (k, 2) m each.
+    """Connect centre lines, (k, 2) m each, by ways up to `longest` m.
 
-    Args:
-        lines: aisles and roads; those that share a point are connected already.
-        space: the free space around them.
-        longest: length, m, of the longest connection.
+    Lines that share a point are connected already.
     """
     stations, xy, owner = _samples(lines)
     cells = space.cells(xy)
     distance, before, source, pairs = space.spread(np.unique(cells))
     at_cell: dict[int, int] = {}
-    for i in _by_importance(stations, owner):
+    # Ends of lines come first.
+    is_end = np.r_[True, owner[1:] != owner[:-1]] | np.r_[owner[1:] != owner[:-1], True]
+    for i in np.lexsort((stations, owner, ~is_end)).tolist():
         at_cell.setdefault(int(cells[i]), i)
     graph = _road_graph(lines, stations, xy, owner)
     length = [shapely.LineString(line).length for line in lines]
@@ -109,12 +108,6 @@ def _samples(lines: Sequence[FloatArray]) -> tuple[FloatArray, FloatArray, IntAr
     return np.concatenate(stations), np.concatenate(xy), np.concatenate(owner)
 
 
-def _by_importance(stations: FloatArray, owner: IntArray) -> list[int]:
-    """Return the samples, ends of lines first."""
-    is_end = np.r_[True, owner[1:] != owner[:-1]] | np.r_[owner[1:] != owner[:-1], True]
-    return [int(i) for i in np.lexsort((stations, owner, ~is_end))]
-
-
 def _road_graph(
     lines: Sequence[FloatArray], stations: FloatArray, xy: FloatArray, owner: IntArray
 ) -> nx.Graph:
@@ -149,11 +142,7 @@ FINE, COARSE, FINE_CELLS = 0.7, 1.0, 250_000
 
 
 class FreeSpace:
-    """A grid over the surroundings of obstacles.
-
-    Args:
-        obstacles: polygons that no car drives over, m.
-    """
+    """A grid over the surroundings of obstacles, polygons, m, that no car drives over."""
 
     def __init__(self, obstacles: Sequence[shapely.Geometry]) -> None:
         whole = shapely.union_all(list(obstacles))
@@ -187,9 +176,8 @@ class FreeSpace:
     def spread(self, start: IntArray) -> tuple[FloatArray, IntArray, IntArray, IntArray]:
         """Drive from cells to all others at once.
 
-        Returns:
-            The cost from the nearest start, (n_cells,) m, the predecessor and the start of each cell, and pairs of
-            neighbouring cells, (m, 2), that belong to different starts.
+        Returns the cost from the nearest start, (n_cells,) m, the predecessor and the start of each cell, and pairs of
+        neighbouring cells, (m, 2), that belong to different starts.
         """
         flat = self.clearance.ravel()
         price = 1.0 + 1.5 * np.clip((COMFORTABLE - flat) / (COMFORTABLE - LEAST_CLEARANCE), 0.0, 1.0)

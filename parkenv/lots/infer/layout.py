@@ -79,14 +79,8 @@ def infer_lot(
 ) -> InferredLot:
     """Infer the lanes and the entry of a car park from its spaces.
 
-    Args:
-        spaces: the parking spaces.
-        obstacles: buildings and other polygons that no car drives over, m.
-        roads: roads of the map, service roads and public streets (source `STREET`).
-        entries: (k, 2) m, entries if known.
-
-    Raises:
-        InputError: no aisle, or no way in, was found.
+    Obstacles are buildings and other polygons, m, that no car drives over; `roads` are those of the map, service roads
+    and public streets (source `STREET`); `entries`, (k, 2) m, are those that are known.
     """
     blocked = [*spaces.boxes(), *obstacles]
     rows, lost = open_rows(spaces, find_rows(spaces), obstacles, [road.points for road in roads])
@@ -241,19 +235,9 @@ def draft_inferred_lot(
 ) -> LotDraft:
     """Draft a lot whose lanes were inferred.
 
-    Args:
-        name: the lot's name.
-        lot: what was inferred.
-        spaces: the spaces that it was inferred from.
-        options: goals and entries given by the user, and whether they may be guessed.
-        source: where the spaces come from.
-        unit: what a space is in the file, such as "outlines".
-        left_out: reasons, each with the names of spaces that were not used for the inference.
-        frame: the lot's geographic frame, or None.
-        goals: (k, 2) m, goals given by the user or found in the file.
-        goal_note: where they come from, if they were found.
-        walls: (k, 2) m each.
-        outlines: (k, 2) m each, parking areas for the figure.
+    `source` is where the spaces come from, `unit` what a space is in the file, such as "outlines", `left_out` names
+    spaces that were not used for the inference, by reason. Goals are (k, 2) m; if they were found in the file,
+    `goal_note` says where. Walls and outlines, those of parking areas for the figure, are (k, 2) m each.
     """
     without_aisle = {reason: [spaces.ids[i] for i in members] for reason, members in lot.left_out.items()}
     lost = sum(map(len, without_aisle.values()))

@@ -103,12 +103,7 @@ def _joined_ends(points: list[FloatArray]) -> list[FloatArray]:
 
 
 def without_stubs(lines: Sequence[Line], count_served: Callable[[Sequence[Line]], int]) -> list[Line]:
-    """Drop short dead ends, the shortest first, unless fewer spaces have a lane before them without it.
-
-    Args:
-        lines: pieces of the network, cut at crossings.
-        count_served: returns the number of spaces with a lane before them.
-    """
+    """Drop short dead ends, the shortest first, unless fewer spaces have a lane before them without it."""
     kept = list(lines)
     served = count_served(kept)
     needed: set[int] = set()
@@ -137,12 +132,8 @@ def without_stubs(lines: Sequence[Line], count_served: Callable[[Sequence[Line]]
 def directed(lines: Sequence[Line], wanted: dict[int, int]) -> tuple[list[Line], list[int]]:
     """Make aisles one-way as far as every lane can still be reached from every other.
 
-    Args:
-        lines: pieces of the network.
-        wanted: for each aisle with a direction, the number of spaces that ask for it; larger ones come first.
-
-    Returns:
-        The lines, and the aisles that had to stay two-way.
+    `wanted` has, for each aisle with a direction, the number of spaces that ask for it; larger ones come first. Returns
+    the lines, and the aisles that had to stay two-way.
     """
     refused = []
     chosen = {k for k, line in enumerate(lines) if line.one_way and line.source < 0}
@@ -283,10 +274,7 @@ class Entry:
 def guess_entry(lines: Sequence[Line], spaces_xy: FloatArray, blocked: Sequence[shapely.Geometry]) -> Entry:
     """Return the most plausible entry: a lane that can be continued out of the car park, with short drives to spaces.
 
-    Args:
-        lines: pieces of the network, cut at crossings.
-        spaces_xy: (n, 2) m, stops before the spaces.
-        blocked: polygons that no car drives over.
+    `spaces_xy`, (n, 2) m, are stops before the spaces.
     """
     for corridor, longest in ((CORRIDOR, LONGEST_WAY_OUT), (NARROW_CORRIDOR, 3 * LONGEST_WAY_OUT)):
         entry = _best_way_out(lines, spaces_xy, blocked, corridor, longest)
@@ -302,10 +290,6 @@ def entries_from_streets(
 
     Cars enter where lanes meet a street. A street remains a lane if spaces open to it or only it connects other lanes;
     then cars enter where it leaves the map.
-
-    Args:
-        lines: pieces of the network, cut at crossings.
-        mouths: (n, 2) m, middles of the slots' open sides.
     """
     is_street = np.array([line.source == STREET for line in lines])
     if not is_street.any():

@@ -59,13 +59,8 @@ def open_rows(
 ) -> tuple[list[OpenRow], IntArray]:
     """Return the rows with their open sides, and the spaces that no aisle can reach.
 
-    A row of which one part is open only to one side and another part only to the other is divided.
-
-    Args:
-        spaces: all spaces.
-        rows: rows of them.
-        obstacles: polygons that no aisle crosses, besides the spaces.
-        roads: centre lines, (k, 2) m each; a row opens to a road before it.
+    A row of which one part is open only to one side and another part only to the other is divided. A row opens to a
+    road before it; `roads` are centre lines, (k, 2) m each. No aisle crosses obstacles or spaces.
     """
     scene = _Scene(spaces, obstacles)
     parts: list[tuple[Row, list[View]]] = []

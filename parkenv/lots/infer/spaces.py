@@ -368,14 +368,9 @@ class CenterRow:
 def spaces_from_centers(
     ids: Sequence[str], xy: FloatArray, yaw: FloatArray | None
 ) -> tuple[Spaces, IntArray, list[CenterRow]]:
-    """Return the rectangles of spaces, the index of each in the list, and the rows of centres.
+    """Return the rectangles of spaces, the index of each in the list, and the rows of centres, (n, 2) m.
 
-    Centres in no row have no rectangle.
-
-    Args:
-        ids: n names.
-        xy: (n, 2) m, centres.
-        yaw: (n,) rad, heading of a car parked nose-in, or None.
+    Centres in no row have no rectangle. `yaw`, (n,) rad, is the heading of a car parked nose-in.
     """
     rows, strays = _find_rows(xy)
     if len(strays) > MOST_STRAYS * len(xy):

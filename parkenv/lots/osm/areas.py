@@ -37,11 +37,8 @@ class Area:
     def of(cls, element: OsmElement, frame: LocalFrame, *, simple: bool) -> Area:
         """Return the area of a closed element.
 
-        Args:
-            element: the element.
-            frame: the lot's frame.
-            simple: whether outlines that cross themselves are refused; otherwise, and if the edge of the map cuts them,
-                they are mended.
+        Outlines that cross themselves are refused if `simple`; otherwise, and if the edge of the map cuts them, they
+        are mended.
         """
         if not element.is_closed:
             raise InputError(f"{element.id}: its outline is open, want its first position again at the end")
@@ -174,10 +171,7 @@ def usable_spaces(
 ) -> tuple[list[Area], list[tuple[Area, str]]]:
     """Return the spaces that are slots, and the others with the reasons.
 
-    Args:
-        spaces: the mapped spaces.
-        parking: the parking areas; spaces in private ones are not slots.
-        with_disabled: whether spaces for disabled drivers are slots.
+    Spaces in private parking areas are not slots.
     """
     private = [a.polygon for a in parking if closed_to_cars(a.element.tags)]
     reasons = [

@@ -97,16 +97,7 @@ MAPPED_OVERLAP, RULE_OVERLAP = 0.4, 0.1
 
 
 def osm_draft(path: str | Path, options: ImportOptions | None = None) -> LotDraft:
-    """Draft a lot from an OpenStreetMap file; see the module for the rules.
-
-    Args:
-        path: `.osm`, `.xml`, `.osm.pbf`, or the JSON and GeoJSON of Overpass.
-        options: goals, entries and bounds given by the user.
-
-    Raises:
-        InputError: the file is damaged, has another format or contains no parking, an outline crosses itself, or
-            the elements are too far apart.
-    """
+    """Draft a lot from an OpenStreetMap file; see the module for the rules."""
     path = Path(path)
     place = read_map(path)
     with naming(path):
@@ -151,11 +142,7 @@ def draft_of_map(
 
 
 def map_frame(elements: Sequence[OsmElement]) -> LocalFrame:
-    """Return the frame around the parking of a map.
-
-    Raises:
-        InputError: the elements are too far apart for one plane.
-    """
+    """Return the frame around the parking of a map."""
     parking = [e for e in elements if _is_parking(e)]
     refuse_far_away(parking)
     return LocalFrame.around(np.concatenate([line for e in parking for line in e.lines]))
@@ -374,7 +361,11 @@ class _LotImport(MapImport):
         roads = used_roads(roads, lanes_around, slots)
         entries = points_in_frame(self.frame, self.options.entries)
         if not len(entries) and roads:
-            entries = street_junctions(roads, streets) if edge is None else self._open_ends(roads, edge)
+            entries = (
+                street_junctions(roads, streets)
+                if edge is None
+                else open_ends(roads, edge, self.points(_is_blind_end))
+            )
         goals, goal_note = points_in_frame(self.frame, self.options.goals), None
         if not len(goals):
             goals, goal_note = find_goals(slots, self.nodes, self.buildings, self.frame)
@@ -422,9 +413,6 @@ class _LotImport(MapImport):
             return shapely.Polygon(shapely.box(*self.box))
         low, high = slots.xy.min(axis=0) - STREETS_AROUND, slots.xy.max(axis=0) + STREETS_AROUND
         return shapely.Polygon(shapely.box(*low, *high))
-
-    def _open_ends(self, roads: Sequence[Road], edge: shapely.Geometry) -> FloatArray:
-        return open_ends(roads, edge, self.points(_is_blind_end))
 
     def _missing(
         self, slots: Slots, roads: Sequence[Road], entries: FloatArray, goals: FloatArray
@@ -515,15 +503,7 @@ def outline_draft(
     frame: LocalFrame,
     options: ImportOptions,
 ) -> LotDraft:
-    """Draft a lot from the outlines of its spaces; `parkenv.lots.infer.layout` has the rules.
-
-    Args:
-        name: the lot's name.
-        elements: all elements of the map.
-        roads: roads open to cars, in the lot's frame.
-        frame: the lot's frame.
-        options: goals, entries and bounds given by the user.
-    """
+    """Draft a lot from the outlines of its spaces; `parkenv.lots.infer.layout` has the rules."""
     drawn = [e for e in elements if is_space(e)]
     if len(drawn) > MOST_SPACES:
         raise InputError(
@@ -630,13 +610,7 @@ class CarPark:
 def import_car_parks(
     path: str | Path, options: ImportOptions, least: int = LEAST_SPACES
 ) -> Iterator[CarPark]:
-    """Yield the car parks of a town, the largest first.
-
-    Args:
-        path: an OpenStreetMap file with outlines of parking spaces.
-        options: whether entries and goals may be guessed, and which spaces count.
-        least: number of spaces below which a group of spaces is no car park.
-    """
+    """Yield the car parks of a town, groups of at least `least` spaces, the largest first."""
     path = Path(path)
     place = read_map(path)
     with naming(path):

@@ -96,8 +96,7 @@ class OsmMap:
     def within(self, bounds: tuple[tuple[float, float], tuple[float, float]]) -> OsmMap:
         """Cut the map at a box: roads end there; everything else stays whole if half of its corners are inside.
 
-        Args:
-            bounds: two corners, each a latitude and a longitude, degrees.
+        The bounds are two corners, each a latitude and a longitude, degrees.
         """
         corners = np.array(bounds)[:, ::-1]
         low, high = corners.min(axis=0), corners.max(axis=0)

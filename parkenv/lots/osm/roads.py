@@ -114,13 +114,9 @@ class Road:
 def road_of(
     element_id: str, tags: Mapping[str, str], points: FloatArray, *, town: bool = False
 ) -> Road | str | None:
-    """Create a road from a way; returns a reason if the road is left out, None if the way is not a road.
+    """Create a road from a way, (k, 2) m; return a reason if the road is left out, None if the way is not a road.
 
-    Args:
-        element_id: such as `way/123`.
-        tags: tags of the way.
-        points: (k, 2) m.
-        town: whether all that cars drive on counts: motorways, tunnels, and private ways to private parking.
+    In a town, all that cars drive on counts: motorways, tunnels, and private ways to private parking.
     """
     kind = tags.get("highway", "").removesuffix("_link")
     if kind not in STREET_WIDTH or tags.get("area") == "yes" or (kind == "motorway" and not town):
@@ -235,10 +231,7 @@ def clipped_road(road: Road, box: shapely.Geometry) -> list[Road]:
 def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> list[Road]:
     """Return the roads connected to slots, without service roads that do not lead to a slot.
 
-    Args:
-        roads: candidates for lanes.
-        around: other roads; a road that meets one of them is not a dead end.
-        slots: the slots to reach.
+    A road that meets one of those around is not a dead end.
     """
     parts = components_with_slots(roads, slots)
     kept = [road for part in parts for road in part]
@@ -258,12 +251,8 @@ def used_roads(roads: Sequence[Road], around: Sequence[Road], slots: Slots) -> l
 def open_ends(roads: Sequence[Road], edge: shapely.Geometry, blind: FloatArray) -> FloatArray:
     """Return the points where streets leave the map and cars may enter, (n, 2) m.
 
-    These are the road ends at the edge of the map or, if no road ends there, all ends that are not dead ends.
-
-    Args:
-        roads: all lanes.
-        edge: the polygon within which roads are lanes.
-        blind: (k, 2) m, road ends that are tagged as dead ends.
+    These are the road ends at the edge of the map or, if no road ends there, all ends that are not dead ends: `blind`,
+    (k, 2) m, are those tagged so.
     """
     ends = [
         xy
@@ -364,13 +353,7 @@ NO_LANE, SPLIT, CUTS = (
 
 
 class Turns(NamedTuple):
-    """The turns of a lot.
-
-    Attributes:
-        kept: those that it has.
-        found: a line that counts the restrictions of the map; none if there are none.
-        left_out: those left out.
-    """
+    """The turns of a lot, a line that counts the restrictions of the map, if there are any, and those left out."""
 
     kept: tuple[Turn, ...]
     found: tuple[str, ...]
@@ -382,15 +365,9 @@ def turns_of(
 ) -> Turns:
     """Return the turns of a lot.
 
-    Left out are those whose streets are no lanes of the lot, those at junctions that were split, and those with which
-    some street could not be reached, or left, that can be without: the map is incomplete there.
-
-    Args:
-        place: the map.
-        frame: frame of the lot.
-        whole: the lanes before junctions were split (`limit_junctions`).
-        lanes: the lanes.
-        away: whether restrictions away from the lanes are listed, too.
+    Left out are those whose streets are no lanes of the lot, those at junctions that were split (`whole` are the lanes
+    before), and those with which some street could not be reached, or left, that can be without: the map is incomplete
+    there. Restrictions away from the lanes are listed, too, if `away`.
     """
     named = [(turn.id, Turn(frame.to_xy(turn.line), turn.only)) for turn in place.turns]
     why = [NO_LANE] * len(named)

@@ -70,13 +70,9 @@ def row_anchors(points: FloatArray, stations: FloatArray, pitch: float, side: Si
 
 
 def row_at(anchors: RowAnchors, offset: FloatArray | float, how: Arrangement, *, with_points: bool) -> Slots:
-    """Create the slots of a row.
+    """Create the slots of a row, their near edge `offset` m, (n,) or scalar, from the centre line.
 
-    Args:
-        anchors: anchors of the row on its road.
-        offset: distance from the centre line to the near edge of the slots, m, (n,) or scalar.
-        how: arrangement of the parked cars.
-        with_points: whether cars pass the row in the order of the road's points.
+    `with_points`: whether cars pass the row in the order of the road's points.
     """
     heading = anchors.along if with_points else -anchors.along
     outward = anchors.outward
@@ -187,17 +183,12 @@ def kerb_of(tags: Mapping[str, str], side: Side) -> Kerb | str | None:
 
 
 def kerb_slots(road: Road, side: Side, kerb: Kerb, closed: Sequence[tuple[float, float]]) -> Slots:
-    """Create the slots along one side of a road.
+    """Create the slots along one side of a road, in the order of its points.
 
-    Cars face the direction of traffic, on the right. The number of slots is the tagged one, at most as many as fit at
-    5 m, or otherwise as many as fit at 6 m (2.5 m if cars park across the street). Slots are spread over the free
-    intervals. A tagged `width` includes cars parked on the carriageway.
-
-    Args:
-        road: the road.
-        side: side of the road in the order of its points.
-        kerb: arrangement of the parked cars.
-        closed: intervals that stay free, start and end in m from the road's start.
+    Cars face the direction of traffic, on the right. The number of slots is the tagged one, at most as many as fit at 5
+    m, or otherwise as many as fit at 6 m (2.5 m if cars park across the street). Slots are spread over the free
+    intervals; the closed ones are start and end in m from the road's start. A tagged `width` includes cars parked on
+    the carriageway.
     """
     how = ARRANGEMENTS[kerb.orientation]
     total = float(np.hypot(*np.diff(road.points, axis=0).T).sum())
@@ -253,12 +244,7 @@ def _distribute(
 
 
 class Junctions:
-    """The junctions of roads, and the parts of kerbs that they keep free.
-
-    Args:
-        roads: all roads, whether cars may park there or not.
-        crossings: (n, 2) m, pedestrian crossings.
-    """
+    """The junctions of roads and pedestrian crossings, (n, 2) m, and the parts of kerbs that they keep free."""
 
     def __init__(self, roads: Sequence[Road], crossings: FloatArray) -> None:
         self._roads = roads
@@ -321,22 +307,12 @@ def fill_outline(
     orientation: str | None,
     capacity: int | None,
 ) -> Slots:
-    """Fill an area with slots by rule: rows of 2.5 × 5 m along both sides of every aisle.
+    """Fill an area with slots by rule: rows of 2.5 × 5 m along both sides of every aisle; none without a road nearby.
 
-    Cars park across the aisle unless an orientation is given; if only slots of 6 × 2.1 m along the aisle fit, cars park
-    along it. Rows begin at the edge of the carriageway, or at the outline if the road passes outside. A slot is inside
-    the outline, clear of roads and blocked areas, and its mouth is nearest to its own road. Rows with more slots are
-    placed first; slots beyond the capacity are dropped from the end.
-
-    Args:
-        outline: the area, m.
-        roads: roads that pass it within 8 m.
-        blocked: areas without slots: buildings, mapped slots.
-        orientation: a key of `ARRANGEMENTS`, or None.
-        capacity: number of slots in the area, or None.
-
-    Returns:
-        The slots; empty without a road nearby.
+    Cars park across the aisle unless an orientation, a key of `ARRANGEMENTS`, is given; if only slots of 6 × 2.1 m
+    along the aisle fit, cars park along it. Rows begin at the edge of the carriageway, or at the outline if the road
+    passes outside. A slot is inside the outline, clear of roads and blocked areas, and its mouth is nearest to its own
+    road. Rows with more slots are placed first; slots beyond the capacity are dropped from the end.
     """
     if not roads:
         return NO_SLOTS

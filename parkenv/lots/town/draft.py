@@ -85,12 +85,7 @@ CLOSED = ("no", "military", "forestry", "agricultural")
 
 @dataclass(frozen=True, eq=False)
 class TownDraft:
-    """The draft of a town, and a table of its facilities.
-
-    Attributes:
-        draft: the lot.
-        facilities: a row for each facility, with the columns of `TABLE`.
-    """
+    """The draft of a town, and a table of its facilities, a row each with the columns of `TABLE`."""
 
     draft: LotDraft
     facilities: list[dict[str, Any]]

@@ -55,16 +55,6 @@ STATION = 20.0  # m, between the points of a street at which buildings are looke
 STRIP_REACH = 20.0  # largest distance, m, of a drawn kerb from its street
 
 
-def capacity_by_class(free_m: float, kind: str) -> float:
-    """Return the expected number of places of an untagged street.
-
-    Args:
-        free_m: m of kerb, both sides, 5 m off the corners at junctions.
-        kind: class of the street, a value of `highway`.
-    """
-    return PLACES_PER_METRE.get(kind, 0.0) * free_m
-
-
 def kerb_sides(
     roads: Sequence[Road],
     crossings: FloatArray,
@@ -74,12 +64,8 @@ def kerb_sides(
 ) -> Iterator[FacilityRow]:
     """Yield the kerbs of roads that have places, under the names of their streets; of a way there may be several.
 
-    Args:
-        roads: the roads of a town.
-        crossings: (n, 2) m, pedestrian crossings.
-        buildings: its buildings; without any, all streets have houses.
-        left_out: where kerbs that nobody may use are listed, by reason.
-        untagged: places of untagged kerbs, as a multiple of the rule's.
+    Kerbs that nobody may use are listed in `left_out`, by reason. Without any buildings, all streets have houses.
+    `untagged` are the places of untagged kerbs, as a multiple of the rule's.
     """
     street = {k: i for i, k in enumerate(k for k, road in enumerate(roads) if road.rank is Rank.STREET)}
     corners = Junctions([roads[k] for k in street], np.empty((0, 2)))
@@ -109,13 +95,17 @@ def kerb_sides(
                     kerb = replace(kerb, capacity=int(free / METRES_PER_PLACE[kerb.orientation]))
                     source, rule = "rule", "length of kerb"
             else:
-                if k not in street or not _may_have_kerbs(road) or (side == "left" and _is_half(road)):
+                if (
+                    k not in street
+                    or any(road.tags.get(key, "no") != "no" for key in ("bridge", "tunnel", "junction"))
+                    or (side == "left" and _is_half(road))
+                ):
                     continue
                 closed = closed + lonely[k]
                 off_corners = corners.closed_intervals(street[k], side) + lonely[k]
                 free = sum(end - start for start, end in free_intervals(total, off_corners))
                 free *= untagged * (2 if _is_half(road) else 1)
-                expected = capacity_by_class(free, kind) + rest[kind]
+                expected = PLACES_PER_METRE.get(kind, 0.0) * free + rest[kind]
                 rest[kind] = expected % 1.0
                 kerb = Kerb("parallel", int(expected), False)
             slots = kerb_slots(road, side, kerb, closed)
@@ -125,12 +115,9 @@ def kerb_sides(
 
 
 def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> FacilityRow | None:
-    """Return the kerb that is drawn as an area, under its name; None if it is not along a street.
+    """Return the kerb that is drawn as an area, under its name.
 
-    Args:
-        area: the drawn kerb.
-        roads: the roads of a town.
-        tree: their lines.
+    None if it is not along one of the roads in the tree.
     """
     tags = area.element.tags
     (index, distance) = tree.query_nearest(area.polygon, return_distance=True, all_matches=False)
@@ -164,11 +151,6 @@ def strip_side(area: Area, roads: Sequence[Road], tree: shapely.STRtree) -> Faci
 def _is_half(road: Road) -> bool:
     """Whether a road is one half of a dual carriageway."""
     return road.oneway and road.tags["highway"] in ("primary", "secondary", "tertiary")
-
-
-def _may_have_kerbs(road: Road) -> bool:
-    tags = road.tags
-    return not any(tags.get(key, "no") != "no" for key in ("bridge", "tunnel", "junction"))
 
 
 def _without_houses(roads: Sequence[Road], buildings: Sequence[Area]) -> list[list[tuple[float, float]]]:

@@ -50,11 +50,9 @@ LONGEST_BEYOND = 600.0  # m, longest way beyond the edge of the map that is assu
 
 @dataclass(frozen=True, eq=False)
 class Streets:
-    """The roads of a town, cut into pieces at junctions.
+    """The roads of a town, whole ways that cars may drive, cut into pieces at junctions.
 
-    Args:
-        roads: the roads that cars may drive, whole ways.
-        cut: ids of the ways that the edge of the map cuts.
+    `cut` are those cut by the edge.
     """
 
     roads: tuple[Road, ...]
@@ -250,13 +248,11 @@ class Streets:
         return [replace(self.roads[k], points=points) for k, points in self._runs(self.kept, set())]
 
     def lanes(self, mouths: FloatArray, entries: FloatArray | None = None) -> tuple[list[Lane], list[Lane]]:
-        """Return the lanes: the connected part without service roads that lead to none of the mouths, (n, 2) m.
+        """Return the lanes before and after junctions are split: the connected part that leads to the mouths, (n, 2) m.
 
-        Ways are cut at junctions with more than four ways out, so that `limit_junctions` can split these. With entries,
-        (m, 2) m, only the shortest ways between these and the mouths are left, each as long lanes as there can be.
-
-        Returns:
-            The lanes before junctions are split, and with these split.
+        Service roads that lead to none are left out. Ways are cut at junctions with more than four ways out, so that
+        `limit_junctions` can split these. With entries, (m, 2) m, only the shortest ways between these and the mouths
+        are left, each as long lanes as there can be.
         """
         kept = self._useful(mouths)
         if entries is not None:
@@ -265,13 +261,12 @@ class Streets:
         back = ~self.oneway[kept]
         ways_out = np.bincount(np.r_[a, b[back]], minlength=len(self.node_xy))
         crowded = set(np.flatnonzero(ways_out > len(MOVES)).tolist())
-        whole = [self._lane(self.roads[k], points) for k, points in self._runs(kept, crowded)]
+        whole = [
+            Lane(points, self.roads[k].oneway, _speed(self.roads[k]))
+            for k, points in self._runs(kept, crowded)
+        ]
         lanes = limit_junctions(whole)
         return whole, lanes if entries is None else _joined(lanes, mouths)
-
-    @staticmethod
-    def _lane(road: Road, points: FloatArray) -> Lane:
-        return Lane(points, road.oneway, _speed(road))
 
     def _between(self, kept: BoolArray, mouths: FloatArray, entries: FloatArray) -> BoolArray:
         """Return the pieces of those kept that are on a shortest way between entries and mouths, (n,) bool."""

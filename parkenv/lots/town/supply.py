@@ -219,13 +219,7 @@ def levels_of(tags: Mapping[str, str]) -> float | None:
 
 
 def expected_capacity(rule: str, area: float | None, levels: float | None) -> int:
-    """Return the number of places by the rule, at least 1.
-
-    Args:
-        rule: a key of `RULES`.
-        area: m², of one level; None: unknown.
-        levels: number of levels; None: unknown.
-    """
+    """Return the number of places by a rule of `RULES`, at least 1; the area (of a level, m²) may be unknown."""
     a = RULES[rule]
     if area is None:
         return a.typical
@@ -363,13 +357,7 @@ def matched(
 
     It is one within `NEAR` of about the same capacity, or one whose name shares a word with it within `SAME_NAME` times
     as far; words that many of the list have, such as *garage*, do not count. In all, distances are as small as can be.
-
-    Args:
-        listed: the car parks.
-        at: (k, 2) m, where they are.
-        names: of the n facilities.
-        capacity: (n,) of these.
-        xy: (n, 2) m, where these are entered.
+    The car parks are at `at`, (k, 2) m; facilities are entered at `xy`, (n, 2) m.
     """
     words = [set(_words(one.name)) for one in listed]
     use = Counter(word for mine in words for word in mine)

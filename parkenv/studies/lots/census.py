@@ -59,14 +59,8 @@ def take_census(
 ) -> list[Row]:
     """Count lots; write census.csv, census.png and contact sheets into a folder.
 
-    Args:
-        places: lots, and folders of lots.
-        folder: where the files go.
-        drive: plan manoeuvres, as `parkenv lot check` does.
-        progress: called as lots are finished.
-
-    Returns:
-        A row for each lot, the largest first; those of files that hold no lot say why.
+    Returns a row for each lot, the largest first; those of files that hold no lot say why. With `drive`, manoeuvres are
+    planned as `parkenv lot check` does.
     """
     from parkenv.show.figures.census import save_census
     from parkenv.show.figures.contact_sheet import save_contact_sheets
@@ -107,13 +101,7 @@ def count_lot(path: Path, *, drive: bool = True) -> tuple[Row, ParkingLot | None
 
 
 def lot_columns(lot: ParkingLot, issues: tuple[QualityIssue, ...] = (), *, drive: bool = True) -> Row:
-    """Return the columns of a lot in a census.
-
-    Args:
-        lot: the lot.
-        issues: what may be wrong with it, as its import knows.
-        drive: plan manoeuvres, as `parkenv lot check` does.
-    """
+    """Return the columns of a lot in a census; `issues` are what may be wrong with it, as its import knows."""
     counts = slots_by_kind(lot)
     drivability = check_drivability(lot, issues, drive=drive)
     low_x, low_y, high_x, high_y = lot.bounds()

@@ -80,14 +80,9 @@ def check_drivability(
     *,
     drive: bool = True,
 ) -> Drivability:
-    """Survey a lot.
+    """Survey a lot; with `drive`, for so many seconds plan the manoeuvres of the car that parks.
 
-    Args:
-        lot: the lot.
-        issues: what may be wrong with it, as its import knows.
-        vehicle: the car that parks.
-        seconds: time for planning manoeuvres.
-        drive: whether manoeuvres are planned.
+    `issues` are what may be wrong with the lot, as its import knows.
     """
     kinds, member = manoeuvre_kinds(lot) if drive else ([], np.zeros(lot.n_slots, dtype=np.int64))
     problems = [*_open_loops(lot), *_blocked_lanes(lot)]

@@ -16,12 +16,7 @@ from parkenv.studies.study import Progress, counted
 
 
 class TownLots(NamedTuple):
-    """The car parks of a town.
-
-    Attributes:
-        rows: a row for each: lot, spaces, slots, lanes, result, error_probability, reason.
-        pictures: contact sheets.
-    """
+    """A row for each car park (lot, spaces, slots, lanes, result, error_probability, reason), and contact sheets."""
 
     rows: list[Row]
     pictures: list[Path]
@@ -34,15 +29,7 @@ def import_town_lots(
     least: int = LEAST_SPACES,
     progress: Progress = lambda *_: None,
 ) -> TownLots:
-    """Write a lot of every car park of a town into a folder.
-
-    Args:
-        place: the file of the town.
-        folder: where the lots go.
-        options: see `import_car_parks`.
-        least: number of spaces of the smallest car park.
-        progress: called as car parks are finished.
-    """
+    """Write a lot of every car park of a town, of at least `least` spaces, into a folder; see `import_car_parks`."""
     rows: list[Row] = []
     lots = []
     done = counted(progress, "car parks")
