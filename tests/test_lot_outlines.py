@@ -316,7 +316,7 @@ class TestExtracts:
         assert lots[0].slot_ids == lots[1].slot_ids
         assert lots[0].slot_xy == pytest.approx(lots[1].slot_xy, abs=0.02)
         path.write_bytes(b"no extract" * 100)
-        with pytest.raises(InputError, match="not an OpenStreetMap extract"):
+        with pytest.raises(InputError, match="not an OpenStreetMap file"):
             import_lot(path, AUTO)
 
 
