@@ -20,7 +20,7 @@ from parkenv.lots.generators import city_lot
 from parkenv.studies.curve.fit import Paths, Town, fit_curve
 from parkenv.studies.curve.lone_search import LoneSearches
 from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Zones
-from parkenv.studies.fleet.measures import Roads
+from parkenv.studies.fleet.roads import Roads
 from parkenv.world.demand import Demand, ExponentialTime, PoissonArrivals
 from planners.heuristics import POLICIES
 

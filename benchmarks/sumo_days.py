@@ -23,9 +23,10 @@ from numpy.typing import NDArray
 
 from benchmarks.rows import Row, absent, duration, equal
 from parkenv.compiled.arrays import FloatArray
-from parkenv.engine.fleet import Fleet, drive_times
+from parkenv.engine.fleet import Fleet
 from parkenv.errors import InputError
 from parkenv.world.lot import ParkingLot
+from parkenv.world.scenario import drive_times
 from parkenv.world.week import HOUR_S
 
 PARKING_WEIGHTS = {

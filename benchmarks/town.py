@@ -12,7 +12,7 @@ import numpy as np
 from benchmarks.rows import Row, duration, equal, peak_memory_gib
 from benchmarks.sumo_days import streets_of, sumo_rows
 from parkenv.compiled.arrays import FloatArray
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import city_lot
 from parkenv.lots.generators import Slots
 from parkenv.scenarios.build import make_scenario
@@ -20,7 +20,7 @@ from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, LogNorma
 from parkenv.world.drive_graph import NODE_TOLERANCE, node_labels
 from parkenv.world.facility import Facility
 from parkenv.world.lot import Lane, ParkingLot, Turn
-from parkenv.world.scenario import Scenario
+from parkenv.world.scenario import Scenario, drive_times
 from parkenv.world.week import HOUR_S
 from planners.heuristics import POLICIES
 

@@ -13,12 +13,13 @@ from pathlib import Path
 
 import numpy as np
 
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import import_town, packaged_lot, write_lot
 from parkenv.scenarios.build import build
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.recorded_days import record_days
+from parkenv.world.scenario import drive_times
 from planners.heuristics import POLICIES
 
 DISTRICTS = {

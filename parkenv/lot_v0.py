@@ -7,6 +7,7 @@ parallel form, which advances by ticks. Both need the extra `multi`: `pip instal
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 import gymnasium as gym
@@ -23,7 +24,7 @@ try:
 except ImportError as error:
     raise DependencyNotInstalled(needs_extra("parkenv.lot_v0", "multi")) from error
 
-from parkenv.engine.fleet import MAX_STEPS, DriverKind, Fleet
+from parkenv.engine.fleet import DriverKind, Fleet, FleetOptions
 from parkenv.engine.records import SEARCHING, TRUNCATED
 from parkenv.engine.spaces import action_number
 from parkenv.files.known_names import MAX_CARS
@@ -49,9 +50,6 @@ class _CarsAsAgents:
         "render_fps": 8,
         "is_parallelizable": False,
     }
-    _fleet_options: tuple[str, ...] = (
-        "delay_s", "leave_full_lot", "manoeuvre_s", "leaving_soon_s", "sees_cars",
-    )  # fmt: skip
 
     def __init__(
         self,
@@ -59,7 +57,7 @@ class _CarsAsAgents:
         cars: int = 5,
         demand: Demand | TownDemand | None = None,
         background: str = "residents",
-        max_cycles: int = MAX_STEPS,
+        max_cycles: int = FleetOptions.max_steps,
         render_mode: str | None = None,
         knows: str = "own",
         **changes: Any,
@@ -69,18 +67,17 @@ class _CarsAsAgents:
             require_whole("cars", cars, least=1, most=MAX_CARS)
             demand = Demand(Headways(int(cars)))
         require_whole("max_cycles", max_cycles, least=1)
-        require_changes((type(self), LotEnv), changes, *self._fleet_options)
-        options = {name: value for name, value in changes.items() if name in self._fleet_options}
-        fields = {name: value for name, value in changes.items() if name not in options}
-        # With the hidden occupancy: not for agents.
-        self.fleet = Fleet(
-            make_scenario(scenario, **fields),
-            demand,
+        own = ("drivers", "background", "max_steps")
+        known = [field.name for field in fields(FleetOptions) if field.name not in own]
+        require_changes((type(self), LotEnv), changes, *known)
+        options = FleetOptions(
+            drivers=(DriverKind(knows=knows, shares=knows == "shared"),),
             background=background,
-            drivers=[DriverKind(knows=knows, shares=knows == "shared")],
             max_steps=max_cycles,
-            **options,
+            **{name: changes.pop(name) for name in known if name in changes},
         )
+        # With the hidden occupancy: not for agents.
+        self.fleet = Fleet(make_scenario(scenario, **changes), demand, options)
         self.scenario = self.fleet.scenario
         self.render_mode, self.max_cycles = render_mode, max_cycles
         self.possible_agents = [f"car_{i}" for i in range(demand.max_cars)]
@@ -330,7 +327,6 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
     """
 
     metadata = _CarsAsAgents.metadata | {"is_parallelizable": True}
-    _fleet_options = (*_CarsAsAgents._fleet_options, "tick_s")
 
     def __init__(
         self, scenario: ScenarioSource = "mini", cars: int = 5, tick_s: float = 1.0, **options: Any

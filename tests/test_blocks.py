@@ -11,8 +11,9 @@ from parkenv import ParkingLot, fleet, make_scenario
 from parkenv.engine.records import STATES
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.show.report.town_map import town_data
-from parkenv.studies.fleet.blocks import ALL, BLOCKS, HOURS, LANES, NOWHERE, Blocks
-from parkenv.studies.fleet.measures import Roads
+from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE, Blocks
+from parkenv.studies.fleet.day import ALL
+from parkenv.studies.fleet.roads import Roads
 from parkenv.world.facility import Facility
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_bound_s
-from parkenv.studies.fleet.measures import Roads
+from parkenv.studies.fleet.roads import Roads
 from parkenv.studies.fleet.study import FleetStudy
 
 

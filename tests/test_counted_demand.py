@@ -12,13 +12,13 @@ from made_maps import FREIBURG, STREET
 from test_import_town import grid
 
 from parkenv import InputError, ParkingLot, make_scenario
-from parkenv.engine.fleet import drive_times
 from parkenv.lots import import_town, write_lot
 from parkenv.lots.generators import NO_SLOTS, Slots
 from parkenv.lots.local_frame import LocalFrame
 from parkenv.lots.osm.elements import read_map
 from parkenv.lots.town.streets import read_streets
 from parkenv.world.facility import Facility
+from parkenv.world.scenario import drive_times
 from parkenv.world.tariff import PUBLIC
 
 LIST = {"P1": (100, 100.0, 205.0), "Parkhaus P0": (100, 260.0, 330.0), "empty": (100, 300.0, 205.0)}

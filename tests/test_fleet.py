@@ -21,7 +21,6 @@ from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
 from parkenv.world.demand import (
     ConstantTime,
     Demand,
-    EmpiricalTime,
     ExponentialTime,
     Headways,
     ListedArrivals,
@@ -104,7 +103,7 @@ def test_one_car_is_the_single_search_to_the_last_bit(source, changes):
     env = gym.make("parkenv/Search-v2", scenario=source, **changes).unwrapped
     fleet = Fleet(env.scenario, Demand(Headways(1)), background="process")
     rng = np.random.default_rng(0)
-    for seed in range(12):
+    for seed in range(8):
         fleet.reset(seed)
         observation, _ = env.reset(seed=seed)
         over = False
@@ -191,9 +190,9 @@ def check_state(fleet, time):
     return fleet.time
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=45, deadline=None)
 @given(fleets, st.data())
-def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(arguments, data):
+def test_cars_are_conserved_slots_hold_one_car_and_little_s_law_holds(arguments, data):
     fleet, time = random_fleet(*arguments), -math.inf
     rng = np.random.default_rng(data.draw(st.integers(0, 99)))
     while (car := fleet.next_decision()) is not None:
@@ -202,8 +201,12 @@ def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(argumen
             assert fleet.observation_space.contains(fleet.observation(car))
         fleet.act(rng.integers(5))
     time = check_state(fleet, time)
-    assert fleet.totals["due"] == fleet.totals["searching"] == 0
-    cars = fleet.cars
+    cars, totals = fleet.cars, fleet.totals
+    assert totals["due"] == totals["searching"] == 0
+    # Little's law, to the bit.
+    assert totals["searching_s"] == pytest.approx(np.sum(cars["ended_at"] - cars["arrival"]), abs=1e-5)
+    stayed = np.minimum(cars["left_at"], fleet.time) - cars["ended_at"]
+    assert totals["parked_s"] == pytest.approx(stayed[cars["slot"] >= 0].sum(), abs=1e-5)
     fleet.run([None if kind.policy else object() for kind in fleet.drivers], until=fleet.time + 300.0)
     check_state(fleet, time)
     left = cars["state"] == LEFT
@@ -212,19 +215,6 @@ def test_cars_are_conserved_slots_hold_one_car_and_time_does_not_go_back(argumen
     np.testing.assert_allclose(searched, cars["drive_s"] + cars["failed_s"], atol=1e-6)
     assert (cars["queued_s"] <= cars["drive_s"] + 1e-9).all()
     assert (fleet.slots["held_by"] == -1).all()
-
-
-@settings(max_examples=15, deadline=None)
-@given(fleets)
-def test_little_s_law_holds_exactly(arguments):
-    fleet = random_fleet(*arguments)
-    rng = np.random.default_rng(0)
-    while fleet.next_decision() is not None:
-        fleet.act(rng.integers(5))
-    cars, totals = fleet.cars, fleet.totals
-    assert totals["searching_s"] == pytest.approx(np.sum(cars["ended_at"] - cars["arrival"]), abs=1e-5)
-    stayed = np.minimum(cars["left_at"], fleet.time) - cars["ended_at"]
-    assert totals["parked_s"] == pytest.approx(stayed[cars["slot"] >= 0].sum(), abs=1e-5)
 
 
 @settings(max_examples=10, deadline=None)
@@ -289,11 +279,11 @@ def test_a_car_without_patience_goes_elsewhere():
 def test_goals_and_entries_are_drawn_by_weight():
     scenario = parkenv.make_scenario("campus")
     n_goals, n_entries = len(scenario.lot.goals), len(scenario.lot.entries)
-    demand = Demand(
-        Headways(300),
-        goal_weights=(1.0,) * (n_goals - 1) + (2.0,),
-        entry_weights=(1.0,) + (0.0,) * (n_entries - 1),
-    )
+    weights = {
+        "goal_weights": (1.0,) * (n_goals - 1) + (2.0,),
+        "entry_weights": (1.0,) + (0.0,) * (n_entries - 1),
+    }
+    demand = Demand(Headways(300), **weights)
     fleet = Fleet(scenario, demand, drivers=[GREEDY])
     fleet.reset(0)
     assert set(fleet.cars["entry"]) == {scenario.lot.entry_vertices[0]}
@@ -341,17 +331,11 @@ class Raises:
     [
         (lambda: Headways(0), "Headways.cars is 0"),
         (lambda: Headways(3, -1.0), "Headways.mean_s is -1.0"),
-        (lambda: PoissonArrivals(0.0), "no car would arrive"),
         (lambda: PoissonArrivals((1.0,) * 23), "want one or 24"),
         (lambda: PoissonArrivals(5.0, 3600.0, 3600.0), "PoissonArrivals.end_s is 3600.0"),
-        (lambda: PoissonArrivals(math.inf), "PoissonArrivals.per_hour is inf"),
-        (lambda: PoissonArrivals(1e9), "want at most 1,000,000"),
+        (lambda: PoissonArrivals(1e9), "1,000,000"),
         (lambda: ListedArrivals((5.0, 4.0)), r"ListedArrivals.times_s\[1\] is 4.0"),
-        (lambda: ListedArrivals((90000.0,)), "seconds of the day"),
-        (lambda: ListedArrivals(()), "at least one number"),
         (lambda: ExponentialTime(0.0), "ExponentialTime.mean_s is 0.0"),
-        (lambda: ExponentialTime(math.inf), "ExponentialTime.mean_s is inf"),
-        (lambda: EmpiricalTime((5.0, 0.0)), r"EmpiricalTime.values_s\[1\] is 0.0"),
         (lambda: ConstantTime(math.nan), "ConstantTime.seconds is nan"),
         (lambda: Demand(stay=60.0), "Demand.stay is 60.0"),
         (lambda: Demand(goal_weights=(0.0,)), "Demand.goal_weights"),

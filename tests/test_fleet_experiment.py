@@ -4,16 +4,17 @@ import math
 
 import numpy as np
 import pytest
-from command_line import parkenv, ran, refused, rows_in, summary_of
+from command_line import parkenv, refused, rows_in, summary_of
 from pictures import shows_color
 
-from parkenv import InputError, SearchProblem, make_scenario, open_run
+from parkenv import InputError, SearchProblem, open_run
 from parkenv.lots import grid_lot
 from parkenv.scenarios.calibration import Calibration
 from parkenv.scenarios.spec import scenario_specs
 from parkenv.show.figures.fleet import KNOWLEDGE_COLORS
 from parkenv.studies.agent_spec import AgentSpec
-from parkenv.studies.fleet.measures import Roads, gini, looks_s
+from parkenv.studies.fleet.measures import gini, random_order_search_s
+from parkenv.studies.fleet.roads import Roads
 from parkenv.studies.fleet.setting import MEASURES, Setting
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import summarize_days
@@ -82,17 +83,8 @@ def test_measures_of_a_day_are_those_of_its_cars():
     assert day["cruised_m"] < day["driven_m"]
     assert day["bound_s"] <= day["clairvoyant_s"] < day["total_s"]
     assert day["search_s"] == pytest.approx((cars["drive_s"] + cars["failed_s"]).mean())
-
-
-def test_nobody_is_faster_than_alone():
-    scenario = make_scenario("mini")
-    roads = Roads(scenario)
-    its = experiment(arrivals_per_hour=(5.0,), knows=("full",))
-    fleet, agents = its.fleet(its.fleet_settings[0])
-    fleet.reset(1)
-    fleet.run(agents)
-    assert (fleet.cars["total_s"] >= roads.alone_s(fleet) - 1e-9).all()
-    parked = fleet.cars[fleet.cars["slot"] >= 0]
+    roads, parked = Roads(fleet.scenario), cars[cars["slot"] >= 0]
+    assert (cars["total_s"] >= roads.alone_s(fleet) - 1e-9).all()
     assert (parked["driven_m"] >= roads.direct_m(parked) - 1e-9).all()
 
 
@@ -102,9 +94,6 @@ def test_an_agent_in_python_drives_as_the_compiled_one():
         for agent in ("first-free", "first-free(within_m=1000)")
     )
     assert compiled["cars"] == python["cars"]
-    its = experiment(agents=("belief",), knows=("own", "reserve"), days=1)
-    days = days_of(its)
-    assert [one[0]["agents"] for one in days] == ["belief", "belief"]
 
 
 def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
@@ -129,13 +118,14 @@ def test_the_price_of_anarchy_is_the_ratio_to_reservations_for_all():
     assert rows[1]["difference_s"] == rows[1]["members_difference_s"] == pytest.approx(np.mean(paired))
     assert math.isnan(rows[1]["others_difference_s"])
     assert math.isnan(summarize_days(days[1:2])[0]["difference_s"])
-    alone = summarize_days(days[:1])
-    assert math.isnan(alone[0]["price_of_anarchy"])
+    _, other = summarize_days([own, reserve[1:]])
+    assert other["difference_s"] == pytest.approx(np.mean(paired[1:])), "of the days that both have"
+    assert math.isnan(summarize_days(days[:1])[0]["price_of_anarchy"])
 
 
 def test_the_closed_form_of_random_looks_ends_at_the_last_slot():
     problem = SearchProblem(lot=grid_lot(1, 20))
-    one, all_but_none = looks_s(problem, np.array([0.0, 1.0]))
+    one, all_but_none = random_order_search_s(problem, np.array([0.0, 1.0]))
     hop_s = 2.5 / problem.v_drive
     assert all_but_none - one == pytest.approx(20 * hop_s, rel=0.05)
 
@@ -148,36 +138,27 @@ def test_the_command_writes_rows_days_and_a_figure(tmp_path):
     summary = summary_of(tmp_path / "a")
     rows = summary["rows"]
     assert len(rows) == 2 * 7
-    wanted = (
-        "agents knows share arrivals_per_hour total_s total_s_ci95 search_s failed_attempts balked_fraction"
-    )
-    assert {*wanted.split(), "price_of_anarchy", "price_of_anarchy_ci95"} <= rows[0].keys()
     assert shows_color(tmp_path / "a" / "fleet.png", KNOWLEDGE_COLORS["reserve"])
     days = rows_in(tmp_path / "a" / "days.csv")
     assert len(days) == 2 * len(rows)
     assert done.stdout.count("reserve ") >= 4
     assert [path.name for path in open_run(tmp_path / "a").figures()] == ["fleet.png"]
-    ran("fleet", *words, "--out", tmp_path / "b")
-    assert (tmp_path / "b" / "days.csv").read_bytes() == (tmp_path / "a" / "days.csv").read_bytes()
 
 
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("--knows", "own,al"), "--knows is 'al', want 'own', 'shared', 'reserve' or 'full'"),
-        (("--knows", "own,own"), "--knows is ['own', 'own'], want different values; 'own' is repeated"),
-        (("--share", "0.5,1.5"), "--share is 1.5, want a number of at most 1"),
-        (("--share", ""), "--share is [], want at least 1 values"),
-        (("--arrivals-per-hour", "0"), "--arrivals-per-hour is '0', want a number above 0"),
-        (("--stay-min", "inf"), "--stay-min is 'inf', want a number"),
-        (
-            ("--hours", "08:00-08:00"),
-            "the arrivals of 'mini' are at one time, want hours in which cars arrive",
-        ),
-        (("--decision-limit", "1", "--backend", "dask"), "decision_limit_s requires the backend loky or ray"),
+        (("--knows", "own,al"), "--knows is 'al'"),
+        (("--knows", "own,own"), "'own' is repeated"),
+        (("--share", "0.5,1.5"), "--share is 1.5"),
+        (("--share", ""), "--share is []"),
+        (("--arrivals-per-hour", "0"), "--arrivals-per-hour is '0'"),
+        (("--stay-min", "inf"), "--stay-min is 'inf'"),
+        (("--hours", "08:00-08:00"), "the arrivals of 'mini' are at one time"),
+        (("--decision-limit", "1", "--backend", "dask"), "decision_limit_s"),
         (("--calibrated", "nothing.json"), "nothing.json"),
-        (("--arrivals-per-hour", "1e6"), "cars arrive in the window, want at most 1,000,000"),
-        (("--agents", "oracle"), "agent 'oracle' knows the future of single searches"),
+        (("--arrivals-per-hour", "1e6"), "1,000,000"),
+        (("--agents", "oracle"), "agent 'oracle'"),
     ],
 )
 def test_bad_input_is_refused_before_anything_is_run(words, message, tmp_path):
@@ -186,41 +167,8 @@ def test_bad_input_is_refused_before_anything_is_run(words, message, tmp_path):
 
 
 def test_an_experiment_without_bounds_is_refused():
-    with pytest.raises(InputError, match="is 40000000 days, want at most 10000000"):
+    with pytest.raises(InputError, match="40000000 days"):
         experiment(days=10_000, arrivals_per_hour=tuple(map(float, range(1, 1001))))
-
-
-WORDS = [
-    "--scenario",
-    "mini",
-    "--hours",
-    "08:00-09:00",
-    "--arrivals-per-hour",
-    "30",
-    "--knows",
-    "own,reserve",
-]
-
-
-def test_a_finished_run_is_extended_and_not_mixed_with_another(tmp_path):
-    out, whole = tmp_path / "out", tmp_path / "whole"
-    ran("fleet", *WORDS, "-n", 1, "--no-figures", "--out", out)
-    for words, message in (
-        (("--stay-min", "30"), "--resume: stay_s was 3600.0"),
-        (("--hours", "08:00-10:00"), "--resume: mini.arrivals.hours was '08:00-09:00'"),
-    ):
-        assert message in refused("fleet", "--resume", *words, "--out", out)
-    done = parkenv("fleet", "--resume", "-n", 2, "--share", "0.5,1", "--out", out)
-    assert (done.returncode, done.stderr) == (0, "")
-    ran("fleet", *WORDS, "-n", 2, "--share", "0.5,1", "--out", whole)
-    assert (out / "days.csv").read_bytes() == (whole / "days.csv").read_bytes()
-
-
-def test_a_part_of_the_days_is_compared_with_the_same_days():
-    its = experiment(knows=("own", "reserve"), days=2)
-    own, reserve = days_of(its)
-    _, row = summarize_days([own, reserve[1:]])
-    assert row["difference_s"] == pytest.approx(reserve[1]["total_s"] - own[1]["total_s"])
 
 
 def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
@@ -228,10 +176,7 @@ def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
     for name, value in (("leaving_soon_s", 20.0), ("manoeuvre_s", 12.0), ("sees_cars", True)):
         changed = crowded.changed(**{name: value})
         assert changed.settings() != crowded.settings()
-        fleet, _ = changed.fleet(changed.fleet_settings[0])
-        expected = value if name == "sees_cars" else float(value)
-        found = fleet.sees_cars if name == "sees_cars" else float(fleet.records[name][0])
-        assert found == expected
+        assert getattr(changed.fleet(changed.fleet_settings[0])[0].options, name) == value
     measured = Calibration("mini", 2.0, 15.0, 14.0, 40, 2.8)
     measured.to_file(tmp_path / "calibrated.json")
     calibrated = crowded.changed(calibrated=tmp_path / "calibrated.json")
@@ -249,27 +194,34 @@ def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
 @pytest.mark.parametrize(
     ("module", "body", "message"),
     [
-        ("leaving", "raise SystemExit(3)", ": its agent raised SystemExit at"),
-        ("endless", "while True: pass", "its agent raised TimeoutError at"),
-        ("raising", "raise RuntimeError('no idea')", ": its agent raised RuntimeError at"),
-        ("mistaken", "return 17, state", "action is 17, want a whole number from 0 to 4"),
+        ("leaving", "raise SystemExit(3)", "SystemExit"),
+        ("endless", "while True: pass", "TimeoutError"),
     ],
 )
-def test_an_agent_that_fails_is_named_with_setting_day_and_car_and_earlier_days_are_kept(
-    tmp_path, module, body, message
-):
+def test_an_agent_that_fails_is_named_and_earlier_days_are_kept(tmp_path, module, body, message):
     (tmp_path / f"{module}.py").write_text(
         "class Failing:\n"
         "    calls = 0\n"
         "    def __init__(self, scenario): pass\n"
         "    def predict(self, observation, state=None, **_):\n"
         "        Failing.calls += 1\n"
-        "        if Failing.calls > 200:\n"
+        "        if Failing.calls > 100:\n"
         f"            {body}\n"
         "        return int(observation['action_mask'].nonzero()[0][-1]), state\n"
     )
     out = tmp_path / "out"
-    words = (*WORDS[:4], "--arrivals-per-hour", "3", "--knows", "own", "-n", 30)
+    words = (
+        "--scenario",
+        "mini",
+        "--hours",
+        "08:00-09:00",
+        "--arrivals-per-hour",
+        3,
+        "--knows",
+        "own",
+        "-n",
+        30,
+    )
     words += ("--decision-limit", "0.5")
     said = refused("fleet", "--agents", f"{module}:Failing", *words, "--jobs", 1, "--out", out, cwd=tmp_path)
     assert message in said

@@ -167,7 +167,7 @@ def test_a_car_in_a_queue_stands_still_in_pictures():
         while (car := fleet.next_decision(fleet.begin + second)) is not None:
             fleet.act(toward((near, far)[car], int(fleet.observation(car)["vertex"])))
         if 1 in (searching := np.flatnonzero(fleet.cars["state"] == SEARCHING)):
-            at[second] = fleet.poses().xy[list(searching).index(1)]
+            at[second] = fleet.poses()[0][list(searching).index(1)]
     hops = np.hypot(*np.diff(np.array(list(at.values())), axis=0).T)
     assert hops.max() <= 0.55 * SCENARIO.v_drive, "it does not jump back"
     assert (hops == 0.0).sum() >= 55, "it waits for half a minute"

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from parkenv.compiled.keyed_random import world_key
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.lots import write_lot
 from parkenv.scenarios.build import make_scenario
@@ -30,6 +30,7 @@ from parkenv.world.demand import (
 )
 from parkenv.world.durations import rest_of_stay
 from parkenv.world.occupancy.process import Arrival, ArrivalDay
+from parkenv.world.scenario import drive_times
 from parkenv.world.tariff import Price, Zone
 from planners.heuristics.policies import POLICIES
 
@@ -179,14 +180,14 @@ def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
     ]
     fleet = Fleet(its, TownDemand(of))
     fleet.reset(3)
-    costs = fleet.zone_cost_s()  # of kerb and residents
+    costs = fleet.scenario.zone_cost_s(fleet.drawn.drivers)  # of kerb and residents
     rich = np.isinf(costs[:, 1])
     assert rich.sum() == 5
     assert_array_equal(costs[rich, 0], 300.0)
     assert_array_equal(costs[~rich], [[900.0, 0.0]] * 5)
     for car in range(10):
-        alone = its.walk_s + its.parking_cost_of(fleet.drivers_of(car)) + its.enter_s
-        assert_array_equal(fleet.arrival_cost_s(car), alone)
+        alone = its.walk_s + its.parking_cost_of(fleet.drawn.drivers_of(car)) + its.enter_s
+        assert_array_equal(fleet.drawn.arrival_cost_s(car), alone)
     with pytest.raises(InputError, match="permit-b"):
         Fleet(its, Demand(Headways(2), classes={"permit-b": 1.0})).reset()
 
@@ -200,7 +201,9 @@ def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
     assert len(cars) == sum(one.parked for one in town.demand.purposes)
     assert_array_equal(np.bincount(cars["parked_at"], minlength=town.lot.n_slots), fleet.counts())
     assert (fleet.counts() <= town.lot.capacity).all()
-    of_car = fleet.zone_cost_s()[fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]]
+    of_car = fleet.scenario.zone_cost_s(fleet.drawn.drivers)[
+        fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]
+    ]
     assert np.isfinite(of_car).all()
 
 

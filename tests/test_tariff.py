@@ -9,7 +9,7 @@ import pytest
 from small_lots import features
 
 from parkenv import InputError, ParkingLot, fleet, make_scenario
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.lots import grid_lot, packaged_lot, write_lot
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
@@ -18,6 +18,7 @@ from parkenv.studies.fleet.drivers import AgentsByStay, policy_of
 from parkenv.world.cost_terms import COST_FIELDS
 from parkenv.world.demand import ConstantTime, Demand, ExponentialTime, Headways
 from parkenv.world.occupancy.process import OccupancyProcess
+from parkenv.world.scenario import drive_times
 from parkenv.world.tariff import NO_ZONE, Hours, Price, Tariff, Zone
 from planners import make_agent
 from planners.heuristics import POLICIES

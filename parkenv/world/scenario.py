@@ -11,6 +11,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from parkenv.compiled.arrays import BoolArray, FloatArray
@@ -412,6 +413,20 @@ class Scenario(SearchProblem):
     def forecast(self, arrival: Arrival) -> Forecast:
         """Return the forecast for a search that starts at the arrival."""
         return (self.prior or self.occupancy).forecast(arrival)
+
+
+def drive_times(problem: SearchProblem, vertex: int | NDArray[np.int64]) -> FloatArray:
+    """Return the shortest drive time from a vertex, or several, to each slot's stop position, (..., n_slots) s.
+
+    It is infinite where there is no way.
+    """
+    return drive_metres(problem.lot, vertex, timed=True) / problem.v_drive
+
+
+def drive_metres(lot: ParkingLot, vertex: int | NDArray[np.int64], *, timed: bool = False) -> FloatArray:
+    """Return the shortest drive from a vertex, or several, to each slot, (..., n_slots) m; see `drive_matrix`."""
+    metres = dijkstra(lot.drive_matrix(timed), indices=np.asarray(vertex))
+    return np.asarray(metres[..., : lot.n_slots])
 
 
 def _read_only(array: NDArray[Any]) -> NDArray[Any]:

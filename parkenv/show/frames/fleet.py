@@ -44,8 +44,7 @@ class FleetRenderer:
         paint(image, view, cars(parked, "resident", SIZE, px=SMALLEST_CAR))
         for goal in sorted({scenario.goal for scenario in fleet.scenarios}):
             paint_goal(image, view, lot.goals[goal])
-        searching = fleet.poses()
-        paint(image, view, cars(posed(searching.xy, searching.yaw), "car", SIZE, px=SMALLEST_CAR, edge="ink"))
+        paint(image, view, cars(posed(*fleet.poses()), "car", SIZE, px=SMALLEST_CAR, edge="ink"))
         line, totals = self._key.copy(), fleet.totals
         counts = (f"{totals[name]:.0f} {name}" for name in ("searching", "parked", "gone"))
         write_line(line, (clock(fleet.time), *counts))

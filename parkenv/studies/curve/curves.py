@@ -18,7 +18,7 @@ from parkenv.files.atomic_write import write_text
 from parkenv.files.csv_tables import csv_columns, csv_text, write_csv
 from parkenv.files.limited_reading import read_json
 from parkenv.studies.curve.fit import OUTCOMES, CurveTable, Paths, fit_form
-from parkenv.studies.fleet.blocks import ALL
+from parkenv.studies.fleet.day import ALL
 from parkenv.studies.results import Row, without_nan
 
 JSON = "curve.json"

@@ -1,4 +1,4 @@
-"""How long one driver more would search, from how full each street and garage is: a model without any fitted number.
+"""The search of one driver more, from how full each street and garage is: a model without any fitted number.
 
 The driver goes to the place that is cheapest by its rule, through it if it has no space, and on from there to the next.
 A *place* is a run of slots on one side of a street, between two junctions and in one zone, or a counted facility. Each
@@ -11,6 +11,7 @@ drive over the chance that it expects of a space; where places were full, others
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
@@ -29,6 +30,38 @@ _ENOUGH = 0.01
 """Chance that nothing was found yet below which a search is not followed any more."""
 
 
+class Places(NamedTuple):
+    """The places of a lot: columns of tables, with a row for each entry or goal; places of a zone fill alike."""
+
+    entry_drive_s: FloatArray  # (n_entries, k)
+    drive_s: FloatArray  # (k, k), from the beginning of a place through it to that of another
+    walk_s: FloatArray  # (n_goals, k)
+    enter_s: FloatArray  # (k,) time inside that drivers expect
+    size: IntArray  # (k,) slots
+    zone: IntArray  # (k,)
+
+
+class Hours(NamedTuple):
+    """States of places in each hour of a day, (n_hours, k)."""
+
+    believed: FloatArray  # P(taken) that drivers expect of a slot
+    full: FloatArray  # chance that there is no space
+    inside_s: FloatArray  # time at the barrier and inside
+
+
+class Searchers(NamedTuple):
+    """Cars, (n,) each; what a second of arrival cost and one of the drive count for them."""
+
+    entry: IntArray
+    goal: IntArray
+    hour: IntArray
+    walks: FloatArray
+    patience_s: FloatArray
+    zone_cost_s: FloatArray  # (n, n_zones)
+    per_cost: float
+    per_drive: float
+
+
 class LoneSearches:
     """Searches of one driver more in the days of a scenario.
 
@@ -40,91 +73,88 @@ class LoneSearches:
         problem, lot = scenarios[0], scenarios[0].lot
         streets = streets_of(lot, np.asarray(problem.move_cost_s))
         begin, end = streets["place_first"][:-1], streets["place_first"][1:] - 1
-        self._slots, self._begin, self._size = streets["slots"], begin, (end - begin + 1).astype(np.int64)
+        self._slots, self._begin, size = streets["slots"], begin, (end - begin + 1).astype(np.int64)
         first, last, zone = self._slots[begin], self._slots[end], lot.zone_of_slot[self._slots[begin]]
         self._capacity, self._entries = lot.capacity, np.unique(lot.entry_vertices)
         drives = lot.drive_matrix(timed=True)
-        to_first_s = [
-            dijkstra(drives, indices=its)[:, first] / problem.v_drive for its in (self._entries, last)
-        ]
-        to_first_s[1] += (streets["along_s"][end] - streets["along_s"][begin])[:, None]
-        walk_s = self._mean(np.array([one.walk_s for one in scenarios]))
+        entry_drive_s, drive_s = (
+            dijkstra(drives, indices=vertices)[:, first] / problem.v_drive
+            for vertices in (self._entries, last)
+        )
+        drive_s += (streets["along_s"][end] - streets["along_s"][begin])[:, None]
         self._inside_s = np.zeros((2, len(first)))
         for place in np.flatnonzero(lot.is_counted[first]):
             facility = lot.facilities[lot.facility_of_slot[first[place]]]
             self._inside_s[:, place] = np.add(facility.gate_s, facility.inside_s)
-        self._of_places = (*to_first_s, walk_s, self._mean(problem.enter_s), self._size, zone)
+        self._size = size
+        walk_s = self._mean(np.array([scenario.walk_s for scenario in scenarios]))
+        self._places = Places(entry_drive_s, drive_s, walk_s, self._mean(problem.enter_s), size, zone)
 
     def _mean(self, of_slots: FloatArray) -> FloatArray:
         return np.asarray(np.add.reduceat(of_slots[..., self._slots], self._begin, axis=-1) / self._size)
 
     def of_day(
-        self, fleet: Fleet, taken: IntArray, looks: IntArray, which: BoolArray, hour: IntArray
+        self, fleet: Fleet, taken: IntArray, sampled: IntArray, which: BoolArray, hour: IntArray
     ) -> FloatArray:
-        """Return what lone searches of cars of a day are like, (4, n): see `lone_searches`.
+        """Return measures of lone searches of cars of a day, (4, n); see `simulate_single_driver`.
 
         Args:
             fleet: the fleet; all cars have the rule of its first kind of drivers.
-            taken: (k, n_slots) how many cars were in each slot at each look.
-            looks: (k,) hours of the day's looks, from 0.
+            taken: (k, n_slots) numbers of cars in each slot at each sample.
+            sampled: (k,) hours of the day's samples, from 0.
             which: (n_cars,) the cars, n of them.
             hour: (n,) the hours in which they arrive.
         """
         rule, cars = fleet.drivers[0].policy, fleet.cars[which]
         weights = RULES.get("" if rule is None else rule.name)
         no_space = np.logical_and.reduceat((taken >= self._capacity)[:, self._slots], self._begin, axis=1)
-        full, filled, believed = np.zeros((3, int(looks[-1]) + 1, len(self._size)))
+        full, filled, believed = np.zeros((3, int(sampled[-1]) + 1, len(self._size)))
         for k in range(len(full)):
-            full[k], filled[k] = (
-                no_space[looks == k].mean(axis=0),
-                self._mean(taken[looks == k].mean(axis=0) / self._capacity),
-            )
+            full[k] = no_space[sampled == k].mean(axis=0)
+            filled[k] = self._mean(taken[sampled == k].mean(axis=0) / self._capacity)
             if weights is None:
                 middle = fleet.begin // HOUR_S * HOUR_S + (k + 0.5) * HOUR_S
-                arrival = Arrival(middle, fleet.day.date)
-                believed[k] = self._mean(np.asarray(fleet.scenario.occupancy.forecast(arrival).p_occupied))
+                forecast = fleet.scenario.occupancy.forecast(Arrival(middle, fleet.day.date))
+                believed[k] = self._mean(np.asarray(forecast.p_occupied))
         empty_s, full_s = self._inside_s
-        return np.asarray(lone_searches(
-            np.searchsorted(self._entries, cars["entry"]), cars["place"].astype(np.int64), hour, cars["walks"].copy(),
-            cars["patience_s"].copy(), fleet.zone_cost_s()[which], *(weights or (1.0, 1.0)), believed, full,
-            empty_s + filled * (full_s - empty_s), *self._of_places,
-        ))  # fmt: skip
+        hours = Hours(believed, full, empty_s + filled * (full_s - empty_s))
+        entry, goal = np.searchsorted(self._entries, cars["entry"]), cars["place"].astype(np.int64)
+        drivers = (
+            cars["walks"].copy(),
+            cars["patience_s"].copy(),
+            fleet.scenario.zone_cost_s(fleet.drawn.drivers)[which],
+        )
+        searchers = Searchers(entry, goal, hour, *drivers, *(weights or (1.0, 1.0)))
+        return np.asarray(simulate_single_driver(searchers, hours, self._places))
 
 
 @compiled(error_model="numpy")
-def lone_searches(
-    entry: IntArray, goal: IntArray, hour: IntArray, walks: FloatArray, patience_s: FloatArray, zone_cost_s: FloatArray,
-    per_cost: float, per_drive: float, believed: FloatArray, full: FloatArray, inside_s: FloatArray,
-    entry_drive_s: FloatArray, drive_s: FloatArray, walk_s: FloatArray, enter_s: FloatArray,
-    size: IntArray, zone: IntArray,
-) -> FloatArray:  # fmt: skip
+def simulate_single_driver(cars: Searchers, hours: Hours, places: Places) -> FloatArray:
     """Follow the searches of n cars from place to place, in all ways that they may go.
-
-    Tables have a column for each place, and a row for each entry, goal or hour; those of `zone_cost_s` are for each car
-    and `zone`. `believed` is P(taken) that drivers expect of a slot, `full` the chance that there is no space,
-    `inside_s` the time at the barrier and inside, `enter_s` what drivers expect of it, and `drive_s` leads from the
-    beginning of a place through it to that of another. Places of a zone fill alike.
 
     Returns:
         (4, n) chance to park; places without a space on the way; search time beyond the direct drive, and walk, s, both
         times the chance.
     """
-    found = np.zeros((4, len(entry)))
+    size, zone = places.size, places.zone
+    sums = np.zeros((4, len(cars.entry)))
     cost_s, expected_free = np.empty(len(size)), np.empty(zone.max() + 1)
-    for car in range(len(entry)):
-        p, full_now, direct_s = believed[hour[car]], full[hour[car]], entry_drive_s[entry[car]]
+    for car in range(len(cars.entry)):
+        hour, walk_s, walks = cars.hour[car], places.walk_s[cars.goal[car]], cars.walks[car]
+        p, full_now, direct_s = hours.believed[hour], hours.full[hour], places.entry_drive_s[cars.entry[car]]
         for k in range(len(size)):
-            cost = walk_s[goal[car], k] * walks[car] + zone_cost_s[car, zone[k]] + enter_s[k]
-            cost_s[k] = per_cost * cost if cost < np.inf else np.inf
+            cost = walk_s[k] * walks + cars.zone_cost_s[car, zone[k]] + places.enter_s[k]
+            cost_s[k] = cars.per_cost * cost if cost < np.inf else np.inf
         expected_free[:] = 0.0
         ahead_s, driven_s, left = direct_s, 0.0, 1.0
-        while left > _ENOUGH and driven_s <= patience_s[car]:
+        while left > _ENOUGH and driven_s <= cars.patience_s[car]:
             best, best_s = -1, np.inf
             for k in range(len(size)):
-                index_s = cost_s[k] + per_drive * ahead_s[k]
+                index_s = cost_s[k] + cars.per_drive * ahead_s[k]
                 if index_s < best_s:
                     odds = (1.0 - p[k]) * DOUBT / (DOUBT + expected_free[zone[k]])
-                    index_s = cost_s[k] + per_drive * ahead_s[k] / (1.0 - (p[k] / (p[k] + odds)) ** size[k])
+                    chance = 1.0 - (p[k] / (p[k] + odds)) ** size[k]
+                    index_s = cost_s[k] + cars.per_drive * ahead_s[k] / chance
                     if index_s < best_s:
                         best, best_s = k, index_s
             if best < 0:
@@ -132,11 +162,11 @@ def lone_searches(
             driven_s += ahead_s[best]
             here = left * (1.0 - full_now[best])
             left -= here
-            found[0, car] += here
-            found[1, car] += left
-            found[2, car] += here * (max(driven_s - direct_s[best], 0.0) + inside_s[hour[car], best])
-            found[3, car] += here * walk_s[goal[car], best] * walks[car]
+            sums[0, car] += here
+            sums[1, car] += left
+            sums[2, car] += here * (max(driven_s - direct_s[best], 0.0) + hours.inside_s[hour, best])
+            sums[3, car] += here * walk_s[best] * walks
             expected_free[zone[best]] += size[best] * (1.0 - p[best])
             cost_s[best] = np.inf
-            ahead_s = drive_s[best]
-    return found
+            ahead_s = places.drive_s[best]
+    return sums

@@ -15,21 +15,18 @@ from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
 from parkenv.studies.fleet.setting import OWN, Demanded, middle_of, times_demanded
-from parkenv.studies.fleet.study import FleetStudy
+from parkenv.studies.fleet.spec import FleetSpec
 from parkenv.studies.results import CsvTable, Results, Row, Table
-from parkenv.studies.study import Study, counted
+from parkenv.studies.study import counted
 from parkenv.studies.workers import Task
 from parkenv.world.week import HOUR_S
 
 if TYPE_CHECKING:
-    from parkenv.compiled.arrays import FloatArray, IntArray
-    from parkenv.engine.fleet import Fleet
     from parkenv.show.report.page import Page
     from parkenv.studies.curve.fit import Paths
     from parkenv.studies.curve.lone_search import LoneSearches
     from parkenv.studies.curve.zones import Zones
-    from parkenv.studies.fleet.blocks import Tally
-    from parkenv.studies.report import Replay
+    from parkenv.studies.fleet.day import Day
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
@@ -49,13 +46,13 @@ def _size(rate: float | str) -> float:
     return times_demanded(rate) if isinstance(rate, str) else rate
 
 
-class CurveStudy(FleetStudy):
+class CurveStudy(FleetSpec):
     """Search time, walk, failed attempts and refusals of each zone as functions of occupancy and demand."""
 
     heading: ClassVar = "Curves"
     table_titles: ClassVar = {"errors": "How far off where they were not fitted", "rows": "Whole lots"}
 
-    kind: Literal["curve"] = "curve"  # type: ignore[assignment]
+    kind: Literal["curve"] = "curve"
     scenarios: Annotated[
         ScenarioList,
         Option("SCENARIO", takes="NAME|FILE|DIR", argument=True, default="town"),
@@ -109,16 +106,12 @@ class CurveStudy(FleetStudy):
 
         return (self.table, ZONES)
 
-    def day_tables(self, fleet: Fleet, tally: Tally, times: FloatArray, taken: IntArray) -> dict[str, Row]:
+    def day_tables(self, day: Day) -> dict[str, Row]:
+        """See `FleetSpec`: searches by zone."""
         from parkenv.studies.curve.zones import ZONES, day_of_zones
 
-        del tally
-        name = fleet.scenario.name
-        return {
-            ZONES.file: day_of_zones(
-                fleet, self.zones[name], self._roads[name], self._lone[name], times, taken
-            )
-        }
+        name = day.fleet.scenario.name
+        return {ZONES.file: day_of_zones(day, self.zones[name], self._lone[name])}
 
     def check(self) -> None:
         """See `Study`: all cars of a curve have equal drivers."""
@@ -136,7 +129,7 @@ class CurveStudy(FleetStudy):
         """Return the days that all demands have; None before there are two."""
         from parkenv.studies.curve.fit import Paths, Town
         from parkenv.studies.curve.zones import ZONES
-        from parkenv.studies.fleet.blocks import purposes_of
+        from parkenv.studies.fleet.day import purpose_names
 
         rows = results.rows(ZONES)
         days: dict[str, list[list[Row]]] = {name: [] for name in self.built}
@@ -144,7 +137,7 @@ class CurveStudy(FleetStudy):
         for setting, items in self.cells():
             its = [rows[key] for day in items for key in self.keys(setting, day) if key in rows]
             days[setting.scenario].append(its)
-            purposes[setting.scenario] = purposes_of(self.fleet(setting)[0])[0]
+            purposes[setting.scenario] = purpose_names(self.fleet(setting)[0])
         n_days = min(len(its) for of_town in days.values() for its in of_town)
         if n_days < 2:
             return None
@@ -170,8 +163,8 @@ class CurveStudy(FleetStudy):
         from parkenv.studies.curve.fit import OUTCOMES, curve_table, held_out_errors, held_out_parts
         from parkenv.studies.fleet.tables import summarize_days
 
-        days = [rows for cell in self.cells() if (rows := results.of(self, cell))]
-        summary: Row = {"rows": summarize_days(days), "errors": [], "cautions": self._cautions()}
+        days = self.finished_days(results)
+        summary: Row = {"rows": summarize_days(days), "errors": [], "cautions": self.cautions()}
         if (paths := self._paths(results)) is None:
             return summary
         fits = len(OUTCOMES) * (len([*held_out_parts(paths, self.seed)]) + 1 + self.bootstraps)
@@ -189,7 +182,7 @@ class CurveStudy(FleetStudy):
         from parkenv.show.plurals import plural
         from parkenv.studies.curve.curves import load_curves
         from parkenv.studies.curve.fit import PREDICTORS, fitted_forms
-        from parkenv.studies.fleet.blocks import ALL
+        from parkenv.studies.fleet.day import ALL
 
         if "zones" not in result.summary:
             return []
@@ -208,24 +201,22 @@ class CurveStudy(FleetStudy):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: how far the first curve is off, and what to mind of the lots."""
+        """See `Study`: how far the first curve is off."""
         from parkenv.studies.curve.fit import CURVE, FORMS
 
-        findings = [
+        return [
             f"{row['outcome']}, {row['held_out']} held out: {row[CURVE]:.1%} off by zone-hours; the best of the usual "
             f"forms {min(row[form] for form in FORMS):.1%}."
             for row in summary["errors"][:1]
         ]
-        return findings + [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         from parkenv.show.report.tables import OF_FLEETS, tables_of
         from parkenv.studies.curve.fit import PREDICTORS
 
-        page: Page = Study.page.__func__(cls, summary, folder)  # type: ignore[attr-defined]
-        return page._replace(tables=tables_of(summary, cls.table_titles, OF_FLEETS | PREDICTORS))
-
-    def replays(self, folder: Path) -> Sequence[Replay]:
-        """See `Study`: a curve has none."""
-        return Study.replays(self, folder)
+        return (
+            super()
+            .page(summary, folder)
+            ._replace(tables=tables_of(summary, cls.table_titles, OF_FLEETS | PREDICTORS))
+        )

@@ -1,4 +1,4 @@
-"""What a day of a fleet tells of each zone: the searches of the cars that go there, and how full it is around.
+"""Per-zone measures of a simulated day: the searches of the cars that go there, and how full it is around.
 
 A *zone* is a goal of the lot, and the spaces within a walk of it. Zones may have spaces in common.
 """
@@ -12,10 +12,8 @@ from typing import Any, Self
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.engine.fleet import Fleet
 from parkenv.studies.curve.lone_search import LoneSearches
-from parkenv.studies.fleet.blocks import hour_of, purposes_of
-from parkenv.studies.fleet.measures import Roads
+from parkenv.studies.fleet.day import Day
 from parkenv.studies.fleet.setting import SETTING_COLUMNS
 from parkenv.studies.results import JsonTable, Row
 from parkenv.world.scenario import Scenario
@@ -82,46 +80,37 @@ class Zones:
         return cls(tuple(map(str, goals)), xy, near, neighbors, near @ kinds, own, streets_s)
 
 
-def day_of_zones(
-    fleet: Fleet, zones: Zones, roads: Roads, lone: LoneSearches, times: FloatArray, taken: IntArray
-) -> dict[str, Any]:
-    """Return the row of `ZONES` of a day whose searches are over, without setting and day.
+def day_of_zones(day: Day, zones: Zones, lone: LoneSearches) -> dict[str, Any]:
+    """Return the row of `ZONES` of a day, without setting and day.
 
-    The search time of a car is what its time from the entry to its space exceeds the direct drive there by: detours,
-    failed attempts, queues, and the way inside a garage.
-
-    Args:
-        fleet: the fleet.
-        zones: the zones of its lot.
-        roads: its shortest drives.
-        lone: its lone searches.
-        times: (k,) s since Monday 00:00, at which slots were looked at.
-        taken: (k, n_slots) how many cars were in each.
+    The search time of a car is its time from the entry to its space beyond the direct drive there: detours, failed
+    attempts, queues, and the way inside a garage.
     """
-    names, purpose = purposes_of(fleet)
-    arrives = fleet.cars["parked_at"] < 0
-    cars, first, looks = fleet.cars[arrives], hour_of(fleet, times[:1]), hour_of(fleet, times)
-    n_looks = np.bincount(looks - first)
-    hour = np.minimum(hour_of(fleet, cars["arrival"]) - first, len(n_looks) - 1)
-    shape = len(zones.names), len(names), len(n_looks)
+    names, purpose = day.purposes
+    fleet, taken, arrives = day.fleet, day.taken, day.fleet.cars["parked_at"] < 0
+    cars, sampled = fleet.cars[arrives], day.hour_of(day.times)
+    first, sampled = sampled[0], sampled - sampled[0]
+    n_samples = np.bincount(sampled)
+    hour = np.minimum(day.hour_of(cars["arrival"]) - first, len(n_samples) - 1)
+    shape = len(zones.names), len(names), len(n_samples)
     flat, parked = np.ravel_multi_index((cars["place"], purpose[arrives], hour), shape), cars["slot"] >= 0
-    search_s = np.maximum(cars["ended_at"] - cars["arrival"] - roads.direct_s(cars), 0.0)
+    search_s = np.maximum(cars["ended_at"] - cars["arrival"] - day.roads.direct_s(cars), 0.0)
     values = (
         np.ones(len(cars)), parked, cars["failed_parks"], search_s * parked, cars["walk_s"] * parked,
-        *lone.of_day(fleet, taken, looks - first, arrives, hour),
+        *lone.of_day(fleet, taken, sampled, arrives, hour),
     )  # fmt: skip
-    sums = [np.bincount(flat, its, np.prod(shape)).reshape(shape) for its in values]
+    sums = [np.bincount(flat, weights, np.prod(shape)).reshape(shape) for weights in values]
     index, arrived = np.nonzero(sums[0]), sums[0].sum(axis=1)
-    there = np.array([taken[looks - first == k].mean(axis=0) for k in range(len(n_looks))]).T
+    there = np.array([taken[sampled == k].mean(axis=0) for k in range(len(n_samples))]).T
     spaces, all_spaces = zones.spaces.sum(axis=1, keepdims=True), fleet.scenario.lot.capacity.sum()
     # The last hour may be a part of one.
-    hours = n_looks * (times[1] - times[0] if len(times) > 1 else HOUR_S) / HOUR_S
+    hours = n_samples * (day.times[1] - day.times[0] if len(day.times) > 1 else HOUR_S) / HOUR_S
     state = (
         zones.near @ there / spaces, zones.neighbors @ arrived / spaces / hours, there.sum(axis=0) / all_spaces,
         arrived.sum(axis=0) / all_spaces / hours,
     )  # fmt: skip
     return (
-        {name: its.tolist() for name, its in zip(INDEX, index, strict=True)}
-        | {name: its[index].round(2).tolist() for name, its in zip(SUMS, sums, strict=True)}
-        | {name: its.round(4).tolist() for name, its in zip(STATE, state, strict=True)}
+        {name: numbers.tolist() for name, numbers in zip(INDEX, index, strict=True)}
+        | {name: total[index].round(2).tolist() for name, total in zip(SUMS, sums, strict=True)}
+        | {name: shares.round(4).tolist() for name, shares in zip(STATE, state, strict=True)}
     )

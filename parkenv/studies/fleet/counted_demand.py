@@ -1,4 +1,4 @@
-"""A town whose car parks were counted: what was counted when, demand that follows it, and the fleet that drives it."""
+"""A town whose car parks were counted, and the demand that follows the counts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from datetime import date
 import numpy as np
 
 from parkenv.compiled.arrays import FloatArray, IntArray
-from parkenv.engine.fleet import DriverKind, Fleet, drive_times
+from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.errors import InputError
 from parkenv.forecast.baselines import last_week
 from parkenv.forecast.counts import Counts
@@ -17,10 +17,11 @@ from parkenv.scenarios.purposes import PurposeSpec, demand_of
 from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import compiled_policy_of
-from parkenv.studies.results import Row
+from parkenv.studies.results import Row, without_nan
 from parkenv.world.arrivals import hours_between
 from parkenv.world.counted_demand import STAYS_H, follow_counts
 from parkenv.world.demand import weights_of_all
+from parkenv.world.scenario import drive_times
 from parkenv.world.week import DAY_HOURS, HOUR_S
 
 PATIENCE_S = 3600.0
@@ -113,25 +114,25 @@ class CountedTown:
 
         Mean stays are those given, h, or else chosen.
         """
-        made = {}
+        specs = {}
         for name, goals, first, counted_cars in zip(self.names, self._goals, at_first, cars, strict=True):
             if not np.isfinite(counted_cars).any():
                 continue
             start = first if np.isfinite(first) else counted_cars[np.isfinite(counted_cars)][0]
             window = self._window.start_s, self._window.end_s
-            found = follow_counts(start, counted_cars, *window, stays_h.get(name, STAYS_H))
+            followed = follow_counts(start, counted_cars, *window, stays_h.get(name, STAYS_H))
             rates = np.zeros(DAY_HOURS)
-            rates[self.hours] = found.per_hour
-            made[name] = PurposeSpec(
+            rates[self.hours] = followed.per_hour
+            specs[name] = PurposeSpec(
                 arrivals_per_hour=tuple(np.round(rates, 3).tolist()),
-                stay_s=found.stay.mean_s,
+                stay_s=followed.stay.mean_s,
                 stay_law="log-normal",
-                stay_cv=found.stay.cv,
+                stay_cv=followed.stay.cv,
                 parked=round(start),
                 patience_s=PATIENCE_S,
                 goals=tuple(goals.tolist()),
             )
-        return made
+        return specs
 
     def fitted(self, days: IntArray, rounds: int, episodes: int, seed: int) -> dict[str, Row]:
         """Fit a purpose for each car park to the mean of its counts on some days, (d,); the fleet drives for it.
@@ -149,20 +150,16 @@ class CountedTown:
         aim, stays_h, purposes = cars, dict[str, tuple[float, ...]](), dict[str, PurposeSpec]()
         for number in range(rounds):
             purposes = self.purposes(at_first, aim, stays_h)
-            stays_h = {name: (its.stay_s / HOUR_S,) for name, its in purposes.items()}
+            stays_h = {name: (purpose.stay_s / HOUR_S,) for name, purpose in purposes.items()}
             driven = self.driven(purposes, seed, range(number * episodes, (number + 1) * episodes))
             aim = np.maximum(aim + _STEP * (cars - driven), 0.0)
-        return {
-            name: {
-                "purpose": purposes[name].tables(),
-                **{
-                    column: [None if np.isnan(n) else float(n) for n in its[k]]
-                    for column, its in (("followed", cars), ("driven", driven), ("aim", aim))
-                },
-            }
-            for k, name in enumerate(self.names)
-            if name in purposes
-        }
+        columns = {"followed": cars, "driven": driven, "aim": aim}
+        fits: dict[str, Row] = {}
+        for k, name in enumerate(self.names):
+            if name in purposes:
+                lists = {column: without_nan(values[k].tolist()) for column, values in columns.items()}
+                fits[name] = {"purpose": purposes[name].tables(), **lists}
+        return fits
 
     def predicted(
         self,
@@ -191,7 +188,7 @@ class CountedTown:
         known = [k for k, name in enumerate(self.names) if name in fit]
         for k in known:
             aim[k], followed[k] = fit[self.names[k]]["aim"], fit[self.names[k]]["followed"]
-        stays_h = {name: (its["purpose"]["stay_s"] / HOUR_S,) for name, its in fit.items()}
+        stays_h = {name: (row["purpose"]["stay_s"] / HOUR_S,) for name, row in fit.items()}
         purposes = self.purposes(before, np.maximum(expected + aim - followed, 0.0), stays_h)
         if known:
             days = range(day * episodes, (day + 1) * episodes)
@@ -204,28 +201,24 @@ class CountedTown:
             "last_week": self.cars(self._last_week, only)[1][0],
             "mean_followed": followed,
         }
-        shares = {name: its / self.capacity[:, None] for name, its in cars.items()}
-        all_known = np.all([np.isfinite(its) for its in shares.values()], axis=0)
+        shares = {name: number / self.capacity[:, None] for name, number in cars.items()}
+        all_known = np.isfinite([*shares.values()]).all(axis=0)
         numbers, hours = np.nonzero(all_known)
         return {
             "car_park": [self.names[k] for k in numbers],
             "hour": self.hours[hours].tolist(),
-            **{name: its[all_known].round(4).tolist() for name, its in shares.items()},
+            **{name: share[all_known].round(4).tolist() for name, share in shares.items()},
         }
 
     def driven(self, purposes: Mapping[str, PurposeSpec], seed: int, days: range) -> FloatArray:
         """Return the mean cars in the car parks at the end of each hour of days of the fleet, (n, n_hours)."""
         scenario = self.scenario
         demand = demand_of({**self.spec.demand, **purposes}, scenario.lot, scenario.arrival)
-        fleet = self._fleet = self._fleet or Fleet(
-            scenario,
-            drivers=[DriverKind(policy=self.policy)],
-            background="none",
-            leave_full_lot=False,
-            demand=demand,
-        )
-        if demand is not None:
-            fleet.demand = demand
+        if self._fleet is None:
+            driver = DriverKind(policy=self.policy)
+            self._fleet = Fleet(scenario, demand, drivers=[driver], background="none", leave_full_lot=False)
+        fleet = self._fleet
+        fleet.demand = demand or fleet.demand
         total = np.zeros((len(self.names), len(self.hours)))
         for day in days:
             fleet.reset(seed, day)

@@ -13,7 +13,8 @@ from parkenv.compiled.arrays import FloatArray
 from parkenv.engine.records import STATES
 from parkenv.show.report.page import page_data, write_page
 from parkenv.show.report.town_map import town_data
-from parkenv.studies.fleet.blocks import ALL, BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
+from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, TABLES, Blocks, by_hour
+from parkenv.studies.fleet.day import ALL
 from parkenv.studies.fleet.setting import Setting
 from parkenv.studies.report import Again, Recording
 from parkenv.studies.report_options import ReportOptions

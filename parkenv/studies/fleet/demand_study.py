@@ -1,4 +1,4 @@
-"""Demand of a town that fills its car parks as counted: fitted on some weeks, and measured on the weeks after."""
+"""Demand of a town that fills its car parks as counted: fitted on some weeks, measured on the weeks after."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from parkenv.studies.workers import Task
 
 PREDICTIONS = ("simulated", "forecast", "last_week", "mean_followed")
-"""What was to be expected of the counts."""
+"""Predictions of the counts."""
 KINDS: dict[str, tuple[int, ...]] = {"scenario": (0, 1, 2, 3, 4), "saturday": (5,), "sunday": (6,)}
 """Weekdays (Monday = 0) that have a demand of their own, by the name of its scenario file."""
 
@@ -57,9 +57,9 @@ class _RollOut(NamedTuple):
 
 
 def _fitted(row: Row) -> Row:
-    for its in row["car_parks"].values():
-        PurposeSpec.parse(its["purpose"], "purpose")
-        np.array([its[column] for column in ("followed", "driven", "aim")], np.float64)
+    for fit in row["car_parks"].values():
+        PurposeSpec.parse(fit["purpose"], "purpose")
+        np.array([fit[column] for column in ("followed", "driven", "aim")], np.float64)
     return row
 
 
@@ -206,46 +206,47 @@ class DemandStudy(Study):
         """See `Study`: mean absolute errors of the fits on the weeks followed, and of all predictions on later days."""
         from scipy.stats import spearmanr
 
-        town, found = self.town, self._found(results)
-        used = np.flatnonzero(np.isfinite(found.shares["counted"]).any(axis=(1, 2)))
+        town, held_out = self.town, self._held_out(results)
+        counts = held_out.shares["counted"]
+        used = np.flatnonzero(np.isfinite(counts).any(axis=(1, 2)))
         if not used.size:
-            if len(found.days) == sum(len(cell.items) for cell in self.cells()):
+            if len(held_out.days) == sum(len(cell.items) for cell in self.cells()):
                 raise InputError(
                     f"{town.counts.source}: no car park is counted both on days followed and on days held out, want "
                     "--from others"
                 )
             return {"rows": []}
-        counts = found.shares["counted"]
-        errors = {name: np.abs(found.shares[name] - counts) for name in PREDICTIONS}
-        errors["fit"] = np.where(np.isfinite(counts), found.fit_error, np.nan)
-        weeks = np.unique((found.days - found.days[0]) // 7, return_inverse=True)[1]
-        come, stay_h = np.nanmean(found.come[used], axis=1), np.nanmean(found.stay_h[used], axis=1)
-        rows: list[Row] = [
-            {
-                "car_park": town.names[number],
-                "capacity": int(town.capacity[number]),
-                "arrivals_a_day": float(come[row]),
-                "stay_h": float(stay_h[row]),
-                "map_weight": float(town.map_weight[number]),
-                "days_held_out": int(np.isfinite(counts[number]).any(axis=1).sum()),
-                "counted": float(counts[number][np.isfinite(counts[number])].mean()),
-                "simulated": float(found.shares["simulated"][number][np.isfinite(counts[number])].mean()),
-                **_errors({name: error[[number]] for name, error in errors.items()}, weeks),
-            }
-            for row, number in enumerate(used.tolist())
-        ]
+        errors = {name: np.abs(held_out.shares[name] - counts) for name in PREDICTIONS}
+        errors["fit"] = np.where(np.isfinite(counts), held_out.fit_error, np.nan)
+        weeks = np.unique((held_out.days - held_out.days[0]) // 7, return_inverse=True)[1]
+        come, stay_h = np.nanmean(held_out.come, axis=1), np.nanmean(held_out.stay_h, axis=1)
+        rows: list[Row] = []
+        for number in used.tolist():
+            known = np.isfinite(counts[number])
+            rows.append(
+                {
+                    "car_park": town.names[number],
+                    "capacity": int(town.capacity[number]),
+                    "arrivals_a_day": float(come[number]),
+                    "stay_h": float(stay_h[number]),
+                    "map_weight": float(town.map_weight[number]),
+                    "days_held_out": int(known.any(axis=1).sum()),
+                    "counted": float(counts[number][known].mean()),
+                    "simulated": float(held_out.shares["simulated"][number][known].mean()),
+                    **_errors({name: error[[number]] for name, error in errors.items()}, weeks),
+                }
+            )
+        correlation = spearmanr(town.map_weight[used], come[used]).statistic if len(used) > 2 else None
         return {
             "rows": rows,
             **_errors(errors, weeks),
-            "days_held_out": len(found.days),
-            "map_rank_correlation": float(spearmanr(town.map_weight[used], come).statistic)
-            if len(used) > 2
-            else None,
+            "days_held_out": len(held_out.days),
+            "map_rank_correlation": None if correlation is None else float(correlation),
             "not_in_lot": town.others,
         }
 
-    def _found(self, results: Results) -> _Found:
-        """Return what is finished as arrays."""
+    def _held_out(self, results: Results) -> HeldOutErrors:
+        """Return the finished days as arrays."""
         town, rows, fits = self.town, results.rows(DAYS), results.rows(FITTED)
         done = [(cell.work.number, item) for cell in self.cells() for item in cell.items if (item,) in rows]
         days = np.array([town.counts.day_index(date.fromisoformat(item)) for _, item in done], np.int64)
@@ -255,40 +256,35 @@ class DemandStudy(Study):
         for k, (number, item) in enumerate(done):
             row = rows[item,]
             at = [town.names.index(name) for name in row["car_park"]]
-            for name, its in shares.items():
-                its[at, k, np.searchsorted(town.hours, row["hour"])] = row[name]
+            for name, values in shares.items():
+                values[at, k, np.searchsorted(town.hours, row["hour"])] = row[name]
             for name, fit in fits[number, kind_of(town.counts.weekday[days[k]])]["car_parks"].items():
                 i, purpose = town.names.index(name), PurposeSpec.parse(fit["purpose"], FITTED.file)
                 driven, followed = (np.array(fit[column], np.float64) for column in ("driven", "followed"))
                 fit_error[i, k] = np.abs(driven - followed) / town.capacity[i]
                 come[i, k], stay_h[i, k] = sum(purpose.arrivals_per_hour), purpose.stay_s / HOUR_S
-        return _Found(days, shares, fit_error, come, stay_h)
+        return HeldOutErrors(days, shares, fit_error, come, stay_h)
 
     def outputs(self, result: Result) -> list[Task[object]]:
         """See `Study`: the predictions, scenarios with the demand of the last roll-out, its weekdays as a picture."""
         from parkenv.show.figures.forecast import CarParkDays, save_counted_demand
 
-        town, found, fits = self.town, self._found(result.results), result.results.rows(FITTED)
-        fitted = {kind: fits[self.roll_outs - 1, kind]["car_parks"] for kind in KINDS}
-        tasks: list[Task[object]] = [
-            partial(_write_predictions, list(result.results.rows(DAYS).values()), result.folder)
-        ]
-        tasks += [
-            partial(
-                self.scenario.changed(
-                    demand=self.scenario.demand | {name: its["purpose"] for name, its in car_parks.items()}
-                ).write,
-                result.folder / f"{kind}.json",
-            )
-            for kind, car_parks in fitted.items()
-            if car_parks
-        ]
-        if not (kinds := [kind for kind, car_parks in fitted.items() if car_parks]):
+        town, held_out, fits = self.town, self._held_out(result.results), result.results.rows(FITTED)
+        last = self.roll_outs - 1
+        fitted = {kind: parks for kind in KINDS if (parks := fits[last, kind]["car_parks"])}
+        predictions = list(result.results.rows(DAYS).values())
+        tasks: list[Task[object]] = [partial(_write_predictions, predictions, result.folder)]
+        for kind, car_parks in fitted.items():
+            demand = self.scenario.demand | {name: fit["purpose"] for name, fit in car_parks.items()}
+            scenario = self.scenario.changed(demand=demand)
+            tasks.append(partial(scenario.write, result.folder / f"{kind}.json"))
+        if not fitted:
             return tasks  # nothing was counted in the last weeks
-        shown = np.isin(found.days, self.days(self.roll_outs - 1)[1])
-        shown &= np.isin(town.counts.weekday[found.days], KINDS[kinds[0]])
-        cars = {name: its[:, shown] * town.capacity[:, None, None] for name, its in found.shares.items()}
-        its = [
+        weekdays = KINDS[next(iter(fitted))]
+        shown = np.isin(held_out.days, self.days(last)[1])
+        shown &= np.isin(town.counts.weekday[held_out.days], weekdays)
+        cars = {name: of[:, shown] * town.capacity[:, None, None] for name, of in held_out.shares.items()}
+        car_park_days = [
             CarParkDays(
                 town.names[k],
                 town.capacity[k],
@@ -299,11 +295,11 @@ class DemandStudy(Study):
             for k in np.flatnonzero(np.isfinite(cars["counted"]).any(axis=(1, 2)))
         ]
         hours = town.hours.astype(np.float64) + 1.0
-        return [*tasks, partial(save_counted_demand, its, hours, result.folder / "demand.png")]
+        return [*tasks, partial(save_counted_demand, car_park_days, hours, result.folder / "demand.png")]
 
 
-class _Found(NamedTuple):
-    """What is finished, of n car parks on d days held out; NaN: unknown."""
+class HeldOutErrors(NamedTuple):
+    """Finished days held out: n car parks on d days; NaN: unknown."""
 
     days: IntArray  # (d,) indices into the days of the counts
     shares: dict[str, FloatArray]  # (n, d, n_hours) by column of `PREDICTED`
@@ -352,6 +348,6 @@ def _errors(errors: Mapping[str, FloatArray], weeks: IntArray) -> Row:
     row: Row = {}
     for name, error in errors.items():
         by_week = (error[:, weeks == week] for week in range(int(weeks.max()) + 1))
-        means = [[np.nanmean(its) for its in one if np.isfinite(its).any()] for one in by_week]
-        row |= columns_of(f"{name}_error", mean_interval([np.mean(its) for its in means if its]))
+        means = [[np.nanmean(park) for park in week if np.isfinite(park).any()] for week in by_week]
+        row |= columns_of(f"{name}_error", mean_interval([np.mean(parks) for parks in means if parks]))
     return row

@@ -1,0 +1,190 @@
+"""The cars of a fleet's world, as its demand draws them."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
+from parkenv.compiled.jit import compiled
+from parkenv.compiled.keyed_random import SLOT_STREAM, car_uniforms
+from parkenv.engine.fleet_options import FleetOptions
+from parkenv.engine.records import CAR, DUE, NO_CAR
+from parkenv.errors import InputError
+from parkenv.files.known_names import KNOWLEDGE
+from parkenv.world.demand import CarPlans, Demand, TownDemand
+from parkenv.world.occupancy.process import ArrivalDay
+from parkenv.world.scenario import Drivers, Scenario, drive_times
+from parkenv.world.week import DAY_S
+
+_TAKEN_BEFORE = 0.8
+"""Chance that a free slot was taken when a car came that is parked at first: it stands in the first slot that was not.
+A counted facility that has room had room."""
+_MOST_PASSED = 30
+
+
+class FleetCars:
+    """The cars of the present world.
+
+    Args:
+        scenario: the scenario, with the demand's weights of entries and goals.
+        demand: the demand of all worlds.
+        options: the options of the fleet.
+
+    Attributes:
+        scenarios: one for each goal with a weight.
+        records: (n_cars,) of the dtype CAR, in order of arrival.
+        drivers: what decides where the cars may park and what it costs them.
+        zone_cost_s: what parking in each zone costs each car, (n_cars, n_zones) s; None where it costs nothing.
+    """
+
+    def __init__(self, scenario: Scenario, demand: Demand | TownDemand, options: FleetOptions) -> None:
+        lot = scenario.lot
+        for name, places in (("goal_weights", lot.goals), ("entry_weights", lot.entries)):
+            if (weights := getattr(demand, name)) and len(weights) != len(places):
+                raise InputError(
+                    f"Demand.{name} has {len(weights)} numbers, lot {lot.name!r} has {len(places)} of these"
+                )
+        goals = range(len(demand.goal_weights))
+        self.scenarios = tuple(scenario.at_goal(goal) for goal in goals) or (scenario,)
+        one_entry = scenario.entry is not None and not demand.entry_weights
+        self._entries = lot.entry_vertices[[scenario.entry]] if one_entry else lot.entry_vertices
+        self._scenario, self._options = scenario, options
+        self._walk_s = np.array([problem.walk_s for problem in self.scenarios])
+        self._way_s = self._ways_s()
+        self.records, self.midnight = np.zeros(0, CAR), 0.0
+        self.drivers = Drivers(0.0, 0.0, 0.0, 0)
+        self.zone_cost_s: FloatArray | None = None
+
+    def _ways_s(self) -> FloatArray:
+        """Return the shortest drives by goal and entry, (n_goals, n_entries) s, to the slot nearest to the goal.
+
+        In a lot that is no town, cars search from the entry on: 0.
+        """
+        if not self._scenario.lot.is_town:
+            return np.zeros((len(self.scenarios), len(self._entries)))
+        drive_s = drive_times(self._scenario, self._entries)
+        nearest = np.where(np.isfinite(drive_s), self._walk_s[:, None], np.inf).argmin(axis=2)
+        way_s = drive_s[np.arange(len(drive_s)), nearest]
+        return np.where(np.isfinite(way_s), way_s, 0.0)
+
+    def draw(self, demand: Demand | TownDemand, key: np.uint64, arrival_s: float, day: ArrivalDay) -> float:
+        """Draw the cars of the world with this key, see `Demand.draw`; return when it begins, s since Monday 00:00."""
+        plans, options = demand.draw(key, arrival_s, len(self._entries), day), self._options
+        self.midnight = midnight = day.weekday * DAY_S
+        begin = midnight + demand.begin_s(arrival_s)
+        cars = self.records = np.zeros(len(plans.arrival_s), CAR)
+        cars["arrival"] = midnight + plans.arrival_s
+        if options.tick_s > 0.0:
+            ticks = np.ceil((cars["arrival"] - begin) / options.tick_s - 1e-9)
+            cars["arrival"] = begin + ticks * options.tick_s
+        cars["entry"], cars["place"] = self._entries[plans.entry], plans.goal
+        cars["stay_s"] = plans.stay_s
+        cars["patience_s"] = plans.patience_s + self._way_s[plans.goal, plans.entry]
+        shares = np.cumsum([kind.weight for kind in options.drivers])
+        number = np.searchsorted(shares / shares[-1], plans.kind, side="right")
+        cars["kind"] = kind = np.minimum(number, len(options.drivers) - 1)
+        policies = [0 if driver.policy is None else driver.policy.address for driver in options.drivers]
+        cars["policy"] = np.array(policies, np.int64)[kind]
+        cars["knows"] = np.array([KNOWLEDGE.index(driver.knows) for driver in options.drivers])[kind]
+        cars["shares"] = np.array([driver.shares for driver in options.drivers])[kind]
+        cars["purpose"], cars["parked_at"] = plans.purpose, NO_CAR
+        cars["walks"] = 1.0 if self._scenario.walk_back else np.where(plans.walks_back, 2.0, 1.0)
+        cars["state"], cars["slot"] = DUE, NO_CAR
+        cars["ended_at"] = cars["left_at"] = np.inf
+        self.drivers = self._drivers_in(plans, demand.class_names)
+        self.zone_cost_s = self._zone_costs()
+        if plans.parked.any():
+            cars["parked_at"][plans.parked] = self._slots_of_parked(plans.parked, demand, key)
+        return begin
+
+    def _drivers_in(self, plans: CarPlans, class_names: tuple[str, ...]) -> Drivers:
+        scenario, cars = self._scenario, self.records
+        classes = np.full(len(cars), scenario.class_bits(scenario.classes), np.int64)
+        for bit, name in enumerate(class_names):
+            classes |= (plans.classes >> bit & 1) * scenario.class_bits((name,))
+        value_of_time = np.where(
+            np.isnan(plans.value_of_time), scenario.driver.value_of_time, plans.value_of_time
+        )
+        return Drivers(cars["stay_s"], cars["arrival"], value_of_time, classes, plans.kwh)
+
+    def drivers_of(self, cars: Any) -> Drivers:
+        """Return the drivers of some cars, an index of `records`."""
+        return Drivers(*(np.asarray(values)[cars] for values in self.drivers))
+
+    def _zone_costs(self) -> FloatArray | None:
+        scenario, cars, lot = self._scenario, self.records, self._scenario.lot
+        if not scenario.has_rules and (cars["walks"] == 1.0).all():
+            return None
+        if not np.isfinite(scenario.zone_price(self.drivers)).all():
+            raise InputError("Demand.stays: a stay is infinite, want finite ones where parking has a price")
+        zone_cost_s = scenario.zone_cost_s(self.drivers)
+        cars["n_forbidden"] = np.isinf(zone_cost_s) @ np.bincount(lot.zone_of_slot, minlength=len(lot.zones))
+        return zone_cost_s
+
+    def arrival_cost_s(self, car: int) -> FloatArray:
+        """Return what arriving in each slot costs a car, (n_slots,) s: walk, and parking for its own stay."""
+        problem, walks = self.scenarios[self.records["place"][car]], self.records["walks"][car]
+        # Computed for all cars at once; for one at a time, tariffs take a millisecond each.
+        known = self.zone_cost_s
+        zone_cost_s = problem.zone_cost_s(self.drivers_of(car)) if known is None else known[car]
+        parking_s = problem.lot.slot_parking_cost_s + zone_cost_s[problem.lot.zone_of_slot]
+        return np.asarray(problem.walk_s * walks + parking_s + problem.enter_s)
+
+    def _slots_of_parked(self, parked: BoolArray, demand: Demand | TownDemand, key: np.uint64) -> IntArray:
+        """Return in which slots cars stand when the world begins."""
+        cars, lot = self.records[parked], self._scenario.lot
+        slots, u = np.empty(len(cars), np.int64), np.empty(len(cars))
+        car_uniforms(key, SLOT_STREAM, 0, u)
+        costs = (
+            np.zeros((len(self.records), len(lot.zones))) if self.zone_cost_s is None else self.zone_cost_s
+        )
+        by_walk = np.argsort(self._walk_s, axis=1, kind="stable").astype(np.int64)
+        place, walks = cars["place"].astype(np.int64), cars["walks"].astype(np.float64)
+        first_counted = lot.n_slots - np.count_nonzero(lot.is_counted)
+        of_lot = self._walk_s, by_walk, lot.zone_of_slot, lot.capacity.copy(), int(first_counted)
+        _park_at_first(place, walks, u, costs[parked], *of_lot, slots)
+        if lost := np.count_nonzero(slots < 0):
+            purpose = demand.purposes[cars["purpose"][np.argmin(slots)]]
+            raise InputError(
+                f"demand.{purpose.name}.parked is {purpose.parked}, want no more cars than find room where they may "
+                f"park when the hours begin: {lost} do not"
+            )
+        return slots
+
+
+@compiled
+def _park_at_first(
+    place: IntArray, walks: FloatArray, u: FloatArray, zone_cost_s: FloatArray, walk_s: FloatArray, by_walk: IntArray,
+    zone_of_slot: IntArray, left: IntArray, first_counted: int, slots: IntArray,
+) -> None:  # fmt: skip
+    """Choose slots for cars, one after another: the cheapest one by walk and price that is free and was so before.
+
+    Cars are places that people walk to, factors of the walk and uniform numbers, (n,) each. `by_walk` are slots by
+    `walk_s`, (n_places, n_slots); `left` are cars that still fit, counted down; counted facilities are the last slots,
+    from `first_counted` on. The result is `slots`, (n,): -1 if none is left where the car may park.
+    """
+    cost_s, chosen = np.empty(_MOST_PASSED), np.empty(_MOST_PASSED, np.int64)
+    for car in range(len(place)):
+        wanted = 1 + min(int(math.log(u[car]) / math.log(_TAKEN_BEFORE)), _MOST_PASSED - 1)
+        n = 0
+        for slot in by_walk[place[car]]:
+            walk = walks[car] * walk_s[place[car], slot]
+            if n == wanted and walk >= cost_s[n - 1]:
+                break
+            cost = walk + zone_cost_s[car, zone_of_slot[slot]]
+            if left[slot] == 0 or cost == np.inf or (n == wanted and cost >= cost_s[n - 1]):
+                continue
+            n = min(n + 1, wanted)
+            at = n - 1
+            while at > 0 and cost_s[at - 1] > cost:
+                cost_s[at], chosen[at] = cost_s[at - 1], chosen[at - 1]
+                at -= 1
+            cost_s[at], chosen[at] = cost, slot
+            if slot >= first_counted:
+                n = wanted = at + 1
+        slots[car] = chosen[n - 1] if n else -1
+        if n:
+            left[chosen[n - 1]] -= 1
