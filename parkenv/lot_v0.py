@@ -102,7 +102,6 @@ class _CarsAsAgents:
         return self._action_spaces[agent]
 
     def _begin(self, seed: int | None) -> list[str]:
-        """Begin the next world, and return its agents: the first of a seed, or the next one of the last seed."""
         if seed is not None:
             require_whole("seed", seed)
             self._seed, self._episode = int(seed), 0
@@ -114,7 +113,6 @@ class _CarsAsAgents:
         return self.possible_agents[: len(self.fleet.cars)]
 
     def _blank_observation(self, car: int) -> dict[str, Any]:
-        """Return the observation of a car that has not arrived: at its entry, nothing known, no action possible."""
         boxes = {name: one for name, one in self._observation_space.items() if isinstance(one, spaces.Box)}
         blank: dict[str, Any] = {name: np.zeros(box.shape, box.dtype) for name, box in boxes.items()}
         blank["vertex"] = np.int64(self.fleet.cars["entry"][car])
@@ -148,7 +146,6 @@ class _CarsAsAgents:
 
 
 def _car_of(agent: str) -> int:
-    """Return the index of an agent's car."""
     return int(agent.rpartition("_")[2])
 
 
@@ -396,11 +393,9 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
 
     @property
     def _now(self) -> float:
-        """Time of the tick, s since Monday 00:00, with a margin for rounding."""
         return self.fleet.begin + (self._tick + _MARGIN) * self.tick_s
 
     def _act(self, actions: dict[str, Any], rewards: dict[str, float], over: dict[str, bool]) -> None:
-        """Carry out the decisions of this tick, and release the cars whose search is over."""
         while (car := self.fleet.next_car(self._now)) is not None:
             agent = f"car_{car}"
             if self.fleet.cars["state"][car] == SEARCHING:
@@ -413,7 +408,6 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
                 self.fleet.release()
 
     def _advance(self, rewards: dict[str, float], over: dict[str, bool]) -> None:
-        """Carry out everything until this tick, and report the cars whose step is over."""
         self.fleet.next_car(self._now)
         self._deciding = set()
         for car in self.fleet.ready_cars():
@@ -422,7 +416,6 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
                 self._deciding.add(f"car_{car}")
 
     def _report(self, car: int, rewards: dict[str, float], over: dict[str, bool]) -> None:
-        """Take over the observation, and the outcome of the last step, of a car."""
         agent, outcome = f"car_{car}", self.fleet.outcome(car)
         self._observations[agent] = self.fleet.observation(car)
         if outcome.begun:

@@ -103,7 +103,6 @@ _ON_TICK = 1e-9  # fraction of a tick
 
 @kernel
 def begin_world_at(address: int) -> None:
-    """Begin the world of a FLEET record whose cars are due."""
     fleet = fleet_at(address, 0)
     empty_shared_slots(address)
     clear_live_map(fleet)
@@ -122,7 +121,6 @@ def begin_world_at(address: int) -> None:
 
 @kernel
 def _stand(fleet: Any, number: int) -> None:
-    """Let a car stand in its slot when the world begins."""
     car = car_at(fleet.cars, number)
     car.state, car.slot, car.ended_at = PARKED, car.parked_at, fleet.time
     if car.slot >= fleet.first_counted:
@@ -177,7 +175,6 @@ def advance_at(address: int, until: float) -> int:
 
 @kernel
 def act_at(address: int, action: int) -> None:
-    """Carry out the decision of the car that is first in the queue."""
     fleet = fleet_at(address, 0)
     act(fleet, int64s(fleet.ready)[fleet.first_ready], action)
 
@@ -192,7 +189,6 @@ def release_at(address: int) -> None:
 
 @kernel
 def init_forecast_at(address: int) -> None:
-    """Initialise the belief of the car `pending` with its external forecast."""
     fleet = fleet_at(address, 0)
     search = search_at(car_at(fleet.cars, fleet.pending).search, 0)
     init_prior(search)
@@ -270,7 +266,6 @@ def _next_arrival(fleet: Any) -> float:
 
 @inlined
 def _next_departure(fleet: Any) -> float:
-    """Return when the next car leaves its slot, infinite if none does."""
     return float(float64s(fleet.departure_times)[0] if fleet.n_departures > 0 else np.inf)
 
 
@@ -282,7 +277,6 @@ def _next_end(fleet: Any) -> float:
 
 @inlined
 def _add_departure(fleet: Any, time: float, number: int) -> None:
-    """Let a parked car leave its slot at a time, s."""
     times, cars, ranks = _heap(fleet, fleet.departure_times, fleet.departing_cars)
     _rank(fleet, number)
     fleet.n_departures = push(times, cars, fleet.n_departures, time, number, ranks)
@@ -290,7 +284,6 @@ def _add_departure(fleet: Any, time: float, number: int) -> None:
 
 @inlined
 def _add_end(fleet: Any, time: float, number: int) -> None:
-    """Let the step of a car be over at a time, s."""
     times, cars, ranks = _heap(fleet, fleet.step_times, fleet.step_cars)
     _rank(fleet, number)
     fleet.n_steps_to_end = push(times, cars, fleet.n_steps_to_end, time, number, ranks)
@@ -298,7 +291,6 @@ def _add_end(fleet: Any, time: float, number: int) -> None:
 
 @inlined
 def _rank(fleet: Any, number: int) -> None:
-    """Let the event of a car come after those at the same time that were added before."""
     int64s(fleet.event_ranks)[number] = fleet.event_number
     fleet.event_number += 1
 
@@ -320,7 +312,6 @@ def _pass_time(fleet: Any, time: float) -> None:
 
 @kernel
 def _arrive(fleet: Any) -> int:
-    """Begin the search of the next car."""
     number = fleet.next_car
     fleet.next_car += 1
     car = car_at(fleet.cars, number)
@@ -353,7 +344,6 @@ def _arrive(fleet: Any) -> int:
 
 @kernel
 def _reach(fleet: Any, number: int) -> None:
-    """End the step of a car: it observes, and is asked again unless its search is over."""
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
     if search.parked:
@@ -386,7 +376,6 @@ def _reach(fleet: Any, number: int) -> None:
 
 @inlined
 def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None:
-    """Let a car wait before a blocked vertex until a time, s."""
     car.queues_since = min(car.queues_since, fleet.time)
     before = search.step_drive_s
     search.step_drive_s += until - fleet.time
@@ -400,7 +389,6 @@ def _queue(fleet: Any, car: Any, search: Any, number: int, until: float) -> None
 
 @inlined
 def _inform(fleet: Any, number: int) -> None:
-    """Give a car what it knows beyond its own observations, and refresh its belief."""
     inform(fleet, number)
     refresh_belief(search_at(car_at(fleet.cars, number).search, 0))
 
@@ -509,7 +497,6 @@ def _keep_step(fleet: Any, search: Any, number: int, origin: int) -> None:
 
 @inlined
 def _round_up(fleet: Any, search: Any) -> None:
-    """Let a step end at a full tick after the beginning of the world, and at least one tick later."""
     begin = fleet.arrival
     ticks = max(
         math.ceil((search.time - begin) / fleet.tick_s - _ON_TICK),
@@ -522,7 +509,6 @@ def _round_up(fleet: Any, search: Any) -> None:
 
 @kernel
 def _end_search(fleet: Any, number: int, state: int) -> None:
-    """Record the end of a search."""
     car = car_at(fleet.cars, number)
     search = search_at(car.search, 0)
     car.state, car.ended_at = state, fleet.time
@@ -547,14 +533,12 @@ def _end_search(fleet: Any, number: int, state: int) -> None:
 
 @inlined
 def _make_ready(fleet: Any, number: int) -> None:
-    """Add a car to the end of the queue."""
     int64s(fleet.ready)[(fleet.first_ready + fleet.n_ready) % fleet.n_cars] = number
     fleet.n_ready += 1
 
 
 @inlined
 def _first_ready(fleet: Any) -> Any:
-    """Remove the first car from the queue, and return it."""
     number = int64s(fleet.ready)[fleet.first_ready]
     fleet.first_ready = (fleet.first_ready + 1) % fleet.n_cars
     fleet.n_ready -= 1
@@ -573,7 +557,6 @@ def _free_search(fleet: Any, car: Any) -> None:
 
 @kernel
 def clear_lanes(fleet: Any) -> None:
-    """Begin a world: no lane is blocked."""
     until, by = float64s(fleet.blocked_until), int64s(fleet.blocked_by)
     for vertex in range(fleet.n_vertices):
         until[vertex], by[vertex] = -np.inf, NO_CAR
@@ -610,7 +593,6 @@ def hold_slot(fleet: Any, car: Any, number: int) -> None:
 
 @inlined
 def release_slot(fleet: Any, car: Any) -> None:
-    """Let a car no longer hold a slot."""
     if car.holds != NO_CAR:
         shared_slot_at(fleet.slots, car.holds).held_by = NO_CAR
         car.holds = NO_CAR

@@ -111,7 +111,6 @@ class FleetCars:
         return Drivers(cars["stay_s"], cars["arrival"], value_of_time, classes, plans.kwh)
 
     def drivers_of(self, cars: Any) -> Drivers:
-        """Return the drivers of some cars, an index of `records`."""
         return Drivers(*(np.asarray(values)[cars] for values in self.drivers))
 
     def _zone_costs(self) -> FloatArray | None:
@@ -134,7 +133,6 @@ class FleetCars:
         return np.asarray(problem.walk_s * walks + parking_s + problem.enter_s)
 
     def _slots_of_parked(self, parked: BoolArray, demand: Demand | TownDemand, key: np.uint64) -> IntArray:
-        """Return in which slots cars stand when the world begins."""
         cars, lot = self.records[parked], self._scenario.lot
         slots, u = np.empty(len(cars), np.int64), np.empty(len(cars))
         car_uniforms(key, SLOT_STREAM, 0, u)

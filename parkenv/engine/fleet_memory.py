@@ -127,7 +127,6 @@ class FleetMemory:
         self.record["n_free"] = first + n
 
     def _add_searches(self) -> None:
-        """Make more SEARCH records, so that more cars can search at a time."""
         size = len(self._rows)
         n = min(max(_FIRST_CHUNK, size), max(int(self.record["n_cars"]) - size, 1))
         sparse, observes = self._lot.n_slots >= records.SPARSE_SLOTS, self._most_observed > 0
@@ -145,13 +144,11 @@ class FleetMemory:
         self._add_free(searches)
 
     def _compute_forecast(self) -> None:
-        """Compute the external forecast of the car that has just arrived."""
         searches, row = self._rows[int(self.cars["search"][self.record["pending"]])]
         searches.complete_arrival(row)
         events.init_forecast_at(self.address)
 
     def _grow_reports(self) -> None:
-        """Make room for more reports that are not on the live map yet."""
         first, n = int(self.record["first_report"]), int(self.record["n_reports"])
         old = self.arrays.get("reports", np.zeros(0, REPORT))
         reports = np.zeros(2 * max(len(old), 2 * len(self.slots), 1024), REPORT)
@@ -160,7 +157,6 @@ class FleetMemory:
         self.record["first_report"], self.record["report_capacity"] = 0, len(reports)
 
     def _grow_steps(self) -> None:
-        """Make room for more steps that are kept."""
         old = self.arrays.get("steps", np.zeros(0, STEP))
         steps = np.zeros(max(2 * len(old), 4096), STEP)
         steps[: len(old)] = old
@@ -227,7 +223,6 @@ class FleetMemory:
 
 
 def _counted(lot: ParkingLot) -> NDArray[Any]:
-    """Return the records.COUNTED records of a lot's counted facilities."""
     facilities = [facility for facility in lot.facilities if facility.is_counted]
     counted = np.zeros(len(facilities), records.COUNTED)
     for name in ("capacity", "gate_s", "inside_s", "delay_s"):

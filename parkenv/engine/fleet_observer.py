@@ -51,7 +51,6 @@ class FleetObserver:
 
     @property
     def space(self) -> spaces.Dict:
-        """The space of a car's observations."""
         space, lot = space_of(self._cars.scenarios, self._most_observed), self._problem.lot
         further: dict[str, spaces.Space[Any]] = {}
         if self._is_guided:
@@ -105,14 +104,12 @@ class FleetObserver:
         return {"local": local, "action_mask": self._mask(car, self._vertices[car])}
 
     def outcome(self, car: int) -> StepOutcome:
-        """Return the result of a car's last step."""
         address = self._search_of(car)
         scenario = self._cars.scenarios[self._cars.records["place"][car]]
         reward, over, _, info = read_step(scenario.name, step_result_at(address))
         return StepOutcome(bool(self._memory.search_of(address)["n_steps"]), reward, over, info)
 
     def _search_of(self, car: int) -> int:
-        """Return the address of the SEARCH record of a car that searches."""
         address = int(self._addresses[car])
         if address == 0:
             state = STATES[self._cars.records["state"][car]]
@@ -129,7 +126,6 @@ class FleetObserver:
         return mask
 
     def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
-        """Return which slots in view of a vertex hold a car that shows that it leaves, (n_slots,)."""
         slots = self._memory.slots
         leaving, viewed = np.zeros(len(slots), np.int8), self._problem.in_view(vertex)
         left_s = slots["leaves_at"][viewed] - self._memory.record["time"]

@@ -87,5 +87,4 @@ class FleetOptions:
             require_number(name, getattr(self, name), least=0.0)
 
     def has_drivers_that_know(self, *knowledge: str) -> bool:
-        """Return whether a kind of driver has one of these kinds of knowledge."""
         return any(kind.knows in knowledge for kind in self.drivers)

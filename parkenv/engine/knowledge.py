@@ -35,7 +35,6 @@ _HALF_LIFE = 0.6931471805599453
 
 @kernel
 def clear_live_map(fleet: Any) -> None:
-    """Begin a world: nothing is reported, nothing is reserved."""
     for slot in range(fleet.n_slots):
         live_slot_at(fleet.live_map, slot).time = -np.inf
     fleet.first_report = fleet.n_reports = 0
@@ -47,7 +46,6 @@ def clear_live_map(fleet: Any) -> None:
 
 @kernel
 def report_view(fleet: Any, search: Any) -> None:
-    """Report what a car has just observed to the live map."""
     scenario, columns = scenario_at(search.scenario, 0), int32s(search.columns)
     viewed, starts = int64s(scenario.viewed), int64s(scenario.view_starts)
     hit_rate, false_alarm_rate = float64s(scenario.hit_rate), float64s(scenario.false_alarm_rate)
@@ -83,7 +81,6 @@ def _write(report: Any, time: float, taken: bool, hit_rate: float, false_alarm_r
 
 @inlined
 def _update_map(fleet: Any) -> None:
-    """Put the reports on the map that are old enough."""
     while fleet.n_reports > 0:
         first = report_at(fleet.reports, fleet.first_report)
         if first.time > fleet.time - fleet.delay_s:
@@ -116,7 +113,6 @@ def inform(fleet: Any, number: int) -> None:
 
 @inlined
 def _inform_by_map(fleet: Any, car: Any, search: Any) -> None:
-    """Take over newer reports than the car's own observations."""
     since, until = car.informed_until, fleet.time - fleet.delay_s
     for slot in range(fleet.n_slots):
         live = live_slot_at(fleet.live_map, slot)

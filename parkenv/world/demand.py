@@ -91,11 +91,9 @@ class CarPlans(NamedTuple):
 
     @classmethod
     def joined(cls, parts: Sequence[CarPlans]) -> CarPlans:
-        """Return the cars of several plans, one after another."""
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in cls._fields})
 
     def at(self, order: IntArray) -> CarPlans:
-        """Return the cars with these indices."""
         return self._replace(**{name: getattr(self, name)[order] for name in self._fields})
 
 
@@ -311,7 +309,6 @@ def weights_of_all(weights: Mapping[str, FloatArray]) -> tuple[float, ...]:
 
 
 def _choices(u: FloatArray, weights: Sequence[float]) -> IntArray:
-    """Return the index that each uniform number chooses by weight; equal weights as `int(u * n)`."""
     if len(set(weights)) == 1:
         return (u * len(weights)).astype(np.int64)
     shares = np.cumsum(weights) / np.sum(weights)

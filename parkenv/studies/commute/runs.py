@@ -39,8 +39,6 @@ TRIP = "trip"
 
 @dataclass(frozen=True)
 class Day:
-    """A day of a commute."""
-
     number: int  # 1, 2, ...
     count: int  # days since the first Monday
     date: str  # ISO date of a recorded day; else empty
@@ -65,7 +63,6 @@ def calendar(scenario: Scenario, days: int) -> list[Day]:
 
 
 def map_file(folder: Path, run: CommuteRun) -> Path:
-    """Return the file of a run's map in the folder of a commute."""
     return folder / MAPS_FOLDER / file_name("_".join(str(value) for value in run.columns.values()), ".sqlite")
 
 
@@ -91,23 +88,19 @@ class CommuteRun:
 
     @property
     def learns(self) -> bool:
-        """Whether trips go into a map."""
         return self.map not in (FIXED, NONE)
 
     @property
     def label(self) -> str:
-        """Name of the agent with its options, for tables."""
         return label_of(shown_name(self.agent.name), self.agent.options)
 
     @property
     def columns(self) -> Row:
-        """Columns that identify the run."""
         return {
             "scenario": self.scenario.name, "map": self.map, "agent": self.label, "course": self.number,
         }  # fmt: skip
 
     def start_map(self) -> PriorModel:
-        """Return the map before any trip."""
         scenario = self.scenario
         walk = scenario.lot.walk_m(scenario.goal)
         match self.map:

@@ -40,8 +40,6 @@ PICTURE = "commute.png"
 
 
 class _Days(NamedTuple):
-    """A block of days of a run, with the trips before."""
-
     run: CommuteRun
     before: list[Trip]
 
@@ -95,7 +93,6 @@ class Commute(Study):
 
     @cached_property
     def built(self) -> list[Scenario]:
-        """The scenarios."""
         from parkenv.scenarios.build import build
         from parkenv.studies.commute.runs import with_fixed_slots
 
@@ -103,7 +100,6 @@ class Commute(Study):
 
     @cached_property
     def runs(self) -> list[CommuteRun]:
-        """All runs: every agent with every map, and the references."""
         from parkenv.studies.commute.runs import CommuteRun
         from parkenv.studies.commute.tables import FIXED, NONE
         from planners.names import WITHOUT_FORECAST
@@ -118,7 +114,6 @@ class Commute(Study):
 
     @cached_property
     def calendars(self) -> dict[str, list[Day]]:
-        """The days of each scenario, by its name."""
         from parkenv.studies.commute.runs import calendar
 
         return {scenario.name: calendar(scenario, self.days) for scenario in self.built}
@@ -159,7 +154,6 @@ class Commute(Study):
             )
 
     def input_of(self, work: CommuteRun, items: Sequence[Day], results: Results) -> _Days:
-        """See `Study`: the trips of the days before."""
         from parkenv.mapping.store import MapStore
         from parkenv.studies.commute.runs import map_file
         from parkenv.world.week import DAY_S
@@ -176,7 +170,6 @@ class Commute(Study):
         return rows
 
     def keep(self, work: CommuteRun, rows: Sequence[Row], results: Results) -> None:
-        """See `Study`: trips go into the map of the run."""
         from parkenv.mapping.store import MapStore
         from parkenv.studies.commute.runs import TRIP, map_file
 
@@ -202,7 +195,6 @@ class Commute(Study):
         return {"rows": day_rows(episodes), "weeks": week_rows(episodes)}
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: the picture."""
         from parkenv.show.figures.commute import save_commute_curves
 
         return [partial(save_commute_curves, result.rows, result.folder / PICTURE)]

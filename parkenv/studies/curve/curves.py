@@ -134,7 +134,6 @@ def load_curves(folder: Path | str) -> Curves:
 
 
 def write_curves(paths: Paths, table: CurveTable, folder: Path) -> None:
-    """Write `curve.csv`, `curve.json`, `activitysim.csv` and `matsim.csv` into a folder."""
     names, n = [paths.names(index) for index in table.numbers.tolist()], len(paths.multiples)
     columns = {name: values.round(_DIGITS).tolist() for name, values in table.columns.items()}
     repeated = [[name for name in its for _ in range(n)] for its in zip(*names, strict=True)]

@@ -80,19 +80,15 @@ def fit_form(name: str, x: FloatArray, y: FloatArray, weight: FloatArray) -> tup
 
 
 def form_at(name: str, fit: tuple[float, FloatArray], x: FloatArray) -> FloatArray:
-    """Return the values of a fitted form."""
     return np.asarray(np.dot(fit[1], FORMS[name][0](x, fit[0])))
 
 
 def fitted_forms(points: Sequence[Row]) -> dict[str, Callable[[FloatArray], FloatArray]]:
-    """Return the usual forms that fit measured zone-hours best."""
     x, y, cars = (np.array([row[name] for row in points]) for name in ("occupancy", "measured", "cars"))
     return {name: partial(form_at, name, fit_form(name, x, y, cars)) for name in FORMS} if len(x) else {}
 
 
 class Town(NamedTuple):
-    """The days of a scenario."""
-
     zones: Zones
     purposes: Sequence[str]  # their names
     days: Sequence[Sequence[Row]]  # rows of `ZONES` by multiple and day
@@ -125,7 +121,6 @@ class Paths:
 
     @classmethod
     def of(cls, towns: Mapping[str, Town], multiples: Sequence[float], first_hour: int) -> Self:
-        """Gather the rows of days, of which all demands have equally many."""
         purposes = tuple(dict.fromkeys(name for town in towns.values() for name in town.purposes))
         parts: list[tuple[Any, ...]] = []
         for number, town in enumerate(towns.values()):
@@ -166,7 +161,6 @@ class Paths:
         return np.asarray(streets_s / streets_s.mean())[self.index[:, 0]]
 
     def totals(self, name: str) -> tuple[FloatArray, FloatArray]:
-        """Return sums of an outcome and numbers of cars, (days, n, m) each."""
         return OUTCOMES[name].total(self.sums), self.sums[OUTCOMES[name].of]
 
     def lone(self, name: str) -> FloatArray:
@@ -303,7 +297,6 @@ def held_out_errors(
 
 
 def _added(groups: IntArray, *values: FloatArray) -> list[FloatArray]:
-    """Return sums over groups of paths, (k, m) each."""
     adds = csr_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))))
     return [np.asarray(adds @ its) for its in values]
 

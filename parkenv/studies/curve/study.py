@@ -80,12 +80,10 @@ class CurveStudy(FleetSpec):
 
     @property
     def demands(self) -> tuple[float | str, ...]:
-        """See `FleetStudy`; ascending."""
         return tuple(sorted(super().demands, key=_size))
 
     @cached_property
     def zones(self) -> dict[str, Zones]:
-        """The zones of each scenario, by its name."""
         from parkenv.studies.curve.zones import Zones
 
         return {name: Zones.of(its, self.reach_m) for name, its in self._goals.items()}
@@ -107,14 +105,12 @@ class CurveStudy(FleetSpec):
         return (self.table, ZONES)
 
     def day_tables(self, day: Day) -> dict[str, Row]:
-        """See `FleetSpec`: searches by zone."""
         from parkenv.studies.curve.zones import ZONES, day_of_zones
 
         name = day.fleet.scenario.name
         return {ZONES.file: day_of_zones(day, self.zones[name], self._lone[name])}
 
     def check(self) -> None:
-        """See `Study`: all cars of a curve have equal drivers."""
         for name, its in (("agents", self.drivers), ("knows", self.knowledge), ("shares", self.shares)):
             if len(its) > 1:
                 raise InputError(f"{name} has {len(its)} values, want one: a curve is of equal drivers")
@@ -126,7 +122,6 @@ class CurveStudy(FleetSpec):
         return super().settings() | {"reach_m": self.reach_m}
 
     def _paths(self, results: Results) -> Paths | None:
-        """Return the days that all demands have; None before there are two."""
         from parkenv.studies.curve.fit import Paths, Town
         from parkenv.studies.curve.zones import ZONES
         from parkenv.studies.fleet.day import purpose_names
@@ -176,7 +171,6 @@ class CurveStudy(FleetSpec):
         return summary | {"zones": zones, "reach_m": self.reach_m, "errors": errors}
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: a picture of the curves of each scenario."""
         from parkenv.files.file_names import file_name
         from parkenv.show.figures.curve import save_curves
         from parkenv.show.plurals import plural
@@ -201,7 +195,6 @@ class CurveStudy(FleetSpec):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: how far the first curve is off."""
         from parkenv.studies.curve.fit import CURVE, FORMS
 
         return [

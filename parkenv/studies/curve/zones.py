@@ -66,7 +66,6 @@ class Zones:
 
     @classmethod
     def of(cls, scenarios: Sequence[Scenario], reach_m: float) -> Self:
-        """Return the zones of a fleet, from its scenarios, one for each goal."""
         lot, goals = scenarios[0].lot, [one.goal for one in scenarios]
         walk_m, xy = np.array([lot.walk_m(goal) for goal in goals]), np.array(lot.goals, float)[goals]
         near = (walk_m <= np.maximum(reach_m, walk_m.min(axis=1, keepdims=True))).astype(float)

@@ -107,12 +107,10 @@ class Blocks:
 
 
 def has_zones(scenario: Scenario) -> bool:
-    """Return whether there is something to say of zones."""
     return scenario.has_rules or scenario.lot.zones != (NO_ZONE,)
 
 
 def zone_prices(scenario: Scenario) -> dict[str, float]:
-    """Return what an hour costs in the zones of a lot."""
     return {
         name: float(zone.price.amount(scenario.priced_at_s, HOUR_S))
         for name, zone in zip(scenario.lot.zones, scenario.zone_rules, strict=True)
@@ -181,7 +179,6 @@ def _block_row(day: Day, hours: IntArray) -> Row:
 
 
 def _with_all(sums: NDArray[Any]) -> NDArray[Any]:
-    """Return sums by block, purpose and hour with those of all purposes first, if there are several."""
     return sums if sums.shape[1] == 1 else np.concatenate([sums.sum(axis=1, keepdims=True), sums], axis=1)
 
 
@@ -194,7 +191,6 @@ def _sums(shape: tuple[int, ...], at: Sequence[IntArray], values: FloatArray | N
 
 
 def _hour_row(day: Day, hours: IntArray) -> Row:
-    """Return the row of `HOURS`: all cars, then those of each purpose if there are several."""
     ends = day.fleet.begin // DAY_S * DAY_S + HOUR_S * (hours + 1)
     names, purpose = day.purposes
     groups = {ALL: np.ones(len(purpose), bool)}
@@ -245,7 +241,6 @@ def summarize_blocks(
 
 
 def _day_by(row: Row, by: str) -> dict[str, Row]:
-    """Return measures of each zone, block or purpose on a day, a row of `BLOCKS`."""
     names, _, grid = _grid(row, by)
     cars, parked = grid["arrivals"].sum(axis=1), grid["parked"].sum(axis=1)
     with np.errstate(invalid="ignore"):

@@ -226,7 +226,6 @@ def _best_place(
 
 @compiled(error_model="numpy")
 def _paid_by(time: float, rents: FloatArray, paid: FloatArray) -> float:
-    """Return the rent of a slot up to a time, s; there is none after the last bin."""
     n_bins = len(rents)
     if time >= n_bins * BIN_S:
         return float(paid[n_bins])
@@ -236,7 +235,6 @@ def _paid_by(time: float, rents: FloatArray, paid: FloatArray) -> float:
 
 @compiled(error_model="numpy")
 def _add_stay(begin: float, end: float, used: FloatArray) -> None:
-    """Add the time of a stay to that of each bin."""
     b = int(begin / BIN_S)
     while b < len(used) and b * BIN_S < end:
         used[b] += min(end, (b + 1) * BIN_S) - max(begin, b * BIN_S)

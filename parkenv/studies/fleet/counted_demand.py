@@ -79,7 +79,6 @@ class CountedTown:
         return near, own
 
     def days_of(self, first: date, end: date) -> IntArray:
-        """Return the indices of the scenario's weekdays from a date to before another one, (d,)."""
         days = np.arange(self.counts.day_index(first), self.counts.day_index(end))
         return days[np.isin(self.counts.weekday[days], self._window.weekdays)]
 

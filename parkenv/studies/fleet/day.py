@@ -42,11 +42,9 @@ class Day(NamedTuple):
 
     @property
     def purposes(self) -> tuple[tuple[str, ...], IntArray]:
-        """The purposes of the drivers, `ALL` if there is one, and the number of that of each car."""
         return purpose_names(self.fleet), np.array(self.fleet.cars["purpose"])
 
     def hour_of(self, time: FloatArray) -> IntArray:
-        """Return the hours of times, s since Monday 00:00, counted from the midnight before the day begins."""
         return hour_of(self.fleet, time)
 
     def paid(self) -> FloatArray:
@@ -115,7 +113,6 @@ class LaneCounts:
         fleet.keep_steps()
 
     def update(self) -> None:
-        """Count the steps since the last call; those of cars that still search are counted later."""
         fleet, lot = self._fleet, self._fleet.scenario.lot
         ended = np.flatnonzero((fleet.cars["state"] > SEARCHING) & np.isnan(self._direct_m))
         self._direct_m[ended] = self._roads.direct_m(fleet.cars[ended])

@@ -52,7 +52,6 @@ class _RollOut(NamedTuple):
 
     @property
     def columns(self) -> Row:
-        """Columns that identify it."""
         return {"roll_out": self.number}
 
 
@@ -119,7 +118,6 @@ class DemandStudy(Study):
 
     @cached_property
     def town(self) -> CountedTown:
-        """The town and its counts."""
         from parkenv.forecast.counts import Counts
         from parkenv.studies.fleet.counted_demand import CountedTown
 
@@ -158,14 +156,12 @@ class DemandStudy(Study):
             )
 
     def settings(self) -> Row:
-        """See `Study`: further roll-outs may be added."""
         from parkenv.studies.fingerprints import search_settings
 
         more = ("weeks", "held_out", "rounds", "episodes", "timezone", "seed")
         return search_settings(self, *more) | {"from": str(self._first), "agent": self.agent.label}
 
     def cells(self) -> list[Cell]:
-        """See `Study`: the days held out."""
         days = self.town.counts.days
         return [
             Cell(_RollOut(number), [days[day].isoformat() for day in self.days(number)[1].tolist()])
@@ -173,7 +169,6 @@ class DemandStudy(Study):
         ]
 
     def stages(self, results: Results) -> Iterator[Stage]:
-        """See `Study`: days are driven with what was fitted to the weeks before."""
         from parkenv.forecast.day_curves import FIT_STEPS, fit_settings, forecast_days
 
         fits = _Fits(**{name: getattr(self, name) for name in DemandStudy.model_fields})
@@ -185,7 +180,6 @@ class DemandStudy(Study):
         yield Stage(self.doing, self, self.cells())
 
     def input_of(self, work: _RollOut, items: Sequence[Any], results: Results) -> _RollOut:
-        """See `Study`: the fit of the weeks before, and the forecast."""
         town = self.town
         day = town.counts.day_index(date.fromisoformat(items[0]))
         before, expected = town.expected(results.kept["forecast"], np.array([day]))
@@ -246,7 +240,6 @@ class DemandStudy(Study):
         }
 
     def _held_out(self, results: Results) -> HeldOutErrors:
-        """Return the finished days as arrays."""
         town, rows, fits = self.town, results.rows(DAYS), results.rows(FITTED)
         done = [(cell.work.number, item) for cell in self.cells() for item in cell.items if (item,) in rows]
         days = np.array([town.counts.day_index(date.fromisoformat(item)) for _, item in done], np.int64)
@@ -266,7 +259,6 @@ class DemandStudy(Study):
         return HeldOutErrors(days, shares, fit_error, come, stay_h)
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: the predictions, scenarios with the demand of the last roll-out, its weekdays as a picture."""
         from parkenv.show.figures.forecast import CarParkDays, save_counted_demand
 
         town, held_out, fits = self.town, self._held_out(result.results), result.results.rows(FITTED)
@@ -309,8 +301,6 @@ class HeldOutErrors(NamedTuple):
 
 
 class _Fits(DemandStudy):
-    """The first stage: demands of the weeks followed, a kind of day each."""
-
     table: ClassVar[Table] = FITTED
     doing: ClassVar = "Fitting weeks followed"
 
@@ -329,7 +319,6 @@ class _Fits(DemandStudy):
 
 
 def _write_predictions(days: Sequence[Row], folder: Path) -> None:
-    """Write what was counted and predicted, a line for each car park and hour of the days held out."""
     columns = ("car_park", "hour", "counted", *PREDICTIONS)
     lines = [[line for day in days for line in day[column]] for column in columns]
     dates = [day["date"] for day in days for _ in day["hour"]]
@@ -337,12 +326,10 @@ def _write_predictions(days: Sequence[Row], folder: Path) -> None:
 
 
 def kind_of(weekday: int) -> str:
-    """Return the kind of a day."""
     return next(kind for kind, weekdays in KINDS.items() if weekday in weekdays)
 
 
 def _errors(errors: Mapping[str, FloatArray], weeks: IntArray) -> Row:
-    """Return mean errors, (n, d, n_hours) each, with intervals over weeks, (d,): the mean of the car parks of each."""
     from parkenv.studies.statistics import columns_of, mean_interval
 
     row: Row = {}

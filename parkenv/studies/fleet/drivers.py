@@ -75,7 +75,6 @@ def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "n
 
 
 def _layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
-    """Return the layers of a policy network, their activation, and whether actions are masked."""
     from torch import nn
 
     if hasattr(policy, "q_net"):
@@ -96,7 +95,6 @@ def _layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
 
 
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
-    """Return the compiled policy of an agent."""
     policy, _ = policy_of(spec, scenario)
     if policy is None:
         raise InputError(f"--agents is {spec.label!r}, want a compiled one, such as usual")

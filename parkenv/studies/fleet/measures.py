@@ -76,7 +76,6 @@ def day_measures(day: Day, counted: FloatArray) -> Row:
 
 
 def car_lists(day: Day) -> dict[str, str]:
-    """Return `CAR_LISTS` of a day, as texts."""
     fleet, arrives = day.fleet, day.fleet.cars["parked_at"] < 0
     cars, lot = fleet.cars[arrives], fleet.scenario.lot
     lists = {"total_cs": 100.0 * cars["total_s"], "member": cars["kind"] == 0}

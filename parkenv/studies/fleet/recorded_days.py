@@ -75,7 +75,6 @@ def record_days(
 
 
 def _lines(fleet: Fleet, day: date) -> list[tuple[str, str, int]]:
-    """Return the observations of a day whose searches are over, as rows of a log."""
     ids, midnight = fleet.scenario.lot.slot_ids, datetime.combine(day, time())
     return [
         ((midnight + timedelta(seconds=second)).isoformat(), ids[slot], int(taken))

@@ -42,7 +42,6 @@ class Roads:
         return np.where(cars["slot"] >= 0, self._metres[rows, cars["slot"]], 0.0)
 
     def direct_s(self, cars: NDArray[np.void]) -> FloatArray:
-        """Return the times of these drives, (n,) s; 0 without a slot."""
         rows = np.searchsorted(self._entries, cars["entry"])
         return np.where(cars["slot"] >= 0, self._drive_s[rows, cars["slot"]], 0.0)
 
@@ -81,7 +80,6 @@ class Roads:
         return np.where(np.isfinite(least_s), least_s, self._problem.give_up_s)
 
     def reach(self) -> dict[str, int]:
-        """Return how many `entries` there are, and from how many half of the spaces cannot be reached."""
         capacity, can = self._problem.lot.capacity, np.isfinite(self._drive_s)
         cut_off = int((can @ capacity < 0.5 * capacity.sum()).sum())
         return {"entries": len(can), "entries_cut_off": cut_off}
@@ -101,7 +99,6 @@ class Roads:
         return clairvoyant_bound_s(self.parking_day(fleet))
 
     def parking_day(self, fleet: Fleet) -> ParkingDay:
-        """Return the day of a fleet that has been reset: its cars to come, and when its residents leave."""
         cars = fleet.cars
         leaves_at = np.where(fleet.taken(), fleet.slots["leaves_at"], -np.inf)
         return ParkingDay(

@@ -58,12 +58,10 @@ def rate_of(value: float | str) -> float | str:
 
 
 def times_demanded(rate: str) -> float:
-    """Return how many times the demand that is given or counted this is."""
     return 1.0 if rate in (GIVEN, COUNTED) else float(rate.removesuffix("x"))
 
 
 def middle_of(rates: Iterable[float | str]) -> float | str:
-    """Return the demand in the middle of several, in their order: that which a page tells of first."""
     demands = list(dict.fromkeys(rates))
     return demands[len(demands) // 2]
 
@@ -105,14 +103,12 @@ class Setting:
 
     @property
     def columns(self) -> Row:
-        """The columns that identify the row."""
         return {
             "scenario": self.scenario, "agents": self.agent.label, "knows": self.knows, "share": self.share,
             "arrivals_per_hour": self.arrivals_per_hour,
         }  # fmt: skip
 
     def holds(self, row: Row) -> bool:
-        """Return whether a row is about this setting."""
         return all(row[name] == value for name, value in self.columns.items())
 
     def __str__(self) -> str:

@@ -161,7 +161,6 @@ class FleetSpec(Study):
     @model_validator(mode="before")
     @classmethod
     def _one_scenario(cls, tables: Any) -> Any:
-        """A file may name one `scenario`."""
         if isinstance(tables, Mapping) and "scenario" in tables:
             return {**{k: v for k, v in tables.items() if k != "scenario"}, "scenarios": [tables["scenario"]]}
         return tables
@@ -183,7 +182,6 @@ class FleetSpec(Study):
 
     @property
     def demands(self) -> tuple[float | str, ...]:
-        """Cars an hour, or multiples of the demand that is given or counted."""
         given = all(scenario.demand for scenario in self.scenarios)
         counted = all(scenario.occupancy.counts for scenario in self.scenarios)
         usual = (GIVEN,) if given else (COUNTED,) if counted else (60.0, 120.0, 240.0)
@@ -191,7 +189,6 @@ class FleetSpec(Study):
 
     @cached_property
     def built(self) -> dict[str, Scenario]:
-        """Lot, residents, hours of arrival, speeds and costs of each scenario, by its name."""
         from parkenv.scenarios.build import build
 
         scenarios = [build(spec).replace(stay_s=self.stay_s) for spec in self.scenarios]
@@ -201,7 +198,6 @@ class FleetSpec(Study):
 
     @property
     def drivers(self) -> tuple[AgentSpec, ...]:
-        """The agents; by default one that minds prices, where there are any, or that knows a town."""
         if self.agents:
             return self.agents
         if self._in_towns:
@@ -211,7 +207,6 @@ class FleetSpec(Study):
 
     @property
     def knowledge(self) -> tuple[str, ...]:
-        """What members know, in turn; by default everything that there is to know, but in towns."""
         return self.knows or ((OWN,) if self._in_towns else KNOWLEDGE)
 
     @property
@@ -220,7 +215,6 @@ class FleetSpec(Study):
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """The measured speed, failure cost and manoeuvre, if any."""
         from parkenv.scenarios.calibration import Calibration
 
         if (path := self.calibrated) is None:
@@ -233,14 +227,12 @@ class FleetSpec(Study):
 
     @property
     def blocked_s(self) -> float:
-        """Time for which a car that parks or leaves blocks its lane, s."""
         if self.manoeuvre_s is not None:
             return self.manoeuvre_s
         return 0.0 if self.calibration is None else self.calibration.manoeuvre_s
 
     @cached_property
     def roads(self) -> dict[str, Roads]:
-        """Shortest drives in each scenario, by its name."""
         from parkenv.studies.fleet.roads import Roads
 
         return {name: Roads(scenario) for name, scenario in self.built.items()}
@@ -332,7 +324,6 @@ class FleetSpec(Study):
         return per_hour * hours * self.days <= MOST_LISTED
 
     def check(self) -> None:
-        """See `Study`: days are equal only in equal hours."""
         windows = {
             name: (scenario.arrival.start_s, scenario.arrival.end_s) for name, scenario in self.built.items()
         }
@@ -358,7 +349,6 @@ class FleetSpec(Study):
         return [self.run_day(work, day) for day in items]
 
     def keep(self, work: Setting, rows: Sequence[Row], results: Results) -> None:
-        """See `Study`: the rows of the further tables."""
         del work
         for table in self.all_tables[1:]:
             results.add([row.pop(table.file) for row in rows], table, sync=False)
@@ -367,11 +357,9 @@ class FleetSpec(Study):
         return work.agent.label
 
     def finished_days(self, results: Results) -> list[list[Row]]:
-        """Return the days of each setting that has some."""
         return [rows for cell in self.cells() if (rows := results.of(self, cell))]
 
     def cautions(self) -> dict[str, str]:
-        """Return warnings of the imports of lots, by scenario."""
         from parkenv.lots.draft import read_provenance
 
         files = {spec.title: spec.lot.file for spec in self.scenarios}
@@ -384,7 +372,6 @@ class FleetSpec(Study):
 
     @property
     def title(self) -> str:
-        """Title of the table and of the picture."""
         from parkenv.show.plurals import plural
 
         lots = [f"{name}: {plural(scenario.lot.n_slots, 'slot')}" for name, scenario in self.built.items()]

@@ -47,13 +47,11 @@ class FleetStudy(FleetSpec):
 
     @property
     def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
-        """See `Study`: blocks, lanes and hours, too."""
         from parkenv.studies.fleet.blocks import TABLES
 
         return (self.table, *TABLES)
 
     def day_tables(self, day: Day) -> dict[str, Row]:
-        """See `FleetSpec`: rows of blocks, lanes and hours."""
         from parkenv.studies.fleet.blocks import day_rows
 
         return day_rows(day)
@@ -88,7 +86,6 @@ class FleetStudy(FleetSpec):
         }
 
     def outputs(self, result: Result) -> list[Task[object]]:
-        """See `Study`: a picture of each scenario, and a page with maps."""
         from parkenv.files.file_names import file_name
         from parkenv.show.figures.fleet import save_fleet_figure, save_zones_figure
         from parkenv.show.plurals import plural
@@ -122,7 +119,6 @@ class FleetStudy(FleetSpec):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
-        """See `Study`: the first setting."""
         row = summary["rows"][0]
         return [
             f"{row['agents']} on {row['scenario']}, {rate_text(row['arrivals_per_hour'])}: {row['total_s']:.1f} s a "

@@ -68,7 +68,6 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
 
 
 def paired_days(days: Sequence[Row], others: Sequence[Row]) -> Pairs:
-    """Return the days of a setting, each with the same day in another one, as far as both have it."""
     by_day = {day["day"]: day for day in others}
     return [(day, by_day[day["day"]]) for day in days if day["day"] in by_day]
 
@@ -111,7 +110,6 @@ def day_means(days: Sequence[Row], measures: Iterable[str], with_interval: Colle
 
 
 def _ratio(name: str, pairs: Pairs, column: str) -> Row:
-    """Return the ratio of the total time of all cars to a column of the same days, with a bootstrap over days."""
     if not pairs or any(math.isnan(theirs[column]) for _, theirs in pairs):
         return columns_of(name, (math.nan, math.nan, math.nan))
     mine, theirs = (
@@ -255,5 +253,4 @@ def _change(after: Row, before: Row, column: str, number: int | None) -> Row:
 
 
 def _with_lists(day: Row) -> Row:
-    """Return a day with `CAR_LISTS` as arrays, (n_cars,) float64, empty where they are not known."""
     return {**day, **{name: np.array(day.get(name, "").split(), np.float64) for name in CAR_LISTS}}
