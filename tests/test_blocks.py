@@ -5,15 +5,14 @@ import re
 
 import numpy as np
 import pytest
-from small_lots import features
+from small_lots import driven, features
 
-from parkenv import ParkingLot, fleet, make_scenario
+from parkenv import ParkingLot, fleet
 from parkenv.engine.records import STATES
 from parkenv.lots import packaged_lot, write_lot
 from parkenv.show.report.town_map import town_data
 from parkenv.studies.fleet.blocks import BLOCKS, HOURS, LANES, NOWHERE, Blocks
 from parkenv.studies.fleet.day import ALL
-from parkenv.studies.fleet.roads import Roads
 from parkenv.world.facility import Facility
 
 
@@ -22,13 +21,9 @@ def run(tmp_path_factory):
     """Two days in a small lot with a kerb, a garage and two zones, in which some cars find no slot."""
     folder, plain = tmp_path_factory.mktemp("blocks"), packaged_lot("mini")
     zone = np.where(plain.walk_m() <= np.median(plain.walk_m()), "centre", "")
+    inside = {"capacity": 2, "xy": (10.0, 14.0), "gate_s": 5.0, "inside_s": (10.0, 30.0)}
     supply = {
-        "facilities": (
-            Facility("Mill Street", "kerb"),
-            Facility(
-                "P1", "garage", "centre", capacity=2, xy=(10.0, 14.0), gate_s=5.0, inside_s=(10.0, 30.0)
-            ),
-        ),
+        "facilities": (Facility("Mill Street", "kerb"), Facility("P1", "garage", "centre", **inside)),
         "slot_facility": np.where((zone == "centre") & (np.cumsum(zone == "centre") <= 3), "Mill Street", ""),
     }
     write_lot(ParkingLot(**features(plain) | {"slot_zone": zone} | supply), folder / "zoned.geojson")
@@ -41,16 +36,12 @@ def run(tmp_path_factory):
             "commuters": {"arrivals_per_hour": 20, "patience_s": 200},
         },
     }
-    found = fleet(
+    result = fleet(
         scenarios=[spec], agents=("random",), knows=("own",), days=2, jobs=1, folder=folder / "run"
-    )  # fmt: skip
-    its, cars = found.study, []
-    for day in range(2):
-        world, agents = its.fleet(its.fleet_settings[0])
-        world.reset(its.seed, day)
-        world.run(agents)
-        cars.append(world.cars)
-    return found, cars
+    )
+    study = result.study
+    worlds = [(study.fleet(study.fleet_settings[0]), day) for day in range(2)]
+    return result, [driven(world, study.seed, day, agents=agents).cars for (world, agents), day in worlds]
 
 
 BLOCKS_OF_RUN = {
@@ -94,9 +85,8 @@ def test_blocks_hold_all_cars_attempts_seconds_metres_and_coins(run):
             assert (blocks["arrivals"] - blocks["departures"])[until].sum() == parked
         centre = blocks["zone"] == "centre"
         assert blocks["paid"][centre].sum() == pytest.approx(blocks["paid"].sum())
-        assert {
-            *zip(blocks["block"], blocks["type"], blocks["zone"], blocks["slots"], strict=True)
-        } == BLOCKS_OF_RUN
+        names = (blocks[name] for name in ("block", "type", "zone", "slots"))
+        assert {*zip(*names, strict=True)} == BLOCKS_OF_RUN
 
 
 def test_purposes_add_up_to_all_cars(run):
@@ -108,12 +98,11 @@ def test_purposes_add_up_to_all_cars(run):
                 assert of_purposes == pytest.approx(every[name].sum())
     names = [one.name for one in run[0].study.built["zoned"].demand.purposes]
     for row in run[0].summary["purposes"]:
-        its = [cars[cars["purpose"] == names.index(row["purpose"])] for cars in run[1]]
-        assert row["parked_a_day"] == np.mean([(cars["slot"] >= 0).sum() for cars in its])
-        assert row["balked_fraction"] == pytest.approx(np.mean([(cars["slot"] < 0).mean() for cars in its]))
-        assert row["search_s"] == pytest.approx(
-            np.mean([(cars["ended_at"] - cars["arrival"]).mean() for cars in its]), abs=0.01
-        )
+        days = [cars[cars["purpose"] == names.index(row["purpose"])] for cars in run[1]]
+        search_s = np.mean([(cars["ended_at"] - cars["arrival"]).mean() for cars in days])
+        assert row["parked_a_day"] == np.mean([(cars["slot"] >= 0).sum() for cars in days])
+        assert row["balked_fraction"] == pytest.approx(np.mean([(cars["slot"] < 0).mean() for cars in days]))
+        assert row["search_s"] == pytest.approx(search_s, abs=0.01)
         # Occupancy by purpose is that of its cars; residents have none.
         assert 0.0 < row["occupancy"] < 1.0
 
@@ -121,11 +110,10 @@ def test_purposes_add_up_to_all_cars(run):
 def test_detours_of_lanes_are_those_of_cars(run):
     days = run[0].results.of(run[0].study, run[0].study.cells()[0])
     for lanes, blocks, day, cars in zip(columns(run, LANES), columns(run, BLOCKS), days, run[1], strict=True):
+        cruised_m = lanes["cruised_m"].sum()
         assert lanes["driven_m"].sum() == pytest.approx(cars["driven_m"].sum(), rel=1e-3)
-        assert lanes["cruised_m"].sum() == pytest.approx(day["cruised_m"] * len(cars), rel=1e-3)
-        assert np.nansum(blocks["cruised_m"] * blocks["arrivals"]) == pytest.approx(
-            lanes["cruised_m"].sum(), rel=1e-3
-        )
+        assert cruised_m == pytest.approx(day["cruised_m"] * len(cars), rel=1e-3)
+        assert np.nansum(blocks["cruised_m"] * blocks["arrivals"]) == pytest.approx(cruised_m, rel=1e-3)
         assert (lanes["cruised_m"] <= lanes["driven_m"]).all()
 
 
@@ -144,17 +132,10 @@ def test_zones_are_groups_of_blocks(run):
     days = columns(run, BLOCKS)
     assert {name: row["slots"] for name, row in zones.items()} == {"centre": 7, "other": 5}
     for name, row in zones.items():
-        its = [day["zone"] == name for day in days]
-        assert row["parked_a_day"] == np.mean(
-            [day["arrivals"][i].sum() for day, i in zip(days, its, strict=True)]
-        )
-        taken = [np.nansum((day["occupancy"] * day["slots"])[i]) for day, i in zip(days, its, strict=True)]
-        hours = [
-            np.isfinite(day["occupancy"][i & (day["block"] == "centre")]).sum()
-            for day, i in zip(days, its, strict=True)
-        ]
-        if name == "centre":
-            assert row["occupancy"] == pytest.approx(np.mean(np.divide(taken, hours)) / 7)
+        assert row["parked_a_day"] == np.mean([day["arrivals"][day["zone"] == name].sum() for day in days])
+    taken = [np.nansum((day["occupancy"] * day["slots"])[day["zone"] == "centre"]) for day in days]
+    hours = [np.isfinite(day["occupancy"][day["block"] == "centre"]).sum() for day in days]
+    assert zones["centre"]["occupancy"] == pytest.approx(np.mean(np.divide(taken, hours)) / 7)
 
 
 def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
@@ -166,10 +147,9 @@ def test_the_map_holds_the_means_of_the_tables_in_one_small_file(run):
     days = columns(run, BLOCKS)
     for number, block in enumerate(town["blocks"]):
         for i, hour in enumerate(shown["hours"]):
-            its = [
-                day["arrivals"][(day["block"] == block["name"]) & (day["hour"] == hour)].sum() for day in days
-            ]
-            assert shown["blocks"]["arrivals"][number][i] == np.mean(its)
+            here = [(day["block"] == block["name"]) & (day["hour"] == hour) for day in days]
+            cars = [day["arrivals"][which].sum() for day, which in zip(days, here, strict=True)]
+            assert shown["blocks"]["arrivals"][number][i] == np.mean(cars)
     for cars in zip(*shown["states"].values(), strict=True):
         assert sum(cars) == pytest.approx(np.mean([len(its) for its in run[1]]))
     assert len(text) < 300_000
@@ -190,8 +170,3 @@ def test_a_counted_facility_is_a_block_of_its_capacity_and_a_square_at_its_place
     np.testing.assert_allclose(corners.mean(axis=0), garage.xy)
     assert np.ptp(corners, axis=0) == pytest.approx([60.0, 60.0], abs=0.1)
     assert 1 <= len(slots["areas"]) <= 4
-
-
-def test_entries_from_which_most_spaces_cannot_be_reached_are_counted():
-    found = Roads(make_scenario("mini")).reach()
-    assert found == {"entries": 1, "entries_cut_off": 0}

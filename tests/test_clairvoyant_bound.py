@@ -100,13 +100,11 @@ def test_no_fleet_is_below_it(knows):
     (scenario,) = scenario_specs("mini")
     scenario = scenario.changed(arrivals={"hours": "08:00-09:00", "days": "weekdays"})
     scenario = scenario.changed(costs={"prices": {} if knows == "own" else {"other": 1.0}})
-    spec = FleetStudy().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
-    its = spec
-    (scenario,) = its.built.values()
-    roads = Roads(scenario)
-    for setting in its.fleet_settings:
-        for day in range(3):
-            fleet, agents = its.fleet(setting)
+    study = FleetStudy().changed(scenario=scenario, knows=(knows,), arrivals_per_hour=(8.0, 40.0))
+    roads = Roads(study.built["mini"])
+    for setting in study.fleet_settings:
+        for day in range(2):
+            fleet, agents = study.fleet(setting)
             fleet.reset(2, day)
             bound_s = clairvoyant_bound_s(roads.parking_day(fleet))
             fleet.run(agents)

@@ -8,12 +8,7 @@ from parkenv import OccupancyProcess, Scenario, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import SEARCHING
 from parkenv.lots import grid_lot
-from parkenv.world.demand import (
-    ConstantTime,
-    Demand,
-    Headways,
-    ListedArrivals,
-)
+from parkenv.world.demand import ConstantTime, Demand, Headways, ListedArrivals
 from parkenv.world.lot import PARK
 from planners.heuristics import POLICIES
 from planners.routes import DriveRoutes
@@ -38,6 +33,7 @@ def toward(slot, vertex):
 def drive(fleet, slots):
     """Run a fleet in which each car parks in its slot; return the observations of each car."""
     seen = {}
+    fleet.reset(0)
     while (car := fleet.next_decision()) is not None:
         observation = fleet.observation(car)
         seen.setdefault(car, []).append(observation)
@@ -59,7 +55,6 @@ def test_a_car_that_parks_blocks_those_behind_it():
     ends = {}
     for manoeuvre_s in (0.0, 30.0):
         fleet = Fleet(SCENARIO, arriving(0.0, 0.5), background="none", manoeuvre_s=manoeuvre_s)
-        fleet.reset(0)
         drive(fleet, [near, far])
         ends[manoeuvre_s] = fleet.cars["ended_at"] - fleet.cars["arrival"]
         assert fleet.cars["queued_s"][0] == 0.0
@@ -71,24 +66,16 @@ def test_a_car_that_parks_blocks_those_behind_it():
 
 
 def test_queues_grow_backwards_and_dissolve():
-    near, far = by_distance()[[3, -1]]
     fleet = Fleet(SCENARIO, arriving(0.0, 1.5, 3.0, 4.5), background="none", manoeuvre_s=60.0)
-    fleet.reset(0)
-    others = by_distance()[[-1, -2, -3]]
-    drive(fleet, [near, *others])
+    drive(fleet, by_distance()[[3, -1, -2, -3]])
     queued = fleet.cars["queued_s"]
     assert queued[0] == 0.0
     assert (np.diff(queued[1:]) < 0).all()
     assert queued[3] > 45.0
     assert fleet.state_names() == ["parked"] * 4
-    assert far == others[0]
-
-
-def test_a_leaving_car_blocks_the_lane():
-    near, far = by_distance()[[0, -1]]
+    # A car that leaves blocks the lane, too.
     fleet = Fleet(SCENARIO, arriving(0.0, 60.0, stay_s=58.0), background="none", manoeuvre_s=20.0)
-    fleet.reset(0)
-    drive(fleet, [near, far])
+    drive(fleet, by_distance()[[0, -1]])
     assert fleet.cars["left_at"][0] < fleet.cars["ended_at"][1]
     assert fleet.cars["queued_s"][1] > 0.0
 
@@ -100,7 +87,6 @@ def test_the_car_that_waits_for_one_that_leaves_has_the_slot():
         # The first leaves while the second stands in a failed attempt; the third comes by in between.
         demand = Demand(ListedArrivals((36000.0, 36040.0, 36049.0)), ConstantTime(46.0))
         fleet = Fleet(SCENARIO, demand, background="none", leaving_soon_s=soon_s)
-        fleet.reset(0)
         drive(fleet, [slot] * 3)
         states[soon_s] = np.argsort(fleet.cars["ended_at"]).tolist()
         assert (fleet.slots["held_by"] == -1).all()
@@ -138,7 +124,6 @@ def test_lights_are_seen_in_view_only_and_before_the_departure_only():
 def test_cars_see_others_in_view_and_where_one_stands():
     slot = int(by_distance()[4])
     fleet = Fleet(SCENARIO, arriving(0.0, 2.0, 4.0), background="none", sees_cars=True)
-    fleet.reset(0)
     seen = drive(fleet, [slot] * 3)
     counts = np.array([observation["cars"].sum(axis=1) for observation in seen[2]])
     assert counts.max() <= 2

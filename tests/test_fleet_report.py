@@ -33,11 +33,10 @@ def test_the_data_replay_the_days_of_the_run(run):
     assert len(data["run"]["findings"]) == 1
     assert len(data["fleets"]) == 8
     assert all(its["agrees"] for its in data["fleets"])
-    settings = [
-        (its["knows"], its["share"], its["arrivals_per_hour"]) for its in data["fleets"] if its["day"] == 0
-    ]
+    names = ("arrivals_per_hour", "knows", "share")
+    settings = [tuple(day[name] for name in names) for day in data["fleets"] if day["day"] == 0]
     assert settings == [
-        (k, s, a) for a in (20, 40) for k, s in (("own", 0), ("reserve", 0.5), ("reserve", 1))
+        (a, *rest) for a in (20, 40) for rest in (("own", 0), ("reserve", 0.5), ("reserve", 1))
     ]
 
 
@@ -72,10 +71,9 @@ def test_failed_attempts_and_queues_are_on_the_track():
         scenario={"lot": "mini", "arrivals": {"hours": "08:00-08:30"}}, agents=["first-free"], knows=["own"],
         arrivals_per_hour=[120], days=1, manoeuvre_s=6.0,
     )  # fmt: skip
-    experiment = spec
-    ((setting, day),) = choose_days(experiment, experiment.fleet_settings, 1)
-    its = record_day(experiment, setting, day, {})["fleet"]
-    fleet, agents = experiment.fleet(experiment.fleet_settings[0])
+    ((setting, day),) = choose_days(spec, spec.fleet_settings, 1)
+    its = record_day(spec, setting, day, {})["fleet"]
+    fleet, agents = spec.fleet(setting)
     fleet.keep_steps()
     fleet.reset(0, 0)
     fleet.run(agents)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from car_park_counts import CURVE, write_counts
-from command_line import parkenv, summary_of
+from command_line import ran, summary_of
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -105,10 +105,9 @@ def test_worlds_of_a_key_have_the_same_cars_and_more_come_if_more_are_wanted():
     scenario = make_scenario("mini")
     times = []
     for times_counted in (1.0, 1.0, 3.0):
-        arrivals = FollowingArrivals(
-            scenario.occupancy, scenario.arrival, ExponentialTime(1200.0), times_counted
-        )
-        fleet = Fleet(scenario, Demand(arrivals, ExponentialTime(1200.0)))
+        stay = ExponentialTime(1200.0)
+        arrivals = FollowingArrivals(scenario.occupancy, scenario.arrival, stay, times_counted)
+        fleet = Fleet(scenario, Demand(arrivals, stay))
         fleet.reset(7, 3)
         times.append(fleet.cars["arrival"].copy())
     assert np.array_equal(times[0], times[1])
@@ -129,14 +128,13 @@ def test_the_fleet_follows_the_counts_of_a_car_park(tmp_path):
     write_counts(tmp_path / "counts.csv", change=lambda park, day, taken: 0.85 * taken)
     words = ("--scenario", "campus", "--occupancy", tmp_path / "counts.csv", "--car-park", "P0")
     words += ("--replay-from", "2024-01-20", "--hours", "07:00-12:30", "-n", 6, "--knows", "own", "--jobs", 1)
-    done = parkenv("fleet", *words, "--out", tmp_path / "out")
-    assert (done.returncode, done.stderr) == (0, "")
+    ran("fleet", *words, "--out", tmp_path / "out")
     summary = summary_of(tmp_path / "out")
     (row,) = summary["rows"]
     assert row["arrivals_per_hour"] == "counted"
     assert row["occupancy"] == pytest.approx(row["counted_occupancy"], abs=0.03)
     hours = summary["hours"]
-    assert [its["hour"] for its in hours] == [7, 8, 9, 10, 11, 12]
+    assert [row["hour"] for row in hours] == [7, 8, 9, 10, 11, 12]
     assert hours[0]["counted_occupancy"] < 0.3 < 0.7 < hours[4]["counted_occupancy"]
     for its in hours:
         assert its["occupancy"] == pytest.approx(its["counted_occupancy"], abs=0.05)

@@ -25,7 +25,7 @@ from parkenv.studies.results import Row
 from parkenv.studies.workers import SERIAL, Workers
 
 CURVE, LONE_SEARCH = "curve", "lone search"
-MOST_CHANCE = 0.3
+MAX_SAMPLING_ERROR = 0.3
 FOLDS = 5
 """Parts of the zones, each of which is held out once."""
 _GROWS, _PURPOSE = (1, 1, 1, 1, 0, 0, 1), 5
@@ -126,13 +126,11 @@ class Paths:
         for number, town in enumerate(towns.values()):
             n_zones, hours = np.shape(town.days[0][0]["occupancy"])
             shape = len(town.days[0]), len(multiples), n_zones, len(town.purposes), hours
-            of_cars = np.zeros((len(SUMS), *shape))
-            state = np.zeros((4, len(multiples), n_zones, hours))
+            of_cars, state = np.zeros((len(SUMS), *shape)), np.zeros((4, len(multiples), n_zones, hours))
             for m, days in enumerate(town.days):
                 for day, row in enumerate(days):
-                    of_cars[:, day, m, row["zone"], row["purpose"], row["hour"]] = [
-                        row[name] for name in SUMS
-                    ]
+                    at = row["zone"], row["purpose"], row["hour"]
+                    of_cars[(slice(None), day, m, *at)] = [row[name] for name in SUMS]
                     for values, name in zip(state[:, m], STATE, strict=True):
                         values += np.array(row[name]) / len(days)
             # More demand makes no zone emptier, but for chance.
@@ -143,9 +141,7 @@ class Paths:
             features = np.concatenate([state[:, :, zone, hour], fixed]).transpose(2, 1, 0)
             index = np.stack([np.full_like(zone, number), zone, known, hour], axis=1)
             parts.append((index, features, of_cars[:, :, :, zone, purpose, hour].transpose(0, 1, 3, 2)))
-        index, features, of_cars = (
-            np.concatenate([part[k] for part in parts], axis) for k, axis in enumerate((0, 0, 2))
-        )
+        index, features, of_cars = map(np.concatenate, zip(*parts, strict=True), (0, 0, 2))
         zones, x = {name: town.zones for name, town in towns.items()}, np.array(multiples)
         usual = {name: int(abs(x - town.usual).argmin()) for name, town in towns.items()}
         sums = dict(zip(SUMS, of_cars, strict=True))
@@ -165,21 +161,20 @@ class Paths:
 
     def lone(self, name: str) -> FloatArray:
         """Return an outcome as lone searches have it, (n, m), growing with the demand; see `LoneSearches`."""
-        sums = {of: self.sums[lone].sum(axis=0) for of, lone in zip(OF_CARS, ("cars", *LONE), strict=True)}
-        total, cars = OUTCOMES[name].total(sums), sums[OUTCOMES[name].of]
+        of_lone = {of: self.sums[lone].sum(axis=0) for of, lone in zip(OF_CARS, ("cars", *LONE), strict=True)}
+        total, cars = OUTCOMES[name].total(of_lone), of_lone[OUTCOMES[name].of]
         # Isotonic regression over the multiples (its min-max formula); k is the last of some, i the first.
-        to = [np.pad(its.cumsum(axis=1), ((0, 0), (1, 0))) for its in (total, cars)]
-        total, cars = (its[:, None, 1:] - its[:, :-1, None] for its in to)
-        means = _mean(total, cars, np.nan)
+        to = [np.pad(sums.cumsum(axis=1), ((0, 0), (1, 0))) for sums in (total, cars)]
+        means = _mean(*(sums[:, None, 1:] - sums[:, :-1, None] for sums in to), np.nan)
         grown = [np.fmin.reduce(means[:, : k + 1, k:], axis=2) for k in range(len(self.multiples))]
-        return np.asarray(np.nan_to_num(np.stack([np.fmax.reduce(its, axis=1) for its in grown], axis=1)))
+        return np.asarray(np.nan_to_num(np.stack([np.fmax.reduce(least, axis=1) for least in grown], axis=1)))
 
     def names(self, index: Sequence[int]) -> tuple[str, str, str, str]:
         """Return the names of town, zone, purpose and clock hour; `all` for -1."""
         town, zone, purpose, hour = index
         name, zones = list(self.towns.items())[town]
         numbered = (zones.names, zone), (self.purposes, purpose), (range(self.first_hour, 48), hour)
-        return name, *("all" if number < 0 else str(its[number]) for its, number in numbered)  # type: ignore[return-value]
+        return name, *("all" if number < 0 else str(names[number]) for names, number in numbered)  # type: ignore[return-value]
 
 
 def _mean(total: Any, cars: Any, missing: float = 0.0) -> FloatArray:
@@ -229,10 +224,9 @@ def _factors(of_days: FloatArray, expected: FloatArray, group: IntArray, share: 
     seen = np.array([np.bincount(group, day.sum(axis=1)) for day in of_days])
     mean = np.bincount(group, expected.sum(axis=1))
     away = _mean(share @ seen - mean, mean)
-    # Of a single day nothing tells chance from what is the zone's own.
-    chance = (
-        _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2) if len(seen) > 1 else np.full(len(mean), 1e12)
-    )
+    # One day gives no estimate of the variance between days.
+    several = len(seen) > 1
+    chance = _mean(seen.var(axis=0, ddof=1) / len(seen), mean**2) if several else np.full(len(mean), 1e12)
     spread = max(float((mean * (away**2 - chance)).sum() / max(mean.sum(), 1e-9)), 0.0)
     return np.asarray(1.0 + away * spread / np.maximum(spread + chance, 1e-12))
 
@@ -260,7 +254,7 @@ def held_out_errors(
 
     Errors are over the zone-hours of each demand, weighted by the cars there, and relative to what was measured; those
     of a perfect curve are chance in the days, half the difference between even and odd ones. Where chance is more than
-    `MOST_CHANCE`, nothing is said.
+    `MAX_SAMPLING_ERROR`, nothing is said.
     """
     rows: list[Row] = []
     shown: list[Row] = []
@@ -268,75 +262,73 @@ def held_out_errors(
     fits = workers.in_order(
         [partial(fit_curve, paths, name, ~held) for name in OUTCOMES for _, held in parts]
     )
-    purposes = [(paths.index[:, 2] == purpose)[:, None] for purpose in range(len(paths.purposes))]
-    x = paths.features[..., 0]
     for name in OUTCOMES:
-        total, cars = (its.mean(axis=0) for its in paths.totals(name))
-        y, known, lone = _mean(total, cars), cars > 0.0, paths.lone(name)
-        predicted: dict[tuple[str, str], FloatArray] = {}
+        total, cars = (sums.mean(axis=0) for sums in paths.totals(name))
+        y, lone = _mean(total, cars), paths.lone(name)
+        predicted: dict[str, dict[str, FloatArray]] = {}
         for what, held in parts:
             common, own = next(fits)
             progress()
-            its_own = {CURVE: own if what == "demands" else common, LONE_SEARCH: lone}
-            for form in (*its_own, *FORMS):
-                values = predicted.setdefault((what, form), np.full_like(y, np.nan))
-                if form in its_own:
-                    values[held] = its_own[form][held]
-                for its in purposes if form in FORMS else ():
-                    train, test = its & ~held & known, its & held
-                    if train.any():
-                        values[test] = form_at(form, fit_form(form, x[train], y[train], cars[train]), x[test])
-        for what in dict.fromkeys(what for what, _ in predicted) if y.any() else ():
-            errors = {form: _errors(paths, name, predicted[what, form]) for form in PREDICTORS}
-            relative = {form: its.pop("relative") for form, its in errors.items()}
-            if errors[CURVE]["chance"] < MOST_CHANCE:
+            by_form = {CURVE: own if what == "demands" else common, LONE_SEARCH: lone}
+            by_form |= {form: _form_elsewhere(paths, form, y, cars, held) for form in FORMS}
+            for form, values in by_form.items():
+                of_form = predicted.setdefault(what, {}).setdefault(form, np.full_like(y, np.nan))
+                of_form[held] = values[held]
+        for what, by_form in predicted.items() if y.any() else ():
+            errors = {form: _errors(paths, name, by_form[form]) for form in PREDICTORS}
+            relative = {form: error.pop("relative") for form, error in errors.items()}
+            if errors[CURVE]["chance"] < MAX_SAMPLING_ERROR:
                 rows.append({"held_out": what, "outcome": OUTCOMES[name].label} | relative | errors[CURVE])
-        if name == "search_s" and ("zones", CURVE) in predicted:
-            shown = _zone_hours(paths, predicted["zones", CURVE])
+        if name == "search_s" and "zones" in predicted:
+            shown = _zone_hours(paths, predicted["zones"][CURVE])
     return rows, shown
+
+
+def _form_elsewhere(paths: Paths, form: str, y: FloatArray, cars: FloatArray, held: BoolArray) -> FloatArray:
+    """Return a usual form where cells are held out, fitted to the others of the same purpose; else NaN."""
+    values, x = np.full_like(y, np.nan), paths.features[..., 0]
+    for purpose in range(len(paths.purposes)):
+        of_purpose = (paths.index[:, 2] == purpose)[:, None]
+        train, test = of_purpose & ~held & (cars > 0.0), of_purpose & held
+        if train.any():
+            values[test] = form_at(form, fit_form(form, x[train], y[train], cars[train]), x[test])
+    return values
 
 
 def _added(groups: IntArray, *values: FloatArray) -> list[FloatArray]:
     adds = csr_matrix((np.ones(len(groups)), (groups, np.arange(len(groups)))))
-    return [np.asarray(adds @ its) for its in values]
+    return [np.asarray(adds @ of_paths) for of_paths in values]
 
 
 def _zone_hours(paths: Paths, predicted: FloatArray) -> list[Row]:
-    total, cars = (its.mean(axis=0) for its in paths.totals("search_s"))
-    hours, first = paths.groups(0, 1, 3), np.unique(paths.groups(0, 1, 3), return_index=True)[1]
-    of = _added(hours, cars, total, cars * predicted)
-    of.insert(1, of[0] * paths.features[first, :, 0])
-    names = [paths.names(index) for index in paths.index[first].tolist()]
-    return [
-        {
-            "scenario": names[k][0],
-            "zone": names[k][1],
-            "hour": int(names[k][3]),
-            "multiple": float(paths.multiples[m]),
-        }
-        | {"cars": float(of[0][k, m])}
-        | {
-            c: float(its[k, m] / of[0][k, m])
-            for c, its in zip(("occupancy", "measured", "predicted"), of[1:], strict=True)
-        }
-        for k, m in np.argwhere(of[0] > 0.0).tolist()
-    ]
+    total, cars = (sums.mean(axis=0) for sums in paths.totals("search_s"))
+    groups = paths.groups(0, 1, 3)
+    first = np.unique(groups, return_index=True)[1]
+    cars, total, expected = _added(groups, cars, total, cars * predicted)
+    sums = {"occupancy": cars * paths.features[first, :, 0], "measured": total, "predicted": expected}
+    rows = []
+    for k, m in np.argwhere(cars > 0.0).tolist():
+        scenario, zone, _, hour = paths.names(paths.index[first[k]].tolist())
+        row = {"scenario": scenario, "zone": zone, "hour": int(hour), "multiple": float(paths.multiples[m])}
+        means = {name: float(values[k, m] / cars[k, m]) for name, values in sums.items()}
+        rows.append({**row, "cars": float(cars[k, m]), **means})
+    return rows
 
 
 def _errors(paths: Paths, name: str, predicted: FloatArray) -> Row:
-    of_days = [np.where(np.isfinite(predicted), its, 0.0) for its in paths.totals(name)]
-    days = np.arange(len(of_days[0])) % 2
-    values = *(its.mean(axis=0) for its in of_days), np.nan_to_num(predicted) * of_days[1].mean(axis=0)
-    total, cars, expected = _added(paths.groups(0, 1, 3), *values)
+    of_days = [np.where(np.isfinite(predicted), sums, 0.0) for sums in paths.totals(name)]
+    odd, groups = np.arange(len(of_days[0])) % 2 == 1, paths.groups(0, 1, 3)
+    means = [sums.mean(axis=0) for sums in of_days]
+    values = *means, np.nan_to_num(predicted) * means[1]
+    total, cars, expected = _added(groups, *values)
     halves = (
-        _added(paths.groups(0, 1, 3), *(its[days == k].mean(axis=0) for its in of_days)) for k in (0, 1)
+        _mean(*_added(groups, *(sums[days].mean(axis=0) for sums in of_days)), np.nan) for days in (~odd, odd)
     )
-    even, odd = (_mean(total, cars, np.nan) for total, cars in halves)
     of_zones, _, expected_of_zones = _added(paths.groups(0, 1), *values)
     whole = float(total.sum()) or np.nan  # of what never happens nothing is relative
     return {
         "relative": float(abs(total - expected).sum() / whole),
-        "chance": float(np.nansum(cars * abs(even - odd)) / 2.0 / whole),
+        "chance": float(np.nansum(cars * abs(np.subtract(*halves))) / 2.0 / whole),
         "of_zones": float(abs(of_zones - expected_of_zones).sum() / whole),
         "measured": float(total.sum() / cars.sum()),
         "bias": float((expected - total).sum() / whole),
@@ -375,16 +367,16 @@ def curve_table(
         workers: where fits run.
         progress: called after each fit.
     """
-    found, adds = [], []
+    numbers, adds = [], []
     for alls in range(8):
         whole = [1 + column for column in range(len(INDEX)) if alls >> column & 1]
         if 2 in whole and len(paths.purposes) == 1:
             continue
-        its = paths.index.copy()
-        its[:, whole] = -1
-        of, row = np.unique(its, axis=0, return_inverse=True)
-        found.append(of)
-        adds.append(csr_matrix((np.ones(len(its)), (row.ravel(), np.arange(len(its))))))
+        index = paths.index.copy()
+        index[:, whole] = -1
+        rows, row = np.unique(index, axis=0, return_inverse=True)
+        numbers.append(rows)
+        adds.append(csr_matrix((np.ones(len(index)), (row.ravel(), np.arange(len(index))))))
     sums = vstack(adds).tocsr()
     # The mix of the searches is that of all demands together, so that what is monotone stays so.
     mix = paths.sums["cars"].mean(axis=(0, 2))[:, None]
@@ -409,10 +401,10 @@ def curve_table(
             drawn.append(added(next(fits)[1]))
             progress()
         half = 1.96 * np.std(drawn[1:], axis=0, ddof=1)
-        total, cars = (np.asarray(sums @ its.mean(axis=0)) for its in paths.totals(name))
+        total, cars = (np.asarray(sums @ of_days.mean(axis=0)) for of_days in paths.totals(name))
         columns[f"{name}_seen"] = _mean(total, cars, np.nan)
         columns[name] = drawn[0]
         columns[f"{name}_low"] = np.maximum.accumulate(np.maximum(drawn[0] - half, 0.0), axis=1)
         high = np.minimum(drawn[0] + half, OUTCOMES[name].most)
         columns[f"{name}_high"] = np.maximum.accumulate(high, axis=1)
-    return CurveTable(np.concatenate(found), np.asarray(sums @ mix)[:, 0], columns)
+    return CurveTable(np.concatenate(numbers), np.asarray(sums @ mix)[:, 0], columns)
