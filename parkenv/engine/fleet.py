@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from gymnasium import spaces
 from gymnasium.error import ResetNeeded
 from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
@@ -17,10 +16,9 @@ from parkenv.compiled.jit import entry_point
 from parkenv.compiled.keyed_random import world_key
 from parkenv.engine import events
 from parkenv.engine.fleet_cars import FleetCars
-from parkenv.engine.fleet_memory import FleetMemory
-from parkenv.engine.fleet_observer import FleetObserver, StepOutcome
+from parkenv.engine.fleet_observer import ObservedFleet
 from parkenv.engine.fleet_options import DriverKind, FleetOptions
-from parkenv.engine.records import NO_SLOT, RESERVE_KNOWLEDGE, SEARCH, SEARCHING, STATES, most_observed_in
+from parkenv.engine.records import NO_SLOT, RESERVE_KNOWLEDGE, SEARCH, SEARCHING, STATES
 from parkenv.engine.spaces import action_number
 from parkenv.errors import InputError
 from parkenv.scenarios.build import ScenarioSource, make_scenario
@@ -36,7 +34,7 @@ __all__ = ["DriverKind", "Fleet", "FleetOptions"]
 _UNREACHABLE_S = 1e9
 
 
-class Fleet(FleetMemory):
+class Fleet(ObservedFleet):
     """Many cars in one lot, driven by compiled policies, by agents in Python, or by both.
 
     Every car is a search as in `parkenv/Search-v2`, with the same actions, observations and costs; its forecast is that
@@ -80,8 +78,7 @@ class Fleet(FleetMemory):
         changes: fields of the options to replace.
 
     Attributes:
-        scenarios: the scenarios of the cars, one for each goal with a weight; `cars["place"]` are indices into it.
-        drawn: the cars as the demand has drawn them.
+        scenario, demand, options, drawn, scenarios, cars, slots, address: see `FleetMemory`.
         day: the day of the present world.
 
     Raises:
@@ -112,16 +109,7 @@ class Fleet(FleetMemory):
         if options.background is None:
             stand = any(purpose.parked for purpose in self.demand.purposes)
             options = replace(options, background="none" if stand else "residents")
-        self.options, self.drivers = options, options.drivers
-        self.drawn = FleetCars(self.scenario, self.demand, options)
-        self.scenarios = self.drawn.scenarios
-        # A car may learn of every slot at once, and attempt one.
-        learns_all = options.has_drivers_that_know("shared", "full")
-        most = 1 + self.scenario.lot.n_slots if learns_all else most_observed_in(self.scenarios)
-        super().__init__(
-            self.scenarios, options, most if any(kind.policy is None for kind in self.drivers) else 0
-        )
-        self._observer = FleetObserver(self.drawn, self, options, most)
+        super().__init__(FleetCars(self.scenario, self.demand, options), options)
         self._agent_states: dict[int, Any] = {}  # of the agents of `run`, by car
         self._drive_s: dict[int, NDArray[np.float64]] = {}  # to all slots, by vertex
 
@@ -143,8 +131,6 @@ class Fleet(FleetMemory):
             self._made_world = occupancy.world(key, Arrival(begin, self.day.date))
             record["world"] = self._made_world.address
         self.hold_cars(self.drawn.records, self.drawn.zone_cost_s)
-        self._observer.begin()
-        self._states = self.cars["state"]  # looking up a field takes a tenth of a decision in Python
         self._agent_states.clear()
         self._advance, self._act = entry_point(events.advance_at, 0, 0.0), entry_point(events.act_at, 0, 0)
         events.begin_world_at(self.address)
@@ -259,26 +245,6 @@ class Fleet(FleetMemory):
         return np.asarray(search["time"] - self.time + self._drive_s[vertex] + self.drawn.arrival_cost_s(car))
 
     # ---- cars and slots
-
-    @property
-    def observation_space(self) -> spaces.Dict:
-        """The space of a car's observations: that of `parkenv/Search-v2`, and further keys; see the class."""
-        return self._observer.space
-
-    def observation(self, car: int) -> dict[str, Any]:
-        """Return what a searching car observed last, as in `parkenv/Search-v2`."""
-        return self._observer.observe(car)
-
-    def local_observation(self, car: int, k: int = 5) -> dict[str, Any]:
-        """Return the `local` observation of a searching car, with k slots; to be called once at each of its decisions.
-
-        `parkenv.engine.local_observation` describes it.
-        """
-        return self._observer.observe_local(car, k)
-
-    def outcome(self, car: int) -> StepOutcome:
-        """Return the result of a car's last step."""
-        return self._observer.outcome(car)
 
     def state_names(self) -> list[str]:
         """Return the state of each car by name; see `parkenv.engine.records.STATES`."""

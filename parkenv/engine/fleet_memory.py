@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -10,12 +10,12 @@ from numpy.typing import NDArray
 
 from parkenv.compiled.memory import address_of, sparse_zeros
 from parkenv.engine import events, records
+from parkenv.engine.fleet_cars import FleetCars
 from parkenv.engine.fleet_options import TIMES, FleetOptions
 from parkenv.engine.kernel import shared_slots_taken_at
 from parkenv.engine.records import CAR, FLEET, REPORT, SEARCH, STEP, ScenarioRecords, Searches
 from parkenv.world.lot import ParkingLot
 from parkenv.world.occupancy.kernel import SHARED_KIND
-from parkenv.world.scenario import Scenario
 
 _FIRST_CHUNK = 16
 
@@ -24,11 +24,11 @@ class FleetMemory:
     """The FLEET record, and the arrays that it points to.
 
     Args:
-        scenarios: one for each goal.
+        drawn: the cars as the demand draws them.
         options: the options of the fleet.
-        most_observed: maximum number of slots that a step observes, if Python decides; else 0.
 
     Attributes:
+        scenarios: the scenarios of the cars, one for each goal with a weight; `cars["place"]` are indices into it.
         record: the FLEET record.
         address: its address, for compiled code.
         world: address of the occupancy that the background is drawn from; 0 if Python makes it.
@@ -38,10 +38,15 @@ class FleetMemory:
         copiers: by address of a SEARCH record, what copies its observation; see `Searches.copiers`.
     """
 
-    def __init__(self, scenarios: Sequence[Scenario], options: FleetOptions, most_observed: int) -> None:
+    def __init__(self, drawn: FleetCars, options: FleetOptions) -> None:
+        self.drawn, self.options, self.drivers = drawn, options, options.drivers
+        scenarios = self.scenarios = drawn.scenarios
         lot, self._records = scenarios[0].lot, np.zeros(1, FLEET)
         self.record, self.address = self._records[0], address_of(self._records, FLEET)
-        self._lot, self._most_observed = lot, most_observed
+        # A car may learn of every slot at once, and attempt one.
+        learns_all = any(kind.knows in ("shared", "full") for kind in self.drivers)
+        self._most_observed = 1 + lot.n_slots if learns_all else records.most_observed_in(scenarios)
+        self._observes = any(kind.policy is None for kind in self.drivers)
         self._tables = ScenarioRecords(scenarios)
         tables = self._tables.records
         self.record["world_kind"], self.world = tables[0]["world_kind"], int(tables[0]["world"])
@@ -51,7 +56,7 @@ class FleetMemory:
             # Where a car may park depends on its driver.
             self._masks = np.ascontiguousarray(scenarios[0].graph_masks, np.uint8)
             tables["action_masks"] = address_of(self._masks, np.uint8)
-        policies = (kind.policy for kind in options.drivers)
+        policies = (kind.policy for kind in self.drivers)
         self._policies = [None if policy is None else policy.data_for(scenarios) for policy in policies]
         numbers = {
             "background": records.BACKGROUNDS.index(options.background),
@@ -99,6 +104,8 @@ class FleetMemory:
     def hold_cars(self, cars: NDArray[np.void], zone_cost_s: NDArray[np.float64] | None) -> None:
         """Point to the cars of a world; no car has a search."""
         self.cars, n = cars, len(cars)
+        # Looking up fields takes a tenth of a decision in Python.
+        self._states, self._vertices, self._addresses = cars["state"], cars["vertex"], cars["search"]
         self.record["n_cars"], self.record["n_free"], self.record["zone_cost_s"] = n, 0, 0
         if zone_cost_s is not None:
             self._point_to(zone_cost_s=zone_cost_s)
@@ -129,17 +136,17 @@ class FleetMemory:
     def _add_searches(self) -> None:
         size = len(self._rows)
         n = min(max(_FIRST_CHUNK, size), max(int(self.record["n_cars"]) - size, 1))
-        sparse, observes = self._lot.n_slots >= records.SPARSE_SLOTS, self._most_observed > 0
-        searches = Searches(self._tables, n, observes, self._most_observed, sparse)
+        lot, most = self.scenarios[0].lot, self._most_observed if self._observes else 0
+        searches = Searches(self._tables, n, self._observes, most, lot.n_slots >= records.SPARSE_SLOTS)
         # A route may pass the street where it begins once more.
-        moves = sparse_zeros((n, 2 * self._lot.n_vertices), np.uint8)
+        moves = sparse_zeros((n, 2 * lot.n_vertices), np.uint8)
         searches.records["moves"] = address_of(moves, np.uint8) + np.arange(n) * moves.shape[1]
         self._pool.append(searches)
         self._moves.append(moves)
         for row in range(n):
             address = searches.address + row * SEARCH.itemsize
             self._rows[address] = searches, row
-            if observes:
+            if self._observes:
                 self.copiers[address] = searches.copiers(row)
         self._add_free(searches)
 

@@ -30,48 +30,35 @@ class StepOutcome(NamedTuple):
     info: dict[str, Any]  # see `parkenv/Search-v2`
 
 
-class FleetObserver:
-    """Observations of the cars of a fleet, and results of their steps.
+class ObservedFleet(FleetMemory):
+    """The memory of a fleet, observations of its cars, and results of their steps."""
 
-    Args:
-        cars: the cars.
-        memory: their searches, which hold observations if a kind of driver has no policy.
-        options: the options of the fleet.
-        most_observed: maximum number of slots that a step observes.
-    """
-
-    def __init__(
-        self, cars: FleetCars, memory: FleetMemory, options: FleetOptions, most_observed: int
-    ) -> None:
-        self._cars, self._memory, self._options = cars, memory, options
-        self._problem, self._most_observed = cars.scenarios[0], most_observed
-        self._is_guided = options.has_drivers_that_know("reserve")
+    def __init__(self, drawn: FleetCars, options: FleetOptions) -> None:
+        super().__init__(drawn, options)
+        self._problem = drawn.scenarios[0]
+        self._is_guided = any(kind.knows == "reserve" for kind in self.drivers)
         self._copy_masks = [mask.copy for mask in self._problem.graph_masks]
         self._surroundings: dict[int, Surroundings] = {}
 
     @property
-    def space(self) -> spaces.Dict:
-        space, lot = space_of(self._cars.scenarios, self._most_observed), self._problem.lot
+    def observation_space(self) -> spaces.Dict:
+        """The space of a car's observations: that of `parkenv/Search-v2`, and further keys; see `Fleet`."""
+        space, lot = space_of(self.scenarios, self._most_observed), self._problem.lot
         further: dict[str, spaces.Space[Any]] = {}
         if self._is_guided:
             further["reserved"] = spaces.Box(-1, 1, (lot.n_slots,), np.int8)
-        if self._options.leaving_soon_s > 0.0:
+        if self.options.leaving_soon_s > 0.0:
             further["leaving"] = spaces.Box(0, 1, (lot.n_slots,), np.int8)
         if self._problem.has_rules:
             further["driver"] = spaces.Box(0.0, np.inf, (6,), np.float64)
-        if self._options.sees_cars:
+        if self.options.sees_cars:
             further["cars"] = spaces.Box(0, _MOST_SEEN, (2, lot.n_vertices), np.int8)
         return spaces.Dict(dict(space.items()) | further)
 
-    def begin(self) -> None:
-        """Observe the cars of a new world."""
-        # Looking up fields takes a tenth of a decision in Python.
-        self._vertices, self._addresses = self._cars.records["vertex"], self._cars.records["search"]
-
-    def observe(self, car: int) -> dict[str, Any]:
-        """Return what a searching car observed last."""
+    def observation(self, car: int) -> dict[str, Any]:
+        """Return what a searching car observed last, as in `parkenv/Search-v2`."""
         address, vertex = self._search_of(car), self._vertices[car]
-        time, p_occupied, belief, step_observed, day_error = self._memory.copiers[address]
+        time, p_occupied, belief, step_observed, day_error = self.copiers[address]
         observation = {
             "vertex": vertex,
             "time": time(),
@@ -82,59 +69,63 @@ class FleetObserver:
             "action_mask": self._mask(car, vertex),
         }
         if self._is_guided:
-            reserved = self._memory.search_of(address)["reserved"]
-            own = np.arange(len(self._memory.slots)) == reserved
+            reserved = self.search_of(address)["reserved"]
+            own = np.arange(len(self.slots)) == reserved
             observation["reserved"] = own.astype(np.int8) - np.int8(reserved == UNGUIDED)
-        if self._options.leaving_soon_s > 0.0:
+        if self.options.leaving_soon_s > 0.0:
             observation["leaving"] = self._leaving_in_view(int(vertex))
         if self._problem.has_rules:
-            driver = *self._cars.drivers_of(car), self._cars.records["walks"][car]
+            driver = *self.drawn.drivers_of(car), self.cars["walks"][car]
             observation["driver"] = np.array(driver, np.float64)
-        if self._options.sees_cars:
+        if self.options.sees_cars:
             observation["cars"] = self._cars_in_view(car, int(vertex))
         return observation
 
-    def observe_local(self, car: int, k: int) -> dict[str, Any]:
-        """Return the `local` observation of a searching car, with k slots; once at each of its decisions."""
+    def local_observation(self, car: int, k: int = 5) -> dict[str, Any]:
+        """Return the `local` observation of a searching car, with k slots; to be called once at each of its decisions.
+
+        `parkenv.engine.local_observation` describes it.
+        """
         address = self._search_of(car)
         if k not in self._surroundings:
-            self._surroundings[k] = Surroundings.of(self._cars.scenarios, k)
+            self._surroundings[k] = Surroundings.of(self.scenarios, k)
         local = np.empty(FIRST_NEAR + PER_NEAR * k, np.float32)
         observe_surroundings_at(address, self._surroundings[k], local)
         return {"local": local, "action_mask": self._mask(car, self._vertices[car])}
 
     def outcome(self, car: int) -> StepOutcome:
+        """Return the result of a car's last step."""
         address = self._search_of(car)
-        scenario = self._cars.scenarios[self._cars.records["place"][car]]
+        scenario = self.scenarios[self.cars["place"][car]]
         reward, over, _, info = read_step(scenario.name, step_result_at(address))
-        return StepOutcome(bool(self._memory.search_of(address)["n_steps"]), reward, over, info)
+        return StepOutcome(bool(self.search_of(address)["n_steps"]), reward, over, info)
 
     def _search_of(self, car: int) -> int:
         address = int(self._addresses[car])
         if address == 0:
-            state = STATES[self._cars.records["state"][car]]
+            state = STATES[self.cars["state"][car]]
             raise InputError(f"car {car} is {state}, want one that searches")
-        if address not in self._memory.copiers:
+        if address not in self.copiers:
             raise InputError("observations are kept only if a kind of driver has no policy")
         return address
 
     def _mask(self, car: int, vertex: int) -> NDArray[np.int8]:
         """Return the actions that a car has at a vertex, (5,): those of the graph, and parking where it may."""
         mask: NDArray[np.int8] = self._copy_masks[vertex]()
-        if mask[PARK] and self._cars.zone_cost_s is not None:
-            mask[PARK] = np.isfinite(self._cars.zone_cost_s[car, self._problem.lot.zone_of_slot[vertex]])
+        if mask[PARK] and self.drawn.zone_cost_s is not None:
+            mask[PARK] = np.isfinite(self.drawn.zone_cost_s[car, self._problem.lot.zone_of_slot[vertex]])
         return mask
 
     def _leaving_in_view(self, vertex: int) -> NDArray[np.int8]:
-        slots = self._memory.slots
+        slots = self.slots
         leaving, viewed = np.zeros(len(slots), np.int8), self._problem.in_view(vertex)
-        left_s = slots["leaves_at"][viewed] - self._memory.record["time"]
-        leaving[viewed] = (left_s > 0.0) & (left_s <= self._options.leaving_soon_s)
+        left_s = slots["leaves_at"][viewed] - self.record["time"]
+        leaving[viewed] = (left_s > 0.0) & (left_s <= self.options.leaving_soon_s)
         return leaving
 
     def _cars_in_view(self, car: int, vertex: int) -> NDArray[np.int8]:
         """Return the numbers of other searching cars by vertex, and of those that stand, (2, n_vertices)."""
-        cars, lot = self._cars.records, self._problem.lot
+        cars, lot = self.cars, self._problem.lot
         others = cars["state"] == SEARCHING
         others[car] = False
         at, stands = cars["vertex"][others], cars["stands"][others]

@@ -85,6 +85,3 @@ class FleetOptions:
         require_whole("max_steps", self.max_steps, least=1)
         for name in TIMES:
             require_number(name, getattr(self, name), least=0.0)
-
-    def has_drivers_that_know(self, *knowledge: str) -> bool:
-        return any(kind.knows in knowledge for kind in self.drivers)
