@@ -10,6 +10,7 @@ from small_lots import features
 
 import parkenv
 from parkenv import InputError, ParkingLot
+from parkenv.engine.records import CAR
 from parkenv.lots import grid_lot, write_lot
 from parkenv.studies.curve.curves import Curves
 from parkenv.studies.curve.fit import (
@@ -22,7 +23,7 @@ from parkenv.studies.curve.fit import (
     form_at,
     held_out_errors,
 )
-from parkenv.studies.curve.lone_search import Hours, Places, Searchers, simulate_single_driver
+from parkenv.studies.curve.lone_search import Hours, Places, simulate_single_driver
 from parkenv.studies.curve.study import CurveStudy
 from parkenv.studies.curve.zones import LONE, OF_CARS, STATE, Zones
 from parkenv.studies.fleet.roads import Roads
@@ -165,12 +166,12 @@ def test_a_day_of_zones_has_all_cars_and_what_their_searches_take_beyond_the_dir
     ],
 )
 def test_a_lone_search_goes_on_to_the_next_best_place_as_often_as_one_is_full(believed, expected):
-    car, place = np.zeros(1, np.int64), np.zeros(2, np.int64)
-    cars = Searchers(*[car] * 3, np.ones(1), np.full(1, 900.0), np.zeros((1, 1)), 1.0, 1.0)
+    cars, first, place = np.zeros(1, CAR), np.zeros(1, np.int64), np.zeros(2, np.int64)
+    cars["walks"], cars["patience_s"] = 1.0, 900.0
     hours = Hours(np.array([believed]), full=np.array([[0.5, 0.2]]), inside_s=np.array([[3.0, 0.0]]))
     entry_drive_s, drive_s = np.array([[10.0, 12.0]]), np.array([[0.0, 13.0], [8.0, 0.0]])
     places = Places(entry_drive_s, drive_s, np.array([[10.0, 40.0]]), np.zeros(2), place + 1, place)
-    found = simulate_single_driver(cars, hours, places)
+    found = simulate_single_driver(cars, first, first, np.zeros((1, 1)), (1.0, 1.0), hours, places)
     np.testing.assert_allclose(found[:, 0], expected)
 
 

@@ -173,7 +173,7 @@ def test_drivers_pay_by_their_own_time_and_park_by_their_classes():
     ]
     fleet = Fleet(its, TownDemand(of))
     fleet.reset(3)
-    costs = fleet.scenario.zone_cost_s(fleet.drawn.drivers)  # of kerb and residents
+    costs = fleet.drawn.zone_costs()  # of kerb and residents
     rich = np.isinf(costs[:, 1])
     assert rich.sum() == 5
     assert_array_equal(costs[rich, 0], 300.0)
@@ -194,9 +194,7 @@ def test_cars_of_the_town_stand_where_they_may_when_its_day_begins():
     assert len(cars) == sum(one.parked for one in town.demand.purposes)
     assert_array_equal(np.bincount(cars["parked_at"], minlength=town.lot.n_slots), fleet.counts())
     assert (fleet.counts() <= town.lot.capacity).all()
-    of_car = fleet.scenario.zone_cost_s(fleet.drawn.drivers)[
-        fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]
-    ]
+    of_car = fleet.drawn.zone_costs()[fleet.cars["parked_at"] >= 0, town.lot.zone_of_slot[cars["parked_at"]]]
     assert np.isfinite(of_car).all()
 
 

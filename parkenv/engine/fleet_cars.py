@@ -47,10 +47,11 @@ class FleetCars:
                 raise InputError(
                     f"Demand.{name} has {len(weights)} numbers, lot {lot.name!r} has {len(places)} of these"
                 )
-        goals = range(len(demand.goal_weights))
-        self.scenarios = tuple(scenario.at_goal(goal) for goal in goals) or (scenario,)
-        one_entry = scenario.entry is not None and not demand.entry_weights
-        self._entries = lot.entry_vertices[[scenario.entry]] if one_entry else lot.entry_vertices
+        self.scenarios = tuple(scenario.at_goal(goal) for goal in range(len(demand.goal_weights))) or (
+            scenario,
+        )
+        all_entries = scenario.entry is None or bool(demand.entry_weights)
+        self._entries = lot.entry_vertices if all_entries else lot.entry_vertices[[scenario.entry]]
         self._scenario, self._options = scenario, options
         self._walk_s = np.array([problem.walk_s for problem in self.scenarios])
         self._way_s = self._ways_s()
@@ -95,7 +96,7 @@ class FleetCars:
         cars["state"], cars["slot"] = DUE, NO_CAR
         cars["ended_at"] = cars["left_at"] = np.inf
         self.drivers = self._drivers_in(plans, demand.class_names)
-        self.zone_cost_s = self._zone_costs()
+        self.zone_cost_s = self._zone_costs_by_rules()
         if plans.parked.any():
             cars["parked_at"][plans.parked] = self._slots_of_parked(plans.parked, demand, key)
         return begin
@@ -110,16 +111,20 @@ class FleetCars:
         )
         return Drivers(cars["stay_s"], cars["arrival"], value_of_time, classes, plans.kwh)
 
+    def zone_costs(self) -> FloatArray:
+        """Return what parking in each zone costs each car, (n_cars, n_zones) s; see `SearchProblem.zone_cost_s`."""
+        return self._scenario.zone_cost_s(self.drivers)
+
     def drivers_of(self, cars: Any) -> Drivers:
         return Drivers(*(np.asarray(values)[cars] for values in self.drivers))
 
-    def _zone_costs(self) -> FloatArray | None:
+    def _zone_costs_by_rules(self) -> FloatArray | None:
         scenario, cars, lot = self._scenario, self.records, self._scenario.lot
         if not scenario.has_rules and (cars["walks"] == 1.0).all():
             return None
         if not np.isfinite(scenario.zone_price(self.drivers)).all():
             raise InputError("Demand.stays: a stay is infinite, want finite ones where parking has a price")
-        zone_cost_s = scenario.zone_cost_s(self.drivers)
+        zone_cost_s = self.zone_costs()
         cars["n_forbidden"] = np.isinf(zone_cost_s) @ np.bincount(lot.zone_of_slot, minlength=len(lot.zones))
         return zone_cost_s
 

@@ -52,10 +52,8 @@ __all__ = [
     "weights_of_all",
 ]  # fmt: skip
 
-MAX_CLASSES = 60
-"""Maximum number of classes of drivers."""
-CHARGING = "charging"
-"""The class of cars that need to charge."""
+MAX_CLASSES = 60  # maximum number of classes of drivers
+CHARGING = "charging"  # the class of cars that need to charge
 
 
 class CarPlans(NamedTuple):

@@ -33,8 +33,7 @@ _COURSES_APART, _DRIVERS_APART = 1_000_000, 1_000
 _MOST_TRIES = 100_000
 
 
-TRIP = "trip"
-"""Key of a search's trip in a row; the map of the run keeps it."""
+TRIP = "trip"  # key of a search's trip in a row; the map of the run keeps it
 
 
 @dataclass(frozen=True)

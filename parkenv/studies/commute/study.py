@@ -34,8 +34,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
     from parkenv.world.scenario import Scenario
 
-MAX_DAYS = 3_650
-"""Maximum number of days of a commute."""
+MAX_DAYS = 3_650  # maximum number of days of a commute
 PICTURE = "commute.png"
 
 

@@ -13,8 +13,7 @@ from parkenv.studies.statistics import columns_of, mean_interval, trimmed_mean_i
 
 FIXED, NONE = "fixed", "none"
 """Names in the column `map` of the references: a right map that does not learn; an agent that uses no map."""
-TRIMMED = 0.1
-"""Share of the courses, at either end, that a robust mean leaves out."""
+TRIMMED = 0.1  # share of the courses, at either end, that a robust mean leaves out
 
 
 _Runs = dict[int, list[Row]]

@@ -25,8 +25,7 @@ JSON = "curve.json"
 NAMES = ("scenario", "zone", "purpose", "hour")
 PERIODS = {"": (0, 48), "_EA": (3, 5), "_AM": (5, 9), "_MD": (9, 14), "_PM": (14, 18), "_EV": (18, 27)}
 """Clock hours of the day, and of the time periods of ActivitySim's example (`network_los.yaml` of `prototype_mtc`)."""
-MOST_BYTES = 500_000_000
-"""Largest file of curves that is read."""
+MOST_BYTES = 500_000_000  # largest file of curves that is read
 _DIGITS = 5
 
 

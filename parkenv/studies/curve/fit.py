@@ -26,8 +26,7 @@ from parkenv.studies.workers import SERIAL, Workers
 
 CURVE, LONE_SEARCH = "curve", "lone search"
 MAX_SAMPLING_ERROR = 0.3
-FOLDS = 5
-"""Parts of the zones, each of which is held out once."""
+FOLDS = 5  # parts of the zones, each of which is held out once
 _GROWS, _PURPOSE = (1, 1, 1, 1, 0, 0, 1), 5
 """Features that a curve may only grow with: `STATE`; not hour and purpose; the outcome of lone searches."""
 _TREES = {

@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.sparse.csgraph import dijkstra
 
 from parkenv.compiled.arrays import BoolArray, FloatArray, IntArray
@@ -26,8 +27,7 @@ from planners.heuristics.streets import DOUBT, streets_of
 
 RULES = {"greedy-drive": (0.0, 1.0), "greedy-goal": (1.0, 1e-6), "greedy-total": (1.0, 3.0)}
 """What a second of arrival cost and one of the drive count for drivers that expect nothing of places."""
-_ENOUGH = 0.01
-"""Chance that nothing was found yet below which a search is not followed any more."""
+_ENOUGH = 0.01  # chance that nothing was found yet below which a search is not followed any more
 
 
 class Places(NamedTuple):
@@ -47,19 +47,6 @@ class Hours(NamedTuple):
     believed: FloatArray  # P(taken) that drivers expect of a slot
     full: FloatArray  # chance that there is no space
     inside_s: FloatArray  # time at the barrier and inside
-
-
-class Searchers(NamedTuple):
-    """Cars, (n,) each; what a second of arrival cost and one of the drive count for them."""
-
-    entry: IntArray
-    goal: IntArray
-    hour: IntArray
-    walks: FloatArray
-    patience_s: FloatArray
-    zone_cost_s: FloatArray  # (n, n_zones)
-    per_cost: float
-    per_drive: float
 
 
 class LoneSearches:
@@ -118,43 +105,50 @@ class LoneSearches:
                 believed[k] = self._mean(np.asarray(forecast.p_occupied))
         empty_s, full_s = self._inside_s
         hours = Hours(believed, full, empty_s + filled * (full_s - empty_s))
-        entry, goal = np.searchsorted(self._entries, cars["entry"]), cars["place"].astype(np.int64)
-        drivers = (
-            cars["walks"].copy(),
-            cars["patience_s"].copy(),
-            fleet.scenario.zone_cost_s(fleet.drawn.drivers)[which],
-        )
-        searchers = Searchers(entry, goal, hour, *drivers, *(weights or (1.0, 1.0)))
-        return np.asarray(simulate_single_driver(searchers, hours, self._places))
+        entry, zone_cost_s = np.searchsorted(self._entries, cars["entry"]), fleet.drawn.zone_costs()[which]
+        of_cars = cars, entry, hour, zone_cost_s, weights or (1.0, 1.0)
+        return np.asarray(simulate_single_driver(*of_cars, hours, self._places))
 
 
 @compiled(error_model="numpy")
-def simulate_single_driver(cars: Searchers, hours: Hours, places: Places) -> FloatArray:
+def simulate_single_driver(
+    cars: NDArray[np.void], entry: IntArray, hour: IntArray, zone_cost_s: FloatArray, weights: tuple[float, float],
+    hours: Hours, places: Places,
+) -> FloatArray:  # fmt: skip
     """Follow the searches of n cars from place to place, in all ways that they may go.
+
+    Args:
+        cars: (n,) of the dtype CAR.
+        entry: (n,) rows of `places.entry_drive_s`.
+        hour: (n,) rows of `hours`.
+        zone_cost_s: (n, n_zones) s.
+        weights: what a second of arrival cost and one of the drive count for the cars.
+        hours: states of places.
+        places: the places.
 
     Returns:
         (4, n) chance to park; places without a space on the way; search time beyond the direct drive, and walk, s, both
         times the chance.
     """
-    size, zone = places.size, places.zone
-    sums = np.zeros((4, len(cars.entry)))
+    size, zone, (per_cost, per_drive) = places.size, places.zone, weights
+    sums = np.zeros((4, len(cars)))
     cost_s, expected_free = np.empty(len(size)), np.empty(zone.max() + 1)
-    for car in range(len(cars.entry)):
-        hour, walk_s, walks = cars.hour[car], places.walk_s[cars.goal[car]], cars.walks[car]
-        p, full_now, direct_s = hours.believed[hour], hours.full[hour], places.entry_drive_s[cars.entry[car]]
+    for car in range(len(cars)):
+        now, walk_s, walks = hour[car], places.walk_s[cars[car].place], cars[car].walks
+        p, full_now, direct_s = hours.believed[now], hours.full[now], places.entry_drive_s[entry[car]]
         for k in range(len(size)):
-            cost = walk_s[k] * walks + cars.zone_cost_s[car, zone[k]] + places.enter_s[k]
-            cost_s[k] = cars.per_cost * cost if cost < np.inf else np.inf
+            cost = walk_s[k] * walks + zone_cost_s[car, zone[k]] + places.enter_s[k]
+            cost_s[k] = per_cost * cost if cost < np.inf else np.inf
         expected_free[:] = 0.0
         ahead_s, driven_s, left = direct_s, 0.0, 1.0
-        while left > _ENOUGH and driven_s <= cars.patience_s[car]:
+        while left > _ENOUGH and driven_s <= cars[car].patience_s:
             best, best_s = -1, np.inf
             for k in range(len(size)):
-                index_s = cost_s[k] + cars.per_drive * ahead_s[k]
+                index_s = cost_s[k] + per_drive * ahead_s[k]
                 if index_s < best_s:
                     odds = (1.0 - p[k]) * DOUBT / (DOUBT + expected_free[zone[k]])
                     chance = 1.0 - (p[k] / (p[k] + odds)) ** size[k]
-                    index_s = cost_s[k] + cars.per_drive * ahead_s[k] / chance
+                    index_s = cost_s[k] + per_drive * ahead_s[k] / chance
                     if index_s < best_s:
                         best, best_s = k, index_s
             if best < 0:
@@ -164,7 +158,7 @@ def simulate_single_driver(cars: Searchers, hours: Hours, places: Places) -> Flo
             left -= here
             sums[0, car] += here
             sums[1, car] += left
-            sums[2, car] += here * (max(driven_s - direct_s[best], 0.0) + hours.inside_s[hour, best])
+            sums[2, car] += here * (max(driven_s - direct_s[best], 0.0) + hours.inside_s[now, best])
             sums[3, car] += here * walk_s[best] * walks
             expected_free[zone[best]] += size[best] * (1.0 - p[best])
             cost_s[best] = np.inf

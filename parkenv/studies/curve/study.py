@@ -14,7 +14,7 @@ from parkenv.files.csv_tables import TEXT
 from parkenv.files.option import Inside, Option, option, words_in
 from parkenv.scenarios.spec import scenario_spec
 from parkenv.studies.fields import TRAFFIC, ScenarioList, Values
-from parkenv.studies.fleet.setting import OWN, Demanded, middle_of, times_demanded
+from parkenv.studies.fleet.setting import OWN, Demanded, times_demanded
 from parkenv.studies.fleet.spec import FleetSpec
 from parkenv.studies.results import CsvTable, Results, Row, Table
 from parkenv.studies.study import counted
@@ -86,7 +86,7 @@ class CurveStudy(FleetSpec):
     def zones(self) -> dict[str, Zones]:
         from parkenv.studies.curve.zones import Zones
 
-        return {name: Zones.of(its, self.reach_m) for name, its in self._goals.items()}
+        return {name: Zones.of(goals, self.reach_m) for name, goals in self._goals.items()}
 
     @cached_property
     def _goals(self) -> dict[str, Sequence[Scenario]]:
@@ -96,7 +96,7 @@ class CurveStudy(FleetSpec):
     def _lone(self) -> dict[str, LoneSearches]:
         from parkenv.studies.curve.lone_search import LoneSearches
 
-        return {name: LoneSearches(its) for name, its in self._goals.items()}
+        return {name: LoneSearches(goals) for name, goals in self._goals.items()}
 
     @property
     def all_tables(self) -> tuple[Table, ...]:  # type: ignore[override]
@@ -111,10 +111,10 @@ class CurveStudy(FleetSpec):
         return {ZONES.file: day_of_zones(day, self.zones[name], self._lone[name])}
 
     def check(self) -> None:
-        for name, its in (("agents", self.drivers), ("knows", self.knowledge), ("shares", self.shares)):
-            if len(its) > 1:
-                raise InputError(f"{name} has {len(its)} values, want one: a curve is of equal drivers")
-        if len({isinstance(its, str) for its in self.demands}) > 1:
+        for name, values in (("agents", self.drivers), ("knows", self.knowledge), ("shares", self.shares)):
+            if len(values) > 1:
+                raise InputError(f"{name} has {len(values)} values, want one: a curve is of equal drivers")
+        if len({isinstance(rate, str) for rate in self.demands}) > 1:
             raise InputError(f"arrivals_per_hour is {self.demands}, want either multiples or cars an hour")
         super().check()
 
@@ -130,24 +130,23 @@ class CurveStudy(FleetSpec):
         days: dict[str, list[list[Row]]] = {name: [] for name in self.built}
         purposes = {}
         for setting, items in self.cells():
-            its = [rows[key] for day in items for key in self.keys(setting, day) if key in rows]
-            days[setting.scenario].append(its)
+            keys = [key for day in items for key in self.keys(setting, day)]
+            days[setting.scenario].append([rows[key] for key in keys if key in rows])
             purposes[setting.scenario] = purpose_names(self.fleet(setting)[0])
-        n_days = min(len(its) for of_town in days.values() for its in of_town)
+        n_days = min(len(of_demand) for of_town in days.values() for of_demand in of_town)
         if n_days < 2:
             return None
-        towns = {
-            name: Town(
-                self.zones[name], purposes[name], [its[:n_days] for its in days[name]], self._usual(name)
-            )
-            for name in days
-        }
+        towns = {}
+        for name, of_town in days.items():
+            equal_days = [of_demand[:n_days] for of_demand in of_town]
+            towns[name] = Town(self.zones[name], purposes[name], equal_days, self._usual(name))
         first_hour = int(next(iter(self.built.values())).arrival.start_s // HOUR_S)
-        return Paths.of(towns, [_size(its) for its in self.demands], first_hour)
+        return Paths.of(towns, [_size(rate) for rate in self.demands], first_hour)
 
     def _usual(self, name: str) -> float:
         """Return a scenario's own demand as `demands` has it; in cars an hour, without its own, the middle one."""
-        own, window, middle = self.built[name].demand, self.built[name].arrival, middle_of(self.demands)
+        own, window = self.built[name].demand, self.built[name].arrival
+        middle = self.demands[len(self.demands) // 2]
         if isinstance(middle, str):
             return 1.0
         return middle if own is None else own.expected / (window.end_s - window.start_s) * HOUR_S
@@ -167,7 +166,7 @@ class CurveStudy(FleetSpec):
         errors, held_out = held_out_errors(paths, *how)
         HELD_OUT.write(results.path, held_out)
         write_curves(paths, curve_table(paths, self.bootstraps, *how), results.path)
-        zones = {name: len(its.names) for name, its in self.zones.items()}
+        zones = {name: len(zones.names) for name, zones in self.zones.items()}
         return summary | {"zones": zones, "reach_m": self.reach_m, "errors": errors}
 
     def outputs(self, result: Result) -> list[Task[object]]:

@@ -59,8 +59,7 @@ MEANS = (
 """Columns of a zone, a block or a purpose that are means over days."""
 OF_CARS = ("search_s", "walk_s", "cruised_m")
 """Columns of `BLOCKS` that are means over cars."""
-MOST_WITH_INTERVALS = 60
-"""Blocks of a setting up to which their means have 95 % intervals."""
+MOST_WITH_INTERVALS = 60  # blocks of a setting up to which their means have 95 % intervals
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,8 +24,7 @@ from parkenv.world.demand import weights_of_all
 from parkenv.world.scenario import drive_times
 from parkenv.world.week import DAY_HOURS, HOUR_S
 
-PATIENCE_S = 3600.0
-"""Drivers come from far, and where a car park is full another one may be far, too."""
+PATIENCE_S = 3600.0  # drivers come from far, and where a car park is full another one may be far, too
 _STEP = 0.7  # share of what is off that a round corrects
 _NEARLY_ALL = 0.95  # of the cars with a goal
 _COUNTED_HOURS = 0.5  # of the hours, in which a car park that is followed has to be counted

@@ -15,10 +15,8 @@ from parkenv.engine.records import SEARCHING, STEP
 from parkenv.studies.fleet.roads import Roads
 from parkenv.world.week import DAY_S, HOUR_S
 
-ALL = "all"
-"""Stands for cars of every purpose."""
-SAMPLE_S = 300.0
-"""Time between two samples of the occupancy, s."""
+ALL = "all"  # stands for cars of every purpose
+SAMPLE_S = 300.0  # time between two samples of the occupancy, s
 
 
 class Day(NamedTuple):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any
 
-from parkenv.engine.network import Layer, NetworkPolicy
+from parkenv.engine.network import NetworkPolicy
 from parkenv.engine.policy import CompiledPolicy
 from parkenv.errors import InputError
 from parkenv.studies.agent_spec import AgentSpec
@@ -70,11 +70,6 @@ def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "n
         sampled: whether to draw actions from the policy, instead of taking the most probable one.
         name: for tables.
     """
-    layers, activation, masked = _layers_of(policy)
-    return NetworkPolicy(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
-
-
-def _layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
     from torch import nn
 
     if hasattr(policy, "q_net"):
@@ -91,7 +86,8 @@ def _layers_of(policy: Any) -> tuple[list[Layer], str, bool]:
             "perceptron of PPO, MaskablePPO or DQN with tanh or relu"
         )
     layers = [(part.weight.detach().cpu().numpy(), part.bias.detach().cpu().numpy()) for part in linear]
-    return layers, others.pop() if others else "tanh", type(policy).__name__.startswith("Maskable")
+    activation, masked = others.pop() if others else "tanh", type(policy).__name__.startswith("Maskable")
+    return NetworkPolicy(layers, k, activation=activation, masked=masked, sampled=sampled, name=name)
 
 
 def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
@@ -162,8 +158,7 @@ def demand_in(
     return Demand(arrivals, stay, ConstantTime(patience_s), entry_weights=entries, goal_weights=goals)
 
 
-_RETRY_S = 0.05
-"""Time until the signal is sent again if raising an exception was not safe, s."""
+_RETRY_S = 0.05  # time until the signal is sent again if raising an exception was not safe, s
 
 
 class LimitedAgent:

@@ -14,8 +14,7 @@ from parkenv.studies.fleet.clairvoyant_bound import ParkingDay, clairvoyant_boun
 from parkenv.world.drive_graph import linestrings
 from parkenv.world.scenario import SearchProblem, drive_metres
 
-MOST_PAIRS = 5_000_000
-"""Pairs of a car and a slot up to which a day has a clairvoyant bound."""
+MOST_PAIRS = 5_000_000  # pairs of a car and a slot up to which a day has a clairvoyant bound
 
 
 class Roads:
@@ -76,7 +75,7 @@ class Roads:
                 for zone in range(len(lot.zones))
             ]
             free_s[its] = np.stack(by_zone, axis=1)[rows[its]]
-        least_s = (free_s + fleet.scenario.zone_cost_s(fleet.drawn.drivers)).min(axis=1)
+        least_s = (free_s + fleet.drawn.zone_costs()).min(axis=1)
         return np.where(np.isfinite(least_s), least_s, self._problem.give_up_s)
 
     def reach(self) -> dict[str, int]:
@@ -110,6 +109,6 @@ class Roads:
             cost_s=np.asarray(self._cost_s, np.float64),
             free_from=leaves_at.astype(np.float64),
             zone=np.array(self._problem.lot.zone_of_slot),
-            zone_cost_s=fleet.scenario.zone_cost_s(fleet.drawn.drivers),
+            zone_cost_s=fleet.drawn.zone_costs(),
             give_up_s=float(self._problem.give_up_s),
         )

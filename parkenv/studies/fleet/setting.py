@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -14,12 +13,10 @@ from parkenv.studies.results import Row
 from parkenv.world.cost_terms import COST_FIELDS
 
 OWN = "own"
-NOWHERE = "no slot"
-"""Stands for the block, and the zone, of cars that find no slot."""
+NOWHERE = "no slot"  # stands for the block, and the zone, of cars that find no slot
 COUNTED = "counted"
 """Arrivals with which the lot becomes as full as counted, or as its world says; `1.2x` are so many times these."""
-GIVEN = "given"
-"""Arrivals of the scenario's own demand; there, `1.2x` are so many times these."""
+GIVEN = "given"  # arrivals of the scenario's own demand; there, `1.2x` are so many times these
 MAX_PER_HOUR = 1e6
 SETTING_COLUMNS = ("scenario", "agents", "knows", "share", "arrivals_per_hour")
 MEASURES = (
@@ -59,11 +56,6 @@ def rate_of(value: float | str) -> float | str:
 
 def times_demanded(rate: str) -> float:
     return 1.0 if rate in (GIVEN, COUNTED) else float(rate.removesuffix("x"))
-
-
-def middle_of(rates: Iterable[float | str]) -> float | str:
-    demands = list(dict.fromkeys(rates))
-    return demands[len(demands) // 2]
 
 
 _NUMBER_OR_TIMES = {

@@ -54,8 +54,7 @@ if TYPE_CHECKING:
     from parkenv.studies.fleet.roads import Roads
     from parkenv.world.scenario import Scenario
 
-MAX_SETTINGS = 10_000
-"""Maximum number of settings of a study."""
+MAX_SETTINGS = 10_000  # maximum number of settings of a study
 MOST_LISTED = 8_000_000
 """Cars that are expected in all settings up to which `cars.csv` has a list of them for each day."""
 NEAREST, MINDS_PRICES, IN_TOWNS = "greedy-drive", "greedy-total", "usual"

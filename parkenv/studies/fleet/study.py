@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from parkenv.studies.runner import Result
 
 PICTURE = "fleet.png"
-MOST_BLOCKS = 60
-"""Rows of blocks up to which the page has a table of them."""
+MOST_BLOCKS = 60  # rows of blocks up to which the page has a table of them
 
 
 class FleetStudy(FleetSpec):
@@ -65,9 +64,6 @@ class FleetStudy(FleetSpec):
         keys = [key for work, items in self.cells() for item in items for key in self.keys(work, item)]
         blocks = results.rows(BLOCKS)
         shown = [blocks[key] for key in keys if key in blocks]
-        zoned = [row for row in shown if has_zones(built[row["scenario"]])]
-        grouped = [row for row in shown if built[row["scenario"]].lot.is_town]
-        mixed = [row for row in shown if set(row["purpose"]) != {ALL}]
         first = next(iter(built.values())).arrival.start_s // 3600.0
         prices = {name: zone_prices(scenario) for name, scenario in built.items()}
         demands = {name: scenario.demand for name, scenario in built.items() if scenario.demand is not None}
@@ -78,9 +74,13 @@ class FleetStudy(FleetSpec):
             "rows": summarize_days(days),
             "changes": summarize_changes(days, prices, purposes),
             "hours": summarize_hours(days, int(first)),
-            "zones": summarize_blocks(zoned, "zone", prices),
-            "blocks": summarize_blocks(grouped, "block", prices),
-            "purposes": summarize_blocks(mixed, "purpose"),
+            "zones": summarize_blocks(
+                [row for row in shown if has_zones(built[row["scenario"]])], "zone", prices
+            ),
+            "blocks": summarize_blocks(
+                [row for row in shown if built[row["scenario"]].lot.is_town], "block", prices
+            ),
+            "purposes": summarize_blocks([row for row in shown if {*row["purpose"]} != {ALL}], "purpose"),
             "reach": [{"scenario": name, **roads.reach()} for name, roads in self.roads.items()],
             "cautions": self.cautions(),
         }

@@ -51,6 +51,10 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
         key = (first["scenario"], first["agents"], knows, share, first["arrivals_per_hour"])
         return paired_days(days, by_setting.get(key, ()))
 
+    def differences(days: list[Row]) -> list[Row]:
+        pairs = paired(days, OWN, 0.0)
+        return [{name: one[c] - other["total_s"] for name, c in DIFFERENCES.items()} for one, other in pairs]
+
     return [
         {
             **{name: days[0][name] for name in SETTING_COLUMNS},
@@ -59,7 +63,7 @@ def summarize_days(settings: Sequence[list[Row]]) -> list[Row]:
             **day_means(
                 days, [name for name in MEASURES if name != COUNTS or _is_counted(days)], WITH_INTERVAL
             ),
-            **_differences(paired(days, OWN, 0.0)),
+            **day_means(differences(days), DIFFERENCES, DIFFERENCES),
             **_ratio("price_of_anarchy", paired(days, ASSIGNED, 1.0), "total_s"),
             **_ratio("price_over_bound", [(day, day) for day in days], "clairvoyant_s"),
         }
@@ -81,18 +85,12 @@ def summarize_hours(settings: Sequence[list[Row]], first: int) -> list[Row]:
     rows = []
     for days in filter(_is_counted, settings):
         simulated, counted = (np.array([day[name].split() for day in days], float).T for name in BY_HOUR)
-        for hour, (mine, theirs) in enumerate(zip(simulated, counted, strict=True), start=first):
-            its = {name: days[0][name] for name in SETTING_COLUMNS} | {"hour": hour}
-            means = {"occupancy": float(mine.mean()), COUNTS: float(theirs.mean())}
-            rows.append(its | means | columns_of("excess", mean_interval(mine - theirs)))
+        setting = {name: days[0][name] for name in SETTING_COLUMNS}
+        for hour, (taken, taken_counted) in enumerate(zip(simulated, counted, strict=True), start=first):
+            means = {"occupancy": float(taken.mean()), COUNTS: float(taken_counted.mean())}
+            excess = columns_of("excess", mean_interval(taken - taken_counted))
+            rows.append({**setting, "hour": hour, **means, **excess})
     return rows
-
-
-def _differences(pairs: Pairs) -> Row:
-    apart = [
-        {name: one[column] - other["total_s"] for name, column in DIFFERENCES.items()} for one, other in pairs
-    ]
-    return day_means(apart, DIFFERENCES, DIFFERENCES)
 
 
 def day_means(days: Sequence[Row], measures: Iterable[str], with_interval: Collection[str]) -> Row:
@@ -110,17 +108,16 @@ def day_means(days: Sequence[Row], measures: Iterable[str], with_interval: Colle
 
 
 def _ratio(name: str, pairs: Pairs, column: str) -> Row:
-    if not pairs or any(math.isnan(theirs[column]) for _, theirs in pairs):
+    if not pairs or any(math.isnan(other[column]) for _, other in pairs):
         return columns_of(name, (math.nan, math.nan, math.nan))
-    mine, theirs = (
-        [day[name] * day["cars"] for day in days]
-        for name, days in zip(("total_s", column), zip(*pairs, strict=True), strict=True)
+    sums = (
+        [day[c] * day["cars"] for day in days]
+        for c, days in zip(("total_s", column), zip(*pairs, strict=True), strict=True)
     )
-    return columns_of(name, ratio_interval(mine, theirs))
+    return columns_of(name, ratio_interval(*sums))
 
 
-NOTICED_S = 1.0
-"""A car is better or worse off if its total time differs by at least this, s."""
+NOTICED_S = 1.0  # a car is better or worse off if its total time differs by at least this, s
 _NAMED = 3  # zones whose prices change alike, above which they are counted
 CHANGES = (
     "change_s", "members_change_s", "others_change_s", "search_change_s", "parking_cost_change_s", "gave_up_change_s",
@@ -209,11 +206,11 @@ def _new_prices(before: Mapping[str, float], after: Mapping[str, float]) -> str 
     for zone, price in after.items():
         if before.get(zone, price) != price:
             new.setdefault(f"{before[zone]:g} → {price:g}", []).append(zone)
-    said = []
+    parts = []
     for prices, zones in new.items():
         named = zones if len(zones) <= _NAMED else [zones[0], f"{len(zones) - 1} zones more"]
-        said.append(f"{', '.join(named)} {prices}")
-    return f"{', '.join(said)} an hour" if said else None
+        parts.append(f"{', '.join(named)} {prices}")
+    return f"{', '.join(parts)} an hour" if parts else None
 
 
 def _change(after: Row, before: Row, column: str, number: int | None) -> Row:
