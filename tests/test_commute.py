@@ -31,6 +31,17 @@ def spec(**changes):
     return Commute.parse(small | {"jobs": 1} | changes, "test")
 
 
+def write_log(path, days):
+    """A log of slots that stay as they are on a day."""
+    lines = ["slot_id,datetime,occupied"]
+    for day, taken in days.items():
+        lines += [
+            f"s{s},{day}T{hour:02}:00,{int(taken[s])}" for s in range(len(taken)) for hour in range(7, 20)
+        ]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
 def test_the_command_writes_rows_maps_picture_and_report(tmp_path):
     out = tmp_path / "run"
     done = ran(
@@ -101,13 +112,9 @@ def test_days_do_not_depend_on_later_ones():
 def test_drivers_come_on_the_next_weekdays_or_recorded_days(tmp_path):
     mini = make_scenario("mini")
     assert [day.count for day in calendar(mini, 7)] == [0, 1, 2, 3, 4, 7, 8]
-    lines = ["slot_id,datetime,occupied"]
     dates = ("2024-03-05", "2024-03-06", "2024-03-09", "2024-03-12", "2024-03-13")
-    for day in dates:
-        lines += [f"s{s},{day}T{hour:02}:00,{(s + hour) % 2}" for s in range(10) for hour in range(7, 20)]
-    path = tmp_path / "log.csv"
-    path.write_text("\n".join(lines) + "\n")
-    log = RecordedOccupancy(OccupancyLog.read(path), mini.lot.walk_m(0), np.arange(10))
+    log = OccupancyLog.read(write_log(tmp_path / "log.csv", {day: np.arange(10) % 2 for day in dates}))
+    log = RecordedOccupancy(log, mini.lot.walk_m(0), np.arange(10))
     recorded = mini.replace(occupancy=log, arrival=ArrivalWindow())
     days = calendar(recorded, 30)
     assert [(day.count, day.date) for day in days] == [
@@ -154,11 +161,8 @@ def test_a_week_of_trips_closes_the_gap_of_a_wrong_map(monkeypatch):
 
 def test_a_log_keeps_its_slots_on_all_days_of_a_commute(tmp_path):
     """Without a mapping, a log's slots are ranked anew for every day; a map could not learn them."""
-    rng, lines = np.random.default_rng(0), ["slot_id,datetime,occupied"]
-    for date in ("2024-03-05", "2024-03-06", "2024-03-07", "2024-03-08"):
-        taken = rng.random(10) < 0.5
-        lines += [f"s{s},{date}T{hour:02}:00,{int(taken[s])}" for s in range(10) for hour in range(7, 20)]
-    (tmp_path / "log.csv").write_text("\n".join(lines) + "\n")
+    rng = np.random.default_rng(0)
+    write_log(tmp_path / "log.csv", {f"2024-03-0{day}": rng.random(10) < 0.5 for day in (5, 6, 7, 8)})
     (tmp_path / "recorded.toml").write_text('lot = "mini"\noccupancy = "log.csv"\n')
     commute = spec(scenarios=[str(tmp_path / "recorded.toml")], drivers=1)
     occupancy = commute.runs[0].scenario.occupancy

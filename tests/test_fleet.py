@@ -266,16 +266,6 @@ def test_residents_leave_and_do_not_come_back():
     assert not (standing & ~before).any()
 
 
-def test_a_car_without_patience_goes_elsewhere():
-    demand = Demand(Headways(4), patience=ConstantTime(20.0))
-    scenario = parkenv.make_scenario("jam", give_up_s=500.0)
-    fleet = driven(Fleet(scenario, demand, drivers=[DriverKind(policy=POLICIES["random"])]), 0)
-    cars = fleet.cars[np.array(fleet.state_names()) == "balked"]
-    assert len(cars)
-    assert (cars["gave_up_s"] == 500.0).all()
-    assert (cars["ended_at"] - cars["arrival"] >= 20.0).all()
-
-
 def test_goals_and_entries_are_drawn_by_weight():
     scenario = parkenv.make_scenario("campus")
     n_goals, n_entries = len(scenario.lot.goals), len(scenario.lot.entries)

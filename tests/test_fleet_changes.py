@@ -4,12 +4,10 @@ import math
 
 import numpy as np
 import pytest
-from command_line import ran, summary_of
 from small_lots import features
 
 from parkenv import InputError, ParkingLot, make_scenario
 from parkenv.lots.formats.geojson import write_lot
-from parkenv.scenarios.spec import ScenarioSpec
 from parkenv.studies.fleet.setting import NOWHERE
 from parkenv.studies.fleet.study import FleetStudy
 from parkenv.studies.fleet.tables import CHANGES, summarize_changes
@@ -75,18 +73,6 @@ def test_changes_are_paired_by_day_and_by_car(days):
 def test_only_equal_hours_have_the_same_cars():
     with pytest.raises(InputError, match=r"arrivals\.hours of 'after' are not those of 'before'"):
         study(BEFORE, AFTER | {"arrivals": {"hours": "09:00-10:00"}}).check()
-
-
-def test_the_command_compares_lots(tmp_path):
-    for spec in (BEFORE, AFTER):
-        ScenarioSpec.parse(spec, "").write(tmp_path / f"{spec['name']}.json")
-    words = ("--arrivals-per-hour", "12", "--knows", "own", "-n", 2, "--jobs", 1, "--no-figures")
-    done = ran("fleet", "--scenario", "before.json,after.json", *words, "--out", "out", cwd=tmp_path)
-    summary = summary_of(tmp_path / "out")
-    (change,) = summary["changes"]
-    first, second = summary["rows"]
-    assert change["change_s"] == pytest.approx(second["total_s"] - first["total_s"])
-    assert "What changes for whom" in done.stdout
 
 
 def test_each_purpose_has_its_own_change_and_together_they_are_that_of_all():
