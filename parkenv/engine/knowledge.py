@@ -1,4 +1,4 @@
-"""What cars of a fleet are told beyond their own observations: the reports of a live map, or the state of every slot.
+"""Shared information in a fleet: reports on the live map, and the state of every slot.
 
 What a car is told counts as observations of its own, so every agent uses it unchanged. Reports from before a car's
 arrival count as observations at its arrival, decayed to it; those that have lost half of their value by then are

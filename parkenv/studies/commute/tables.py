@@ -79,9 +79,9 @@ def _difference(
     interval: Callable[[Sequence[float]], tuple[float, float, float]] = mean_interval,
 ) -> Row:
     paired = [
-        _course_mean("total_s", its) - _course_mean("total_s", reference[course])
-        for course, its in courses.items()
-        if len(reference.get(course, ())) == len(its)
+        _course_mean("total_s", searches) - _course_mean("total_s", reference[course])
+        for course, searches in courses.items()
+        if len(reference.get(course, ())) == len(searches)
     ]
     if not paired:
         return {}
@@ -97,6 +97,6 @@ def _robust(values: Sequence[float]) -> tuple[float, float, float]:
 
 
 def _mean(name: str, courses: Iterable[Sequence[Row]]) -> Row:
-    means = [_course_mean(name, its) for its in courses]
+    means = [_course_mean(name, searches) for searches in courses]
     # Agents without a map have no forecast error.
     return columns_of(name, mean_interval(means) if np.isfinite(means).all() else (np.nan, np.nan, np.nan))

@@ -92,15 +92,15 @@ class Curves:
         first = next(iter(self.curves))[0] if scenario is None else scenario
         x, *names = np.broadcast_arrays(np.asarray(given, float), first, zone, purpose, hour)
         values = np.empty((3, *x.shape))
-        asked = np.stack([its.astype(str) for its in names], axis=-1)
+        asked = np.stack([of_axis.astype(str) for of_axis in names], axis=-1)
         for key in {*map(tuple, asked.reshape(-1, len(NAMES)).tolist())}:
-            at, its = (asked == key).all(axis=-1), self._curve(key)
-            if outcome not in its:
+            at, curve = (asked == key).all(axis=-1), self._curve(key)
+            if outcome not in curve:
                 raise InputError(f"outcome is {outcome!r:.40}; {nearest(outcome, OUTCOMES)}")
-            knots, unique = np.unique(np.array(its[along], float), return_index=True)
+            knots, unique = np.unique(np.array(curve[along], float), return_index=True)
             inside = np.clip(x[at], knots[0], knots[-1])
             for k, column in enumerate((outcome, f"{outcome}_low", f"{outcome}_high")):
-                y = np.array(its[column], float)[unique]
+                y = np.array(curve[column], float)[unique]
                 values[k, at] = PchipInterpolator(knots, y)(inside) if len(knots) > 1 else y[0]
         return CurveValue(*values)
 
@@ -127,7 +127,7 @@ def load_curves(folder: Path | str) -> Curves:
     path = Path(folder) / JSON
     content = read_json(path, MOST_BYTES)
     try:
-        return Curves({tuple(str(its[name]) for name in NAMES): its for its in content["curves"]})
+        return Curves({tuple(str(curve[name]) for name in NAMES): curve for curve in content["curves"]})
     except (InputError, KeyError, TypeError) as error:
         raise InputError(f"{path}: want curves with {', '.join(NAMES)}") from error
 
@@ -135,18 +135,18 @@ def load_curves(folder: Path | str) -> Curves:
 def write_curves(paths: Paths, table: CurveTable, folder: Path) -> None:
     names, n = [paths.names(index) for index in table.numbers.tolist()], len(paths.multiples)
     columns = {name: values.round(_DIGITS).tolist() for name, values in table.columns.items()}
-    repeated = [[name for name in its for _ in range(n)] for its in zip(*names, strict=True)]
+    repeated = [[name for name in of_axis for _ in range(n)] for of_axis in zip(*names, strict=True)]
     repeated += [
         paths.multiples.tolist() * len(names),
-        *([x for row in its for x in row] for its in columns.values()),
+        *([x for row in rows for x in row] for rows in columns.values()),
     ]
     write_text(
         folder / "curve.csv",
         csv_text((*NAMES, "multiple", *columns), [], header=True) + csv_columns(repeated),
     )
     curves = [
-        dict(zip(NAMES, its, strict=True)) | {name: values[k] for name, values in columns.items()}
-        for k, its in enumerate(names)
+        dict(zip(NAMES, key, strict=True)) | {name: values[k] for name, values in columns.items()}
+        for k, key in enumerate(names)
     ]
     whole = without_nan({"multiples": paths.multiples.tolist(), "curves": curves})
     write_text(folder / JSON, json.dumps(whole, allow_nan=False) + "\n")
@@ -168,18 +168,19 @@ def zone_rows(paths: Paths, table: CurveTable) -> tuple[list[Row], list[Row]]:
     for number, (name, zones) in enumerate(paths.towns.items()):
         minutes = (column["search_s"] + column["walk_s"])[:, paths.usual[name]] / 60.0
         for at, zone_name in enumerate(zones.names):
-            its = np.flatnonzero(of_all & (town == number) & (zone == at))
-            if not its.size:
+            hours = np.flatnonzero(of_all & (town == number) & (zone == at))
+            if not hours.size:
                 continue
             row: Row = {"scenario": name, "zone_id": zone_name}
             for period, (begin, end) in PERIODS.items():
-                inside = its[(paths.first_hour + hour[its] >= begin) & (paths.first_hour + hour[its] < end)]
+                clock = paths.first_hour + hour[hours]
+                inside = hours[(clock >= begin) & (clock < end)]
                 weighed = np.average(minutes[inside], weights=table.cars[inside]) if inside.size else None
                 row[f"TERMINAL{period}"] = weighed if weighed is None else round(float(weighed), 2)
             terminal.append(row)
-            weight = np.repeat(table.cars[its], len(paths.multiples))
+            weight = np.repeat(table.cars[hours], len(paths.multiples))
             b, (alpha,) = fit_form(
-                "a exp(b x)", column["occupancy"][its].ravel(), column["search_s"][its].ravel(), weight
+                "a exp(b x)", column["occupancy"][hours].ravel(), column["search_s"][hours].ravel(), weight
             )
             x, y = zones.xy[at].round(2).tolist()
             row = {"scenario": name, "zone": zone_name, "x": x, "y": y}

@@ -49,11 +49,11 @@ class Outcome(NamedTuple):
 
 
 OUTCOMES = {
-    "search_s": Outcome("search time, s", lambda its: its["search_s"], "parked"),
-    "walk_s": Outcome("walk, s", lambda its: its["walk_s"], "parked"),
-    "failed_attempts": Outcome("failed attempts", lambda its: its["failed"], "cars"),
+    "search_s": Outcome("search time, s", lambda sums: sums["search_s"], "parked"),
+    "walk_s": Outcome("walk, s", lambda sums: sums["walk_s"], "parked"),
+    "failed_attempts": Outcome("failed attempts", lambda sums: sums["failed"], "cars"),
     "balked_fraction": Outcome(
-        "share that finds no space", lambda its: its["cars"] - its["parked"], "cars", 1.0
+        "share that finds no space", lambda sums: sums["cars"] - sums["parked"], "cars", 1.0
     ),
 }
 FORMS: Mapping[str, tuple[Callable[[FloatArray, float], list[FloatArray]], FloatArray]] = {

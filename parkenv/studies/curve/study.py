@@ -184,12 +184,12 @@ class CurveStudy(FleetSpec):
         errors = [r for r in result.summary["errors"] if r["held_out"] == "zones"][:1]
         off = {key: row[key] for row in errors for key in (*PREDICTORS, "chance")}
         for name, zones in self.zones.items():
-            its = {p: curve for (s, z, p, h), curve in curves.items() if (s, z, h) == (name, ALL, ALL)}
-            its = {ALL: its[ALL]} | its
+            by_purpose = {p: curve for (s, z, p, h), curve in curves.items() if (s, z, h) == (name, ALL, ALL)}
+            by_purpose = {ALL: by_purpose[ALL]} | by_purpose
             of_zones = [row for row in points if row["scenario"] == name]
             title = f"{name}: {plural(len(zones.names), 'zone')}, {plural(self.days, 'day')} of each demand"
             path = result.folder / (PICTURE if len(self.zones) == 1 else file_name(f"curve_{name}", ".png"))
-            tasks.append(partial(save_curves, its, of_zones, off, fitted_forms(of_zones), title, path))
+            tasks.append(partial(save_curves, by_purpose, of_zones, off, fitted_forms(of_zones), title, path))
         return tasks
 
     @classmethod

@@ -56,9 +56,9 @@ class Roads:
         middle = (lot.vertex_xy[:, None] + ends).reshape(-1, 2) / 2
         tree = shapely.STRtree(linestrings([lane.points for lane in lot.lanes]))
         edge, lane = tree.query_nearest(shapely.points(middle), all_matches=False)
-        found = np.zeros(len(middle), np.int64)
-        found[edge] = lane
-        return found.reshape(lot.neighbors.shape)
+        lanes = np.zeros(len(middle), np.int64)
+        lanes[edge] = lane
+        return lanes.reshape(lot.neighbors.shape)
 
     def alone_s(self, fleet: Fleet) -> FloatArray:
         """Return the total time of each car in an empty lot that it knows, (n,) s: no car can be faster.
@@ -68,13 +68,13 @@ class Roads:
         cars, lot = fleet.cars, self._problem.lot
         rows, free_s = np.searchsorted(self._entries, cars["entry"]), np.zeros((len(cars), len(lot.zones)))
         for place, walks in sorted({*zip(cars["place"].tolist(), cars["walks"].tolist(), strict=True)}):
-            its = (cars["place"] == place) & (cars["walks"] == walks)
+            alike = (cars["place"] == place) & (cars["walks"] == walks)
             cost_s = fleet.scenarios[place].walk_s * walks + lot.slot_parking_cost_s
             by_zone = [
                 (self._drive_s[:, lot.zone_of_slot == zone] + cost_s[lot.zone_of_slot == zone]).min(axis=1)
                 for zone in range(len(lot.zones))
             ]
-            free_s[its] = np.stack(by_zone, axis=1)[rows[its]]
+            free_s[alike] = np.stack(by_zone, axis=1)[rows[alike]]
         least_s = (free_s + fleet.drawn.zone_costs()).min(axis=1)
         return np.where(np.isfinite(least_s), least_s, self._problem.give_up_s)
 

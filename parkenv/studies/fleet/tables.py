@@ -154,31 +154,30 @@ def summarize_changes(
     first = settings[0][0]["scenario"] if settings else ""
     rows = []
     for days in settings:
-        its = {name: days[0][name] for name in SETTING_COLUMNS}
-        for what, before in (("scenario", {"scenario": first}), ("knows", {"knows": OWN, "share": 0.0})):
-            earlier = by_setting.get(tuple((its | before)[name] for name in SETTING_COLUMNS), [])
-            rate = its["arrivals_per_hour"]
-            follows = isinstance(rate, str) and rate != GIVEN and not purposes.get(str(its["scenario"]))
+        after = {name: days[0][name] for name in SETTING_COLUMNS}
+        rate = after["arrivals_per_hour"]
+        follows = isinstance(rate, str) and rate != GIVEN and not purposes.get(str(after["scenario"]))
+        for what, earlier in (("scenario", {"scenario": first}), ("knows", {"knows": OWN, "share": 0.0})):
             if what == "scenario" and (follows or rate == COUNTED):
                 continue  # a demand that follows counts has its own cars in every scenario
-            if its[what] != before[what] and (pairs := paired_days(days, earlier)):
-                names = _words(what, its | before), _words(what, its)
-                head = {"change": what, "before": names[0], "after": names[1], **its, "days": len(pairs)}
-                old, new = (prices.get(str(one["scenario"]), {}) for one in (its | before, its))
-                head["prices"] = _new_prices(old, new)
-                zones = enumerate((NOWHERE, *old)) if len(old) > 1 else ()
-                mixed = all(len(day["purpose"]) for day in pairs[0])
-                named = enumerate(purposes.get(str((its | before)["scenario"]), ())) if mixed else ()
-                parts = [
-                    ("", None, None),
-                    *(("zone", *one) for one in zones),
-                    *(("purpose", *one) for one in named),
-                ]
-                for column, number, name in parts:
-                    changes = [_change(*pair, column, number) for pair in pairs]
-                    if name != NOWHERE or all(change["cars_a_day"] for change in changes):
-                        part = {"zone": None, "purpose": None} | ({column: name} if column else {})
-                        rows.append(head | part | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
+            before = after | earlier
+            pairs = paired_days(days, by_setting.get(tuple(before.values()), ()))
+            if after[what] == before[what] or not pairs:
+                continue
+            old, new = (prices.get(str(setting["scenario"]), {}) for setting in (before, after))
+            head = {"change": what, "before": _words(what, before), "after": _words(what, after), **after}
+            head |= {"days": len(pairs), "prices": _new_prices(old, new)}
+            zones = (NOWHERE, *old) if len(old) > 1 else ()
+            mixed = all(len(day["purpose"]) for day in pairs[0])
+            named = purposes.get(str(before["scenario"]), ()) if mixed else ()
+            parts: list[tuple[str, int | None, str | None]] = [("", None, None)]
+            parts += [("zone", *zone) for zone in enumerate(zones)]
+            parts += [("purpose", *purpose) for purpose in enumerate(named)]
+            for column, number, name in parts:
+                changes = [_change(*pair, column, number) for pair in pairs]
+                if name != NOWHERE or all(change["cars_a_day"] for change in changes):
+                    part = {"zone": None, "purpose": None} | ({column: name} if column else {})
+                    rows.append(head | part | day_means(changes, ("cars_a_day", *CHANGES), CHANGES))
     return sorted(rows, key=lambda row: row["change"] != "scenario")
 
 
@@ -232,20 +231,20 @@ def _change(after: Row, before: Row, column: str, number: int | None) -> Row:
     times, earlier, member = after["total_cs"], before["total_cs"], after["member"]
     if not len(times) == len(earlier) == len(member) > 0:
         return row
-    its = np.ones(len(times), bool) if number is None else before[column] == number
+    chosen = np.ones(len(times), bool) if number is None else before[column] == number
     gained = (times - earlier) / 100.0
     cents, earlier_cents = after["paid_cents"], before["paid_cents"]
     if len(cents) or len(earlier_cents):
         free = np.zeros(len(times))  # in a lot without prices
         cents, earlier_cents = (known if len(known) else free for known in (cents, earlier_cents))
-        row["paid_change"] = mean_or_nan((cents - earlier_cents)[its] / 100.0)
+        row["paid_change"] = mean_or_nan((cents - earlier_cents)[chosen] / 100.0)
     if number is not None:
-        row |= {"cars_a_day": float(its.sum()), "change_s": mean_or_nan(gained[its])}
+        row |= {"cars_a_day": float(chosen.sum()), "change_s": mean_or_nan(gained[chosen])}
     return row | {
-        "members_change_s": mean_or_nan(gained[its & (member == 1.0)]),
-        "others_change_s": mean_or_nan(gained[its & (member == 0.0)]),
-        "better_off": mean_or_nan((gained <= -NOTICED_S)[its]),
-        "worse_off": mean_or_nan((gained >= NOTICED_S)[its]),
+        "members_change_s": mean_or_nan(gained[chosen & (member == 1.0)]),
+        "others_change_s": mean_or_nan(gained[chosen & (member == 0.0)]),
+        "better_off": mean_or_nan((gained <= -NOTICED_S)[chosen]),
+        "worse_off": mean_or_nan((gained >= NOTICED_S)[chosen]),
     }
 
 
