@@ -217,7 +217,7 @@ class LotEnv(_CarsAsAgents, AECEnv[str, Observation, Any]):  # type: ignore[misc
     - `leaving_soon_s`: above 0, cars signal for that time that they are about to leave, in a further key of the
       observation, `leaving`; a car that waits at such a slot holds it.
     - `sees_cars`: whether observations have the key `cars`: the other cars in view. `parkenv.engine.fleet.Fleet`
-      describes these options and keys.
+      describes these options.
     - further keywords replace fields of the scenario, e.g. `failure_s=90.0`.
 
     ```python
@@ -423,16 +423,10 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
             over[agent] = int(self.fleet.cars["state"][car]) not in (SEARCHING, TRUNCATED)
 
 
-def raw_env(**options: Any) -> LotEnv:
-    """Make the AEC form without wrappers; options see `LotEnv`."""
-    return LotEnv(**options)
+raw_env, parallel_env = LotEnv, LotParallelEnv
+"""The AEC form without wrappers, and the parallel form."""
 
 
 def env(**options: Any) -> wrappers.OrderEnforcingWrapper[str, Observation, Any]:
     """Make the AEC form with PettingZoo's checks of actions and of the order of calls; options see `LotEnv`."""
     return wrappers.OrderEnforcingWrapper(wrappers.AssertOutOfBoundsWrapper(raw_env(**options)))
-
-
-def parallel_env(**options: Any) -> LotParallelEnv:
-    """Make the parallel form; options see `LotParallelEnv`."""
-    return LotParallelEnv(**options)
