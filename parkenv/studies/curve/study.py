@@ -196,19 +196,17 @@ class CurveStudy(FleetSpec):
     def findings(cls, summary: Row) -> list[str]:
         from parkenv.studies.curve.fit import CURVE, FORMS
 
-        return [
+        findings = [
             f"{row['outcome']}, {row['held_out']} held out: {row[CURVE]:.1%} off by zone-hours; the best of the usual "
             f"forms {min(row[form] for form in FORMS):.1%}."
             for row in summary["errors"][:1]
         ]
+        return findings + [f"On {name}, {caution}" for name, caution in summary["cautions"].items()]
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
         from parkenv.show.report.tables import OF_FLEETS, tables_of
         from parkenv.studies.curve.fit import PREDICTORS
 
-        return (
-            super()
-            .page(summary, folder)
-            ._replace(tables=tables_of(summary, cls.table_titles, OF_FLEETS | PREDICTORS))
-        )
+        tables = tables_of(summary, cls.table_titles, OF_FLEETS | PREDICTORS)
+        return super().page(summary, folder)._replace(tables=tables)

@@ -119,11 +119,11 @@ class FleetStudy(FleetSpec):
 
     @classmethod
     def findings(cls, summary: Row) -> list[str]:
+        """See `Study`: the first setting, and warnings of the imports of lots."""
         row = summary["rows"][0]
-        return [
-            f"{row['agents']} on {row['scenario']}, {rate_text(row['arrivals_per_hour'])}: {row['total_s']:.1f} s a "
-            f"car, {row['balked_fraction']:.1%} find no slot."
-        ]
+        setting = f"{row['agents']} on {row['scenario']}, {rate_text(row['arrivals_per_hour'])}"
+        finding = f"{setting}: {row['total_s']:.1f} s a car, {row['balked_fraction']:.1%} find no slot."
+        return [finding, *(f"On {name}, {caution}" for name, caution in summary["cautions"].items())]
 
     @classmethod
     def page(cls, summary: Row, folder: Path) -> Page:
