@@ -67,22 +67,13 @@ def map_file(folder: Path, run: CommuteRun) -> Path:
 
 @dataclass(frozen=True, eq=False)
 class CommuteRun:
-    """One driver, or a fleet that shares a map, with one agent and one map to start from.
-
-    Args:
-        scenario: the scenario.
-        agent: the agent.
-        map: empty, right, wrong, `FIXED` or `NONE`.
-        number: number of the repetition, from 0.
-        fleet: number of drivers.
-        seed: seed of the commute.
-    """
+    """One driver, or a fleet that shares a map, with one agent and one map to start from."""
 
     scenario: Scenario
     agent: AgentSpec
-    map: str
-    number: int
-    fleet: int
+    map: str  # empty, right, wrong, `FIXED` or `NONE`
+    number: int  # of the repetition, from 0
+    fleet: int  # number of drivers
     seed: int
 
     @property
@@ -112,15 +103,7 @@ class CommuteRun:
         return scenario.occupancy
 
     def run(self, days: Sequence[Day], before: Sequence[Trip]) -> list[Row]:
-        """Run some days.
-
-        Args:
-            days: the days, in order.
-            before: all trips of the days before.
-
-        Returns:
-            A row for each search, with its trip under `TRIP` if trips go into a map.
-        """
+        """Run some days, after trips of the days before; return a row for each search, with any trip under `TRIP`."""
         rows: list[Row] = []
         known = self.start_map()
         agent = make_agent(self.agent.name, self.scenario, **self.agent.options)

@@ -185,11 +185,7 @@ def fit_curve(
 ) -> tuple[FloatArray, FloatArray]:
     """Fit an outcome; return it as all zones have it in common, and with the factors of each zone, (n, m) each.
 
-    Args:
-        paths: the days.
-        name: of the outcome.
-        train: weights of the cells to fit to, which broadcast to (n, m).
-        days: how often each day counts; once by default.
+    `train` are weights of the cells to fit to, which broadcast to (n, m); each day counts once, or as `days` says.
     """
     with with_extra("a fit of curves", "fit"):
         from sklearn.ensemble import HistGradientBoostingRegressor
@@ -357,15 +353,7 @@ def curve_table(
     workers: Workers = SERIAL,
     progress: Callable[[], None] = lambda: None,
 ) -> CurveTable:
-    """Fit all outcomes, with intervals by a bootstrap over days and zones, and add up zones, purposes and hours.
-
-    Args:
-        paths: the days.
-        bootstraps: how often they are drawn anew.
-        seed: seed of the draws.
-        workers: where fits run.
-        progress: called after each fit.
-    """
+    """Fit all outcomes, with intervals by a bootstrap over days and zones, and add up zones, purposes and hours."""
     numbers, adds = [], []
     for alls in range(8):
         whole = [1 + column for column in range(len(INDEX)) if alls >> column & 1]

@@ -168,15 +168,15 @@ class CountedTown:
         episodes: int,
         seed: int,
     ) -> Row:
-        """Drive a day with the demand that its forecast tells; return the lines of it as columns.
+        """Drive a day with the demand that its forecast tells: the mean of some days of the fleet.
 
         Args:
             day: index of the day.
             fit: of the weeks before, see `fitted`; its stays and corrections hold on this day, too.
             before: (n,) cars that are there when the day begins.
             expected: (n, n_hours) cars by the forecast that was made before the day.
-            episodes: days of the fleet, of which the mean is taken.
-            seed: seed of these days.
+            episodes: number of days of the fleet.
+            seed: of these days.
 
         Returns:
             Columns, with a line for each car park and hour where all are known: `car_park`, `hour`, and shares of the

@@ -54,15 +54,7 @@ class Day(NamedTuple):
 
 
 def simulate(fleet: Fleet, agents: Sequence[Any], roads: Roads, seed: int, number: int) -> Day:
-    """Simulate a day of a fleet.
-
-    Args:
-        fleet: the fleet.
-        agents: see `Fleet.run`.
-        roads: its shortest drives.
-        seed: seed of the days.
-        number: number of the day.
-    """
+    """Simulate a day of a fleet, by its seed and number, with the agents of `Fleet.run`."""
     fleet.reset(seed, number)
     clairvoyant_s, window = roads.clairvoyant_s(fleet), fleet.scenario.arrival
     times = fleet.begin + np.arange(0.0, window.end_s - window.start_s, SAMPLE_S)

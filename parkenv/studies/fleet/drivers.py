@@ -62,13 +62,9 @@ def policy_of(
 
 
 def network_policy(policy: Any, k: int, *, sampled: bool = False, name: str = "network") -> NetworkPolicy:
-    """Return a policy of stable-baselines3 or sb3-contrib as a compiled driver of a fleet.
+    """Return a policy of stable-baselines3 or sb3-contrib, for `local` observations of k slots, as a compiled driver.
 
-    Args:
-        policy: of PPO, MaskablePPO or DQN on the `local` observation.
-        k: number of slots in the observation.
-        sampled: whether to draw actions from the policy, instead of taking the most probable one.
-        name: for tables.
+    It draws its actions if `sampled`, instead of taking the most probable one.
     """
     from torch import nn
 
@@ -98,13 +94,7 @@ def compiled_policy_of(spec: AgentSpec, scenario: Scenario) -> CompiledPolicy:
 
 
 class AgentsByStay:
-    """An agent in Python for each car of a fleet, which plans with what the car's own stay costs.
-
-    Args:
-        spec: the agent.
-        scenario: what all cars have in common.
-        known: further options.
-    """
+    """An agent in Python for each car of a fleet, which plans with what the car's own stay costs."""
 
     def __init__(self, spec: AgentSpec, scenario: Scenario, known: Mapping[str, Any]) -> None:
         self._spec, self._scenario, self._options = spec, scenario, {**known, **spec.options}
@@ -166,10 +156,6 @@ class LimitedAgent:
 
     The error comes from a timer's signal, which Python handles between two of its instructions. So compiled code that
     never returns is not stopped.
-
-    Args:
-        agent: has `predict(observation, state)`.
-        limit_s: wall time of a decision, s.
     """
 
     def __init__(self, agent: Any, limit_s: float) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 from collections.abc import Iterator
-from datetime import date, datetime, time, timedelta
+from datetime import datetime, timedelta
 from io import StringIO
 from pathlib import Path
 
@@ -21,7 +21,7 @@ from parkenv.studies.agent_spec import AgentSpec
 from parkenv.studies.fleet.drivers import compiled_policy_of
 from parkenv.studies.study import Progress
 
-FIRST_MONDAY = date(2024, 1, 1)
+FIRST_MONDAY = datetime(2024, 1, 1)
 """Days of a fleet have no date; in a log the first is in this week, the next one a week later."""
 _BEFORE_S = 1  # between the last observation of a state and the next state
 
@@ -41,15 +41,8 @@ def record_days(
     A counted facility is taken while it is full. The log has each slot at the beginning of the day, and whenever it
     changes, to the second.
 
-    Args:
-        spec: the scenario. What its drivers expect in the first round is a typical week.
-        path: the log, .csv or .csv.gz.
-        agent: drives all cars.
-        days: number of days.
-        rounds: how often they are driven. From the second time on, drivers expect what the days before were like; the
-            last ones are recorded.
-        seed: seed of the days.
-        progress: called as days are driven.
+    The days are driven in rounds, of which the last one is recorded: drivers expect a typical week in the first, and
+    then what the days of the round before were like.
     """
     occupancy: object = "typical"
     for number in range(rounds):
@@ -62,7 +55,11 @@ def record_days(
         for day in range(days):
             fleet.reset(seed, day)
             fleet.run()
-            lines += _lines(fleet, FIRST_MONDAY + timedelta(weeks=day, days=fleet.day.weekday))
+            midnight = FIRST_MONDAY + timedelta(weeks=day, days=fleet.day.weekday)
+            lines += [
+                ((midnight + timedelta(seconds=second)).isoformat(), scenario.lot.slot_ids[slot], int(taken))
+                for slot, second, taken in observations(fleet)
+            ]
             progress("Days", number * days + day + 1, rounds * days)
         text = StringIO()
         csv.writer(text, lineterminator="\n").writerows([("datetime", "slot_id", "occupied"), *lines])
@@ -72,14 +69,6 @@ def record_days(
             beside.write_bytes(gzip.compress(content, mtime=0) if path.suffix == ".gz" else content)
         occupancy = {"log": str(path), "mapping": SAME_SLOTS}
     return len(lines)
-
-
-def _lines(fleet: Fleet, day: date) -> list[tuple[str, str, int]]:
-    ids, midnight = fleet.scenario.lot.slot_ids, datetime.combine(day, time())
-    return [
-        ((midnight + timedelta(seconds=second)).isoformat(), ids[slot], int(taken))
-        for slot, second, taken in observations(fleet)
-    ]
 
 
 def observations(fleet: Fleet) -> Iterator[tuple[int, int, bool]]:
