@@ -13,9 +13,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from ordered_entry import ORDERED_ENTRY
 from small_lots import driven, small_lot
+from test_counted_occupancy import counted
+from test_search_vector import recorded_scenario
 
 import parkenv
-from parkenv import InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
+from parkenv import ArrivalWindow, InputError, OccupancyProcess, Scenario, SensorBand, SensorModel
 from parkenv.engine.fleet import DriverKind, Fleet
 from parkenv.engine.records import DUE, LEFT, PARKED, SEARCHING
 from parkenv.world.demand import (
@@ -57,32 +59,10 @@ def test_no_function_for_a_record_is_compiled_for_one_that_merely_begins_like_it
     assert taken_for == {("FLEET", "SHARED_WORLD")}
 
 
-def recorded_scenario():
-    from parkenv import ArrivalWindow, OccupancyLog, RecordedOccupancy
-
-    campus = parkenv.make_scenario("mini")
-    n, days = campus.lot.n_slots, ("2024-03-04", "2024-03-05", "2024-03-06")
-    rng = np.random.default_rng(3)
-    slot, day, period = (a.ravel() for a in np.meshgrid(range(n), range(3), range(48), indexing="ij"))
-    log = OccupancyLog(
-        tuple(map(str, range(n))), days, slot, day, period * 1800.0, rng.random(slot.size) < 0.6
-    )
-    occupancy = RecordedOccupancy(log, campus.lot.walk_m(0), np.arange(n))
-    window = ArrivalWindow((0, 1, 2), 8 * 3600.0, 12 * 3600.0)
-    return campus.replace(name="log", occupancy=occupancy, prior=None, arrival=window)
-
-
 def counted_scenario():
     """Days of counted car parks, with a forecast that Python computes at every arrival."""
-    from parkenv import ArrivalWindow
-    from parkenv.world.occupancy.counted import CountedOccupancy
-
     mini = parkenv.make_scenario("mini")
-    curve = np.stack([np.interp(range(24), [0, 10, 23], [0.2, top, 0.3]) for top in (0.9, 0.6)])
-    days = ("2024-01-01", "2024-01-02")
-    level = np.log(curve / (1.0 - curve))
-    attraction = np.linspace(1.0, -1.0, mini.lot.n_slots)
-    occupancy = CountedOccupancy(days, curve, level, np.full((2, 24), 0.8), attraction)
+    occupancy = counted(attraction=np.linspace(1.0, -1.0, mini.lot.n_slots))
     window = ArrivalWindow((0, 1), 9 * 3600.0, 12 * 3600.0)
     return mini.replace(name="counted", occupancy=occupancy, prior=None, arrival=window)
 
