@@ -152,12 +152,12 @@ class CountedTown:
             driven = self.driven(purposes, seed, range(number * episodes, (number + 1) * episodes))
             aim = np.maximum(aim + _STEP * (cars - driven), 0.0)
         columns = {"followed": cars, "driven": driven, "aim": aim}
-        fits: dict[str, Row] = {}
-        for k, name in enumerate(self.names):
-            if name in purposes:
-                lists = {column: without_nan(values[k].tolist()) for column, values in columns.items()}
-                fits[name] = {"purpose": purposes[name].tables(), **lists}
-        return fits
+        return {
+            name: {"purpose": purposes[name].tables()}
+            | {column: without_nan(cars_of[k].tolist()) for column, cars_of in columns.items()}
+            for k, name in enumerate(self.names)
+            if name in purposes
+        }
 
     def predicted(
         self,
