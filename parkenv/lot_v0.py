@@ -351,11 +351,7 @@ class LotParallelEnv(_CarsAsAgents, ParallelEnv[str, Observation, Any]):  # type
     def step(
         self, actions: dict[str, Any]
     ) -> tuple[
-        dict[str, Observation],
-        dict[str, float],
-        dict[str, bool],
-        dict[str, bool],
-        dict[str, dict[str, Any]],
+        dict[str, Observation], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
     ]:
         """Carry out the actions of the cars that have to decide, and go on to the next tick.
 

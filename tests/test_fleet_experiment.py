@@ -193,10 +193,7 @@ def test_cars_get_in_each_others_way_as_calibrated(tmp_path):
 
 @pytest.mark.parametrize(
     ("module", "body", "message"),
-    [
-        ("leaving", "raise SystemExit(3)", "SystemExit"),
-        ("endless", "while True: pass", "TimeoutError"),
-    ],
+    [("leaving", "raise SystemExit(3)", "SystemExit"), ("endless", "while True: pass", "TimeoutError")],
 )
 def test_an_agent_that_fails_is_named_and_earlier_days_are_kept(tmp_path, module, body, message):
     (tmp_path / f"{module}.py").write_text(
