@@ -50,8 +50,8 @@ class FleetCars:
         self.scenarios = tuple(scenario.at_goal(goal) for goal in range(len(demand.goal_weights))) or (
             scenario,
         )
-        all_entries = scenario.entry is None or bool(demand.entry_weights)
-        self._entries = lot.entry_vertices if all_entries else lot.entry_vertices[[scenario.entry]]
+        entry = None if demand.entry_weights else scenario.entry
+        self._entries = lot.entry_vertices if entry is None else lot.entry_vertices[[entry]]
         self._scenario, self._options = scenario, options
         self._walk_s = np.array([problem.walk_s for problem in self.scenarios])
         self._way_s = self._ways_s()
