@@ -164,7 +164,8 @@ class Paths:
         total, cars = OUTCOMES[name].total(of_lone), of_lone[OUTCOMES[name].of]
         # Isotonic regression over the multiples (its min-max formula); k is the last of some, i the first.
         to = [np.pad(sums.cumsum(axis=1), ((0, 0), (1, 0))) for sums in (total, cars)]
-        means = _mean(*(sums[:, None, 1:] - sums[:, :-1, None] for sums in to), np.nan)
+        total, cars = (sums[:, None, 1:] - sums[:, :-1, None] for sums in to)
+        means = _mean(total, cars, np.nan)
         grown = [np.fmin.reduce(means[:, : k + 1, k:], axis=2) for k in range(len(self.multiples))]
         return np.asarray(np.nan_to_num(np.stack([np.fmax.reduce(least, axis=1) for least in grown], axis=1)))
 
@@ -316,14 +317,13 @@ def _errors(paths: Paths, name: str, predicted: FloatArray) -> Row:
     means = [sums.mean(axis=0) for sums in of_days]
     values = *means, np.nan_to_num(predicted) * means[1]
     total, cars, expected = _added(groups, *values)
-    halves = (
-        _mean(*_added(groups, *(sums[days].mean(axis=0) for sums in of_days)), np.nan) for days in (~odd, odd)
-    )
+    halves = [_added(groups, *(sums[days].mean(axis=0) for sums in of_days)) for days in (~odd, odd)]
+    of_even, of_odd = (_mean(half_total, half_cars, np.nan) for half_total, half_cars in halves)
     of_zones, _, expected_of_zones = _added(paths.groups(0, 1), *values)
     whole = float(total.sum()) or np.nan  # of what never happens nothing is relative
     return {
         "relative": float(abs(total - expected).sum() / whole),
-        "chance": float(np.nansum(cars * abs(np.subtract(*halves))) / 2.0 / whole),
+        "chance": float(np.nansum(cars * abs(of_even - of_odd)) / 2.0 / whole),
         "of_zones": float(abs(of_zones - expected_of_zones).sum() / whole),
         "measured": float(total.sum() / cars.sum()),
         "bias": float((expected - total).sum() / whole),
